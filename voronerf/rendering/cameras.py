@@ -1,0 +1,299 @@
+"""Pinhole cameras with lens distortion: pixels to rays, points to pixels.
+
+c cameras, r rays, b chosen pixels, n points.
+
+Frames. A pose maps camera to world coordinates; camera axes are OpenGL's: x right, y up, the camera looks along -z. The
+world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel is
+at (0.5, 0.5). Distortion is OpenCV's radial-tangential model with (k1, k2, p1, p2), on image-plane coordinates
+u = (x - cx) / fx, v = (y - cy) / fy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+NEWTON_STEPS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """A batch of rays in world coordinates.
+
+    Attributes:
+        origins: float32 [r, 3].
+        directions: float32 [r, 3], unit length.
+    """
+
+    origins: Tensor
+    directions: Tensor
+
+    def __len__(self) -> int:
+        return self.origins.shape[0]
+
+    def __getitem__(self, index: Tensor | slice) -> Rays:
+        return Rays(self.origins[index], self.directions[index])
+
+    def to(self, device: torch.device | str) -> Rays:
+        return Rays(self.origins.to(device), self.directions.to(device))
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """c cameras that share an image size.
+
+    Attributes:
+        poses: float32 [c, 4, 4], camera to world.
+        intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
+        width: of every image, in pixels.
+        height: of every image, in pixels.
+        distortion: float32 [c, 4], (k1, k2, p1, p2) as OpenCV defines them, or None for none.
+    """
+
+    poses: Tensor
+    intrinsics: Tensor
+    width: int
+    height: int
+    distortion: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if self.poses.dim() != 3 or self.poses.shape[1:] != (4, 4):
+            raise ValueError(f"Cameras: poses must have shape [c, 4, 4], got {list(self.poses.shape)}")
+        expected = [len(self.poses), 4]
+        if list(self.intrinsics.shape) != expected:
+            raise ValueError(f"Cameras: intrinsics must have shape {expected}, got {list(self.intrinsics.shape)}")
+        if self.distortion is not None and list(self.distortion.shape) != expected:
+            raise ValueError(f"Cameras: distortion must have shape {expected}, got {list(self.distortion.shape)}")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"Cameras: width and height must be >= 1, got {self.width} x {self.height}")
+
+    def __len__(self) -> int:
+        return self.poses.shape[0]
+
+    def __getitem__(self, index: Tensor | slice | Sequence[int]) -> Cameras:
+        """The cameras chosen by a slice, a list or an index tensor."""
+        distortion = None if self.distortion is None else self.distortion[index]
+        return replace(self, poses=self.poses[index], intrinsics=self.intrinsics[index], distortion=distortion)
+
+    @property
+    def origins(self) -> Tensor:
+        """Camera centres, [c, 3]."""
+        return self.poses[:, :3, 3]
+
+    @property
+    def forward(self) -> Tensor:
+        """Unit viewing directions (optical axes), [c, 3]."""
+        return -self.poses[:, :3, 2]
+
+    def to(self, device: torch.device | str) -> Cameras:
+        distortion = None if self.distortion is None else self.distortion.to(device)
+        return replace(
+            self, poses=self.poses.to(device), intrinsics=self.intrinsics.to(device), distortion=distortion
+        )
+
+    def downscaled(self, factor: int) -> Cameras:
+        """Cameras of the images averaged over blocks of `factor` x `factor` pixels.
+
+        Columns and rows that fill no whole block are dropped at the right and at the bottom, so that focal lengths and the
+        principal point are exactly divided by `factor`.
+
+        Raises:
+            ValueError: `factor` is below 1, or no whole block is left.
+        """
+        if factor < 1:
+            raise ValueError(f"downscaled: factor must be >= 1, got {factor}")
+        if factor > min(self.width, self.height):
+            raise ValueError(f"downscaled: factor {factor} leaves no pixel of {self.width} x {self.height}")
+        return replace(
+            self, intrinsics=self.intrinsics / factor, width=self.width // factor, height=self.height // factor
+        )
+
+    def rays(self, image_index: Tensor, x: Tensor, y: Tensor) -> Rays:
+        """Rays through pixels.
+
+        Args:
+            image_index: integer [b], the camera of each pixel.
+            x: [b] column. Integers name pixels (the ray goes through their centre), floats are positions in the image.
+            y: [b] row, likewise.
+        """
+        u, v = self._image_plane(image_index, _position(x), _position(y))
+        pose = self.poses[image_index]
+        local = torch.stack((u, -v, -torch.ones_like(u)), dim=-1)
+        directions = (pose[:, :3, :3] @ local[:, :, None])[:, :, 0]
+        return Rays(pose[:, :3, 3], torch.nn.functional.normalize(directions, dim=-1))
+
+    def image_rays(self, index: int) -> Rays:
+        """Rays through all pixel centres of one camera, row by row: [height * width]."""
+        device = self.poses.device
+        y, x = torch.meshgrid(
+            torch.arange(self.height, device=device), torch.arange(self.width, device=device), indexing="ij"
+        )
+        return self.rays(torch.full_like(x.reshape(-1), index), x.reshape(-1), y.reshape(-1))
+
+    def project(self, points: Tensor, index: int) -> tuple[Tensor, Tensor]:
+        """Where one camera sees points.
+
+        Args:
+            points: [n, 3], world.
+            index: the camera.
+
+        Returns:
+            (pixels [n, 2], depth [n]): positions (x, y) in the image, and distance along the optical axis in world units.
+            Points with depth <= 0 are behind the camera; their pixels mean nothing.
+        """
+        pose = self.poses[index]
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        depth = -local[:, 2]
+        safe = torch.where(depth > 0, depth, torch.ones_like(depth))
+        u, v = local[:, 0] / safe, -local[:, 1] / safe
+        if self.distortion is not None:
+            u, v = distort(u, v, self.distortion[index])
+        fx, fy, cx, cy = self.intrinsics[index].unbind(-1)
+        return torch.stack((u * fx + cx, v * fy + cy), dim=-1), depth
+
+    def _image_plane(self, image_index: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Undistorted image-plane coordinates of pixel positions; all [b]."""
+        if self.distortion is None:
+            fx, fy, cx, cy = self.intrinsics[image_index].unbind(-1)
+            return (x - cx) / fx, (y - cy) / fy
+        # float64: a millionth of a pixel is below the resolution of float32
+        fx, fy, cx, cy = self.intrinsics[image_index].double().unbind(-1)
+        u, v = undistort((x - cx) / fx, (y - cy) / fy, self.distortion[image_index].double())
+        return u.to(self.poses.dtype), v.to(self.poses.dtype)
+
+
+def distort(u: Tensor, v: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    """OpenCV's lens model: where the lens puts the ideal image-plane point (u, v).
+
+    Source: OpenCV, "Camera Calibration and 3D Reconstruction", radial-tangential model with k1, k2, p1, p2.
+
+    Args:
+        u: [n].
+        v: [n].
+        coefficients: (k1, k2, p1, p2), [4] or [n, 4].
+    """
+    k1, k2, p1, p2 = coefficients.unbind(-1)
+    r2 = u * u + v * v
+    radial = 1 + r2 * (k1 + r2 * k2)
+    return (
+        u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u),
+        v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v,
+    )
+
+
+def undistort(u: Tensor, v: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse of `distort` by Newton's method, from the distorted point itself.
+
+    Converges quadratically wherever the lens model is invertible between the start and the solution, which holds inside
+    the image of any lens this model describes; a fixed number of steps keeps the device out of the host's hands. Give
+    float64 for an error below a millionth of a pixel.
+    """
+    k1, k2, p1, p2 = coefficients.unbind(-1)
+    a, b = u, v
+    for _ in range(NEWTON_STEPS):
+        r2 = a * a + b * b
+        radial = 1 + r2 * (k1 + r2 * k2)
+        slope = 2 * k1 + 4 * k2 * r2  # d radial / d r2, times 2
+        du, dv = distort(a, b, coefficients)
+        du, dv = du - u, dv - v
+        aa = radial + a * a * slope + 2 * p1 * b + 6 * p2 * a
+        ab = a * b * slope + 2 * p1 * a + 2 * p2 * b
+        bb = radial + b * b * slope + 6 * p1 * b + 2 * p2 * a
+        determinant = aa * bb - ab * ab
+        a, b = a - (bb * du - ab * dv) / determinant, b - (aa * dv - ab * du) / determinant
+    return a, b
+
+
+def focus_point(cameras: Cameras) -> Tensor | None:
+    """The point closest to all optical axes (least squares), float32 [3].
+
+    Returns:
+        None where there is no such point in front of the cameras: axes that are nearly parallel, or look outwards.
+    """
+    origins, forward = cameras.origins.double(), cameras.forward.double()
+    across = torch.eye(3, dtype=torch.float64, device=origins.device) - forward[:, :, None] * forward[:, None, :]
+    matrix = across.mean(0)
+    if torch.linalg.eigvalsh(matrix)[0] < 1e-3:
+        return None
+    point = torch.linalg.solve(matrix, (across @ origins[:, :, None]).mean(0)[:, 0])
+    ahead = ((point - origins) * forward).sum(-1)
+    return point.to(cameras.poses.dtype) if (ahead > 0).double().mean() > 0.5 else None
+
+
+def look_at(origins: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """Poses [c, 4, 4] of cameras at `origins` [c, 3] that look at `target` [3] with `up` [3] upwards in the image.
+
+    A camera that looks along `up` itself takes another axis for it.
+    """
+    back = torch.nn.functional.normalize(origins - target, dim=-1)
+    along = torch.cross(up.expand_as(back), back, dim=-1)
+    spare = torch.cross(up.roll(1).expand_as(back), back, dim=-1)
+    right = torch.where(along.norm(dim=-1, keepdim=True) > 1e-4, along, spare)
+    right = torch.nn.functional.normalize(right, dim=-1)
+    poses = torch.eye(4, dtype=origins.dtype, device=origins.device).repeat(len(origins), 1, 1)
+    poses[:, :3] = torch.stack((right, torch.cross(back, right, dim=-1), back, origins), dim=-1)
+    return poses
+
+
+def orbit_cameras(
+    count: int,
+    *,
+    radius: float,
+    elevation: float,
+    width: int,
+    height: int,
+    focal: float,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    start: float = 0.0,
+) -> Cameras:
+    """Cameras evenly spaced on a circle around the z axis, looking at `centre`.
+
+    Args:
+        count: number of cameras, >= 1.
+        radius: distance to the centre, world units.
+        elevation: above the horizon, degrees.
+        width: pixels.
+        height: pixels.
+        focal: pixels; the principal point is the middle of the image.
+        centre: looked at.
+        start: azimuth of the first camera, degrees.
+    """
+    if count < 1:
+        raise ValueError(f"orbit_cameras: count must be >= 1, got {count}")
+    azimuth = math.radians(start) + torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+    climb = math.radians(elevation)
+    around = torch.stack(
+        (azimuth.cos() * math.cos(climb), azimuth.sin() * math.cos(climb), torch.full_like(azimuth, math.sin(climb))),
+        dim=-1,
+    )
+    target = torch.tensor(centre, dtype=torch.float64)
+    poses = look_at(target + radius * around, target, torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64))
+    intrinsics = torch.tensor((focal, focal, width / 2, height / 2)).repeat(count, 1)
+    return Cameras(poses.float(), intrinsics.float(), width, height)
+
+
+def turntable_cameras(cameras: Cameras, count: int) -> Cameras:
+    """An orbit like the given cameras: around their focus, at their mean distance, elevation and focal length."""
+    centre = focus_point(cameras)
+    if centre is None:
+        centre = (cameras.origins + cameras.forward).mean(0)
+    offset = cameras.origins - centre
+    radius = float(offset.norm(dim=-1).mean())
+    climb = float((offset[:, 2] / offset.norm(dim=-1).clamp_min(1e-9)).mean().clamp(-0.95, 0.95))
+    return orbit_cameras(
+        count,
+        radius=radius,
+        elevation=math.degrees(math.asin(climb)),
+        width=cameras.width,
+        height=cameras.height,
+        focal=float(cameras.intrinsics[:, :2].mean()),
+        centre=centre.tolist(),
+    ).to(cameras.poses.device)
+
+
+def _position(pixel: Tensor) -> Tensor:
+    return pixel if pixel.is_floating_point() else pixel + 0.5

@@ -1,0 +1,48 @@
+"""Rays against the scene's box. r rays; distances are along the unit direction, in world units."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def intersect_box(
+    origins: Tensor, directions: Tensor, box: Tensor | None, near: float, far: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The part of each ray between `near` and `far` that lies in an axis-aligned box (slab method).
+
+    Args:
+        origins: [r, 3].
+        directions: [r, 3]; components may be zero.
+        box: [2, 3], lowest and highest corner, or None for all of space.
+        near: nearest distance of interest, >= 0.
+        far: farthest.
+
+    Returns:
+        (near [r], far [r], hit bool [r]). A ray that misses has hit False and far == near, so that its samples have no
+        extent. A ray that only touches the box misses.
+    """
+    if directions.shape != origins.shape or origins.dim() != 2 or origins.shape[1] != 3:
+        raise ValueError(
+            "intersect_box: origins and directions must have the same shape [r, 3], "
+            f"got {list(origins.shape)} and {list(directions.shape)}"
+        )
+    if not 0 <= near < far:
+        raise ValueError(f"intersect_box: near and far must satisfy 0 <= near < far, got {near} and {far}")
+    if box is None:
+        first = torch.full_like(origins[:, 0], near)
+        return first, torch.full_like(first, far), torch.ones_like(first, dtype=torch.bool)
+    if box.shape != (2, 3):
+        raise ValueError(f"intersect_box: box must have shape [2, 3], got {list(box.shape)}")
+    low, high = (box[0] - origins) / directions, (box[1] - origins) / directions
+    first, last = torch.minimum(low, high), torch.maximum(low, high)
+    # 0 / 0 and +-inf: a ray parallel to a slab is inside it at all distances or at none
+    parallel = directions == 0
+    inside = (origins >= box[0]) & (origins <= box[1])
+    infinity = torch.full_like(first, float("inf"))
+    first = torch.where(parallel, torch.where(inside, -infinity, infinity), first)
+    last = torch.where(parallel, torch.where(inside, infinity, -infinity), last)
+    enter = first.amax(-1).clamp(near, far)
+    leave = last.amin(-1).clamp(near, far)
+    hit = leave > enter
+    return enter, torch.where(hit, leave, enter), hit
