@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +25,17 @@ import torch
 
 BACKENDS = ("reference", "native", "warp")
 ORDER = {"cpu": ("native", "reference"), "cuda": ("native", "warp", "reference")}
+OPS = (
+    "nearest_centre",
+    "locate_cell",
+    "cell_sort",
+    "grouped_linear",
+    "grouped_mlp",
+    "frequency_encode",
+    "integrated_encode",
+    "composite",
+    "resample",
+)
 
 
 class BackendUnavailable(RuntimeError):
@@ -37,7 +49,7 @@ class Implementation:
     Attributes:
         target: ``"module:function"``, imported on first use.
         devices: device types it runs on; empty means any.
-        dtypes: dtypes of the first argument it takes; empty means any.
+        dtypes: dtypes of the op's first tensor it takes; empty means any.
     """
 
     target: str
@@ -45,28 +57,49 @@ class Implementation:
     dtypes: tuple[torch.dtype, ...] = ()
 
 
-OPS = (
-    "nearest_centre",
-    "locate_cell",
-    "cell_sort",
-    "grouped_linear",
-    "grouped_mlp",
-    "frequency_encode",
-    "integrated_encode",
-    "composite",
-    "resample",
-)
+@dataclass(frozen=True)
+class Row:
+    """One line of the table of ops and backends, as `voronerf info` prints it.
+
+    Attributes:
+        op: name of the op.
+        backend: name of the backend.
+        devices: device types on which this pair can run here and now.
+        dtypes: names of the dtypes it takes, ``("any",)`` for all, empty where there is no implementation.
+        reason: why it cannot run, or cannot run on some device, in one line; empty where nothing is missing.
+    """
+
+    op: str
+    backend: str
+    devices: tuple[str, ...]
+    dtypes: tuple[str, ...]
+    reason: str
+
+    @property
+    def available(self) -> bool:
+        """Whether the pair runs on some device of this machine."""
+        return bool(self.devices)
+
+
+_COORDINATES = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 
 _REGISTRY: dict[tuple[str, str], Implementation] = {
-    (op, "reference"): Implementation(f"voronerf.reference.{op}:{op}") for op in OPS
+    **{(op, "reference"): Implementation(f"voronerf.reference.{op}:{op}") for op in OPS},
+    ("nearest_centre", "native"): Implementation("voronerf._native:nearest_centre", ("cpu", "cuda"), _COORDINATES),
+    ("locate_cell", "native"): Implementation("voronerf._native:locate_cell", ("cpu", "cuda"), _COORDINATES),
+    ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
+    ("nearest_centre", "warp"): Implementation(
+        "voronerf.kernels.nearest_centre:nearest_centre", ("cpu", "cuda"), _COORDINATES
+    ),
 }
-
 
 _FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {}
 
 
 def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
     """Implementation of `op` for a device and dtype, with the signature of the reference function.
+
+    Works inside ``torch.compile(fullgraph=True)``: the choice is made while tracing.
 
     Args:
         op: name of the op, one of ``OPS``.
@@ -75,21 +108,118 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
         dtype: dtype of the op's first tensor argument.
 
     Raises:
-        ValueError: unknown backend.
+        ValueError: unknown op or backend.
         BackendUnavailable: the backend asked for by name is not available, or does not take this device or dtype.
     """
     return _FUNCTIONS[op, _choose(op, backend, device.type, device.index, dtype)]
 
 
-# torch.compile runs this at trace time and keeps the answer; the function itself is then found by a traceable look-up.
+def why_not(op: str, backend: str, device: torch.device, dtype: torch.dtype | None = None) -> str | None:
+    """Reason, with the remedy where there is one, why a backend cannot run an op; None if it can.
+
+    Args:
+        op: name of the op.
+        backend: a name from ``BACKENDS``.
+        device: device of the op's tensors.
+        dtype: dtype of the op's first tensor argument; None leaves it out of the question.
+    """
+    implementation = _REGISTRY.get((op, backend))
+    if implementation is None:
+        others = [other for other in BACKENDS if (op, other) in _REGISTRY]
+        return f"there is no {backend} implementation of {op}; use backend={_choices(others)}"
+    if implementation.devices and device.type not in implementation.devices:
+        return f"the {backend} implementation of {op} runs on {_choices(implementation.devices)}, not on {device.type}"
+    if dtype is not None and implementation.dtypes and dtype not in implementation.dtypes:
+        return (
+            f"the {backend} implementation of {op} takes {_choices(_names(implementation.dtypes))}, not {_name(dtype)}"
+        )
+    return missing(backend, device)
+
+
+def missing(backend: str, device: torch.device) -> str | None:
+    """Reason, with the remedy, why a backend as a whole cannot run on a device here; None if it can."""
+    if device.type == "cuda" and not torch.cuda.is_available():
+        return "torch sees no CUDA device; use device='cpu', or a CUDA build of torch on a machine with a GPU"
+    if backend == "reference":
+        return None
+    try:
+        module = importlib.import_module("voronerf._native" if backend == "native" else "voronerf.kernels")
+    except BackendUnavailable as error:
+        return str(error)
+    reason: str | None = module.missing(device)
+    return reason
+
+
+def table() -> list[Row]:
+    """Every op and backend: where it runs here, which dtypes it takes, and what is missing."""
+    rows = []
+    for op in OPS:
+        for backend in BACKENDS:
+            reasons = {device: why_not(op, backend, torch.device(device)) for device in ORDER}
+            implementation = _REGISTRY.get((op, backend))
+            dtypes = () if implementation is None else _names(implementation.dtypes) or ("any",)
+            devices = tuple(device for device, reason in reasons.items() if reason is None)
+            distinct = dict.fromkeys(reason for reason in reasons.values() if reason is not None)
+            rows.append(Row(op, backend, devices, dtypes, "; ".join(distinct)))
+    return rows
+
+
+def describe() -> dict[str, Any]:
+    """What this installation is made of: versions, threads, and how the compiled module was built."""
+    from voronerf import __version__
+
+    return {
+        "voronerf": __version__,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "torch": torch.__version__,
+        "threads": torch.get_num_threads(),
+        "cuda devices": [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())],
+        "native": _describe("voronerf._native"),
+        "warp": _describe("voronerf.kernels"),
+    }
+
+
+def _describe(module: str) -> dict[str, Any]:
+    try:
+        described: dict[str, Any] = importlib.import_module(module).describe()
+    except BackendUnavailable as error:
+        return {"available": False, "reason": str(error)}
+    return {"available": True, **described}
+
+
+# torch.compile runs this while tracing and keeps the answer; the function is then found by a look-up it can trace.
 @torch.compiler.assume_constant_result
 def _choose(op: str, backend: str, device: str, index: int | None, dtype: torch.dtype) -> str:
     return _choose_once(op, backend, device, index, dtype)
 
 
 @functools.cache
-def _choose_once(op: str, backend: str, device: str, index: int | None, dtype: torch.dtype) -> str:
-    implementation = _REGISTRY[op, "reference"]
-    module, _, function = implementation.target.partition(":")
-    _FUNCTIONS[op, "reference"] = getattr(importlib.import_module(module), function)
-    return "reference"
+def _choose_once(op: str, backend: str, device_type: str, index: int | None, dtype: torch.dtype) -> str:
+    if op not in OPS:
+        raise ValueError(f"resolve: op must be one of {_choices(OPS)}, got {op!r}")
+    if backend != "auto" and backend not in BACKENDS:
+        raise ValueError(f"{op}: backend must be one of {_choices(('auto', *BACKENDS))}, got {backend!r}")
+    device = torch.device(device_type) if index is None else torch.device(device_type, index)
+    if backend == "auto":
+        order = ORDER.get(device_type, ("reference",))
+        backend = next(name for name in order if why_not(op, name, device, dtype) is None)
+    else:
+        reason = why_not(op, backend, device, dtype)
+        if reason is not None:
+            raise BackendUnavailable(f"{op}: backend {backend!r} is not available: {reason}")
+    module, _, function = _REGISTRY[op, backend].target.partition(":")
+    _FUNCTIONS[op, backend] = getattr(importlib.import_module(module), function)
+    return backend
+
+
+def _choices(names: tuple[str, ...] | list[str]) -> str:
+    return " | ".join(repr(name) for name in names)
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def _names(dtypes: tuple[torch.dtype, ...]) -> tuple[str, ...]:
+    return tuple(_name(dtype) for dtype in dtypes)

@@ -1,0 +1,102 @@
+"""Device and backend fixtures, and ``--require``.
+
+A test that takes ``device`` and ``backend`` runs once for every pair; ``@pytest.mark.op("nearest_centre")`` keeps the
+pairs that implement that op. Taking ``device`` alone runs it on each device, ``backend`` alone on each backend of the
+CPU::
+
+    @pytest.mark.op("nearest_centre")
+    def test_ties(device, backend):  # reference-cpu, native-cpu, warp-cpu, reference-cuda, native-cuda, warp-cuda
+        cells = voronerf.nearest_centre(points.to(device), centres.to(device), backend=backend)
+
+    def test_empty(device):  # cpu, cuda
+        ...
+
+``@pytest.mark.native``, ``@pytest.mark.cuda`` and ``@pytest.mark.warp`` say that a test needs that part. What is absent
+is a skip with its reason; ``--require native,cuda,warp`` turns those skips into failures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from voronerf import backends
+
+PARTS = ("native", "cuda", "warp")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--require", default="", help=f"parts that must be present, from {','.join(PARTS)}")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "op(name): run on the backends that implement this op")
+    unknown = _required(config) - set(PARTS)
+    if unknown:
+        raise pytest.UsageError(f"--require takes {','.join(PARTS)}, got {','.join(sorted(unknown))}")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    wants_device = "device" in metafunc.fixturenames
+    wants_backend = "backend" in metafunc.fixturenames
+    own = {name for mark in metafunc.definition.iter_markers("parametrize") for name in _names(mark)}
+    if own & {"device", "backend"}:
+        return
+    devices = ("cpu", "cuda") if wants_device else ("cpu",)
+    if not wants_backend:
+        if wants_device:
+            metafunc.parametrize("device", devices, indirect=True)
+        return
+    mark = metafunc.definition.get_closest_marker("op")
+    names = [b for b in backends.BACKENDS if mark is None or (mark.args[0], b) in backends._REGISTRY]
+    if wants_device:
+        pairs = [(backend, device) for device in devices for backend in names]
+        metafunc.parametrize(("backend", "device"), pairs, indirect=["device"], ids=["-".join(pair) for pair in pairs])
+    else:
+        metafunc.parametrize("backend", names)
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest) -> torch.device:
+    return torch.device(request.param)
+
+
+@pytest.fixture(autouse=True)
+def _same_seed() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    for part, reason in _absent(item):
+        if part in _required(item.config):
+            pytest.fail(f"--require {part}: {reason}", pytrace=False)
+        pytest.skip(f"{part}: {reason}")
+
+
+def _absent(item: pytest.Item) -> Iterator[tuple[str, str]]:
+    """Parts a test needs and this machine lacks, each with the reason."""
+    params = getattr(getattr(item, "callspec", None), "params", {})
+    device = torch.device(params.get("device", "cpu"))
+    named = {part for part in PARTS if item.get_closest_marker(part) is not None}
+    if device.type == "cuda" or "cuda" in named:
+        device = torch.device("cuda")
+        reason = backends.missing("reference", device)
+        if reason is not None:
+            yield "cuda", reason
+            return
+    for backend in sorted(({params.get("backend", "auto")} | named) & {"native", "warp"}):
+        reason = backends.missing(backend, device)
+        if reason is not None:
+            yield backend, reason
+
+
+def _required(config: pytest.Config) -> set[str]:
+    return {part for part in config.getoption("--require").split(",") if part}
+
+
+def _names(mark: pytest.Mark) -> list[str]:
+    names = mark.args[0] if mark.args else mark.kwargs["argnames"]
+    return [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
