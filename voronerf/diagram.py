@@ -1,0 +1,421 @@
+"""Nested Voronoi diagrams: which cell of space a point belongs to.
+
+Letters: n points, k centres of one diagram, m centres of all diagrams of a tree, g diagrams (internal nodes) of a tree.
+
+A diagram gives each point of space to its nearest centre, `v(x) = argmin_i |x - v_i|` (Elsner et al. 2023, "Adaptive
+Voronoi NeRFs", section 3). A centre may be refined by a diagram of its own, and so on: a query goes down level by level
+until it reaches a centre that is not refined, a leaf. The leaves are the cells that own networks. They are numbered
+depth-first, so the leaves of one refined cell are contiguous and stand where their parent stood.
+
+With power weights the nearest centre is the one with the smallest `|x - v_i|^2 - w_i` among its siblings. Adding a
+constant to the weights of one diagram changes nothing. A heavy weight can leave a sibling without any points, and a
+centre may then lie outside of its own cell.
+
+Coordinates are in scene units, in the world frame of the points that are asked about.
+"""
+
+import itertools
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf import ops
+
+_CHUNK_ELEMENTS = 1 << 22  # distances held at once by sample_cell: 16 MiB in float32
+
+
+class VoronoiDiagram(nn.Module):
+    """A Voronoi or power diagram of any depth, as flat tables that `ops.locate_cell` reads.
+
+    A diagram is never changed in place by its own methods: `refine` returns a new one. Its buffers stay float32
+    whatever dtype a surrounding module is converted to, because rounding the centres would move samples to networks
+    that never saw them.
+
+    Attributes:
+        centres: float32 [m, 3], the centres of all diagrams, diagram after diagram; diagram 0 is the root.
+        child_offsets: int32 [g + 1]; diagram j owns rows `child_offsets[j] : child_offsets[j + 1]` of `centres`.
+        child: int32 [m]; a value c >= 0 says that diagram c refines this centre, c < 0 that it is leaf number `-c - 1`.
+        power: float32 [m] power weights in squared scene units, or None for a plain Voronoi diagram.
+        depth: number of levels; 1 for a flat diagram.
+        num_cells: number of leaves.
+    """
+
+    centres: Tensor
+    child_offsets: Tensor
+    child: Tensor
+    power: Tensor | None
+    depth: int
+    num_cells: int
+
+    def __init__(self, centres: Tensor, *, weights: Tensor | None = None) -> None:
+        """Makes a flat diagram; a single centre is legal and means one cell, all of space.
+
+        Args:
+            centres: floating [k, 3], k >= 1, finite; copied to float32.
+            weights: floating [k] power weights in squared scene units, or None.
+
+        Raises:
+            ValueError: wrong shape, no centre, or a value that is not finite.
+            TypeError: not a floating-point tensor.
+        """
+        super().__init__()
+        _check_finite_table("centres", centres, (-1, 3))
+        k = centres.shape[0]
+        if k == 0:
+            raise ValueError("VoronoiDiagram: centres must hold at least one centre, got shape [0, 3]")
+        if weights is not None:
+            _check_finite_table("weights", weights, (k,))
+        device = centres.device
+        self._set_tables(
+            centres.detach().to(torch.float32, copy=True).contiguous(),
+            torch.tensor([0, k], dtype=torch.int32, device=device),
+            -1 - torch.arange(k, dtype=torch.int32, device=device),
+            None if weights is None else weights.detach().to(device, torch.float32, copy=True).contiguous(),
+        )
+
+    def _set_tables(self, centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None) -> None:
+        self.depth, self.num_cells = _check_tree(centres, child_offsets, child, power)
+        self.register_buffer("centres", centres)
+        self.register_buffer("child_offsets", child_offsets)
+        self.register_buffer("child", child)
+        self.register_buffer("power", power)
+
+    @classmethod
+    def _from_tables(
+        cls, centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None
+    ) -> "VoronoiDiagram":
+        diagram = cls.__new__(cls)
+        nn.Module.__init__(diagram)
+        diagram._set_tables(centres, child_offsets, child, power)
+        return diagram
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], prefix: str = "") -> "VoronoiDiagram":
+        """Makes the diagram that a `state_dict` describes, whatever its size and depth.
+
+        Args:
+            state: a state dict of a diagram, or of a module that holds one under `prefix`.
+            prefix: what stands before "centres", e.g. "diagram.".
+
+        Raises:
+            ValueError: a table is missing or the tables are not those of a tree.
+        """
+        names = ("centres", "child_offsets", "child")
+        missing = [prefix + name for name in names if prefix + name not in state]
+        if missing:
+            raise ValueError(f"VoronoiDiagram: state must hold {', '.join(missing)}, got {len(state)} other entries")
+        centres, child_offsets, child = (state[prefix + name].detach().clone() for name in names)
+        power = state.get(prefix + "power")
+        return cls._from_tables(centres, child_offsets, child, None if power is None else power.detach().clone())
+
+    @property
+    def leaf_rows(self) -> Tensor:
+        """int64 [num_cells]: the row of `centres` that each leaf is."""
+        rows = torch.nonzero(self.child < 0).squeeze(1)
+        return rows[torch.argsort(self.child[rows], descending=True)]
+
+    @property
+    def leaf_centres(self) -> Tensor:
+        """float32 [num_cells, 3]: the centre of each leaf among its siblings."""
+        return self.centres[self.leaf_rows]
+
+    def paths(self) -> Tensor:
+        """int64 [num_cells, depth]: the number of each leaf's ancestors among their siblings, level by level.
+
+        The last number is the leaf's own; -1 stands past the end of the shallower branches of an uneven tree.
+        `paths()[:, 0]` is the cell of the root diagram that a leaf lies in, which is what a drawing colours by.
+        """
+        offsets, child = self.child_offsets.tolist(), self.child.tolist()
+        paths = torch.full((self.num_cells, self.depth), -1, dtype=torch.int64)
+        pending: list[tuple[int, list[int]]] = [(0, [])]
+        while pending:
+            node, path = pending.pop()
+            for row in range(offsets[node], offsets[node + 1]):
+                here = [*path, row - offsets[node]]
+                if child[row] >= 0:
+                    pending.append((child[row], here))
+                else:
+                    paths[-child[row] - 1, : len(here)] = torch.tensor(here)
+        return paths.to(self.centres.device)
+
+    def locate(self, points: Tensor, *, backend: str = "auto") -> Tensor:
+        """The leaf that each point lies in.
+
+        Args:
+            points: floating [..., 3]; half types are compared in float32, float64 points in float64.
+            backend: see `voronerf.backends`.
+
+        Returns:
+            int32 [...], ties to the lowest index of a level, points that are not finite to the first cell of a level.
+
+        Raises:
+            ValueError: the last dimension of points is not 3.
+        """
+        flat = self._flatten("locate", points)
+        dtype = torch.float64 if flat.dtype == torch.float64 else torch.float32
+        flat, centres = flat.to(dtype), self.centres.to(dtype)
+        weights = None if self.power is None else self.power.to(dtype)
+        if self.depth == 1:
+            cells = ops.nearest_centre(flat, centres, weights=weights, backend=backend)
+        else:
+            cells = ops.locate_cell(
+                flat, centres, self.child_offsets, self.child, depth=self.depth, weights=weights, backend=backend
+            )
+        return cells.reshape(points.shape[:-1])
+
+    def sample_cell(self, points: Tensor, *, temperature: float, generator: torch.Generator | None = None) -> Tensor:
+        """Draws the leaf of each point at random, near centres being likelier (the paper's stochastic assignment).
+
+        The paper draws the cell "from the vector of distances" and leaves the law open. Here, at each level of the
+        tree, child i of the diagram reached so far is drawn with probability
+
+            p_i = exp(-d_i / temperature) / sum_j exp(-d_j / temperature),     d_i = |x - v_i|,
+
+        so a leaf's probability is the product of these along its path, the temperature being the same at every level: a
+        length in scene units, about the width of the band along the borders in which cells mix. With power weights
+        `d_i = sqrt(|x - v_i|^2 + max_j w_j - w_i)` over the siblings j, which is the plain distance when all weights
+        are equal and does not depend on a constant added to them. The limit of temperature 0 is `locate`, which is what
+        0 gives.
+
+        Args:
+            points: floating [..., 3].
+            temperature: >= 0, in scene units.
+            generator: of the device of `points`; None for torch's global one.
+
+        Returns:
+            int32 [...] leaf numbers.
+
+        Raises:
+            ValueError: the last dimension of points is not 3, or the temperature is negative or not finite.
+        """
+        if not 0.0 <= temperature < float("inf"):
+            raise ValueError(f"sample_cell: temperature must be finite and at least 0, got {temperature}")
+        if temperature == 0.0:
+            return self.locate(points)
+        flat = self._flatten("sample_cell", points).to(torch.float32)
+        widest = int((self.child_offsets[1:] - self.child_offsets[:-1]).max())
+        pieces = flat.split(max(1, _CHUNK_ELEMENTS // (3 * widest)))
+        cells = [self._sample_piece(piece, widest, temperature, generator) for piece in pieces]
+        return torch.cat(cells).reshape(points.shape[:-1]) if cells else flat.new_empty(0, dtype=torch.int32)
+
+    def _sample_piece(
+        self, points: Tensor, widest: int, temperature: float, generator: torch.Generator | None
+    ) -> Tensor:
+        column = torch.arange(widest, device=points.device)
+        last = self.centres.shape[0] - 1
+        child = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
+        for _ in range(self.depth):
+            node = child.clamp(min=0)
+            first = self.child_offsets[node]
+            rows = (first[:, None] + column).clamp(max=last)
+            absent = first[:, None] + column >= self.child_offsets[node + 1][:, None]
+            squared = (points[:, None] - self.centres[rows]).square().sum(2)
+            if self.power is not None:
+                weights = self.power[rows].masked_fill(absent, -float("inf"))
+                squared = squared + weights.amax(1, keepdim=True) - self.power[rows]
+            # Gumbel-max: the argmax of logit - log(e), e exponential, is a draw from the softmax of the logits.
+            noise = torch.empty_like(squared).exponential_(generator=generator).log()
+            score = (-squared.clamp(min=0).sqrt() / temperature - noise).nan_to_num(nan=-1e30, neginf=-1e30)
+            choice = score.masked_fill(absent, -float("inf")).argmax(1, keepdim=True)
+            child = torch.where(child < 0, child, self.child[rows.gather(1, choice).squeeze(1)])
+        return -1 - child
+
+    def refine(self, children: Mapping[int, "Tensor | VoronoiDiagram"]) -> tuple["VoronoiDiagram", Tensor]:
+        """A new diagram in which the named leaves are refined; the other leaves stay as they are.
+
+        A child of a single cell leaves its parent a leaf. Refining a diagram of a single cell gives the child itself,
+        with no level that decides nothing.
+
+        Args:
+            children: leaf number -> centres [k, 3] of the diagram inside it, or a `VoronoiDiagram` of any depth.
+
+        Returns:
+            The refined diagram, and `parents`, int64 [new num_cells]: for each new leaf the old leaf that it lies in.
+
+        Raises:
+            ValueError: a leaf out of range or named twice, or centres that `VoronoiDiagram` refuses.
+            TypeError: a leaf that is no integer, or centres that are no tensor.
+        """
+        device = self.centres.device
+        grafts: dict[int, VoronoiDiagram] = {}
+        for key, value in children.items():
+            leaf = operator.index(key)
+            if not 0 <= leaf < self.num_cells:
+                raise ValueError(f"refine: children must name leaves 0..{self.num_cells - 1}, got {leaf}")
+            if leaf in grafts:
+                raise ValueError(f"refine: children must name each leaf once, got {leaf} twice")
+            graft = value if isinstance(value, VoronoiDiagram) else VoronoiDiagram(value)
+            grafts[leaf] = graft
+
+        counts = torch.ones(self.num_cells, dtype=torch.int64)
+        for leaf, graft in grafts.items():
+            counts[leaf] = graft.num_cells
+        parents = torch.repeat_interleave(torch.arange(self.num_cells), counts).to(device)
+        if self.num_cells == 1 and grafts:
+            graft = grafts[0]
+            power = None if graft.power is None else graft.power.to(device, copy=True)
+            centres, offsets, child = (
+                t.to(device, copy=True) for t in (graft.centres, graft.child_offsets, graft.child)
+            )
+            return VoronoiDiagram._from_tables(centres, offsets, child, power), parents
+
+        # The grafts' rows and diagrams go behind the present ones; only leaf numbers and links have to be shifted.
+        first_leaf = (counts.cumsum(0) - counts).to(device, torch.int32)
+        child = torch.where(self.child < 0, -1 - first_leaf[(-1 - self.child).clamp(min=0)], self.child)
+        leaf_rows = self.leaf_rows.tolist()
+        tables, offsets_all, links, powers = [self.centres], [self.child_offsets], [child], [self._power_or_zero()]
+        rows, nodes = self.centres.shape[0], self.child_offsets.shape[0] - 1
+        for leaf, graft in sorted(grafts.items()):
+            if graft.num_cells == 1:
+                continue
+            inner = graft.child.to(device)
+            child[leaf_rows[leaf]] = nodes
+            links.append(torch.where(inner < 0, inner - first_leaf[leaf], inner + nodes))
+            offsets_all.append(graft.child_offsets[1:].to(device) + rows)
+            tables.append(graft.centres.to(device))
+            powers.append(graft._power_or_zero().to(device))
+            rows, nodes = rows + graft.centres.shape[0], nodes + graft.child_offsets.shape[0] - 1
+        weighted = self.power is not None or any(graft.power is not None for graft in grafts.values())
+        refined = VoronoiDiagram._from_tables(
+            torch.cat(tables), torch.cat(offsets_all), torch.cat(links), torch.cat(powers) if weighted else None
+        )
+        return refined, parents
+
+    def extra_repr(self) -> str:
+        """What `print` shows."""
+        kind = "Voronoi" if self.power is None else "power"
+        return f"{kind}, cells={self.num_cells}, depth={self.depth}"
+
+    def _power_or_zero(self) -> Tensor:
+        return torch.zeros_like(self.centres[:, 0]) if self.power is None else self.power
+
+    def _flatten(self, op: str, points: Tensor) -> Tensor:
+        if points.dim() == 0 or points.shape[-1] != 3:
+            raise ValueError(f"{op}: points must have shape [..., 3], got {list(points.shape)}")
+        if not points.is_floating_point():
+            raise TypeError(f"{op}: points must be floating-point, got {points.dtype}")
+        return points.detach().reshape(-1, 3)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "VoronoiDiagram":
+        kept = {name: getattr(self, name) for name in ("centres", "power")}
+        super()._apply(fn, recurse)
+        for name, table in kept.items():
+            moved = getattr(self, name)
+            if table is not None and moved.dtype != table.dtype:
+                setattr(self, name, table.to(moved.device))
+        return self
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Takes on the size and depth of what is loaded, which torch would otherwise refuse."""
+        if prefix + "centres" in state_dict:
+            device = self.centres.device
+            loaded = VoronoiDiagram.from_state(state_dict, prefix)
+            power = None if loaded.power is None else loaded.power.to(device)
+            self._set_tables(loaded.centres.to(device), loaded.child_offsets.to(device), loaded.child.to(device), power)
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def uniform_centres(box: Tensor, k: int) -> Tensor:
+    """k centres spread evenly over a box, as near to a regular grid as k allows (the paper's "uniform" ablation).
+
+    The box is cut across its longest side into 2 equal parts where k is even, into 3 where k is divisible by 3, and
+    otherwise into 2 parts in proportion to the centres on either side; each part likewise, until it holds one centre,
+    at its middle. All parts have the same volume. In a cube 8, 27, 64 ... give cubic grids, 12 gives 2 x 2 x 3, and 16
+    gives 4 x 2 x 2.
+
+    Args:
+        box: floating [2, 3], lowest and highest corner; flat boxes are allowed.
+        k: number of centres, >= 1.
+
+    Returns:
+        [k, 3] in the dtype and on the device of `box`.
+
+    Raises:
+        ValueError: k < 1, a wrong shape, a value that is not finite, or a highest corner below the lowest.
+    """
+    if k < 1:
+        raise ValueError(f"uniform_centres: k must be at least 1, got {k}")
+    if tuple(box.shape) != (2, 3):
+        raise ValueError(f"uniform_centres: box must have shape [2, 3], got {list(box.shape)}")
+    low, high = box.tolist()
+    if not bool(torch.isfinite(box).all()) or any(a > b for a, b in zip(low, high, strict=True)):
+        raise ValueError(f"uniform_centres: box must be finite with box[0] <= box[1], got {box.tolist()}")
+
+    def place(low: list[float], high: list[float], k: int) -> list[list[float]]:
+        if k == 1:
+            return [[(a + b) / 2 for a, b in zip(low, high, strict=True)]]
+        if k % 2 == 0:
+            shares = [k // 2] * 2
+        elif k % 3 == 0:
+            shares = [k // 3] * 3
+        else:
+            shares = [k // 2, k - k // 2]
+        sides = [b - a for a, b in zip(low, high, strict=True)]
+        # Rounding must not decide between equal sides: they count as equal up to one part in a million.
+        axis = next(i for i, side in enumerate(sides) if side >= max(sides) * (1 - 1e-6))
+        centres: list[list[float]] = []
+        start, done = low[axis], 0
+        for share in shares:
+            done += share
+            end = low[axis] + sides[axis] * done / k
+            centres += place([*low[:axis], start, *low[axis + 1 :]], [*high[:axis], end, *high[axis + 1 :]], share)
+            start = end
+        return centres
+
+    return torch.tensor(place(low, high, k), dtype=box.dtype, device=box.device)
+
+
+def _check_finite_table(name: str, table: Tensor, shape: tuple[int, ...]) -> None:
+    if not isinstance(table, Tensor) or not table.is_floating_point():
+        got = table.dtype if isinstance(table, Tensor) else type(table).__name__
+        raise TypeError(f"VoronoiDiagram: {name} must be a floating-point tensor, got {got}")
+    wanted = "[k, 3]" if len(shape) == 2 else f"[{shape[0]}]"
+    matches = table.dim() == len(shape) and all(s in (-1, t) for s, t in zip(shape, table.shape, strict=True))
+    if not matches:
+        raise ValueError(f"VoronoiDiagram: {name} must have shape {wanted}, got {list(table.shape)}")
+    if not bool(torch.isfinite(table).all()):
+        raise ValueError(f"VoronoiDiagram: {name} must be finite, got NaN or infinity")
+
+
+def _check_tree(centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None) -> tuple[int, int]:
+    """Checks the tables of a tree, which may come from a damaged file; returns its depth and number of leaves."""
+
+    def refuse(rule: str) -> ValueError:
+        return ValueError(f"VoronoiDiagram: tables of a tree must {rule}")
+
+    _check_finite_table("centres", centres, (-1, 3))
+    m = centres.shape[0]
+    if power is not None:
+        _check_finite_table("power", power, (m,))
+    if any(table.dtype != torch.int32 or table.dim() != 1 for table in (child_offsets, child)):
+        raise refuse("hold child_offsets and child as int32 vectors")
+    offsets, links = child_offsets.tolist(), child.tolist()
+    if len(links) != m or len(offsets) < 2 or offsets[0] != 0 or offsets[-1] != m:
+        raise refuse(f"cover all {m} centres, got {len(links)} links and offsets {offsets[:1]}..{offsets[-1:]}")
+    if any(a >= b for a, b in itertools.pairwise(offsets)):
+        raise refuse("give every diagram at least one centre")
+
+    depth, leaf = 0, 0
+    seen = [False] * (len(offsets) - 1)
+    # Depth-first, first child first, as the leaves are numbered: rows are stacked in reverse.
+    stack = [(row, 1) for row in reversed(range(offsets[0], offsets[1]))]
+    seen[0] = True
+    while stack:
+        row, level = stack.pop()
+        depth = max(depth, level)
+        link = links[row]
+        if link < 0:
+            if link != -1 - leaf:
+                raise refuse(f"number the leaves depth-first, got {-1 - link} where {leaf} was due")
+            leaf += 1
+            continue
+        if link >= len(seen) or seen[link]:
+            raise refuse(f"refer to each diagram once, got diagram {link} of {len(seen)} again or out of range")
+        seen[link] = True
+        stack += [(inner, level + 1) for inner in reversed(range(offsets[link], offsets[link + 1]))]
+    if not all(seen):
+        raise refuse("reach every diagram from the root")
+    return depth, leaf
