@@ -1,0 +1,118 @@
+"""Keeping the samples at which the picture is still wrong.
+
+The importance of a sample is `w * E(r)`: its contribution to its ray times the squared error of that ray's colour
+(Elsner et al. 2023, section 4). About 10,000 samples an epoch are kept, the same number from every batch, the heaviest
+of it, so that no batch and no time within the epoch counts more than another.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+
+class SampleReservoir:
+    """A ring of the heaviest samples of the last `batches` batches.
+
+    Every batch gives its `quota = ceil(capacity / batches)` heaviest samples, so at most `batches * quota` are held, 16
+    bytes each; after `batches` batches the oldest batch is overwritten. Samples of importance 0 and those with a
+    position or an importance that is not finite are never kept, and a batch that has fewer samples than its quota gives
+    what it has.
+
+    `add` reads no device value on the host, so it may stand in a training loop that runs ahead of its GPU.
+
+    Attributes:
+        capacity: number of samples asked for.
+        batches: number of batches that share it.
+        quota: samples kept of each batch.
+    """
+
+    def __init__(self, capacity: int = 10_000, batches: int = 100, *, device: torch.device | str = "cpu") -> None:
+        """Makes an empty reservoir.
+
+        Args:
+            capacity: samples to keep in all, >= 1.
+            batches: batches that share the capacity, >= 1: those of one epoch, or of the time between two subdivisions.
+            device: where the samples are held.
+
+        Raises:
+            ValueError: capacity or batches below 1.
+        """
+        if capacity < 1 or batches < 1:
+            raise ValueError(f"SampleReservoir: capacity and batches must be at least 1, got {capacity} and {batches}")
+        self.capacity, self.batches = capacity, batches
+        self.quota = -(-capacity // batches)
+        self._points = torch.zeros(batches, self.quota, 3, device=device)
+        self._importance = torch.zeros(batches, self.quota, device=device)
+        self._added = 0
+
+    def add(self, points: Tensor, importance: Tensor) -> None:
+        """Keeps the heaviest samples of one batch.
+
+        Args:
+            points: floating [..., 3], scene units.
+            importance: floating [...], the leading shape of `points`; any scale, since only ratios count.
+
+        Raises:
+            ValueError: shapes that do not match.
+        """
+        if points.dim() == 0 or points.shape[-1] != 3 or points.shape[:-1] != importance.shape:
+            raise ValueError(
+                "SampleReservoir.add: points must have shape [..., 3] and importance the same without the 3, "
+                f"got {list(points.shape)} and {list(importance.shape)}"
+            )
+        device = self._points.device
+        points = points.detach().reshape(-1, 3).to(device, torch.float32)
+        importance = importance.detach().reshape(-1).to(device, torch.float32)
+        valid = (importance > 0) & torch.isfinite(importance) & torch.isfinite(points).all(1)
+        kept, index = torch.where(valid, importance, 0).topk(min(self.quota, importance.shape[0]))
+        slot = self._added % self.batches
+        self._importance[slot] = 0
+        self._importance[slot, : kept.shape[0]] = kept
+        self._points[slot, : kept.shape[0]] = points[index]
+        self._added += 1
+
+    def samples(self) -> tuple[Tensor, Tensor]:
+        """What is kept, oldest batch first: points float32 [m, 3] and importance float32 [m], all > 0; m = 0 before any
+        batch."""
+        start = self._added % self.batches if self._added > self.batches else 0
+        importance = self._importance.roll(-start, 0).reshape(-1)
+        kept = importance > 0
+        return self._points.roll(-start, 0).reshape(-1, 3)[kept], importance[kept]
+
+    def clear(self) -> None:
+        """Forgets all samples."""
+        self._importance.zero_()
+        self._added = 0
+
+    def __len__(self) -> int:
+        return int((self._importance > 0).sum())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Tensors from which `load_state_dict` restores the reservoir bit for bit."""
+        return {
+            "points": self._points.clone(),
+            "importance": self._importance.clone(),
+            "added": torch.tensor(self._added, dtype=torch.int64),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restores a state of a reservoir of the same capacity and number of batches.
+
+        Raises:
+            ValueError: an entry is missing, or belongs to a reservoir of another capacity or number of batches.
+        """
+        missing = [name for name in ("points", "importance", "added") if name not in state]
+        if missing:
+            raise ValueError(
+                f"SampleReservoir: state must hold {', '.join(missing)}, got {', '.join(state) or 'nothing'}"
+            )
+        for name, table in (("points", self._points), ("importance", self._importance)):
+            if state[name].shape != table.shape:
+                raise ValueError(
+                    f"SampleReservoir: {name} must have shape {list(table.shape)} (batches, quota), "
+                    f"got {list(state[name].shape)}"
+                )
+        self._points.copy_(state["points"])
+        self._importance.copy_(state["importance"])
+        self._added = int(state["added"])
