@@ -1,0 +1,125 @@
+"""Validators shared by every public operation.
+
+Each raises at once with a message of one form, "operation: argument must <rule>, got <what came>": ValueError for
+shapes and values, TypeError for dtypes and kinds. Only shapes, dtypes and devices are looked at: no element of a tensor
+is read, so that an operation can be traced by ``torch.compile`` and captured in a CUDA graph.
+
+Dimension letters in a rule ("n", "k+1") bind at their first use. Passing the same ``sizes`` dictionary to several
+checks makes a letter mean the same number in all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+INDEX = (torch.int32,)
+MAX_COUNT = 2**31 - 1
+"""Rows of one call: index tensors are int32."""
+
+
+def check_tensor(op: str, name: str, value: object) -> None:
+    """Raises TypeError unless ``value`` is a tensor."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{op}: {name} must be a tensor, got {type(value).__name__}")
+
+
+def check_shape(
+    op: str, name: str, tensor: Tensor, shape: Sequence[int | str], sizes: dict[str, int] | None = None
+) -> None:
+    """Checks a tensor against a shape such as ``("n", 3)`` or ``("k+1",)``.
+
+    Args:
+        op: operation named in the error.
+        name: argument named in the error.
+        tensor: what to check; anything but a tensor is a TypeError.
+        shape: a number, a letter, or a letter plus one, for every dimension.
+        sizes: what the letters are bound to so far; letters met for the first time are added.
+
+    Raises:
+        TypeError: not a tensor.
+        ValueError: another shape.
+    """
+    check_tensor(op, name, tensor)
+    sizes = {} if sizes is None else sizes
+    wanted = [str(entry) for entry in shape]
+    fits = tensor.dim() == len(wanted)
+    if fits:
+        for entry, size in zip(shape, tensor.shape, strict=True):
+            if isinstance(entry, int):
+                fits = fits and size == entry
+                continue
+            letter, extra = (entry[:-2], 1) if entry.endswith("+1") else (entry, 0)
+            if letter in sizes:
+                fits = fits and size == sizes[letter] + extra
+            elif size < extra:
+                fits = False
+            else:
+                sizes[letter] = size - extra
+    if not fits:
+        letters = [entry.removesuffix("+1") for entry in wanted if not entry.isdigit()]
+        bound = ", ".join(f"{letter} = {sizes[letter]}" for letter in dict.fromkeys(letters) if letter in sizes)
+        rule = f"[{', '.join(wanted)}]" + (f" with {bound}" if bound else "")
+        raise ValueError(f"{op}: {name} must have shape {rule}, got {list(tensor.shape)}")
+
+
+def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATS) -> None:
+    """Raises TypeError unless the tensor's dtype is one of ``dtypes``."""
+    check_tensor(op, name, tensor)
+    if tensor.dtype not in dtypes:
+        names = [_short(dtype) for dtype in dtypes]
+        rule = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
+        raise TypeError(f"{op}: {name} must have dtype {rule}, got {_short(tensor.dtype)}")
+
+
+def check_same_dtype(op: str, **tensors: Tensor | None) -> None:
+    """Raises TypeError unless all named tensors (None is passed over) share the dtype of the first."""
+    first: tuple[str, torch.dtype] | None = None
+    for name, tensor in tensors.items():
+        if tensor is None:
+            continue
+        if first is None:
+            first = (name, tensor.dtype)
+        elif tensor.dtype != first[1]:
+            raise TypeError(
+                f"{op}: {name} must have the dtype of {first[0]}, {_short(first[1])}, got {_short(tensor.dtype)}"
+            )
+
+
+def check_same_device(op: str, **tensors: Tensor | None) -> None:
+    """Raises ValueError unless all named tensors (None is passed over) are on the device of the first."""
+    first: tuple[str, torch.device] | None = None
+    for name, tensor in tensors.items():
+        if tensor is None:
+            continue
+        if first is None:
+            first = (name, tensor.device)
+        elif tensor.device != first[1]:
+            raise ValueError(f"{op}: {name} must be on the device of {first[0]}, {first[1]}, got {tensor.device}")
+
+
+def check_count(op: str, name: str, count: int) -> None:
+    """Raises ValueError when a batch has more rows than an int32 index can number."""
+    if count > MAX_COUNT:
+        raise ValueError(f"{op}: {name} must have fewer than 2**31 rows, got {count}: split the batch")
+
+
+def check_integer(op: str, name: str, value: int, minimum: int) -> None:
+    """Raises TypeError unless ``value`` is an int, ValueError when it is below ``minimum``."""
+    if isinstance(value, bool) or not isinstance(value, (int, torch.SymInt)):
+        raise TypeError(f"{op}: {name} must be an integer, got {type(value).__name__}")
+    if value < minimum:
+        raise ValueError(f"{op}: {name} must be at least {minimum}, got {value}")
+
+
+def check_choice(op: str, name: str, value: object, choices: Sequence[str]) -> None:
+    """Raises ValueError unless ``value`` is one of ``choices``."""
+    if value not in choices:
+        raise ValueError(f"{op}: {name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def _short(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")

@@ -1,0 +1,122 @@
+"""The layer table of a per-cell network: what ``grouped_mlp`` runs, and what a field or a router describes.
+
+A network is a list of linear layers with elementwise activations. Each layer names where its inputs come from, so that
+skip connections and a branch that sees the view direction are entries of a table rather than code, and one kernel runs
+them all. The original NeRF (Mildenhall et al. 2020, figure 7) and the networks of KiloNeRF are both such tables.
+
+Letters: d features of a raw position (3) or direction (3), L octaves of the frequency encoding, i inputs and o outputs
+of a layer, k cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
+POSITIONS = "positions"
+DIRECTIONS = "directions"
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One linear layer and its activation.
+
+    Attributes:
+        inputs: sources concatenated in this order: "positions", "directions", or the index of an earlier layer.
+        width: output features.
+        activation: one of ``ACTIVATIONS``, applied to the sum of product and bias.
+    """
+
+    inputs: tuple[int | str, ...]
+    width: int
+    activation: str = "none"
+
+
+@dataclass(frozen=True)
+class MLP:
+    """A network as a table of layers.
+
+    Attributes:
+        layers: in order of evaluation.
+        outputs: indices of the layers whose results are concatenated into the network's output.
+        position_octaves: octaves of the frequency encoding of the positions (the input itself is included: d -> d +
+            2dL); None takes the positions as they come.
+        direction_octaves: the same for the view directions.
+
+    Raises:
+        ValueError: a table that cannot be evaluated: no layers or outputs, a source that is not an earlier layer, a
+            width below 1, an unknown activation, negative octaves.
+    """
+
+    layers: tuple[Layer, ...]
+    outputs: tuple[int, ...]
+    position_octaves: int | None = None
+    direction_octaves: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.layers:
+            raise ValueError("MLP: layers must hold at least one layer, got none")
+        for index, layer in enumerate(self.layers):
+            _check_layer(index, layer)
+        if not self.outputs:
+            raise ValueError("MLP: outputs must name at least one layer, got none")
+        for output in self.outputs:
+            if not isinstance(output, int) or not 0 <= output < len(self.layers):
+                raise ValueError(f"MLP: outputs must be layer indices 0 to {len(self.layers) - 1}, got {output!r}")
+        for name, octaves in (
+            ("position_octaves", self.position_octaves),
+            ("direction_octaves", self.direction_octaves),
+        ):
+            if octaves is not None and octaves < 0:
+                raise ValueError(f"MLP: {name} must be None or at least 0, got {octaves}")
+
+    @property
+    def out_features(self) -> int:
+        """Features of the network's output."""
+        return sum(self.layers[index].width for index in self.outputs)
+
+    @property
+    def uses_directions(self) -> bool:
+        """Whether any layer reads the view directions."""
+        return any(DIRECTIONS in layer.inputs for layer in self.layers)
+
+    def source_width(self, source: int | str, positions_d: int, directions_d: int = 0) -> int:
+        """Features that a source contributes to a layer's input, after encoding."""
+        if source == POSITIONS:
+            return encoded_width(positions_d, self.position_octaves)
+        if source == DIRECTIONS:
+            return encoded_width(directions_d, self.direction_octaves)
+        assert isinstance(source, int)
+        return self.layers[source].width
+
+    def input_width(self, layer: int, positions_d: int, directions_d: int = 0) -> int:
+        """Input features i of layer number ``layer``, for raw positions and directions of the given widths."""
+        return sum(self.source_width(source, positions_d, directions_d) for source in self.layers[layer].inputs)
+
+    def weight_shapes(self, positions_d: int, directions_d: int = 0) -> list[tuple[int, int]]:
+        """Shape [o, i] of every layer's weight (without the leading k cells)."""
+        return [
+            (layer.width, self.input_width(index, positions_d, directions_d)) for index, layer in enumerate(self.layers)
+        ]
+
+
+def encoded_width(features: int, octaves: int | None) -> int:
+    """Width of ``features`` raw values after frequency encoding with the input included."""
+    return features if octaves is None else features * (1 + 2 * octaves)
+
+
+def _check_layer(index: int, layer: Layer) -> None:
+    if not layer.inputs:
+        raise ValueError(f"MLP: layer {index} must have at least one input, got none")
+    for source in layer.inputs:
+        earlier = isinstance(source, int) and not isinstance(source, bool) and 0 <= source < index
+        if not earlier and source not in (POSITIONS, DIRECTIONS):
+            raise ValueError(
+                f"MLP: layer {index} must read 'positions', 'directions' or an earlier layer, got {source!r}"
+            )
+    if layer.width < 1:
+        raise ValueError(f"MLP: layer {index} must have a width of at least 1, got {layer.width}")
+    if layer.activation not in ACTIVATIONS:
+        raise ValueError(
+            f"MLP: layer {index} must have an activation of {', '.join(ACTIVATIONS)}, got {layer.activation!r}"
+        )
