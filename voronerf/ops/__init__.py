@@ -1,0 +1,32 @@
+"""The operations: each validates its arguments, chooses a backend, and calls it.
+
+Letters used throughout: n samples or points, k cells, d features, r rays, s samples of a ray, m packed samples, L
+octaves. Index tensors are int32. ``offsets`` is always [k + 1]: cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``
+of arrays sorted by cell.
+"""
+
+from voronerf.layers import MLP, Layer
+from voronerf.ops.cell_sort import cell_sort
+from voronerf.ops.composite import Composite, composite
+from voronerf.ops.frequency_encode import frequency_encode
+from voronerf.ops.grouped_linear import grouped_linear
+from voronerf.ops.grouped_mlp import grouped_mlp
+from voronerf.ops.integrated_encode import integrated_encode
+from voronerf.ops.locate_cell import locate_cell
+from voronerf.ops.nearest_centre import nearest_centre
+from voronerf.ops.resample import resample
+
+__all__ = [
+    "MLP",
+    "Composite",
+    "Layer",
+    "cell_sort",
+    "composite",
+    "frequency_encode",
+    "grouped_linear",
+    "grouped_mlp",
+    "integrated_encode",
+    "locate_cell",
+    "nearest_centre",
+    "resample",
+]

@@ -1,0 +1,41 @@
+"""Sorting samples by cell. n samples, k cells."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_shape
+
+_OP = "cell_sort"
+
+
+def cell_sort(cells: Tensor, k: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
+    """Stable order of samples by cell, and where each cell begins.
+
+    ``x[order]`` is sorted by cell, and the samples of a cell keep their order; ``y_sorted`` is put back by
+    ``y[order] = y_sorted``. The result is the same to the bit on every backend. Cells may be empty.
+
+    Args:
+        cells: int32 [n], values 0 to k - 1, n < 2**31.
+        k: number of cells, at least 1.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        order int32 [n], the original row of each sorted row; offsets int32 [k + 1], cell c being sorted rows
+        ``offsets[c]`` to ``offsets[c + 1]``.
+
+    Raises:
+        ValueError: shape, k, an unknown backend; on the CPU also a cell outside 0 to k - 1. (On a GPU and in a compiled
+            graph the values are not read: what is below 0 is sorted before ``offsets[0]`` and what is above k - 1 after
+            ``offsets[k]``, rows that belong to no cell.)
+        TypeError: dtype.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    check_shape(_OP, "cells", cells, ("n",))
+    check_dtype(_OP, "cells", cells, INDEX)
+    check_integer(_OP, "k", k, 1)
+    check_count(_OP, "cells", cells.shape[0])
+    run = backends.resolve(_OP, backend=backend, device=cells.device, dtype=cells.dtype)
+    order, offsets = run(cells, k)
+    return order, offsets

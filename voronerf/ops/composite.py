@@ -1,0 +1,70 @@
+"""Volume rendering. r rays, s samples of a ray, m samples of all rays (packed), c channels."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
+from voronerf.reference.composite import Composite
+
+_OP = "composite"
+
+
+def composite(
+    sigma: Tensor,
+    rgb: Tensor,
+    depths: Tensor,
+    deltas: Tensor,
+    *,
+    ray_offsets: Tensor | None = None,
+    background: Tensor | None = None,
+    backend: str = "auto",
+) -> Composite:
+    """Colour, opacity and depth of rays, from the density and colour of their samples.
+
+    ``weight_i = T_i (1 - exp(-sigma_i delta_i))`` with ``T_i = exp(-sum over j < i of sigma_j delta_j)``: Max 1995, and
+    Mildenhall et al. 2020, equation 3. Samples of a ray are in order of depth. Infinite density is opaque, unless its
+    delta is 0; a sample that is not a number spoils its own ray alone.
+
+    Args:
+        sigma: density, per unit of length, at least 0: [r, s], or [m] packed.
+        rgb: [r, s, c] or [m, c].
+        depths: distance along the ray: [r, s] or [m].
+        deltas: length of ray each sample stands for, at least 0: [r, s] or [m].
+        ray_offsets: int32 [r + 1] for packed samples: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``,
+            which may be none. None for the dense form.
+        background: [c] or [r, c], added with weight 1 - opacity; None for none. A ray with no sample shows it alone.
+        backend: "auto", "reference", "native" or "warp".
+
+    All floating-point arguments share one dtype, float16 to float64; sums are taken in float32 at least. Differentiable
+    in all of them.
+
+    Returns:
+        Composite(colour [r, c], opacity [r], depth [r], weights like sigma). ``depth`` is the sum of weight times depth
+        and is not divided by the opacity.
+
+    Raises:
+        ValueError: shapes, devices or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    samples = ("r", "s") if ray_offsets is None else ("m",)
+    check_shape(_OP, "sigma", sigma, samples, sizes)
+    check_shape(_OP, "rgb", rgb, (*samples, "c"), sizes)
+    check_shape(_OP, "depths", depths, samples, sizes)
+    check_shape(_OP, "deltas", deltas, samples, sizes)
+    check_dtype(_OP, "sigma", sigma)
+    if ray_offsets is not None:
+        check_shape(_OP, "ray_offsets", ray_offsets, ("r+1",), sizes)
+        check_dtype(_OP, "ray_offsets", ray_offsets, INDEX)
+    if background is not None:
+        check_shape(_OP, "background", background, ("c",) if background.dim() == 1 else ("r", "c"), sizes)
+    check_same_dtype(_OP, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas, background=background)
+    check_same_device(
+        _OP, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas, ray_offsets=ray_offsets, background=background
+    )
+    check_count(_OP, "sigma", sigma.numel())
+    run = backends.resolve(_OP, backend=backend, device=sigma.device, dtype=sigma.dtype)
+    return Composite(*run(sigma, rgb, depths, deltas, ray_offsets=ray_offsets, background=background))

@@ -1,0 +1,39 @@
+"""The frequency encoding of NeRF. n points, d features, L octaves."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import check_count, check_dtype, check_integer, check_shape
+
+_OP = "frequency_encode"
+
+
+def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, backend: str = "auto") -> Tensor:
+    """``[x, sin x, cos x, sin 2x, cos 2x, ..., sin 2^(L-1) x, cos 2^(L-1) x]``, each a block of d features.
+
+    The layout of nerf-pytorch: no factor of pi, and x itself first. Mildenhall et al. 2020, equation 4. Angles are
+    taken in float32 at least.
+
+    Args:
+        x: [n, d] floating point, n < 2**31.
+        octaves: L, at least 0.
+        include_input: whether x itself comes first.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        [n, d + 2 d L], or [n, 2 d L] without the input, in the dtype of x.
+
+    Raises:
+        ValueError: shape, octaves or an unknown backend.
+        TypeError: dtype.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    check_shape(_OP, "x", x, ("n", "d"))
+    check_dtype(_OP, "x", x)
+    check_integer(_OP, "octaves", octaves, 0)
+    check_count(_OP, "x", x.shape[0])
+    run = backends.resolve(_OP, backend=backend, device=x.device, dtype=x.dtype)
+    encoded: Tensor = run(x, octaves, include_input=include_input)
+    return encoded

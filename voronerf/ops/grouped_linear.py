@@ -1,0 +1,73 @@
+"""One linear layer for each cell. n samples, k cells, i inputs, o outputs."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import (
+    INDEX,
+    check_choice,
+    check_count,
+    check_dtype,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+)
+from voronerf.layers import ACTIVATIONS
+
+_OP = "grouped_linear"
+
+
+def grouped_linear(
+    x: Tensor,
+    offsets: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    *,
+    activation: str = "none",
+    backend: str = "auto",
+) -> Tensor:
+    """``activation(W_c x + b_c)`` with the layer of each sample's cell c.
+
+    Gradients of every order to x, weight and bias. Products are accumulated in float32 at least. Under
+    ``torch.autocast`` the arguments are cast to its dtype, float64 excepted, as for ``torch.nn.functional.linear``.
+
+    Args:
+        x: [n, i] floating point, sorted by cell, n < 2**31, i >= 1.
+        offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows of no cell (before
+            ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
+        weight: [k, o, i], o >= 1, the dtype of x.
+        bias: [k, o] or None.
+        activation: "none", "relu", "softplus", "sigmoid" or "sine".
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        [n, o] in the dtype of x (of autocast, where it is on).
+
+    Raises:
+        ValueError: shapes, devices, an unknown activation or backend; on the CPU also offsets that fall or exceed n.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "x", x, ("n", "i"), sizes)
+    check_shape(_OP, "weight", weight, ("k", "o", "i"), sizes)
+    check_shape(_OP, "offsets", offsets, ("k+1",), sizes)
+    check_dtype(_OP, "x", x)
+    check_dtype(_OP, "offsets", offsets, INDEX)
+    check_dtype(_OP, "weight", weight)
+    if bias is not None:
+        check_shape(_OP, "bias", bias, ("k", "o"), sizes)
+        check_dtype(_OP, "bias", bias)
+    check_same_device(_OP, x=x, offsets=offsets, weight=weight, bias=bias)
+    check_count(_OP, "x", sizes["n"])
+    check_choice(_OP, "activation", activation, ACTIVATIONS)
+    if min(sizes["k"], sizes["o"], sizes["i"]) < 1:
+        raise ValueError(f"{_OP}: weight must have no empty dimension, got {list(weight.shape)}")
+    if not torch.is_autocast_enabled(x.device.type):
+        check_same_dtype(_OP, x=x, weight=weight, bias=bias)
+    run = backends.resolve(_OP, backend=backend, device=x.device, dtype=x.dtype)
+    y: Tensor = run(x, offsets, weight, bias, activation=activation)
+    return y

@@ -1,0 +1,44 @@
+"""The integrated encoding of mip-NeRF. n Gaussians, L octaves."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_same_dtype, check_shape
+
+_OP = "integrated_encode"
+
+
+def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend: str = "auto") -> Tensor:
+    """Expectation of the frequency encoding over a Gaussian with diagonal covariance.
+
+    Block l holds ``sin(2^l mu) exp(-4^l var / 2)`` and then ``cos(2^l mu) exp(-4^l var / 2)``, three features each: the
+    layout of ``frequency_encode`` without its input, which it equals for variances of 0. Barron et al. 2021 (mip-NeRF),
+    equations 13 and 14; their code puts all sines before all cosines.
+
+    Args:
+        means: [n, 3] floating point, n < 2**31.
+        variances: [n, 3], at least 0, squared units of the means, the dtype of the means.
+        octaves: L, at least 0.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        [n, 6L] in the dtype of the means.
+
+    Raises:
+        ValueError: shapes, devices, octaves or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "means", means, ("n", 3), sizes)
+    check_shape(_OP, "variances", variances, ("n", 3), sizes)
+    check_dtype(_OP, "means", means)
+    check_same_dtype(_OP, means=means, variances=variances)
+    check_same_device(_OP, means=means, variances=variances)
+    check_integer(_OP, "octaves", octaves, 0)
+    check_count(_OP, "means", sizes["n"])
+    run = backends.resolve(_OP, backend=backend, device=means.device, dtype=means.dtype)
+    encoded: Tensor = run(means, variances, octaves)
+    return encoded

@@ -1,0 +1,74 @@
+"""Which leaf of a tree of Voronoi diagrams a point lies in. n points, m centres of all diagrams together, g
+diagrams."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
+
+_OP = "locate_cell"
+
+
+def locate_cell(
+    points: Tensor,
+    centres: Tensor,
+    child_offsets: Tensor,
+    child: Tensor,
+    *,
+    depth: int,
+    weights: Tensor | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """Leaf of every point, going down from the root: at each level the nearest centre of the diagram the point is in.
+
+    Diagram 0 is the root; diagram j owns rows ``child_offsets[j]`` to ``child_offsets[j + 1]`` of ``centres``. Exact,
+    with ties to the lowest index, as ``nearest_centre``; a point that is not finite takes the first centre at every
+    level. Trees may be uneven. Not differentiable.
+
+    Args:
+        points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are compared in float32.
+        centres: [m, 3] floating point, finite, m >= 1; every diagram has at least one.
+        child_offsets: int32 [g + 1], g >= 1.
+        child: int32 [m]. ``child[c] >= 0``: centre c is refined by diagram ``child[c]``; ``child[c] < 0``: centre c is
+            leaf number ``-child[c] - 1``.
+        depth: levels of the tree, 1 for a flat diagram.
+        weights: [m] floating point or None: power diagrams (squared scene units).
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        leaf int32 [n].
+
+    Raises:
+        ValueError: shapes, devices, depth or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "points", points, ("n", 3), sizes)
+    check_shape(_OP, "centres", centres, ("m", 3), sizes)
+    check_shape(_OP, "child_offsets", child_offsets, ("g+1",), sizes)
+    check_shape(_OP, "child", child, ("m",), sizes)
+    check_dtype(_OP, "points", points)
+    check_dtype(_OP, "centres", centres)
+    check_dtype(_OP, "child_offsets", child_offsets, INDEX)
+    check_dtype(_OP, "child", child, INDEX)
+    if weights is not None:
+        check_shape(_OP, "weights", weights, ("m",), sizes)
+        check_dtype(_OP, "weights", weights)
+    check_same_device(_OP, points=points, centres=centres, child_offsets=child_offsets, child=child, weights=weights)
+    check_count(_OP, "points", sizes["n"])
+    check_integer(_OP, "depth", depth, 1)
+    if sizes["m"] < 1 or sizes["g"] < 1:
+        count = f"{sizes['m']} centres in {sizes['g']} diagrams"
+        raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
+    dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
+    if weights is not None:
+        dtype = torch.promote_types(dtype, weights.dtype)
+        weights = weights.detach().to(dtype)
+    points, centres = points.detach().to(dtype), centres.detach().to(dtype)
+    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=dtype)
+    leaf: Tensor = run(points, centres, child_offsets, child, depth=depth, weights=weights)
+    return leaf

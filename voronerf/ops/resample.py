@@ -1,0 +1,53 @@
+"""Hierarchical sampling. r rays, s bins of a ray."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_same_dtype, check_shape
+
+_OP = "resample"
+
+
+def resample(
+    weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None, backend: str = "auto"
+) -> Tensor:
+    """Depths drawn from the piecewise constant density in which bin i of a ray holds mass ``weights[:, i]``.
+
+    Inverse of the cumulative distribution, Mildenhall et al. 2020, section 5.2. Weights that are negative or not finite
+    count as 0; a ray whose weights are all 0 is drawn as though every bin weighed the same. Not differentiable: depths
+    carry no gradient to the weights, the edges or the uniforms.
+
+    Args:
+        weights: [r, s] floating point, s >= 1; need not sum to 1.
+        edges: [r, s + 1], rising along a ray, the dtype of the weights.
+        count: depths of a ray, at least 1.
+        uniforms: [r, count] in 0 to 1, in any order, the dtype of the weights; None for the midpoints of ``count``
+            equal strata, which is deterministic.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        depths [r, count], rising along a ray, in the dtype of the edges.
+
+    Raises:
+        ValueError: shapes, devices, count or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "weights", weights, ("r", "s"), sizes)
+    check_shape(_OP, "edges", edges, ("r", "s+1"), sizes)
+    check_integer(_OP, "count", count, 1)
+    if uniforms is not None:
+        check_shape(_OP, "uniforms", uniforms, ("r", "count"), {**sizes, "count": count})
+    check_dtype(_OP, "weights", weights)
+    check_same_dtype(_OP, weights=weights, edges=edges, uniforms=uniforms)
+    check_same_device(_OP, weights=weights, edges=edges, uniforms=uniforms)
+    check_count(_OP, "weights", weights.numel())
+    check_count(_OP, "depths", sizes["r"] * count)
+    if sizes["s"] < 1:
+        raise ValueError(f"{_OP}: weights must have at least one bin, got none")
+    run = backends.resolve(_OP, backend=backend, device=weights.device, dtype=weights.dtype)
+    depths: Tensor = run(weights, edges, count, uniforms=uniforms)
+    return depths

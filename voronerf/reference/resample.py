@@ -1,0 +1,27 @@
+"""Hierarchical sampling. r rays, s bins of a ray."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+@torch.no_grad()
+def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None) -> Tensor:
+    """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
+    wide = torch.promote_types(edges.dtype, torch.float32)
+    mass = torch.where(weights.isfinite(), weights, 0).to(wide).clamp(min=0)
+    mass = torch.where(mass.sum(dim=1, keepdim=True) > 0, mass, 1)
+    upper = mass.cumsum(dim=1)
+    lower = upper - mass
+    if uniforms is None:
+        strata = torch.arange(count, dtype=wide, device=edges.device)
+        uniforms = ((strata + 0.5) / count).expand(weights.shape[0], count)
+    target = uniforms.to(wide).sort(dim=1).values.clamp(0, 1) * upper[:, -1:]
+    # A target on the edge of two bins belongs to the later one, so a bin of no mass is never drawn; the last bin that
+    # has mass takes what rounds to the very end.
+    last = (upper < upper[:, -1:]).sum(dim=1, keepdim=True)
+    bins = torch.minimum(torch.searchsorted(upper, target.contiguous(), right=True), last)
+    inside = ((target - lower.gather(1, bins)) / mass.gather(1, bins)).clamp(0, 1)
+    near, far = edges.to(wide).gather(1, bins), edges.to(wide).gather(1, bins + 1)
+    return torch.minimum(near + inside * (far - near), far).to(edges.dtype)
