@@ -1,0 +1,42 @@
+"""Scenes: the files of Blender synthetic scenes and of real captures, and one computed from formulas."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from voronerf.data.blender import load_blender
+from voronerf.data.builtin import builtin_scene
+from voronerf.data.capture import load_capture
+from voronerf.data.scene import Scene, SceneError, Split
+
+__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "load_scene"]
+
+BUILTIN_SIZE = 100
+
+
+def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
+    """Loads a scene.
+
+    Args:
+        source: "builtin", or a folder with `transforms_train.json` (Blender synthetic) or `transforms.json` (a capture).
+        downscale: factor by which images are made smaller, >= 1. Divides the built-in scene's 100 pixels too.
+
+    Raises:
+        SceneError: one line that names what is wrong with which file.
+    """
+    if downscale < 1:
+        raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")
+    if str(source) == "builtin":
+        if downscale > BUILTIN_SIZE:
+            raise SceneError(f"builtin: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
+        return builtin_scene(BUILTIN_SIZE // downscale)
+    folder = Path(source)
+    if not folder.exists():
+        raise SceneError(f"{folder}: there is no such folder")
+    if (folder / "transforms_train.json").is_file():
+        return load_blender(folder, downscale)
+    if (folder / "transforms.json").is_file():
+        return load_capture(folder, downscale)
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: is no folder")
+    raise SceneError(f"{folder}: is no scene, it has neither transforms_train.json (Blender) nor transforms.json")

@@ -1,0 +1,77 @@
+"""Blender synthetic scenes (Mildenhall et al. 2020): `transforms_train.json`, `transforms_test.json`, RGBA images.
+
+The object sits at the origin, cameras look at it from about 4 units away; what is transparent is white.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from voronerf.data.carving import carve_box
+from voronerf.data.images import read_images
+from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.transforms import Frame, number, read_transforms
+from voronerf.rendering.cameras import Cameras
+
+NEAR, FAR = 2.0, 6.0
+
+
+def load_blender(folder: Path, downscale: int) -> Scene:
+    """Loads a Blender synthetic scene.
+
+    The test views are those of `transforms_test.json`, or of `transforms_val.json` where there is none.
+
+    Args:
+        folder: holds `transforms_train.json`.
+        downscale: factor by which images are made smaller, averaging areas of the composited image.
+
+    Returns:
+        The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of the
+        training views; without alpha the box is None.
+
+    Raises:
+        SceneError: a file is missing, broken or inconsistent.
+    """
+    train_file = folder / "transforms_train.json"
+    choices = [folder / "transforms_test.json", folder / "transforms_val.json"]
+    test_file = next((path for path in choices if path.is_file()), None)
+    if test_file is None:
+        raise SceneError(f"{folder}: has transforms_train.json but neither transforms_test.json nor transforms_val.json")
+    entries, train_frames = read_transforms(train_file)
+    test_entries, test_frames = read_transforms(test_file)
+
+    near = number(entries, "near", train_file, positive=True) or NEAR
+    far = number(entries, "far", train_file, positive=True) or FAR
+    if near >= far:
+        raise SceneError(f"{train_file}: near must be below far, got {near} and {far}")
+
+    paths = [frame.path for frame in (*train_frames, *test_frames)]
+    images, size = read_images(paths, downscale)
+    count = len(train_frames)
+    train = _split(entries, train_file, train_frames, images[:count], size, downscale)
+    test = _split(test_entries, test_file, test_frames, images[count:], size, downscale)
+    box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
+    return Scene(folder.resolve().name, train, test, near, far, box, "linear", "white")
+
+
+def _split(
+    entries: dict[str, Any],
+    path: Path,
+    frames: list[Frame],
+    images: torch.Tensor,
+    size: tuple[int, int],
+    downscale: int,
+) -> Split:
+    angle = number(entries, "camera_angle_x", path, positive=True)
+    if angle is None or angle >= math.pi:
+        raise SceneError(f"{path}: camera_angle_x must be an angle between 0 and pi, got {angle}")
+    width, height = size
+    focal = 0.5 * width / math.tan(0.5 * angle)
+    intrinsics = torch.tensor((focal, focal, width / 2, height / 2)).repeat(len(frames), 1)
+    poses = torch.stack([frame.pose for frame in frames]).float()
+    cameras = Cameras(poses, intrinsics, width, height).downscaled(downscale)
+    return Split(cameras, images, tuple(frame.path.stem for frame in frames))

@@ -1,0 +1,170 @@
+"""Real captures: `transforms.json` with intrinsics, lens distortion and poses (instant-ngp, nerfstudio).
+
+Poses are OpenGL's, as everywhere. The scene is moved, turned and scaled: the point that the cameras look at becomes the
+origin, their mean up direction the z axis, and the farthest camera is at distance 1.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.data.carving import carve_box
+from voronerf.data.images import read_images
+from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.transforms import Frame, number, read_transforms
+from voronerf.rendering.cameras import Cameras, distort, focus_point, undistort
+
+HOLD_OUT = 8
+# of the distance from the focus to the nearest camera: what is closer to a camera than this was not photographed sharply
+NEAR = 0.3
+FAR = 8.0
+PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
+UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
+
+
+def load_capture(folder: Path, downscale: int) -> Scene:
+    """Loads a capture; every 8th image in the order of their names is held out for testing.
+
+    Rays of an opaque capture reach from near the cameras to eight times their distance, sampled in disparity: a plain
+    network in such coordinates learns the object and, coarsely, the room. With alpha it is an object on white, in a box
+    carved from the masks.
+
+    Args:
+        folder: holds `transforms.json`.
+        downscale: factor by which images are made smaller.
+
+    Raises:
+        SceneError: the file is broken, its lens model is not supported, it has fewer than two images.
+    """
+    path = folder / "transforms.json"
+    entries, frames = read_transforms(path)
+    frames = sorted(frames, key=lambda frame: frame.path.as_posix())
+    if len(frames) < 2:
+        raise SceneError(f"{path}: one image is too few, one is held out for testing")
+    images, size = read_images([frame.path for frame in frames], downscale)
+
+    intrinsics, distortion = [], []
+    for frame in frames:
+        values = {**entries, **frame.entries}
+        _check_lens_model(values, path)
+        intrinsics.append(_intrinsics(values, size, path, frame))
+        distortion.append([number(values, key, path) or 0.0 for key in ("k1", "k2", "p1", "p2")])
+    bent = torch.tensor(distortion)
+    cameras = Cameras(
+        normalise_poses(torch.stack([frame.pose for frame in frames])).float(),
+        torch.tensor(intrinsics),
+        size[0],
+        size[1],
+        bent if bool(bent.any()) else None,
+    )
+    _check_lens_inverts(cameras, path)
+    cameras = cameras.downscaled(downscale)
+
+    nearest = float(cameras.origins.norm(dim=-1).min())
+    near, far, box, spacing, background = NEAR * nearest, FAR, None, "disparity", None
+    if images.shape[-1] == 4 and bool((images[..., 3] < 255).any()):
+        spacing, background = "linear", "white"
+        near, far = 0.05 * nearest, 2.0
+        box = carve_box(cameras, images[..., 3], near, far)
+    else:
+        images = images[..., :3]
+
+    held_out = torch.arange(len(frames)) % HOLD_OUT == 0
+    return Scene(
+        folder.resolve().name,
+        _split(cameras, images, frames, ~held_out),
+        _split(cameras, images, frames, held_out),
+        near,
+        far,
+        box,
+        spacing,
+        background,
+    )
+
+
+def normalise_poses(poses: Tensor) -> Tensor:
+    """Moves the cameras' focus to the origin, their mean up direction to +z, and the farthest camera to distance 1.
+
+    Cameras without a common focus (parallel axes, looking outwards) are centred on themselves.
+
+    Args:
+        poses: float64 [c, 4, 4].
+    """
+    cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
+    centre = focus_point(cameras)
+    if centre is None:
+        centre = cameras.origins.mean(0)
+    result = poses.clone()
+    result[:, :3, 3] -= centre
+    up = poses[:, :3, 1].mean(0)
+    if up.norm() > 0.1:
+        z = up / up.norm()
+        spare = torch.eye(3, dtype=poses.dtype)[int(z.abs().argmin())]
+        x = torch.nn.functional.normalize(torch.linalg.cross(spare, z), dim=0)
+        turn = torch.stack((x, torch.linalg.cross(z, x), z))
+        result[:, :3] = turn @ result[:, :3]
+    extent = float(result[:, :3, 3].norm(dim=-1).max())
+    result[:, :3, 3] /= extent if extent > 0 else 1.0
+    return result
+
+
+def _split(cameras: Cameras, images: Tensor, frames: list[Frame], chosen: Tensor) -> Split:
+    names = tuple(frame.path.stem for frame, wanted in zip(frames, chosen.tolist()) if wanted)
+    return Split(cameras[chosen], images[chosen].contiguous(), names)
+
+
+def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> list[float]:
+    """(fx, fy, cx, cy) in pixels, of a frame's entries over those of the whole file."""
+    width, height = size
+    for key, actual in (("w", width), ("h", height)):
+        stated = number(values, key, path, positive=True)
+        if stated is not None and stated != actual:
+            raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {path} says {key} = {stated:g}")
+    fx, fy = (number(values, key, path, positive=True) for key in ("fl_x", "fl_y"))
+    angles = {}
+    for key in ("camera_angle_x", "camera_angle_y"):
+        angle = number(values, key, path, positive=True)
+        if angle is not None and angle >= math.pi:
+            raise SceneError(f"{path}: {key} must be an angle between 0 and pi, got {angle}")
+        angles[key] = angle
+    if fx is None and angles["camera_angle_x"] is not None:
+        fx = 0.5 * width / math.tan(0.5 * angles["camera_angle_x"])
+    if fy is None and angles["camera_angle_y"] is not None:
+        fy = 0.5 * height / math.tan(0.5 * angles["camera_angle_y"])
+    if fx is None and fy is None:
+        raise SceneError(f"{path}: has no focal length (fl_x or camera_angle_x)")
+    fx, fy = fx or fy, fy or fx
+    cx, cy = number(values, "cx", path), number(values, "cy", path)
+    assert fx is not None and fy is not None
+    return [fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy]
+
+
+def _check_lens_model(values: dict[str, Any], path: Path) -> None:
+    model = values.get("camera_model", "OPENCV")
+    if values.get("is_fisheye") or model not in PINHOLE_MODELS:
+        name = "fisheye" if values.get("is_fisheye") else model
+        raise SceneError(f"{path}: camera model {name} is not supported, only {', '.join(PINHOLE_MODELS)}")
+    used = [key for key in UNSUPPORTED if number(values, key, path)]
+    if used:
+        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only k1, k2, p1, p2")
+
+
+def _check_lens_inverts(cameras: Cameras, path: Path) -> None:
+    """Pixels of the image's border must have a ray; a lens model that folds over inside the image has none."""
+    if cameras.distortion is None:
+        return
+    edge = torch.linspace(0, 1, 33, dtype=torch.float64)
+    x = torch.cat((edge, edge, torch.zeros(33), torch.ones(33)))[None] * cameras.width
+    y = torch.cat((torch.zeros(33), torch.ones(33), edge, edge))[None] * cameras.height
+    fx, fy, cx, cy = cameras.intrinsics.double()[:, :, None].unbind(1)
+    coefficients = cameras.distortion.double()[:, None, :]
+    u, v = (x - cx) / fx, (y - cy) / fy
+    again, and_again = distort(*undistort(u, v, coefficients), coefficients)
+    error = torch.maximum((again - u).abs() * fx, (and_again - v).abs() * fy)
+    if not bool((error < 1e-3).all()):
+        raise SceneError(f"{path}: the lens distortion k1, k2, p1, p2 cannot be inverted inside the image")

@@ -1,0 +1,72 @@
+"""A scene: images with their cameras, and where to look for it in space.
+
+c images of h x w pixels. World units and axes as in `voronerf.rendering.cameras`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from voronerf.rendering.cameras import Cameras
+
+
+class SceneError(ValueError):
+    """Data that make no scene. The message is one line and names the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """The images of one part of a scene.
+
+    Attributes:
+        cameras: c cameras.
+        images: uint8 [c, h, w, 3] opaque, or [c, h, w, 4] with straight (not premultiplied) alpha.
+        names: of the images, for tables and file names.
+    """
+
+    cameras: Cameras
+    images: Tensor
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def truth(self, index: int, background: Tensor | None) -> Tensor:
+        """One image in 0..1 over `background` ([3]; None is black, as in rendering), float32 [h, w, 3]."""
+        image = self.images[index].float() / 255
+        if image.shape[-1] == 3:
+            return image
+        colour = image[..., :3] * image[..., 3:]
+        return colour if background is None else colour + background.to(colour) * (1 - image[..., 3:])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Training and test views of the same space.
+
+    Attributes:
+        name: short, fit for a folder's name.
+        train: views to learn from.
+        test: views held out.
+        near: distance along a ray before which there is nothing.
+        far: distance behind which there is nothing.
+        box: float32 [2, 3], lowest and highest corner of an axis-aligned box that holds everything, or None if unknown.
+        spacing: of samples along a ray that suits the scene, "linear" or "disparity".
+        background: "white": seen through whatever is transparent; None: an opaque capture, there is no background.
+    """
+
+    name: str
+    train: Split
+    test: Split
+    near: float
+    far: float
+    box: Tensor | None
+    spacing: str
+    background: str | None
+
+    def background_colour(self, device: torch.device | str = "cpu") -> Tensor | None:
+        """The background as float32 [3] in 0..1, or None."""
+        return None if self.background is None else torch.ones(3, device=device)

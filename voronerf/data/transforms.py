@@ -1,0 +1,121 @@
+"""The parts that Blender's `transforms_*.json` and a capture's `transforms.json` share: frames, poses, numbers."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from voronerf.data.scene import SceneError
+
+log = logging.getLogger(__name__)
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+ORTHONORMAL = 2e-3
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a transforms file: where it lies, its pose float64 [4, 4], and its own entries."""
+
+    path: Path
+    pose: Tensor
+    entries: dict[str, Any]
+
+
+def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
+    """Reads a transforms file and finds its images.
+
+    Images that are listed but missing are left out, with one line in the log (logger `voronerf.data.transforms`, level
+    WARNING) that says how many.
+
+    Args:
+        path: the JSON file.
+
+    Returns:
+        (the file's top-level entries, the frames whose image exists, in the file's order).
+
+    Raises:
+        SceneError: the file does not parse, has no frames, no image of any frame exists, or a matrix is no pose.
+    """
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise SceneError(f"{path}: is no JSON: {error}") from None
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
+    frames = entries.get("frames") if isinstance(entries, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise SceneError(f"{path}: has no frames")
+
+    found = []
+    for position, frame in enumerate(frames):
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str) or "\0" in name:
+            raise SceneError(f"{path}: frame {position} has no file_path")
+        pose = _pose(frame.get("transform_matrix"), f"{path}: frame {position} ({name})")
+        image = _image_path(path.parent / name)
+        if image is not None:
+            found.append(Frame(image, pose, frame))
+    if not found:
+        raise SceneError(
+            f"{path}: none of its {len(frames)} images exists, the first is {path.parent / frames[0]['file_path']}"
+        )
+    if len(found) < len(frames):
+        missing = len(frames) - len(found)
+        log.warning("%s: %d of %d listed images are missing and are skipped", path, missing, len(frames))
+    return entries, found
+
+
+def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = False) -> float | None:
+    """A finite number of a transforms file, None where there is no such entry.
+
+    Raises:
+        SceneError: the entry is no finite number, or not positive where it must be.
+    """
+    value = entries.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise SceneError(f"{path}: {key} must be a finite number, got {value!r}")
+    if positive and value <= 0:
+        raise SceneError(f"{path}: {key} must be positive, got {value!r}")
+    return float(value)
+
+
+def _image_path(path: Path) -> Path | None:
+    """The file itself, or with the suffix that Blender's files leave out."""
+    if path.is_file():
+        return path
+    return next((named for suffix in SUFFIXES if (named := path.with_name(path.name + suffix)).is_file()), None)
+
+
+def _pose(matrix: object, where: str) -> Tensor:
+    """Checks that rows of numbers are a rigid motion; float64 [4, 4]."""
+    try:
+        values = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SceneError(f"{where}: transform_matrix is no matrix of numbers") from None
+    if values.shape not in ((4, 4), (3, 4)):
+        raise SceneError(f"{where}: transform_matrix must be 4 x 4, got shape {list(values.shape)}")
+    if not np.isfinite(values).all():
+        raise SceneError(f"{where}: transform_matrix has values that are not finite")
+    rotation = values[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > ORTHONORMAL or np.linalg.det(rotation) < 0:
+        raise SceneError(
+            f"{where}: transform_matrix is no pose, its upper left 3 x 3 is no rotation "
+            f"(determinant {np.linalg.det(rotation):.3g}, off orthonormal by {error:.2g})"
+        )
+    if values.shape[0] == 4 and np.abs(values[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise SceneError(f"{where}: transform_matrix is no pose, its last row must be 0 0 0 1")
+    pose = np.eye(4)
+    pose[:3] = values[:3]
+    return torch.from_numpy(pose)
