@@ -1,0 +1,179 @@
+"""The commands behind ``voronerf train | eval | render | info``. Each returns the process's exit status."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from voronerf import backends
+from voronerf.cli.display import TrainingDisplay
+from voronerf.data import Scene, load_scene
+from voronerf.rendering.cameras import turntable_cameras
+from voronerf.rendering.volume import render_image
+from voronerf.training.config import ConfigError, TrainConfig, check_device
+from voronerf.training.runs import choose_directory, score_views, write_curve, write_panels
+from voronerf.training.trainer import Trainer, load_run
+from voronerf.training.video import write_video
+
+console = Console(soft_wrap=True)
+
+
+def train(config: TrainConfig) -> int:
+    """Train a scene: coarse network, balanced Voronoi cells, cells trained further."""
+    scene = load_scene(config.data, downscale=config.downscale)
+    summary = run_training(choose_directory(config, scene), scene)
+    return 0 if summary["complete"] else 130
+
+
+def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
+    """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
+
+    Ctrl-C ends training after the step in hand: the checkpoint and the summary are written, the pictures are not. A
+    second Ctrl-C ends the process at once.
+    """
+    assert config.out is not None
+    with TrainingDisplay(console, scene.name) as display:
+        trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
+        before = signal.getsignal(signal.SIGINT)
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            trainer.request_stop()
+            signal.signal(signal.SIGINT, before)
+
+        signal.signal(signal.SIGINT, stop)
+        try:
+            summary = trainer.run()
+        finally:
+            signal.signal(signal.SIGINT, before)
+    if not summary["complete"]:
+        console.print(f"stopped; continue with --resume --out {config.out}", highlight=False)
+        return summary
+    if config.panels:
+        write_panels(
+            trainer.router,
+            scene,
+            config.out / "images",
+            samples=config.samples,
+            views=config.panels,
+            backend=config.backend,
+        )
+    write_curve(config.out)
+    console.print(f"wrote {config.out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/", highlight=False)
+    return summary
+
+
+def evaluate_run(
+    run: Path,
+    /,
+    data: str | None = None,
+    downscale: int | None = None,
+    views: int | None = None,
+    panels: int = 4,
+    samples: int | None = None,
+    device: str = "cpu",
+    backend: str = "auto",
+) -> int:
+    """Score a trained run on its test views and draw panels: truth, render, error, depth, cells.
+
+    Args:
+        run: The run directory.
+        data: Scene folder, where it has moved since training.
+        downscale: Factor on the images; default as in training.
+        views: Number of test views, evenly spread; default all.
+        panels: Number of views drawn.
+        samples: Samples per ray; default as in training.
+        device: Torch device.
+        backend: Backend of the operations.
+    """
+    config, router, scene = _load(run, data, downscale, device, backend)
+    samples = samples or config.samples
+    result = score_views(router, scene, samples=samples, views=views, backend=backend, path=run / "eval.json")
+    table = Table("view", "psnr [dB]", "ssim")
+    for view in result["views"]:
+        table.add_row(view["name"], f"{view['psnr']:.2f}", f"{view['ssim']:.4f}")
+    table.add_section()
+    table.add_row("mean", f"{result['psnr']:.2f}", f"{result['ssim']:.4f}")
+    console.print(table)
+    if panels:
+        write_panels(router, scene, run / "images", samples=samples, views=panels, backend=backend)
+    console.print(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""), highlight=False)
+    return 0
+
+
+def render(
+    run: Path,
+    /,
+    out: Path | None = None,
+    frames: int = 60,
+    fps: int = 24,
+    data: str | None = None,
+    downscale: int | None = None,
+    samples: int | None = None,
+    device: str = "cpu",
+    backend: str = "auto",
+) -> int:
+    """Render a turntable video of a trained run.
+
+    Args:
+        run: The run directory.
+        out: The video file, .mp4 or .gif; default turntable.mp4 in the run directory.
+        frames: Frames of one turn.
+        fps: Frames per second.
+        data: Scene folder, where it has moved since training.
+        downscale: Factor on the images, which decides the video's size; default as in training.
+        samples: Samples per ray; default as in training.
+        device: Torch device.
+        backend: Backend of the operations.
+    """
+    if frames < 1 or fps < 1:
+        raise ConfigError(f"--frames and --fps must be at least 1, got {frames} and {fps}")
+    config, router, scene = _load(run, data, downscale, device, backend)
+    cameras = turntable_cameras(scene.train.cameras, frames).to(device)
+    pictures = []
+    for frame in track(range(frames), description="rendering", console=console, disable=not console.is_terminal):
+        image = render_image(
+            router,
+            cameras,
+            frame,
+            near=scene.near,
+            far=scene.far,
+            box=None if scene.box is None else scene.box.to(device),
+            samples=samples or config.samples,
+            background=scene.background_colour(device),
+            spacing=scene.spacing,
+            backend=backend,
+        )
+        pictures.append((image.colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu())
+    path = out or run / "turntable.mp4"
+    write_video(path, torch.stack(pictures), fps)
+    console.print(f"wrote {path}", highlight=False)
+    return 0
+
+
+def info() -> int:
+    """Show what this installation can use: build, instruction set, backends, and why something is missing."""
+    for name, value in backends.describe().items():
+        console.print(f"{name:14} {value}", highlight=False, markup=False)
+    table = Table("op", "backend", "devices", "dtypes", "available")
+    for row in backends.table():
+        table.add_row(*row.cells())
+    console.print(table)
+    return 0
+
+
+def _load(
+    run: Path, data: str | None, downscale: int | None, device: str, backend: str
+) -> tuple[TrainConfig, Any, Scene]:
+    check_device(device)
+    config, router = load_run(run, device=device, backend=backend)
+    config = replace(config, data=data or config.data, downscale=downscale or config.downscale)
+    return config, router, load_scene(config.data, downscale=config.downscale)

@@ -1,0 +1,70 @@
+"""What a running training shows: a live line on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from voronerf.training.trainer import Progress as TrainingProgress
+
+
+class _Rate(ProgressColumn):
+    """Rays per second, in thousands."""
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.fields['speed'] / 1000:6.1f} k rays/s")
+
+
+class TrainingDisplay:
+    """Shows step, stage, rays/s, loss, PSNR and the time left; the trainer's callbacks are its two methods.
+
+    Args:
+        console: Where to write; its own detection of a terminal decides between a live line and plain ones.
+        label: Name of the run.
+    """
+
+    def __init__(self, console: Console, label: str) -> None:
+        self.console = console
+        self.progress = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:3.0f} %"),
+            TextColumn("step {task.fields[step]}"),
+            TextColumn("{task.fields[stage]}"),
+            _Rate(),
+            TextColumn("loss {task.fields[loss]:.5f}"),
+            TextColumn("{task.fields[psnr]}"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            refresh_per_second=4,
+        )
+        self.task = self.progress.add_task(label, total=1.0, step=0, stage="", speed=0.0, loss=0.0, psnr="")
+        self.loss = 0.0
+
+    def __enter__(self) -> TrainingDisplay:
+        self.progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.progress.stop()
+
+    def on_step(self, now: TrainingProgress) -> None:
+        self.loss = now.loss if now.step <= 1 else 0.95 * self.loss + 0.05 * now.loss
+        self.progress.update(
+            self.task,
+            completed=now.fraction,
+            step=now.step,
+            stage="coarse" if now.cells == 1 else f"{now.cells} cells",
+            speed=now.rays_per_second,
+            loss=self.loss,
+            psnr="" if now.psnr is None else f"psnr {now.psnr:.2f} dB",
+        )
+
+    def on_event(self, line: str) -> None:
+        self.console.print(line, highlight=False, markup=False)

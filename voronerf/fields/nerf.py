@@ -1,0 +1,165 @@
+"""The NeRF field: an MLP from a point and a view direction to a colour and a density.
+
+Letters: n samples, r rays. Positions are in scene units, directions are unit vectors, densities are per scene unit.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from voronerf.layers import MLP, Layer
+from voronerf.ops import grouped_mlp
+
+#: Density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2:
+#: translucent enough that every sample of a ray receives a gradient, opaque enough that the colours do as well.
+INITIAL_DENSITY = 0.1
+
+
+class NeRF(nn.Module):
+    """The architecture of NeRF (Mildenhall et al. 2020, figure 7), of any width and depth.
+
+    ``depth`` ReLU layers see the encoded position, again after each layer listed in ``skips``; a linear head gives the
+    density; a linear feature layer followed by one ReLU layer of half the width, which also sees the encoded view
+    direction, gives the colour. Without view directions the colour is a linear head on the trunk.
+
+    Density is ``density_scale * softplus(raw)`` rather than the paper's ReLU. A ReLU whose input turns negative
+    everywhere has no gradient left, which is how a NeRF on a white background collapses to an all-white image within
+    its first hundred steps; softplus always has one (mip-NeRF, section 3.1, made the same choice). The head's bias is set
+    so that the untrained density is ``INITIAL_DENSITY``. ``density_scale`` only changes the unit in which the network
+    speaks: surfaces need densities near 100 a unit, which a network of order-one outputs reaches sooner with a scale.
+
+    The field describes itself by ``layers`` (a table, see :class:`voronerf.layers.MLP`) and :meth:`linears`, in the
+    table's order; :class:`voronerf.VoronoiRouter` uses the two to evaluate all cells' copies of it in one pass.
+
+    Args:
+        width: Channels of the hidden layers, at least 2.
+        depth: Hidden layers before the heads, at least 1.
+        skips: Indices of trunk layers whose output is joined with the encoded position again.
+        position_octaves: Frequencies of the position's encoding; 0 takes the position as it is.
+        direction_octaves: The same for the view direction.
+        view_directions: Whether colour depends on the view direction.
+        density_scale: Factor on the density, per scene unit, > 0.
+
+    Raises:
+        ValueError: For a width, depth, skip or scale out of range.
+    """
+
+    def __init__(
+        self,
+        width: int = 64,
+        depth: int = 8,
+        skips: tuple[int, ...] = (4,),
+        position_octaves: int = 10,
+        direction_octaves: int = 4,
+        view_directions: bool = True,
+        density_scale: float = 10.0,
+    ) -> None:
+        super().__init__()
+        if width < 2:
+            raise ValueError(f"NeRF: width must be at least 2, got {width}")
+        if depth < 1:
+            raise ValueError(f"NeRF: depth must be at least 1, got {depth}")
+        if not density_scale > 0:
+            raise ValueError(f"NeRF: density_scale must be positive, got {density_scale}")
+        if min(position_octaves, direction_octaves) < 0:
+            raise ValueError(f"NeRF: octaves must not be negative, got {position_octaves} and {direction_octaves}")
+        skips = tuple(s for s in skips if s < depth - 1)
+        if any(s < 0 for s in skips):
+            raise ValueError(f"NeRF: skips must be indices of trunk layers, got {skips}")
+
+        self.width = width
+        self.view_directions = view_directions
+        self.density_scale = density_scale
+
+        table = [Layer(("positions",), width, "relu")]
+        for i in range(1, depth):
+            table.append(Layer(("positions", i - 1) if i - 1 in skips else (i - 1,), width, "relu"))
+        trunk = depth - 1
+        table.append(Layer((trunk,), 1))
+        if view_directions:
+            table.append(Layer((trunk,), width))
+            table.append(Layer((depth + 1, "directions"), max(width // 2, 1), "relu"))
+            table.append(Layer((depth + 2,), 3))
+        else:
+            table.append(Layer((trunk,), 3))
+        self.layers = MLP(
+            layers=tuple(table),
+            outputs=(len(table) - 1, depth),
+            position_octaves=position_octaves,
+            direction_octaves=direction_octaves if view_directions else None,
+        )
+
+        shapes = self.layers.weight_shapes(3, 3)
+        linears = [nn.Linear(i, o) for o, i in shapes]
+        self.trunk = nn.ModuleList(linears[:depth])
+        self.density = linears[depth]
+        self.feature = linears[depth + 1] if view_directions else None
+        self.view = linears[depth + 2] if view_directions else None
+        self.colour = linears[-1]
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """He initialisation of the ReLU layers (He et al. 2015), small heads, and a density that can grow."""
+        for layer in self.trunk:
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)
+        for head in (self.feature, self.view):
+            if head is not None:
+                nn.init.kaiming_uniform_(head.weight, nonlinearity="relu")
+                nn.init.zeros_(head.bias)
+        for head in (self.density, self.colour):
+            nn.init.xavier_uniform_(head.weight, gain=0.1)
+            nn.init.zeros_(head.bias)
+        # The inverse of softplus, so that the untrained density is INITIAL_DENSITY wherever the head's weights say 0.
+        start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale)).log()
+        nn.init.constant_(self.density.bias, float(start))
+
+    def linears(self) -> list[nn.Linear]:
+        """The linear layers in the order of ``layers``."""
+        heads = [self.density, self.feature, self.view, self.colour] if self.feature else [self.density, self.colour]
+        return [*self.trunk, *heads]  # type: ignore[list-item]
+
+    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Turns the network's outputs into what a renderer needs.
+
+        Args:
+            raw: [n, 4]: colour before its sigmoid, density before its softplus.
+
+        Returns:
+            (colour [n, 3] in 0..1, density [n] >= 0 per scene unit), float32 or wider.
+        """
+        raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
+        return torch.sigmoid(raw[..., :3]), F.softplus(raw[..., 3]) * self.density_scale
+
+    def forward(
+        self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Evaluates the field.
+
+        Args:
+            positions: [n, 3] in scene units.
+            directions: Unit vectors [n, 3], or [r, 3] together with ``ray_index``; not needed without view directions.
+            ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
+
+        Returns:
+            (colour [n, 3] in 0..1, density [n] per scene unit).
+
+        Raises:
+            ValueError: When view directions are needed and missing, or shapes disagree.
+        """
+        if self.view_directions and directions is None:
+            raise ValueError("NeRF: directions must be given, since the colour depends on the view direction")
+        offsets = torch.tensor([0, positions.shape[0]], dtype=torch.int32, device=positions.device)
+        linears = self.linears()
+        raw = grouped_mlp(
+            positions,
+            offsets,
+            [layer.weight[None] for layer in linears],
+            [layer.bias[None] for layer in linears],
+            layers=self.layers,
+            directions=directions if self.view_directions else None,
+            direction_index=ray_index if self.view_directions else None,
+        )
+        return self.activate(raw)

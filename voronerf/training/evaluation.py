@@ -1,0 +1,69 @@
+"""Scores of a trained field on the test views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from voronerf.data import Scene
+from voronerf.rendering.volume import RenderedImage, render_image
+from voronerf.router import VoronoiRouter
+from voronerf.training.metrics import psnr, ssim
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """PSNR in dB and SSIM of one view, colours in 0..1 on the scene's background."""
+
+    name: str
+    psnr: float
+    ssim: float
+
+
+def view_numbers(count: int, views: int | None) -> list[int]:
+    """``views`` of ``count`` test views, evenly spread from the first; all of them for None."""
+    if views is None or views >= count:
+        return list(range(count))
+    return [i * count // views for i in range(views)]
+
+
+@torch.no_grad()
+def render_view(router: VoronoiRouter, scene: Scene, view: int, *, samples: int, backend: str) -> RenderedImage:
+    """One test view as the router sees it, samples at the middle of their strata."""
+    device = next(router.parameters()).device
+    router.eval()
+    return render_image(
+        router,
+        scene.test.cameras.to(device),
+        view,
+        near=scene.near,
+        far=scene.far,
+        box=None if scene.box is None else scene.box.to(device),
+        samples=samples,
+        background=scene.background_colour(device),
+        spacing=scene.spacing,
+        backend=backend,
+    )
+
+
+def evaluate(
+    router: VoronoiRouter, scene: Scene, *, samples: int, views: int | None = None, backend: str = "auto"
+) -> list[ViewScore]:
+    """PSNR and SSIM of ``views`` evenly spread test views (None: all)."""
+    device = next(router.parameters()).device
+    scores = []
+    for view in view_numbers(len(scene.test.names), views):
+        image = render_view(router, scene, view, samples=samples, backend=backend)
+        target = scene.test.truth(view, scene.background_colour()).to(device)
+        colour = image.colour.clamp(0, 1)
+        scores.append(ViewScore(scene.test.names[view], float(psnr(colour, target)), float(ssim(colour, target))))
+    return scores
+
+
+def mean_scores(scores: list[ViewScore]) -> dict[str, float]:
+    """Means per image, as the literature reports them."""
+    return {
+        "psnr": sum(s.psnr for s in scores) / len(scores),
+        "ssim": sum(s.ssim for s in scores) / len(scores),
+    }

@@ -1,0 +1,87 @@
+"""Run directories: choosing one, and drawing what a trained run looks like."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from voronerf.data import Scene
+from voronerf.router import VoronoiRouter
+from voronerf.training.checkpoint import write_text
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.evaluation import evaluate, mean_scores, render_view, view_numbers
+from voronerf.training.panels import save_panel
+from voronerf.training.plots import plot_curves
+from voronerf.training.trainer import checkpoint_path
+
+
+def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
+    """The configuration with ``out`` filled in and checked.
+
+    Raises:
+        ConfigError: When ``out`` holds a run already and ``resume`` is off, or ``resume`` has nothing to continue.
+    """
+    out = config.out
+    if out is None:
+        if config.resume:
+            raise ConfigError("--resume needs --out, the run directory to continue")
+        root = Path("runs")
+        names = [scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000))]
+        out = next(root / name for name in names if not (root / name).exists())
+    elif not config.resume and (out / "config.json").exists():
+        raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
+    elif config.resume and not checkpoint_path(out).is_file():
+        raise ConfigError(f"--resume needs a checkpoint in --out, got {out}")
+    return replace(config, out=out)
+
+
+def write_panels(
+    router: VoronoiRouter, scene: Scene, folder: Path, *, samples: int, views: int, backend: str = "auto"
+) -> list[Path]:
+    """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
+    paths = []
+    background = scene.background_colour()
+    for view in view_numbers(len(scene.test), views):
+        image = render_view(router, scene, view, samples=samples, backend=backend)
+        # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
+        cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=backend).reshape(image.opacity.shape)
+        path = folder / f"{scene.test.names[view]}.png"
+        save_panel(
+            path,
+            truth=scene.test.truth(view, background),
+            colour=image.colour.cpu(),
+            opacity=image.opacity.cpu(),
+            depth=image.depth.cpu(),
+            cells=cells.cpu(),
+        )
+        paths.append(path)
+    return paths
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """The evaluations of a run, in order."""
+    path = run / "metrics.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+
+
+def write_curve(run: Path) -> Path | None:
+    """Plots PSNR over training seconds into ``plots/psnr.png``; None when nothing was evaluated."""
+    metrics = read_metrics(run)
+    if not metrics:
+        return None
+    path = run / "plots" / "psnr.png"
+    plot_curves(path, {run.name: [(m["seconds"], m["psnr"]) for m in metrics]})
+    return path
+
+
+def score_views(
+    router: VoronoiRouter, scene: Scene, *, samples: int, views: int | None, backend: str, path: Path | None = None
+) -> dict[str, Any]:
+    """Scores of test views, one by one and in the mean; written to ``path`` as JSON when given."""
+    scores = evaluate(router, scene, samples=samples, views=views, backend=backend)
+    result = {**mean_scores(scores), "views": [asdict(score) for score in scores]}
+    if path is not None:
+        write_text(path, json.dumps(result, indent=2) + "\n")
+    return result
