@@ -1,0 +1,56 @@
+// Stable counting sort on the CPU: a histogram a chunk, one scan over (cell, chunk), a scatter a chunk. Every row has
+// one possible place in a stable order, so neither the chunks nor the threads can change the result.
+#include "cell_sort.h"
+
+#include <algorithm>
+
+namespace voronerf {
+
+bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
+                   int threads) {
+  const int64_t rows = cell_sort_chunk_rows(k), chunks = cell_sort_chunks(n, k);
+  bool valid = true;
+#pragma omp parallel for schedule(static) num_threads(threads) reduction(&& : valid) if (threads > 1 && chunks > 1)
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+    int32_t* count = workspace + chunk * k;
+    std::fill(count, count + k, 0);
+    bool inside = true;
+    for (int64_t i = chunk * rows, end = std::min(n, i + rows); i < end; ++i) {
+      // As unsigned, a negative cell is above k as well.
+      if (static_cast<uint32_t>(cells[i]) < static_cast<uint32_t>(k)) {
+        ++count[cells[i]];
+      } else {
+        inside = false;
+      }
+    }
+    valid = valid && inside;
+  }
+  if (!valid) return false;
+
+  // In place, a count becomes the first place of that cell's rows of that chunk: walk the chunks once for the cells'
+  // totals (in `offsets`), once to hand out the places, both along the rows of the workspace.
+  std::fill(offsets, offsets + k + 1, 0);
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+    for (int64_t c = 0; c < k; ++c) offsets[c + 1] += workspace[chunk * k + c];
+  }
+  for (int64_t c = 0; c < k; ++c) offsets[c + 1] += offsets[c];
+  for (int64_t c = 0; c < k; ++c) {
+    int32_t place = offsets[c];
+    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+      const int32_t count = workspace[chunk * k + c];
+      workspace[chunk * k + c] = place;
+      place += count;
+    }
+  }
+
+#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1 && chunks > 1)
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+    int32_t* place = workspace + chunk * k;
+    for (int64_t i = chunk * rows, end = std::min(n, i + rows); i < end; ++i) {
+      order[place[cells[i]]++] = static_cast<int32_t>(i);
+    }
+  }
+  return true;
+}
+
+}  // namespace voronerf

@@ -1,0 +1,25 @@
+// The CUDA half as bindings.cpp sees it: launchers on the caller's stream (an opaque cudaStream_t), all pointers on the
+// device. The same contracts as the CPU functions in <op>.h.
+#pragma once
+
+#include <cstdint>
+
+namespace voronerf {
+
+// Makes a device current for this thread, so that the static runtime launches where the caller's stream lives.
+void cuda_set_device(int device);
+
+template <typename T>
+void nearest_centre_cuda(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
+                         void* stream);
+
+// A cell below 0 sorts before offsets[0], one from k on after offsets[k]: raising would need a host read.
+void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
+                    void* stream);
+
+// `child_offsets` and `child` are not checked; a point that reaches no leaf in `depth` levels gets a negative number.
+template <typename T>
+void locate_cell_cuda(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
+                      const int32_t* child, int32_t* leaves, int64_t n, int depth, void* stream);
+
+}  // namespace voronerf

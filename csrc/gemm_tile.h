@@ -1,0 +1,156 @@
+// Small dense products on tiles that stay in cache: C[r][:] = init + sum_k A(r, k) B[k][:], the outputs in vector
+// lanes.
+//
+// A block of R rows by V vectors lives in registers, its A values are broadcast from memory: with 32 registers 6 x 64,
+// 8 x 48, 12 x 32 and 12 x 16 outputs, with 16 registers 6 x 2 vectors. That is 1.7 to 2.4 multiply-adds a load, so the
+// multiply-add units are the limit, not the cache. All three products of a layer have this form:
+//
+//   forward          rows are samples, k the inputs,  A = activations [rows][k],  B = packed weights [k][outputs]
+//   input gradient   rows are samples, k the outputs, A = gradients [rows][k],    B = weights [k][inputs]
+//   weight gradient  rows are inputs,  k the samples, A = activations [k][rows],  B = gradients [k][outputs]
+//
+// A concatenation is a list of sources, walked one after the other with the same accumulators. What is left of the rows
+// runs in a block of exactly its size: nothing outside `rows` is read or written. Columns come in whole blocks of 16;
+// B, C and `initial` must be padded to that.
+#pragma once
+
+#include "simd.h"
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+namespace {
+
+constexpr int64_t kPanel = 64;  // columns of a packed panel of B
+
+VN_INLINE F32 load(const float* from) {
+  F32 a;
+  __builtin_memcpy(&a, from, sizeof a);
+  return a;
+}
+
+VN_INLINE void store(float* to, F32 a) {
+  __builtin_memcpy(to, &a, sizeof a);
+}
+
+// One source of a concatenated A: `depth` values of k, in rows of `stride` floats.
+struct Source {
+  const float* data;
+  int64_t stride;
+  int64_t depth;
+};
+
+enum class Finish { none, relu, relu_slope };
+
+struct Product {
+  const Source* sources;
+  int64_t count;
+  const float* b;  // [sum of depths][b_stride]
+  int64_t b_stride;
+  const float* initial;  // one row to start from, or null: 0
+  float* c;
+  int64_t c_stride;
+  bool accumulate;  // start from C instead
+  Finish finish;
+  const float* slope;  // relu_slope: C is multiplied by slope > 0, [rows][c_stride]
+};
+
+// Rows of a block that fill the registers.
+template <int V>
+constexpr int block_rows() {
+  return kLanes < 16 ? 6 : V == 4 ? 6 : V == 3 ? 8 : 12;
+}
+
+template <int R, int V, bool Transposed>
+void block(const Product& p, int64_t row, int64_t column) {
+  F32 sum[R][V];
+  if (p.accumulate) {
+    for (int r = 0; r < R; ++r) {
+      for (int v = 0; v < V; ++v) sum[r][v] = load(p.c + (row + r) * p.c_stride + column + v * kLanes);
+    }
+  } else {
+    for (int v = 0; v < V; ++v) {
+      const F32 start = p.initial == nullptr ? splat(0.0f) : load(p.initial + column + v * kLanes);
+      for (int r = 0; r < R; ++r) sum[r][v] = start;
+    }
+  }
+  const float* b = p.b + column;
+  const int64_t b_stride = p.b_stride;
+  for (int64_t s = 0; s < p.count; ++s) {
+    const int64_t depth = p.sources[s].depth, stride = p.sources[s].stride;
+    if (Transposed) {
+      const float* a = p.sources[s].data + row;
+      for (int64_t k = 0; k < depth; ++k, a += stride, b += b_stride) {
+        F32 w[V];
+        for (int v = 0; v < V; ++v) w[v] = load(b + v * kLanes);
+        for (int r = 0; r < R; ++r) {
+          const F32 x = splat(a[r]);
+          for (int v = 0; v < V; ++v) sum[r][v] = fma(x, w[v], sum[r][v]);
+        }
+      }
+    } else {
+      const float* a[(R + 3) / 4];
+      for (int g = 0; g < (R + 3) / 4; ++g) a[g] = p.sources[s].data + (row + 4 * g) * stride;
+      for (int64_t k = 0; k < depth; ++k, b += b_stride) {
+        F32 w[V];
+        for (int v = 0; v < V; ++v) w[v] = load(b + v * kLanes);
+        for (int r = 0; r < R; ++r) {
+          const F32 x = splat(a[r / 4][(r % 4) * stride + k]);
+          for (int v = 0; v < V; ++v) sum[r][v] = fma(x, w[v], sum[r][v]);
+        }
+      }
+    }
+  }
+  for (int r = 0; r < R; ++r) {
+    for (int v = 0; v < V; ++v) {
+      const int64_t at = (row + r) * p.c_stride + column + v * kLanes;
+      F32 value = sum[r][v];
+      // Comparisons are written so that NaN passes, as in torch.
+      if (p.finish == Finish::relu) value = value < splat(0.0f) ? splat(0.0f) : value;
+      if (p.finish == Finish::relu_slope)
+        value = value * (load(p.slope + at) > splat(0.0f) ? splat(1.0f) : splat(0.0f));
+      store(p.c + at, value);
+    }
+  }
+}
+
+template <int R, int V, bool Transposed>
+VN_INLINE void rest(const Product& p, int64_t rows, int64_t row, int64_t column) {
+  if constexpr (R > 0) {
+    if (rows == R) {
+      block<R, V, Transposed>(p, row, column);
+    } else {
+      rest<R - 1, V, Transposed>(p, rows, row, column);
+    }
+  }
+}
+
+template <int V, bool Transposed>
+void strip(const Product& p, int64_t rows, int64_t column) {
+  constexpr int kRows = block_rows<V>();
+  int64_t row = 0;
+  for (; row + kRows <= rows; row += kRows) block<kRows, V, Transposed>(p, row, column);
+  rest<kRows - 1, V, Transposed>(p, rows - row, row, column);
+}
+
+// C [rows][columns], columns a multiple of 16 and at most kPanel.
+template <bool Transposed>
+void multiply(const Product& p, int64_t rows, int64_t columns) {
+#if VN_ISA == 2
+  switch (columns / kLanes) {
+    case 4:
+      return strip<4, Transposed>(p, rows, 0);
+    case 3:
+      return strip<3, Transposed>(p, rows, 0);
+    case 2:
+      return strip<2, Transposed>(p, rows, 0);
+    default:
+      return strip<1, Transposed>(p, rows, 0);
+  }
+#else
+  for (int64_t column = 0; column < columns; column += 2 * kLanes) strip<2, Transposed>(p, rows, column);
+#endif
+}
+
+}  // namespace
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf

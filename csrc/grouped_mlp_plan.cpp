@@ -1,0 +1,203 @@
+#include <algorithm>
+
+#include "common.h"
+#include "grouped_mlp_planner.h"
+
+namespace voronerf {
+
+namespace {
+
+int64_t pad(int64_t width) {
+  return ceil_div(width, kGranule) * kGranule;
+}
+
+// Buffers that live over intervals of time share the workspace: first fit, in the order of asking.
+class Arena {
+ public:
+  int64_t take(int64_t size, int64_t start, int64_t end) {
+    int64_t offset = 0;
+    for (bool moved = true; moved;) {
+      moved = false;
+      for (const Block& other : blocks_) {
+        const bool together = start <= other.end && other.start <= end;
+        if (together && offset < other.offset + other.size && other.offset < offset + size) {
+          offset = other.offset + other.size;
+          moved = true;
+        }
+      }
+    }
+    blocks_.push_back({offset, size, start, end});
+    total_ = std::max(total_, offset + size);
+    return offset;
+  }
+  int64_t total() const { return total_; }
+
+ private:
+  struct Block {
+    int64_t offset, size, start, end;
+  };
+  std::vector<Block> blocks_;
+  int64_t total_ = 0;
+};
+
+}  // namespace
+
+// Time of the forward pass: 0 inputs, l + 1 layer l. The backward pass follows: layer l at `turn(l)`, the encodings at
+// the end.
+void MlpPlanner::place_buffers() {
+  const int64_t count = plan_.layer_count, end = 2 * count + 2;
+  const auto turn = [&](int64_t l) { return 2 * count - l; };
+  Arena arena;
+  std::vector<int64_t> last_use(count, 0);
+  int64_t last_position = 0, last_direction = 0;
+  std::vector<int64_t> first_gradient(count, end);
+  int64_t position_gradient = end, direction_gradient = end;
+  for (int64_t l = 0; l < count; ++l) {
+    last_use[l] = std::max(last_use[l], l + 1);
+    if (!layers_[l].live) continue;
+    for (const MlpPlanSource& s : sources_[l]) {
+      const bool layer = s.from >= 0;
+      int64_t& use = layer ? last_use[s.from] : s.from == kFromPositions ? last_position : last_direction;
+      int64_t& first = layer                      ? first_gradient[s.from]
+                       : s.from == kFromPositions ? position_gradient
+                                                  : direction_gradient;
+      use = std::max(use, l + 1);
+      first = std::min(first, turn(l));
+    }
+  }
+  const auto buffer = [&](int64_t width, int64_t from, int64_t to) {
+    const int64_t stride = pad(width);
+    return MlpBuffer{arena.take(stride * plan_.tile, from, to), stride};
+  };
+  const auto place_input = [&](MlpPlanInput& input, int64_t last, int64_t first_contribution) {
+    if (!input.used) return;
+    input.table = arena.take(3 * pad(input.width), 0, end);
+    // One vector more, since the encoder loads a whole one for each row.
+    input.staged = {arena.take(pad(input.raw * plan_.tile) + 2 * kGranule, 0, end), input.raw};
+    if (input.copied) input.value = buffer(input.width, 0, plan_.gradients ? end : last);
+    if (input.gradient_wanted) input.gradient = buffer(input.width, first_contribution, end);
+  };
+  place_input(plan_.positions, last_position, position_gradient);
+  place_input(plan_.directions, last_direction, direction_gradient);
+  for (int64_t l = 0; l < count; ++l) {
+    MlpPlanLayer& layer = layers_[l];
+    if (!layer.live) continue;
+    layer.value = buffer(layer.width, l + 1, plan_.gradients ? end : last_use[l]);
+    if (!plan_.gradients) continue;
+    if (layer.slope_kept) layer.slope = buffer(layer.width, 0, end);
+    layer.gradient = buffer(layer.width, layer.from_output ? count + 1 : first_gradient[l], turn(l));
+  }
+  for (int64_t l = 0; l < count; ++l) {
+    MlpPlanLayer& layer = layers_[l];
+    if (!layer.live) continue;
+    layer.packed = arena.take(layer.depth * layer.padded, 0, end);
+    layer.bias = arena.take(layer.padded, 0, end);
+    if (!plan_.gradients) continue;
+    for (MlpPlanSource& s : sources_[l]) {
+      if (s.gradient) s.packed = arena.take(layer.width * pad(s.width), 0, end);
+    }
+  }
+  if (plan_.parameter_gradients) plan_.own_partial = arena.take(plan_.partial, 0, end);
+  plan_.workspace = arena.total();
+}
+
+// A source's gradient is the sum over the layers that read it, last layer first.
+void MlpPlanner::order_gradients() {
+  const int64_t count = plan_.layer_count;
+  std::vector<const MlpPlanSource*> seen(count, nullptr);
+  std::vector<MlpPlanSource*> latest(count, nullptr);
+  bool positions_seen = false, directions_seen = false;
+  for (int64_t l = count; l-- > 0;) {
+    if (!layers_[l].live) continue;
+    for (MlpPlanSource& s : sources_[l]) {
+      if (s.from >= 0) {
+        s.gradient = true;
+        s.first = seen[s.from] == nullptr && !layers_[s.from].from_output;
+        seen[s.from] = latest[s.from] = &s;
+      } else {
+        bool& before = s.from == kFromPositions ? positions_seen : directions_seen;
+        s.gradient = (s.from == kFromPositions ? plan_.positions : plan_.directions).gradient_wanted;
+        s.first = !before;
+        before = true;
+      }
+    }
+  }
+  for (int64_t l = 0; l < count; ++l) {
+    if (latest[l] == nullptr) continue;
+    latest[l]->last = true;
+    layers_[l].slope_fused = layers_[l].activation == static_cast<int>(Activation::relu);
+  }
+}
+
+void MlpPlanner::mark_live(const MlpTable& table) {
+  for (const int output : table.outputs) layers_[output].live = layers_[output].from_output = true;
+  for (int64_t l = plan_.layer_count; l-- > 0;) {
+    if (!layers_[l].live) continue;
+    for (const int from : table.layers[l].inputs) {
+      if (from >= 0) layers_[from].live = true;
+      if (from == kFromPositions) plan_.positions.used = true;
+      if (from == kFromDirections) plan_.directions.used = true;
+    }
+  }
+}
+
+MlpPlanner::MlpPlanner(const MlpTable& table, bool indexed_directions, const MlpWanted& wanted) {
+  plan_.layer_count = static_cast<int64_t>(table.layers.size());
+  plan_.gradients = wanted.parameters || wanted.positions || wanted.directions;
+  plan_.parameter_gradients = wanted.parameters;
+  layers_.resize(table.layers.size());
+  sources_.resize(table.layers.size());
+  const auto input = [](int64_t raw, int octaves, bool gather, bool gradient) {
+    MlpPlanInput it{};
+    it.raw = raw;
+    it.octaves = octaves;
+    it.width = octaves < 0 ? raw : raw * (1 + 2 * octaves);
+    it.copied = octaves >= 0 || gather;
+    it.gradient_wanted = gradient;
+    return it;
+  };
+  plan_.positions = input(table.positions, table.position_octaves, false, wanted.positions);
+  plan_.directions = input(table.directions, table.direction_octaves, indexed_directions, wanted.directions);
+
+  int64_t widest = 1;
+  for (size_t l = 0; l < layers_.size(); ++l) {
+    MlpPlanLayer& layer = layers_[l];
+    layer.activation = static_cast<int>(table.layers[l].activation);
+    layer.width = table.layers[l].width;
+    layer.padded = pad(layer.width);
+    layer.slope_kept = table.layers[l].activation == Activation::sine;
+    widest = std::max(widest, layer.padded);
+    for (const int from : table.layers[l].inputs) {
+      MlpPlanSource s{};
+      s.from = from;
+      s.width = from >= 0                ? layers_[from].width
+                : from == kFromPositions ? plan_.positions.width
+                                         : plan_.directions.width;
+      s.row = layer.depth;
+      layer.depth += s.width;
+      sources_[l].push_back(s);
+    }
+    layer.sources = sources_[l].data();
+    layer.source_count = static_cast<int64_t>(sources_[l].size());
+    layer.partial = plan_.partial;
+    layer.partial_bias = plan_.partial + layer.depth * layer.padded;
+    plan_.partial = layer.partial_bias + layer.padded;
+  }
+  int64_t column = 0;
+  for (const int output : table.outputs) {
+    outputs_.push_back({output, column});
+    column += layers_[output].width;
+  }
+  plan_.out_features = column;
+  mark_live(table);
+  plan_.positions.gradient_wanted &= plan_.positions.used;
+  plan_.directions.gradient_wanted &= plan_.directions.used;
+  order_gradients();
+  plan_.tile = widest >= 64 ? 48 : 96;
+  place_buffers();
+  plan_.layers = layers_.data();
+  plan_.outputs = outputs_.data();
+  plan_.output_count = static_cast<int64_t>(outputs_.size());
+}
+
+}  // namespace voronerf

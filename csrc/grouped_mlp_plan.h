@@ -1,0 +1,83 @@
+// What the tiles of grouped_mlp do, in plain numbers: which buffer each value lives in, which products and in what
+// order. Made once a call from the layer table (grouped_mlp_plan.cpp), read by the kernels of every instruction set; so
+// it holds pointers to plain arrays, and no container.
+#pragma once
+
+#include <cstdint>
+
+namespace voronerf {
+
+constexpr int64_t kGranule = 16;  // columns of every buffer are padded to a multiple of this
+
+// Values of one kind for the rows of a tile: `offset` floats into the workspace, rows of `stride` floats.
+struct MlpBuffer {
+  int64_t offset, stride;
+};
+
+struct MlpPlanSource {
+  int from;            // a layer, kFromPositions or kFromDirections
+  int64_t width, row;  // its values, and the first input of the layer they are
+  bool gradient;       // whether to compute its gradient
+  bool first;          // ... as the first contribution to its buffer
+  bool last;           // ... as the last one, after which the gradient is complete
+  int64_t packed;      // [o][width] in panels, in the workspace
+};
+
+struct MlpPlanLayer {
+  bool live;  // reaches an output
+  int activation;
+  int64_t width, padded, depth;  // outputs, padded to kGranule; inputs
+  const MlpPlanSource* sources;
+  int64_t source_count;
+  int64_t packed, bias;  // weights [depth][padded] in panels, bias [padded], in the workspace
+  MlpBuffer value, slope, gradient;
+  bool slope_kept;                // sine: its cosine is kept for the backward pass
+  bool slope_fused;               // relu: applied by the product that completes the gradient
+  bool from_output;               // part of the network's output
+  int64_t partial, partial_bias;  // gradients [depth][padded] and [padded], in a partial
+};
+
+struct MlpPlanOutput {
+  int layer;
+  int64_t column;
+};
+
+// Raw features and their encoding.
+struct MlpPlanInput {
+  int64_t raw, octaves, width;  // octaves -1: none
+  bool used, copied;            // copied: values lie in `value`, otherwise they are read where they are
+  MlpBuffer staged, value, gradient;
+  int64_t table;  // lanes of the encoding, in the workspace: [3][value.stride] source feature, scale, phase
+  bool gradient_wanted;
+};
+
+struct MlpPlan {
+  MlpPlanInput positions, directions;
+  const MlpPlanLayer* layers;
+  int64_t layer_count;
+  const MlpPlanOutput* outputs;
+  int64_t output_count, out_features;
+  int64_t tile;              // rows
+  int64_t workspace;         // floats a thread needs
+  int64_t partial;           // floats of one partial weight gradient
+  int64_t own_partial;       // a thread's own partial, in its workspace
+  bool gradients;            // made for the backward pass
+  bool parameter_gradients;  // weights and biases wanted
+};
+
+// Pointers of one call.
+struct MlpData {
+  const float* positions;
+  const float* directions;
+  const int32_t* direction_index;
+  const float* const* weights;
+  const float* const* biases;
+  float* out;
+  const float* grad_out;
+  float* const* grad_weights;
+  float* const* grad_biases;
+  float* grad_positions;
+  float* grad_directions;  // one row a sample
+};
+
+}  // namespace voronerf

@@ -1,0 +1,43 @@
+// Instruction sets of the CPU paths. Every file *_isa.cpp is compiled once for each, with its own flags and VN_ISA set;
+// the caller names one at run time, so one build runs on any processor of its architecture.
+#pragma once
+
+namespace voronerf {
+
+enum class Isa : int { portable = 0, avx2 = 1, avx512 = 2 };
+
+// Whether this processor and its operating system can run it.
+bool isa_supported(Isa isa);
+
+}  // namespace voronerf
+
+// The paths that exist in a build. x86-64 has all three, anything else the portable one.
+#if defined(__x86_64__)
+#define VN_FOR_ISA(isa, call)            \
+  switch (isa) {                         \
+    case ::voronerf::Isa::avx512:        \
+      return ::voronerf::avx512::call;   \
+    case ::voronerf::Isa::avx2:          \
+      return ::voronerf::avx2::call;     \
+    default:                             \
+      return ::voronerf::portable::call; \
+  }
+#define VN_DECLARE_FOR_ISA(declaration) \
+  namespace portable {                  \
+  declaration;                          \
+  }                                     \
+  namespace avx2 {                      \
+  declaration;                          \
+  }                                     \
+  namespace avx512 {                    \
+  declaration;                          \
+  }
+#else
+#define VN_FOR_ISA(isa, call) \
+  (void)isa;                  \
+  return ::voronerf::portable::call;
+#define VN_DECLARE_FOR_ISA(declaration) \
+  namespace portable {                  \
+  declaration;                          \
+  }
+#endif

@@ -1,0 +1,59 @@
+// Nearest centre on the CPU: blocks of points over threads. A point's answer depends on that point alone, so the result
+// does not depend on the number of threads.
+#include "nearest_centre.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "common.h"
+
+namespace voronerf {
+
+namespace {
+
+// Points of a task: a few microseconds of work at small k, small enough to share n = 10,000 between two threads.
+constexpr int64_t kBlock = 2048;
+
+}  // namespace
+
+template <typename T>
+float nearest_centre_weight_bound(const T* weights, int64_t k) {
+  if (weights == nullptr) return 0.0f;
+  double bound = 0.0;
+  // An infinite weight is no part of the bound: it makes its value infinite, which the screening leaves to float64.
+  for (int64_t j = 0; j < k; ++j) {
+    if (std::isfinite(weights[j])) bound = std::max(bound, std::fabs(static_cast<double>(weights[j])));
+  }
+  // Where D overflows float32 but D - w does not, screening is void; an infinite bound sends every point to float64.
+  return bound > 1e30 ? std::numeric_limits<float>::infinity() : static_cast<float>(bound);
+}
+
+template <typename T>
+void nearest_centre_serial(const T* points, const T* centres, const T* weights, float weight_bound, int32_t* cells,
+                           int64_t n, int64_t k, Isa isa) {
+  VN_FOR_ISA(isa, nearest_centre(points, centres, weights, weight_bound, cells, n, k))
+}
+
+template <typename T>
+void nearest_centre_cpu(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
+                        Isa isa, int threads) {
+  const float weight_bound = nearest_centre_weight_bound(weights, k);
+  const int64_t blocks = ceil_div(n, kBlock);
+#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1 && blocks > 1)
+  for (int64_t b = 0; b < blocks; ++b) {
+    const int64_t start = b * kBlock;
+    nearest_centre_serial(points + 3 * start, centres, weights, weight_bound, cells + start,
+                          std::min(kBlock, n - start), k, isa);
+  }
+}
+
+template void nearest_centre_cpu(const float*, const float*, const float*, int32_t*, int64_t, int64_t, Isa, int);
+template void nearest_centre_cpu(const double*, const double*, const double*, int32_t*, int64_t, int64_t, Isa, int);
+template void nearest_centre_serial(const float*, const float*, const float*, float, int32_t*, int64_t, int64_t, Isa);
+template void nearest_centre_serial(const double*, const double*, const double*, float, int32_t*, int64_t, int64_t,
+                                    Isa);
+template float nearest_centre_weight_bound(const float*, int64_t);
+template float nearest_centre_weight_bound(const double*, int64_t);
+
+}  // namespace voronerf

@@ -1,0 +1,216 @@
+// The one place that knows instruction sets: a vector of float32 and the operations the kernels need, for the
+// instruction set of the including file (VN_ISA: 0 portable, 1 AVX2 + FMA, 2 AVX-512; see isa.h).
+//
+// Everything here has internal linkage. A file compiled for AVX-512 must not leave an inline function behind that the
+// linker could pick for a processor without it, so *_isa.cpp files include no standard header but <cstdint> and
+// <cstddef>.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#ifndef VN_ISA
+#error "compile with VN_ISA=0, 1 or 2"
+#endif
+
+#if VN_ISA == 2
+#include <immintrin.h>
+#define VN_ISA_NAMESPACE avx512
+#elif VN_ISA == 1
+#include <immintrin.h>
+#define VN_ISA_NAMESPACE avx2
+#else
+#define VN_ISA_NAMESPACE portable
+#endif
+
+#define VN_INLINE static inline __attribute__((always_inline, unused))
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+
+#if VN_ISA == 2
+
+constexpr int kLanes = 16;
+using F32 = __m512;
+using I32 = __m512i;
+using Mask = __mmask16;
+
+VN_INLINE F32 splat(float a) {
+  return _mm512_set1_ps(a);
+}
+VN_INLINE I32 splat(int32_t a) {
+  return _mm512_set1_epi32(a);
+}
+VN_INLINE F32 sub(F32 a, F32 b) {
+  return _mm512_sub_ps(a, b);
+}
+VN_INLINE F32 mul(F32 a, F32 b) {
+  return _mm512_mul_ps(a, b);
+}
+VN_INLINE F32 add(F32 a, F32 b) {
+  return _mm512_add_ps(a, b);
+}
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
+  return _mm512_fmadd_ps(a, b, c);
+}
+// With a full mask these are the plain instructions; gcc 12 warns of an uninitialised operand in its unmasked ones (its
+// bug 105593).
+VN_INLINE F32 min(F32 a, F32 b) {
+  return _mm512_maskz_min_ps(0xffff, a, b);
+}
+VN_INLINE F32 max(F32 a, F32 b) {
+  return _mm512_maskz_max_ps(0xffff, a, b);
+}
+VN_INLINE F32 abs(F32 a) {
+  return _mm512_abs_ps(a);
+}
+VN_INLINE Mask less(F32 a, F32 b) {
+  return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ);
+}
+VN_INLINE I32 select(Mask m, I32 a, I32 b) {
+  return _mm512_mask_mov_epi32(b, m, a);
+}
+VN_INLINE unsigned bits(Mask m) {
+  return m;
+}
+VN_INLINE void store(int32_t* to, I32 a) {
+  _mm512_storeu_si512(to, a);
+}
+
+// Sixteen points [16,3] to their three coordinates.
+VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
+  const F32 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + 16), c = _mm512_loadu_ps(p + 32);
+  // Lanes 0-10 of x, y and the first ten of z come from a and b, the rest from c; index 16 + i takes lane i of the
+  // second.
+  const I32 x_ab = _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0);
+  const I32 y_ab = _mm512_setr_epi32(1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0);
+  const I32 z_ab = _mm512_setr_epi32(2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0);
+  const I32 x_c = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29);
+  const I32 y_c = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30);
+  const I32 z_c = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31);
+  x = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, x_ab, b), x_c, c);
+  y = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, y_ab, b), y_c, c);
+  z = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, z_ab, b), z_c, c);
+}
+
+#elif VN_ISA == 1
+
+constexpr int kLanes = 8;
+using F32 = __m256;
+using I32 = __m256i;
+using Mask = __m256;
+
+VN_INLINE F32 splat(float a) {
+  return _mm256_set1_ps(a);
+}
+VN_INLINE I32 splat(int32_t a) {
+  return _mm256_set1_epi32(a);
+}
+VN_INLINE F32 sub(F32 a, F32 b) {
+  return _mm256_sub_ps(a, b);
+}
+VN_INLINE F32 mul(F32 a, F32 b) {
+  return _mm256_mul_ps(a, b);
+}
+VN_INLINE F32 add(F32 a, F32 b) {
+  return _mm256_add_ps(a, b);
+}
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
+  return _mm256_fmadd_ps(a, b, c);
+}
+VN_INLINE F32 min(F32 a, F32 b) {
+  return _mm256_min_ps(a, b);
+}
+VN_INLINE F32 max(F32 a, F32 b) {
+  return _mm256_max_ps(a, b);
+}
+VN_INLINE F32 abs(F32 a) {
+  return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), a);
+}
+VN_INLINE Mask less(F32 a, F32 b) {
+  return _mm256_cmp_ps(a, b, _CMP_LT_OQ);
+}
+VN_INLINE I32 select(Mask m, I32 a, I32 b) {
+  return _mm256_blendv_epi8(b, a, _mm256_castps_si256(m));
+}
+VN_INLINE unsigned bits(Mask m) {
+  return static_cast<unsigned>(_mm256_movemask_ps(m));
+}
+VN_INLINE void store(int32_t* to, I32 a) {
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(to), a);
+}
+
+VN_INLINE __m256 load_halves(const float* low, const float* high) {
+  return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(low)), _mm_loadu_ps(high), 1);
+}
+
+// Eight points [8,3] to their three coordinates; the shuffles work on points 0-3 and 4-7 side by side.
+VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
+  const __m256 a = load_halves(p, p + 12);                             // x0 y0 z0 x1
+  const __m256 b = load_halves(p + 4, p + 16);                         // y1 z1 x2 y2
+  const __m256 c = load_halves(p + 8, p + 20);                         // z2 x3 y3 z3
+  const __m256 xy = _mm256_shuffle_ps(b, c, _MM_SHUFFLE(2, 1, 3, 2));  // x2 y2 x3 y3
+  const __m256 yz = _mm256_shuffle_ps(a, b, _MM_SHUFFLE(1, 0, 2, 1));  // y0 z0 y1 z1
+  x = _mm256_shuffle_ps(a, xy, _MM_SHUFFLE(2, 0, 3, 0));
+  y = _mm256_shuffle_ps(yz, xy, _MM_SHUFFLE(3, 1, 2, 0));
+  z = _mm256_shuffle_ps(yz, c, _MM_SHUFFLE(3, 0, 3, 1));
+}
+
+#else
+
+// Four lanes of the compiler's own vectors: SSE2 on x86-64, NEON on arm64.
+constexpr int kLanes = 4;
+typedef float F32 __attribute__((vector_size(16)));
+typedef int32_t I32 __attribute__((vector_size(16)));
+typedef I32 Mask;
+
+VN_INLINE F32 splat(float a) {
+  return F32{a, a, a, a};
+}
+VN_INLINE I32 splat(int32_t a) {
+  return I32{a, a, a, a};
+}
+VN_INLINE F32 sub(F32 a, F32 b) {
+  return a - b;
+}
+VN_INLINE F32 mul(F32 a, F32 b) {
+  return a * b;
+}
+VN_INLINE F32 add(F32 a, F32 b) {
+  return a + b;
+}
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
+  return a * b + c;
+}
+VN_INLINE F32 min(F32 a, F32 b) {
+  return a < b ? a : b;
+}
+VN_INLINE F32 max(F32 a, F32 b) {
+  return a > b ? a : b;
+}
+VN_INLINE F32 abs(F32 a) {
+  return reinterpret_cast<F32>(reinterpret_cast<I32>(a) & splat(0x7fffffff));
+}
+VN_INLINE Mask less(F32 a, F32 b) {
+  return a < b;
+}
+VN_INLINE I32 select(Mask m, I32 a, I32 b) {
+  return (m & a) | (~m & b);
+}
+VN_INLINE unsigned bits(Mask m) {
+  return (m[0] & 1u) | (m[1] & 2u) | (m[2] & 4u) | (m[3] & 8u);
+}
+VN_INLINE void store(int32_t* to, I32 a) {
+  __builtin_memcpy(to, &a, sizeof a);
+}
+
+VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
+  x = F32{p[0], p[3], p[6], p[9]};
+  y = F32{p[1], p[4], p[7], p[10]};
+  z = F32{p[2], p[5], p[8], p[11]};
+}
+
+#endif
+
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf

@@ -1,0 +1,207 @@
+"""Build of the compiled module ``voronerf._C``; everything else is in pyproject.toml.
+
+The extension knows nothing of torch: C++17, pybind11 and, where nvcc is found, CUDA. A build.ninja is written and run, so a
+build is parallel and redoes only what has changed, headers included. Files named ``*_isa.cpp`` are compiled once for each
+instruction set (csrc/isa.h); the choice among them is made at run time.
+
+Environment:
+    CXX, CXXFLAGS                the C++ compiler (default c++, else g++) and flags to add
+    VORONERF_CUDA                auto (default): with CUDA where nvcc is found; 1: fail without it; 0: never
+    VORONERF_CUDA_ARCHITECTURES  such as "80;90": machine code for each, and PTX of the last for what comes after it
+    CUDA_HOME, MAX_JOBS          where CUDA is; parallel jobs
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
+
+ROOT = Path(__file__).resolve().parent
+SOURCES = ROOT / "csrc"
+X86_ISAS = {
+    "portable": ["-DVN_ISA=0"],
+    "avx2": ["-DVN_ISA=1", "-mavx2", "-mfma"],
+    "avx512": ["-DVN_ISA=2", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma"],
+}
+# Short, for the sake of build time: 8.x runs the code of 80, and everything after 9.0 compiles the PTX of 90 at load time.
+DEFAULT_ARCHITECTURES = "75;80;90"
+
+
+class NinjaBuildExt(build_ext):
+    """Writes build.ninja, runs it, and copies the module to where setuptools wants it."""
+
+    def build_extension(self, ext: Extension) -> None:
+        """Build the one extension there is."""
+        build = ROOT / "build" / f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
+        build.mkdir(parents=True, exist_ok=True)
+        cuda = find_cuda()
+        write_if_changed(build / "build_info.h", build_info(cuda))
+        module = build / Path(self.get_ext_filename(ext.name)).name
+        write_if_changed(build / "build.ninja", ninja_file(module, cuda))
+        command = [*ninja(), "-C", str(build)]
+        if jobs := os.environ.get("MAX_JOBS") or (str(self.parallel) if self.parallel else ""):
+            command += ["-j", jobs]
+        subprocess.run(command, check=True)
+        target = Path(self.get_ext_fullpath(ext.name))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(module, target)
+        print(f"voronerf: {cuda.outcome}")
+
+
+class Cuda:
+    """What was found of CUDA: nvcc and architectures, or neither; the outcome in one line."""
+
+    def __init__(self, outcome: str, nvcc: Path | None = None, architectures: tuple[str, ...] = ()) -> None:
+        self.outcome, self.nvcc, self.architectures = outcome, nvcc, architectures
+
+    def flags(self) -> list[str]:
+        """Flags of nvcc that name the architectures."""
+        flags = [f"-gencode=arch=compute_{arch},code=sm_{arch}" for arch in self.architectures]
+        last = self.architectures[-1]
+        return [*flags, f"-gencode=arch=compute_{last},code=compute_{last}"]
+
+
+def find_cuda() -> Cuda:
+    """Follow VORONERF_CUDA and VORONERF_CUDA_ARCHITECTURES."""
+    wish = os.environ.get("VORONERF_CUDA", "auto")
+    if wish not in ("auto", "0", "1"):
+        raise SystemExit(f"voronerf: VORONERF_CUDA must be auto, 0 or 1, got {wish!r}")
+    if wish == "0":
+        return Cuda("built without CUDA: VORONERF_CUDA=0")
+    home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
+    places = [home + "/bin"] if home else [*os.environ.get("PATH", "").split(os.pathsep), "/usr/local/cuda/bin"]
+    found = shutil.which("nvcc", path=os.pathsep.join(places))
+    if found is None:
+        if wish == "1":
+            raise SystemExit(
+                "voronerf: VORONERF_CUDA=1, but there is no nvcc; install the CUDA toolkit or set CUDA_HOME"
+            )
+        return Cuda("built without CUDA: no nvcc on PATH, in CUDA_HOME or in /usr/local/cuda")
+    wanted = os.environ.get("VORONERF_CUDA_ARCHITECTURES")
+    if wanted:
+        architectures = tuple(wanted.replace(",", ";").split(";"))
+    else:
+        known = subprocess.run([found, "--list-gpu-code"], check=True, capture_output=True, text=True).stdout.split()
+        architectures = tuple(arch for arch in DEFAULT_ARCHITECTURES.split(";") if f"sm_{arch}" in known)
+    return Cuda(f"built with CUDA for {';'.join(architectures)} by {found}", Path(found), architectures)
+
+
+def compiler() -> str:
+    """The C++ compiler."""
+    return os.environ.get("CXX") or shutil.which("c++") or "g++"
+
+
+def ninja() -> list[str]:
+    """The ninja of this environment, or the one on PATH."""
+    try:
+        import ninja as package
+
+        return [str(Path(package.BIN_DIR) / "ninja")]
+    except ImportError:
+        return ["ninja"]
+
+
+def isas() -> dict[str, list[str]]:
+    """Instruction sets of this architecture and their flags."""
+    x86 = platform.machine().lower() in ("x86_64", "amd64") and "aarch64" not in compiler()
+    return X86_ISAS if x86 else {"portable": X86_ISAS["portable"]}
+
+
+def build_info(cuda: Cuda) -> str:
+    """A header that records the build."""
+    version = subprocess.run([*shlex.split(compiler()), "--version"], check=True, capture_output=True, text=True).stdout
+    values = {
+        "VN_COMPILER": f'"{version.splitlines()[0]}"',
+        "VN_OPENMP": str(int(sys.platform != "darwin")),
+        "VN_CUDA": str(int(cuda.nvcc is not None)),
+        "VN_CUDA_OUTCOME": f'"{cuda.outcome}"',
+        "VN_CUDA_ARCHITECTURES": f'"{";".join(cuda.architectures)}"',
+    }
+    return "#pragma once\n" + "".join(f"#define {name} {value}\n" for name, value in values.items())
+
+
+def ninja_file(module: Path, cuda: Cuda) -> str:
+    """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder."""
+    import pybind11
+
+    # fp-contract: results are defined by separate roundings (csrc/nearest_centre_math.h); fused ones are asked for by name.
+    common = ["-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off", "-Wall", "-Wextra", "-I."]
+    openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas"]
+    includes = [f"-I{SOURCES}", f"-isystem{pybind11.get_include()}", f"-isystem{sysconfig.get_path('include')}"]
+    extra = shlex.split(os.environ.get("CXXFLAGS", ""))
+    # libgomp is left out of the link: voronerf/_native.py binds the module to the copy that torch has loaded.
+    if cuda.nvcc is not None:
+        # nvcc knows where its static runtime is. With that, the module loads on a machine without CUDA.
+        common.append("-DVN_WITH_CUDA")
+        linker = [str(cuda.nvcc), "-shared", "-cudart=static", "-ccbin", compiler(), "-Xlinker", "--exclude-libs,ALL"]
+    elif sys.platform == "darwin":
+        linker = [compiler(), "-bundle", "-undefined", "dynamic_lookup"]
+    else:
+        linker = [compiler(), "-shared", "-Wl,--exclude-libs,ALL"]
+    lines = [
+        "rule cxx",
+        f"  command = {compiler()} {join(common + openmp + includes + extra)} $flags -MMD -MF $out.d -c $in -o $out",
+        "  depfile = $out.d",
+        "  deps = gcc",
+        "  description = $out",
+        "rule link",
+        f"  command = {join(linker)} $in -o $out",
+        "  description = $out",
+    ]
+    if cuda.nvcc is not None:
+        host = join(["-Xcompiler", "-fPIC,-fvisibility=hidden,-ffp-contract=off", "-ccbin", compiler()])
+        flags = join(["-std=c++17", "-O3", "-cudart=static", *cuda.flags(), f"-I{SOURCES}", "-I."])
+        lines += [
+            "rule nvcc",
+            f"  command = {join([str(cuda.nvcc)])} {flags} {host} -MMD -MF $out.d -c $in -o $out",
+            "  depfile = $out.d",
+            "  deps = gcc",
+            "  description = $out",
+        ]
+    objects = []
+    for source in sorted(SOURCES.iterdir()):
+        if source.name.endswith("_isa.cpp"):
+            for isa, flags_of_isa in isas().items():
+                objects.append(f"{source.stem}.{isa}.o")
+                lines += [f"build {objects[-1]}: cxx {quote(str(source))}", f"  flags = {join(flags_of_isa)}"]
+        elif source.suffix == ".cpp":
+            objects.append(f"{source.name}.o")
+            lines.append(f"build {objects[-1]}: cxx {quote(str(source))}")
+        elif source.suffix == ".cu" and cuda.nvcc is not None:
+            objects.append(f"{source.name}.o")
+            lines.append(f"build {objects[-1]}: nvcc {quote(str(source))}")
+    lines.append(f"build {quote(module.name)}: link {' '.join(objects)}")
+    return "\n".join([*lines, f"default {quote(module.name)}", ""])
+
+
+def quote(path: str) -> str:
+    """A path in a build.ninja."""
+    return path.replace("$", "$$").replace(":", "$:").replace(" ", "$ ")
+
+
+def join(flags: list[str]) -> str:
+    """Flags in a command of a build.ninja."""
+    return shlex.join(flags).replace("$", "$$")
+
+
+def write_if_changed(path: Path, text: str) -> None:
+    """Write a file, leaving its time of change alone where the text is the same."""
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)
+
+
+setup(
+    packages=[*find_packages(include=["voronerf", "voronerf.*"]), "voronerf.kernels"],
+    package_dir={"voronerf": "voronerf", "voronerf.kernels": "kernels"},
+    ext_modules=[Extension("voronerf._C", sources=[])],
+    cmdclass={"build_ext": NinjaBuildExt},
+)
