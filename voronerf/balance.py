@@ -16,6 +16,7 @@ from torch import Tensor
 
 from voronerf import ops
 from voronerf.diagram import VoronoiDiagram, uniform_centres
+from voronerf.transport import transport
 
 
 @dataclass(frozen=True)
@@ -93,14 +94,14 @@ def balance(
         points: floating [m, 3], finite.
         importance: floating [m], finite, >= 0, not all 0.
         k: number of cells, 1 <= k <= number of distinct points.
-        method: "published".
+        method: "published" (a plain Voronoi diagram) or "transport" (a power diagram).
         steps: number of updates; 0 leaves the first centres where they are.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
         normalise: "neighbourhood" or "global".
         init: the first centres. "random": distinct samples, all equally likely (the paper's, default of "published").
-            "weighted": distinct samples drawn one by one with probability proportional to importance. "uniform":
-            `uniform_centres` over the bounding box of the samples.
+            "weighted": distinct samples drawn one by one with probability proportional to importance (default of
+            "transport"). "uniform": `uniform_centres` over the bounding box of the samples.
         generator: CPU generator of the draws; None for torch's global one.
         backend: of the cell queries, see `voronerf.backends`.
 
@@ -110,8 +111,8 @@ def balance(
         TypeError: points or importance that are not floating-point.
     """
     check_samples("balance", points, importance)
-    _check_choice("method", method, ("published",))
-    init = init or "random"
+    _check_choice("method", method, ("published", "transport"))
+    init = init or ("random" if method == "published" else "weighted")
     _check_choice("init", init, ("random", "weighted", "uniform"))
     _check_choice("normalise", normalise, ("neighbourhood", "global"))
     if k < 1:
@@ -125,16 +126,27 @@ def balance(
     samples = points.detach().to("cpu", torch.float32).contiguous()
     masses = importance.detach().to("cpu", torch.float64)
 
-    def weigh(centres: Tensor) -> Tensor:
-        return cell_weights(ops.nearest_centre(samples, centres, backend=backend), masses, k)
+    def weigh(centres: Tensor, power: Tensor | None = None) -> Tensor:
+        return cell_weights(ops.nearest_centre(samples, centres, weights=power, backend=backend), masses, k)
 
-    centres = first_centres(samples, masses, k, init=init, generator=generator)
+    centres, power = first_centres(samples, masses, k, init=init, generator=generator), None
     before = after = weigh(centres)
-    for _ in range(steps if k > 1 else 0):
-        centres = published_step(centres, after, alpha=alpha, neighbours=neighbours, normalise=normalise)
-        after = weigh(centres)
+    if method == "transport" and k > 1:
+        centres, power = transport(samples, masses, centres, generator=generator)
+        after = weigh(centres, power)
+    elif k > 1:
+        for _ in range(steps):
+            centres = published_step(centres, after, alpha=alpha, neighbours=neighbours, normalise=normalise)
+            after = weigh(centres)
     device = points.device
-    return Balance(centres.to(device), None, before.to(device), after.to(device), imbalance(before), imbalance(after))
+    return Balance(
+        centres=centres.to(device),
+        power=None if power is None else power.to(device),
+        before=before.to(device),
+        after=after.to(device),
+        imbalance_before=imbalance(before),
+        imbalance_after=imbalance(after),
+    )
 
 
 def published_step(centres: Tensor, weights: Tensor, *, alpha: float, neighbours: int, normalise: str) -> Tensor:
