@@ -24,9 +24,13 @@ class LayeredField(Protocol):
 
     layers: MLP
 
-    def linears(self) -> list[nn.Linear]: ...
+    def linears(self) -> list[nn.Linear]:
+        """The linear layers in the table's order."""
+        ...
 
-    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]: ...
+    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Turns the table's outputs [n, out] into what the field returns."""
+        ...
 
 
 class VoronoiRouter(nn.Module):
@@ -36,8 +40,8 @@ class VoronoiRouter(nn.Module):
     optimiser sees as many tensors as for one field, and the networks run as grouped products over samples sorted by
     cell rather than as a loop over modules. A diagram of one cell is the field itself.
 
-    Every cell starts as a copy of the field (inheritance, Adaptive Voronoi NeRFs section 3.3): positions stay global, so
-    identical copies render exactly what the field renders, and no seam appears at the split.
+    Every cell starts as a copy of the field (inheritance, Adaptive Voronoi NeRFs): positions stay global, so identical
+    copies render exactly what the field renders, and no seam appears at the split.
 
     Args:
         module: A field with a layer table (:class:`LayeredField`); copied, never changed.
@@ -90,6 +94,7 @@ class VoronoiRouter(nn.Module):
 
     @property
     def num_cells(self) -> int:
+        """Cells of the diagram, networks of the router."""
         return self.diagram.num_cells
 
     def assign(self, positions: Tensor) -> Tensor:
@@ -202,7 +207,7 @@ class VoronoiRouter(nn.Module):
             )
         if parents.dtype != torch.int64:
             raise TypeError(f"VoronoiRouter.subdivide: parents must be int64, got {parents.dtype}")
-        if parents.numel() and not (0 <= int(parents.min()) and int(parents.max()) < self.num_cells):
+        if int(parents.min()) < 0 or int(parents.max()) >= self.num_cells:
             raise ValueError(
                 f"VoronoiRouter.subdivide: parents must lie in 0..{self.num_cells - 1}, got "
                 f"{int(parents.min())}..{int(parents.max())}"
@@ -247,6 +252,7 @@ class VoronoiRouter(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def extra_repr(self) -> str:
+        """What ``print(router)`` shows beside the field's modules."""
         return f"num_cells={self.num_cells}, depth={self.diagram.depth}, assignment={self.assignment!r}"
 
 

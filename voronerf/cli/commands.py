@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -163,9 +162,9 @@ def info() -> int:
     """Show what this installation can use: build, instruction set, backends, and why something is missing."""
     for name, value in backends.describe().items():
         console.print(f"{name:14} {value}", highlight=False, markup=False)
-    table = Table("op", "backend", "devices", "dtypes", "available")
+    table = Table("op", "backend", "runs on", "dtypes", "why not elsewhere")
     for row in backends.table():
-        table.add_row(*row.cells())
+        table.add_row(row.op, row.backend, ", ".join(row.devices), ", ".join(row.dtypes), row.reason)
     console.print(table)
     return 0
 

@@ -55,6 +55,7 @@ class TrainingDisplay:
         self.progress.stop()
 
     def on_step(self, now: TrainingProgress) -> None:
+        """Shows the state after a step; the loss is smoothed over about twenty steps."""
         self.loss = now.loss if now.step <= 1 else 0.95 * self.loss + 0.05 * now.loss
         self.progress.update(
             self.task,
@@ -67,4 +68,5 @@ class TrainingDisplay:
         )
 
     def on_event(self, line: str) -> None:
+        """Prints a line that stays, above the live one."""
         self.console.print(line, highlight=False, markup=False)

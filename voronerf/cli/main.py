@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from voronerf.backends import BackendUnavailable
-from voronerf.cli import commands
+from voronerf.cli import commands, demo
 from voronerf.training.trainer import TrainingError
 
 
@@ -32,7 +32,7 @@ def main(args: list[str] | None = None) -> int:
                 "eval": commands.evaluate_run,
                 "render": commands.render,
                 "info": commands.info,
-                "demo": commands.demo,
+                "demo": demo.demo,
             },
             prog="voronerf",
             description="Adaptive Voronoi NeRFs: one small network per Voronoi cell, trained and run as one.",

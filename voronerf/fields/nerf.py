@@ -26,9 +26,9 @@ class NeRF(nn.Module):
 
     Density is ``density_scale * softplus(raw)`` rather than the paper's ReLU. A ReLU whose input turns negative
     everywhere has no gradient left, which is how a NeRF on a white background collapses to an all-white image within
-    its first hundred steps; softplus always has one (mip-NeRF, section 3.1, made the same choice). The head's bias is set
-    so that the untrained density is ``INITIAL_DENSITY``. ``density_scale`` only changes the unit in which the network
-    speaks: surfaces need densities near 100 a unit, which a network of order-one outputs reaches sooner with a scale.
+    its first hundred steps; softplus always has one (mip-NeRF, section 3.1, made the same choice). The head's bias is
+    set so that the untrained density is ``INITIAL_DENSITY``. ``density_scale`` only changes the unit in which the
+    network speaks: surfaces need densities near 100 a unit, which outputs of order one reach sooner with a scale.
 
     The field describes itself by ``layers`` (a table, see :class:`voronerf.layers.MLP`) and :meth:`linears`, in the
     table's order; :class:`voronerf.VoronoiRouter` uses the two to evaluate all cells' copies of it in one pass.
@@ -102,24 +102,19 @@ class NeRF(nn.Module):
 
     def reset_parameters(self) -> None:
         """He initialisation of the ReLU layers (He et al. 2015), small heads, and a density that can grow."""
-        for layer in self.trunk:
+        for layer in self.linears():
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
-        for head in (self.feature, self.view):
-            if head is not None:
-                nn.init.kaiming_uniform_(head.weight, nonlinearity="relu")
-                nn.init.zeros_(head.bias)
         for head in (self.density, self.colour):
             nn.init.xavier_uniform_(head.weight, gain=0.1)
-            nn.init.zeros_(head.bias)
         # The inverse of softplus, so that the untrained density is INITIAL_DENSITY wherever the head's weights say 0.
         start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale)).log()
         nn.init.constant_(self.density.bias, float(start))
 
     def linears(self) -> list[nn.Linear]:
         """The linear layers in the order of ``layers``."""
-        heads = [self.density, self.feature, self.view, self.colour] if self.feature else [self.density, self.colour]
-        return [*self.trunk, *heads]  # type: ignore[list-item]
+        linears = [*self.trunk, self.density, self.feature, self.view, self.colour]
+        return [layer for layer in linears if isinstance(layer, nn.Linear)]
 
     def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Turns the network's outputs into what a renderer needs.

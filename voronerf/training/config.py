@@ -28,7 +28,7 @@ class TrainConfig:
     downscale: int = 1
     """Factor by which the images are made smaller on load."""
     out: Path | None = None
-    """Run directory, which must not hold a run already unless --resume; default: runs/SCENE, or the first free runs/SCENE-N."""
+    """Run directory, without a run in it unless --resume; default: runs/SCENE, or the first free runs/SCENE-N."""
     resume: bool = False
     """Continue the run in --out from its last checkpoint."""
     seed: int = 0
@@ -121,6 +121,7 @@ class TrainConfig:
         return tuple(0.15 + 0.35 * i / (levels - 1) for i in range(levels))
 
     def to_json(self) -> str:
+        """The settings as JSON text, which :meth:`from_json` reads."""
         values = dataclasses.asdict(self)
         values["out"] = None if self.out is None else str(self.out)
         return json.dumps(values, indent=2) + "\n"

@@ -7,12 +7,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from voronerf.training.panels import save_panel
+
 from voronerf.data import Scene
 from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import write_text
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.evaluation import evaluate, mean_scores, render_view, view_numbers
-from voronerf.training.panels import save_panel
 from voronerf.training.plots import plot_curves
 from voronerf.training.trainer import checkpoint_path
 

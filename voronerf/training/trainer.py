@@ -176,8 +176,23 @@ class Trainer:
             TrainingError: When the loss stops being finite; the last checkpoint is left as it was.
             OSError: When a checkpoint cannot be written.
         """
+        self.advance()
+        self.save()
+        if not self.stopped:
+            self._evaluate(self.config.evaluations, self.config.final_views)
+        return self._summarise()
+
+    def advance(self, until: float = math.inf) -> None:
+        """Trains until ``until`` training seconds or the end of the budget, whichever comes first.
+
+        :meth:`run` is this, once, and the final evaluation; calling it in turns lets several trainers share a machine
+        so that its noise falls on all of them alike.
+
+        Raises:
+            As :meth:`run`.
+        """
         saved_at = self.seconds
-        while self.fraction < 1 and not self.stopped:
+        while self.fraction < 1 and self.seconds < until and not self.stopped:
             started = time.perf_counter()
             if self.level < len(self.config.cells) and self.fraction >= self.config.splits[self.level]:
                 self._split()
@@ -199,10 +214,6 @@ class Trainer:
             if self.seconds - saved_at >= self.config.checkpoint_every:
                 self.save()
                 saved_at = self.seconds
-        self.save()
-        if not self.stopped:
-            self._evaluate(self.config.evaluations, self.config.final_views)
-        return self._summarise()
 
     def _step(self) -> float:
         config = self.config

@@ -1,0 +1,243 @@
+"""VoronoiRouter: equal to a loop over cells, inheritance of parameters and moments, state across subdivisions."""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from voronerf.diagram import VoronoiDiagram
+from voronerf.fields import NeRF
+from voronerf.router import VoronoiRouter
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(3)
+
+
+@pytest.fixture
+def field() -> NeRF:
+    torch.manual_seed(0)
+    return NeRF(width=10, depth=3, skips=(1,))
+
+
+def samples(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    return torch.randn(n, 3, generator=generator), F.normalize(torch.randn(n, 3, generator=generator), dim=-1)
+
+
+def perturbed(router: VoronoiRouter, generator: torch.Generator) -> VoronoiRouter:
+    with torch.no_grad():
+        for parameter in router.parameters():
+            parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
+    return router
+
+
+def loop(router: VoronoiRouter, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, list[nn.Module]]:
+    """What the router stands for: a mask and a module for each cell."""
+    cells = router.diagram.locate(positions)
+    rgb, sigma = torch.zeros(len(positions), 3), torch.zeros(len(positions))
+    modules = [router.cell(i) for i in range(router.num_cells)]
+    for i, module in enumerate(modules):
+        mask = cells == i
+        if mask.any():
+            part_rgb, part_sigma = module(positions[mask], directions[mask])
+            rgb = rgb.masked_scatter(mask[:, None], part_rgb)
+            sigma = sigma.masked_scatter(mask, part_sigma)
+    return rgb, sigma, modules
+
+
+@pytest.mark.parametrize("k", [1, 2, 16, 300])
+def test_identical_cells_are_the_field(field: NeRF, generator: torch.Generator, k: int) -> None:
+    router = VoronoiRouter(field, torch.randn(k, 3, generator=generator))
+    positions, directions = samples(257, generator)
+    torch.testing.assert_close(router(positions, directions), field(positions, directions))
+
+
+@pytest.mark.parametrize("n", [0, 1, 97])
+def test_distinct_cells_equal_a_loop_over_masks(field: NeRF, generator: torch.Generator, n: int) -> None:
+    router = perturbed(VoronoiRouter(field, torch.randn(13, 3, generator=generator)), generator)
+    positions, directions = samples(n, generator)
+    rgb, sigma = router(positions, directions)
+    expected_rgb, expected_sigma, modules = loop(router, positions, directions)
+    torch.testing.assert_close(rgb, expected_rgb)
+    torch.testing.assert_close(sigma, expected_sigma)
+    if n > 0:
+        factor = torch.randn(n, 4, generator=generator)
+        (torch.cat([rgb, sigma[:, None]], 1) * factor).sum().backward()
+        (torch.cat([expected_rgb, expected_sigma[:, None]], 1) * factor).sum().backward()
+        for name, parameter in router.module.named_parameters():
+            for i, module in enumerate(modules):
+                expected = module.get_parameter(name).grad
+                expected = torch.zeros_like(parameter[i]) if expected is None else expected
+                torch.testing.assert_close(parameter.grad[i], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_nested_diagram_with_gradient_to_the_positions(field: NeRF, generator: torch.Generator) -> None:
+    flat = VoronoiDiagram(torch.randn(4, 3, generator=generator))
+    nested, _ = flat.refine({1: torch.randn(3, 3, generator=generator), 3: torch.randn(5, 3, generator=generator)})
+    router = perturbed(VoronoiRouter(field, nested), generator)
+    positions, directions = samples(60, generator)
+    positions.requires_grad_()
+    gradients = []
+    for rgb, sigma in (router(positions, directions), loop(router, positions, directions)[:2]):
+        gradients.append(torch.autograd.grad(rgb.sum() + sigma.sum(), positions)[0])
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-4, atol=1e-4)
+
+
+def test_per_ray_directions(field: NeRF, generator: torch.Generator) -> None:
+    router = perturbed(VoronoiRouter(field, torch.randn(5, 3, generator=generator)), generator)
+    positions, _ = samples(40, generator)
+    _, directions = samples(8, generator)
+    index = (torch.arange(40) // 5).int()
+    torch.testing.assert_close(router(positions, directions, index), router(positions, directions[index]))
+
+
+def trained(field: NeRF, generator: torch.Generator) -> tuple[VoronoiRouter, torch.optim.Optimizer]:
+    """A router of three cells after a few steps of Adam in two parameter groups."""
+    router = VoronoiRouter(field, torch.randn(3, 3, generator=generator))
+    heads = [p for name, p in router.named_parameters() if "colour" in name]
+    rest = [p for name, p in router.named_parameters() if "colour" not in name]
+    optimizer = torch.optim.Adam([{"params": heads, "lr": 1e-2}, {"params": rest}], lr=1e-3)
+    for _ in range(3):
+        rgb, sigma = router(*samples(50, generator))
+        optimizer.zero_grad()
+        (rgb.square().sum() + sigma.sum()).backward()
+        optimizer.step()
+    return router, optimizer
+
+
+def test_subdivide_inherits_parameters_and_moments(field: NeRF, generator: torch.Generator) -> None:
+    router, optimizer = trained(field, generator)
+    positions, directions = samples(200, generator)
+    before = [t.detach() for t in router(positions, directions)]
+    old = {name: p.detach().clone() for name, p in router.named_parameters()}
+    moments = {name: copy.deepcopy(optimizer.state[p]) for name, p in router.named_parameters()}
+    diagram, parents = router.diagram.refine({0: torch.randn(4, 3, generator=generator), 2: torch.randn(2, 3)})
+    router.subdivide(diagram, parents, optimizer=optimizer)
+
+    assert router.num_cells == 7
+    for name, parameter in router.named_parameters():
+        assert torch.equal(parameter, old[name][parents]), name
+        state = optimizer.state[parameter]
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(state[key], moments[name][key][parents]), (name, key)
+        assert torch.equal(state["step"], moments[name]["step"])
+    # Nothing else is left in the optimiser, and its groups keep their rates.
+    assert set(optimizer.state) == set(router.parameters())
+    assert {p for g in optimizer.param_groups for p in g["params"]} == set(router.parameters())
+    assert [g["lr"] for g in optimizer.param_groups] == [1e-2, 1e-3]
+    # The split itself changes nothing that is seen: no ghosting, no seam.
+    for now, then in zip(router(positions, directions), before, strict=True):
+        torch.testing.assert_close(now, then)
+
+
+def test_children_part_ways_after_the_split(field: NeRF, generator: torch.Generator) -> None:
+    router, optimizer = trained(field, generator)
+    diagram, parents = router.diagram.refine({0: torch.randn(4, 3, generator=generator)})
+    router.subdivide(diagram, parents, optimizer=optimizer)
+    rgb, sigma = router(*samples(300, generator))
+    optimizer.zero_grad()
+    (rgb.square().sum() + sigma.sum()).backward()
+    optimizer.step()
+    weight = router.module.trunk[0].weight
+    assert not torch.equal(weight[0], weight[1])
+
+
+def test_random_initialisation_is_fresh_and_reproducible(field: NeRF, generator: torch.Generator) -> None:
+    weights = []
+    for _ in range(2):
+        router, optimizer = trained(field, torch.Generator().manual_seed(1))
+        router.generator = torch.Generator().manual_seed(5)
+        diagram, parents = router.diagram.refine({0: torch.tensor([[0.0, 0, 0], [1, 0, 0]])})
+        router.subdivide(diagram, parents, optimizer=optimizer, inherit=False)
+        weights.append(router.module.trunk[0].weight.detach().clone())
+        assert len(optimizer.state) == 0
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0][0], weights[0][1])
+
+
+def test_state_dict_round_trips_across_subdivisions(field: NeRF, generator: torch.Generator) -> None:
+    inner = VoronoiDiagram(torch.randn(6, 3, generator=generator), weights=torch.rand(6, generator=generator))
+    diagram, _ = inner.refine({2: torch.randn(3, 3, generator=generator)})
+    source = perturbed(VoronoiRouter(field, diagram), generator)
+    buffer = io.BytesIO()
+    torch.save(source.state_dict(), buffer)
+    buffer.seek(0)
+    positions, directions = samples(80, generator)
+    for k in (1, 8, 20):
+        target = VoronoiRouter(field, torch.randn(k, 3, generator=generator))
+        buffer.seek(0)
+        target.load_state_dict(torch.load(buffer, weights_only=True))
+        assert target.num_cells == 8
+        assert torch.equal(target(positions, directions)[0], source(positions, directions)[0])
+
+
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda router: pickle.loads(pickle.dumps(router))])
+def test_copies_are_independent(field: NeRF, generator: torch.Generator, clone: object) -> None:
+    router = VoronoiRouter(field, torch.randn(3, 3, generator=generator))
+    other = clone(router)  # type: ignore[operator]
+    positions, directions = samples(20, generator)
+    before = router(positions, directions)[0]
+    perturbed(other, generator)
+    assert torch.equal(router(positions, directions)[0], before)
+    assert not torch.equal(other(positions, directions)[0], before)
+
+
+def test_stochastic_assignment_is_for_training_only(field: NeRF, generator: torch.Generator) -> None:
+    router = VoronoiRouter(field, torch.randn(8, 3, generator=generator), assignment="stochastic", temperature=0.3)
+    router.generator = torch.Generator().manual_seed(0)
+    positions, _ = samples(500, generator)
+    nearest = router.diagram.locate(positions)
+    drawn = router.assign(positions)
+    assert 0.1 < (drawn != nearest).float().mean() < 0.9
+    assert not torch.equal(router.assign(positions), drawn)
+    assert torch.equal(router.eval().assign(positions), nearest)
+
+
+def test_the_wrapped_field_is_left_alone(field: NeRF, generator: torch.Generator) -> None:
+    before = {name: p.detach().clone() for name, p in field.named_parameters()}
+    perturbed(VoronoiRouter(field, torch.randn(3, 3, generator=generator)), generator)
+    assert all(torch.equal(p, before[name]) for name, p in field.named_parameters())
+
+
+def test_frozen_parameters_stay_frozen(field: NeRF) -> None:
+    field.density.requires_grad_(False)
+    router = VoronoiRouter(field, torch.zeros(1, 3))
+    diagram, parents = router.diagram.refine({0: torch.randn(2, 3)})
+    router.subdivide(diagram, parents)
+    frozen = {name for name, p in router.named_parameters() if not p.requires_grad}
+    assert frozen == {"module.density.weight", "module.density.bias"}
+
+
+def test_errors(field: NeRF, generator: torch.Generator) -> None:
+    centres = torch.randn(3, 3, generator=generator)
+    with pytest.raises(TypeError, match="module must describe itself by a layer table.*got Linear"):
+        VoronoiRouter(nn.Linear(3, 4), centres)
+    with pytest.raises(ValueError, match="centres must"):
+        VoronoiRouter(field, torch.randn(8, 2))
+    with pytest.raises(ValueError, match="assignment must be 'nearest' or 'stochastic', got 'near'"):
+        VoronoiRouter(field, centres, assignment="near")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="temperature must be positive, got 0"):
+        VoronoiRouter(field, centres, temperature=0)
+    router = VoronoiRouter(field, centres)
+    with pytest.raises(ValueError, match=r"positions must have shape \[n, 3\], got \[4, 2\]"):
+        router(torch.randn(4, 2))
+    with pytest.raises(ValueError, match="directions must be given"):
+        router(torch.randn(4, 3))
+    with pytest.raises(ValueError, match="got 2 rows for 4 positions"):
+        router(torch.randn(4, 3), torch.randn(2, 3))
+    with pytest.raises(IndexError, match="index must be below 3, got 3"):
+        router.cell(3)
+    finer, parents = router.diagram.refine({0: torch.randn(2, 3)})
+    with pytest.raises(ValueError, match=r"parents must have shape \[4\], got \[3\]"):
+        router.subdivide(finer, parents[:3])
+    with pytest.raises(TypeError, match="parents must be int64, got torch.int32"):
+        router.subdivide(finer, parents.int())
+    with pytest.raises(ValueError, match=r"parents must lie in 0\.\.2, got 0\.\.7"):
+        router.subdivide(finer, torch.tensor([0, 1, 2, 7]))

@@ -1,0 +1,98 @@
+"""Checkpoint files: exact, atomic, refused with the file's name when they are broken."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+from voronerf.training.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    load_checkpoint,
+    load_optimizer_tensors,
+    optimizer_tensors,
+    save_checkpoint,
+    write_text,
+)
+
+
+def example() -> Checkpoint:
+    tensors = {"a.x": torch.randn(3, 4), "a.y": torch.arange(5, dtype=torch.uint8), "b.z": torch.tensor(1.5)}
+    return Checkpoint(tensors, {"step": 7, "name": "é", "none": None})
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    saved = example()
+    save_checkpoint(tmp_path / "new" / "last.safetensors", saved)
+    loaded = load_checkpoint(tmp_path / "new" / "last.safetensors")
+    assert loaded.values == saved.values
+    assert loaded.tensors.keys() == saved.tensors.keys()
+    assert all(
+        torch.equal(t, saved.tensors[name]) and t.dtype == saved.tensors[name].dtype
+        for name, t in loaded.tensors.items()
+    )
+    assert loaded.group("a").keys() == {"x", "y"}
+
+
+@pytest.mark.parametrize("failing", ["fsync", "replace"])
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str) -> None:
+    path = tmp_path / "last.safetensors"
+    save_checkpoint(path, example())
+    before = path.read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, failing, full)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(path, example())
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["last.safetensors"]
+
+
+def test_broken_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "last.safetensors"
+    with pytest.raises(CheckpointError, match=r"last.safetensors: there is no checkpoint"):
+        load_checkpoint(path)
+    save_checkpoint(path, example())
+    data = path.read_bytes()
+    for broken in (b"", b"not a checkpoint", data[:40], data[:-3], pickle.dumps({"a": 1})):
+        path.write_bytes(broken)
+        with pytest.raises(CheckpointError, match=r"last.safetensors: not a readable checkpoint"):
+            load_checkpoint(path)
+
+
+def test_another_format_is_refused(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    save_file({"x": torch.zeros(1)}, tmp_path / "x.safetensors", {"format": "pt"})
+    with pytest.raises(CheckpointError, match="not a voronerf-checkpoint-1 file, its format is 'pt'"):
+        load_checkpoint(tmp_path / "x.safetensors")
+
+
+def test_text_is_replaced_whole(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.json", "long old text")
+    write_text(tmp_path / "a.json", "new")
+    assert (tmp_path / "a.json").read_text() == "new"
+
+
+def test_optimizer_state_round_trips() -> None:
+    def step(parameter: torch.nn.Parameter, optimizer: torch.optim.Optimizer) -> None:
+        optimizer.zero_grad()
+        parameter.square().sum().backward()
+        optimizer.step()
+
+    first = torch.nn.Parameter(torch.randn(4))
+    optimizer = torch.optim.Adam([first], lr=0.1, fused=True)
+    step(first, optimizer)
+    second = torch.nn.Parameter(first.detach().clone())
+    other = torch.optim.Adam([second], lr=0.1, fused=True)
+    load_optimizer_tensors(other, optimizer_tensors(optimizer))
+    step(first, optimizer)
+    step(second, other)
+    assert torch.equal(first, second)

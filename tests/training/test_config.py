@@ -1,0 +1,73 @@
+"""Settings: every rule has its message, and JSON gives back what went in."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig, differences
+
+
+def test_defaults_are_usable() -> None:
+    config = TrainConfig()
+    assert config.budget == 480 and config.splits == (0.2,)
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"), [((), ()), ((4,), (0.2,)), ((4, 4), (0.15, 0.5)), ((2, 2, 2), (0.15, 0.325, 0.5))]
+)
+def test_default_splits(cells: tuple[int, ...], expected: tuple[float, ...]) -> None:
+    assert TrainConfig(cells=cells).splits == pytest.approx(expected)
+
+
+def test_json_round_trip(tmp_path: Path) -> None:
+    config = TrainConfig(data="x", out=tmp_path, steps=3, cells=(4, 4), split_at=(0.2, 0.7), skips=(1, 2))
+    assert TrainConfig.from_json(config.to_json()) == config
+    assert TrainConfig.from_json(TrainConfig().to_json()) == TrainConfig()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"out": null, "colour": 3}', '{"out": 3}'])
+def test_json_of_something_else(text: str) -> None:
+    with pytest.raises(ConfigError, match="run/config.json: not a configuration of this version"):
+        TrainConfig.from_json(text, "run/config.json")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"budget": 3.0, "steps": 3}, "give --budget SECONDS or --steps N, not both"),
+        ({"budget": 0.0}, "--budget must be a positive number of seconds, got 0.0"),
+        ({"budget": float("nan")}, "--budget must be a positive number of seconds, got nan"),
+        ({"steps": 0}, "--steps must be at least 1, got 0"),
+        ({"downscale": 0}, "--downscale must be at least 1, got 0"),
+        ({"rays": 0}, "--rays must be at least 1, got 0"),
+        ({"width": 1}, "--width must be at least 2, got 1"),
+        ({"lr": 0.0}, "--lr must be positive, got 0.0"),
+        ({"lr_final": 2.0}, r"--lr-final must lie in \(0, 1\], got 2.0"),
+        ({"warmup": 1.0}, r"--warmup must lie in \[0, 1\), got 1.0"),
+        ({"cells": (0,)}, r"--cells must be at least 2 on every level \(none for one network\), got \(0,\)"),
+        ({"cells": (4,), "split_at": (0.2, 0.4)}, "--split-at must have one fraction for each of the 1 levels"),
+        ({"cells": (4, 4), "split_at": (0.4, 0.2)}, "--split-at must be rising fractions between 0 and 1"),
+        ({"split_at": (1.0,)}, "--split-at must be rising fractions between 0 and 1"),
+        ({"device": "gpu7"}, "--device must name a device that is present, got 'gpu7'"),
+        ({"backend": "fast"}, "--backend must be auto, .*got 'fast'"),
+        ({"eval_views": 0}, "--eval-views must be at least 1, got 0"),
+        ({"temperature": -1.0}, "--temperature must be positive, got -1.0"),
+    ],
+)
+def test_bad_settings(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        TrainConfig(**settings)
+
+
+def test_differences_name_what_cannot_change() -> None:
+    assert {f.name for f in dataclasses.fields(TrainConfig)} >= RESUMABLE
+    a = TrainConfig(steps=10)
+    assert differences(a, dataclasses.replace(a, steps=20, out=Path("x"), resume=True)) == []
+    assert differences(a, dataclasses.replace(a, width=32, lr_final=0.5)) == [
+        "--width 64 -> 32",
+        "--lr-final 0.05 -> 0.5",
+    ]

@@ -1,0 +1,81 @@
+"""``voronerf demo``: the whole method on the built-in scene beside one network, at equal training time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from voronerf.cli.commands import console, run_training
+from voronerf.data import Scene, builtin_scene
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.plots import plot_curves
+from voronerf.training.runs import read_metrics
+
+
+def demo(
+    out: Path = Path("runs/demo"),
+    budget: float = 75.0,
+    cells: int = 16,
+    size: int = 100,
+    seed: int = 0,
+    backend: str = "auto",
+) -> int:
+    """Train the built-in scene twice for the same time, one coarse network and Voronoi cells, and compare.
+
+    Args:
+        out: Folder for the two runs; `single` and `voronoi` inside it are replaced.
+        budget: Training seconds of each run.
+        cells: Voronoi cells.
+        size: Pixels along the side of the images, at most 100.
+        seed: Seed of both runs.
+        backend: Backend of the operations.
+    """
+    if not 1 <= size <= 100:
+        raise ConfigError(f"--size must lie in 1..100, got {size}")
+    scene = builtin_scene(size)
+    results: dict[str, dict[str, Any]] = {}
+    for name, levels in (("single", ()), ("voronoi", (cells,))):
+        run = out / name
+        _remove_run(run)
+        networks = f"{cells} Voronoi cells" if levels else "one coarse network"
+        console.print(f"\n[bold]{name}[/bold]: {networks}, {budget:.0f} s", highlight=False)
+        config = TrainConfig(
+            out=run, budget=budget, cells=levels, seed=seed, backend=backend, evaluations=6, eval_views=5
+        )
+        results[name] = run_training(config, scene)
+        if not results[name]["complete"]:
+            return 130
+    _report(out, scene, results)
+    return 0
+
+
+def _report(out: Path, scene: Scene, results: dict[str, dict[str, Any]]) -> None:
+    """The table and the picture that the demo is about."""
+    curves = {name: [(m["seconds"], m["psnr"]) for m in read_metrics(out / name)] for name in results}
+    splits = {name: [s["started_at_second"] for s in r["stages"][1:]] for name, r in results.items()}
+    plot_curves(out / "psnr.png", curves, splits=splits, title="built-in scene, equal training time")
+    table = Table("network", "parameters", "steps", "training [s]", "psnr [dB]", "ssim", title="test views")
+    for result in results.values():
+        table.add_row(
+            "one coarse network" if result["cells"] == 1 else f"{result['cells']} Voronoi cells",
+            f"{result['parameters']:,}",
+            f"{result['steps']:,}",
+            f"{result['seconds']:.0f}",
+            f"{result['psnr']:.2f}",
+            f"{result['ssim']:.4f}",
+        )
+    console.print()
+    console.print(table)
+    console.print(f"pictures: {out / 'voronoi' / 'images'} (truth, render, error, depth, cells)", highlight=False)
+    console.print(f"curves:   {out / 'psnr.png'}", highlight=False)
+
+
+def _remove_run(run: Path) -> None:
+    """Removes the files of an earlier demo, and nothing that a run does not write."""
+    for pattern in ("config.json", "metrics.jsonl", "summary.json", "eval.json"):
+        (run / pattern).unlink(missing_ok=True)
+    for folder in ("checkpoints", "images", "plots", "samples"):
+        for file in (run / folder).glob("*"):
+            file.unlink()
