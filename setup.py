@@ -1,8 +1,8 @@
 """Build of the compiled module ``voronerf._C``; everything else is in pyproject.toml.
 
-The extension knows nothing of torch: C++17, pybind11 and, where nvcc is found, CUDA. A build.ninja is written and run, so a
-build is parallel and redoes only what has changed, headers included. Files named ``*_isa.cpp`` are compiled once for each
-instruction set (csrc/isa.h); the choice among them is made at run time.
+The extension knows nothing of torch: C++17, pybind11 and, where nvcc is found, CUDA. A build.ninja is written and run,
+so a build is parallel and redoes only what has changed, headers included. Files named ``*_isa.cpp`` are compiled once
+for each instruction set (csrc/isa.h); the choice among them is made at run time.
 
 Environment:
     CXX, CXXFLAGS                the C++ compiler (default c++, else g++) and flags to add
@@ -32,7 +32,7 @@ X86_ISAS = {
     "avx2": ["-DVN_ISA=1", "-mavx2", "-mfma"],
     "avx512": ["-DVN_ISA=2", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma"],
 }
-# Short, for the sake of build time: 8.x runs the code of 80, and everything after 9.0 compiles the PTX of 90 at load time.
+# Short, for the sake of build time: 8.x runs the code of 80, and what comes after 9.0 compiles the PTX of 90.
 DEFAULT_ARCHITECTURES = "75;80;90"
 
 
@@ -82,9 +82,7 @@ def find_cuda() -> Cuda:
     found = shutil.which("nvcc", path=os.pathsep.join(places))
     if found is None:
         if wish == "1":
-            raise SystemExit(
-                "voronerf: VORONERF_CUDA=1, but there is no nvcc; install the CUDA toolkit or set CUDA_HOME"
-            )
+            raise SystemExit("voronerf: VORONERF_CUDA=1 but no nvcc; install the CUDA toolkit or set CUDA_HOME")
         return Cuda("built without CUDA: no nvcc on PATH, in CUDA_HOME or in /usr/local/cuda")
     wanted = os.environ.get("VORONERF_CUDA_ARCHITECTURES")
     if wanted:
@@ -133,7 +131,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder."""
     import pybind11
 
-    # fp-contract: results are defined by separate roundings (csrc/nearest_centre_math.h); fused ones are asked for by name.
+    # fp-contract: results are defined by separate roundings (csrc/nearest_centre_math.h); fused ones are named.
     common = ["-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off", "-Wall", "-Wextra", "-I."]
     openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas"]
     includes = [f"-I{SOURCES}", f"-isystem{pybind11.get_include()}", f"-isystem{sysconfig.get_path('include')}"]

@@ -10,7 +10,7 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32
                    int threads) {
   const int64_t rows = cell_sort_chunk_rows(k), chunks = cell_sort_chunks(n, k);
   bool valid = true;
-#pragma omp parallel for schedule(static) num_threads(threads) reduction(&& : valid) if (threads > 1 && chunks > 1)
+#pragma omp parallel for schedule(dynamic) num_threads(threads) reduction(&& : valid) if (threads > 1 && chunks > 1)
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     int32_t* count = workspace + chunk * k;
     std::fill(count, count + k, 0);
@@ -43,7 +43,7 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32
     }
   }
 
-#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1 && chunks > 1)
+#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1 && chunks > 1)
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     int32_t* place = workspace + chunk * k;
     for (int64_t i = chunk * rows, end = std::min(n, i + rows); i < end; ++i) {

@@ -67,17 +67,17 @@ struct MlpPlan {
 
 // Pointers of one call.
 struct MlpData {
-  const float* positions;
-  const float* directions;
-  const int32_t* direction_index;
-  const float* const* weights;
-  const float* const* biases;
-  float* out;
-  const float* grad_out;
-  float* const* grad_weights;
-  float* const* grad_biases;
-  float* grad_positions;
-  float* grad_directions;  // one row a sample
+  const float* positions = nullptr;
+  const float* directions = nullptr;
+  const int32_t* direction_index = nullptr;
+  const float* const* weights = nullptr;
+  const float* const* biases = nullptr;
+  float* out = nullptr;
+  const float* grad_out = nullptr;
+  float* const* grad_weights = nullptr;
+  float* const* grad_biases = nullptr;
+  float* grad_positions = nullptr;
+  float* grad_directions = nullptr;  // one row a sample
 };
 
 }  // namespace voronerf

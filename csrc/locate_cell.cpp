@@ -115,7 +115,7 @@ bool locate_cell_cpu(const T* points, const T* centres, const T* weights, const 
   const Tree<T> tree{centres, weights, nearest_centre_weight_bound(weights, m), child_offsets, child, depth, isa};
   const int64_t blocks = ceil_div<int64_t>(n, kBlock);
   bool arrived = true;
-#pragma omp parallel for schedule(static) num_threads(threads) reduction(&& : arrived) if (threads > 1 && blocks > 1)
+#pragma omp parallel for schedule(dynamic) num_threads(threads) reduction(&& : arrived) if (threads > 1 && blocks > 1)
   for (int64_t b = 0; b < blocks; ++b) {
 #ifdef _OPENMP
     int32_t* place = workspace + omp_get_thread_num() * m;

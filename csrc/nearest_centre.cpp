@@ -40,7 +40,7 @@ void nearest_centre_cpu(const T* points, const T* centres, const T* weights, int
                         Isa isa, int threads) {
   const float weight_bound = nearest_centre_weight_bound(weights, k);
   const int64_t blocks = ceil_div(n, kBlock);
-#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1 && blocks > 1)
+#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1 && blocks > 1)
   for (int64_t b = 0; b < blocks; ++b) {
     const int64_t start = b * kBlock;
     nearest_centre_serial(points + 3 * start, centres, weights, weight_bound, cells + start,

@@ -1,14 +1,14 @@
 """The compiled module as PyTorch ops; the only importer of ``voronerf._C``.
 
-n points, k cells, m centres of a tree, g diagrams. Each entry is a functional ``torch.library`` custom op that makes its
-inputs contiguous, allocates outputs and workspace, and passes addresses, sizes, and a thread count or a stream. Shapes,
-dtypes and devices have been validated by ``voronerf.ops``. Importing this module raises ``BackendUnavailable`` where the
-extension is missing.
+n points, k cells, m centres of a tree, g diagrams. Each entry is a functional ``torch.library`` custom op that makes
+its inputs contiguous, allocates outputs and workspace, and passes addresses, sizes, and a thread count or a stream.
+Shapes, dtypes and devices have been validated by ``voronerf.ops``. Importing this module raises ``BackendUnavailable``
+where the extension is missing.
 
-OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch has
-loaded. Linking it would not do: torch's wheels bring a libgomp of their own, under the name ``libgomp.so.1`` (CPU wheels: the
-loader would share it) or a hashed one such as ``libgomp-a34b3233.so.1`` (the loader would add the system's, a second pool of
-threads that competes with torch's, or fail where the system has none).
+OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch
+has loaded. Linking it would not do: torch's wheels bring a libgomp of their own, named ``libgomp.so.1`` (CPU wheels; the
+loader would share it) or with a hash, such as ``libgomp-a34b3233.so.1`` (the loader would add the system's, a second
+pool of threads that competes with torch's, or fail where the system has none).
 """
 
 from __future__ import annotations

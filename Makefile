@@ -1,0 +1,46 @@
+# Set-up happens by itself: a virtual environment in .venv from requirements-ci.txt, and the extension built in place, both
+# redone only when their inputs change. PYTHON is the interpreter to start from.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+# Parts that must be there, such as REQUIRE=native,warp: their absence fails tests instead of skipping them.
+REQUIRE ?=
+TEST_ARGS ?=
+# Every architecture nvcc 13 knows that a user may have; the last also as PTX.
+CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
+
+SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
+
+.PHONY: demo test bench check cuda-check clean
+
+demo: $(VENV)/.built
+	@$(BIN)/voronerf demo
+
+test: $(VENV)/.built
+	@$(BIN)/pytest -q $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
+
+bench: $(VENV)/.built
+	@$(BIN)/python benchmarks/throughput.py
+
+check: $(VENV)/.built
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/mypy
+	@$(BIN)/clang-format --dry-run --Werror csrc/*
+	@$(BIN)/pytest -q tests/test_layers.py
+
+cuda-check:
+	@$(PYTHON) csrc/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info voronerf/_C.*.so .mypy_cache .pytest_cache .ruff_cache
+
+$(VENV)/.installed: requirements-ci.txt
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-ci.txt
+	@touch $@
+
+$(VENV)/.built: $(VENV)/.installed $(SOURCES)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
+	@touch $@

@@ -1,0 +1,234 @@
+// Tasks of grouped_mlp over threads. A task is a cell and a range of its rows; which tasks there are depends on the sizes
+// alone, and partial weight gradients are summed in the order of the rows, so results do not depend on the number of threads
+// or on which thread took what.
+#include "grouped_mlp.h"
+
+#include <omp.h>
+
+#include <algorithm>
+#include <cstdlib>
+#include <memory>
+#include <new>
+#include <stdexcept>
+#include <string>
+
+#include "common.h"
+#include "grouped_mlp_isa.h"
+#include "grouped_mlp_planner.h"
+
+namespace voronerf {
+
+namespace {
+
+// Rows of a task: enough to pay for packing the weights, few enough to keep every thread busy to the end.
+constexpr int64_t kFewestRows = 96, kMostRows = 2048, kFewestGradientRows = 384, kMostGradientRows = 4096;
+constexpr int64_t kTasks = 64;
+// Partial weight gradients of one call, in floats: wide networks get longer tasks instead of more memory.
+constexpr int64_t kPartialFloats = int64_t{1} << 24;
+constexpr int64_t kAlign = 64;
+
+struct Task {
+  int64_t cell, begin, end;
+  int64_t partial;  // index of its partial; -1: the cell's only task
+};
+
+struct Tasks {
+  std::vector<Task> tasks;
+  std::vector<int64_t> first_partial;  // [k+1] for each cell
+};
+
+// Memory that a calling thread keeps: a fresh page costs a microsecond at its first touch.
+class Workspace {
+ public:
+  float* take(int64_t floats) {
+    if (floats > size_) {
+      memory_.reset();
+      memory_.reset(static_cast<float*>(std::aligned_alloc(kAlign, ceil_div(floats * 4, kAlign) * kAlign)));
+      size_ = memory_ == nullptr ? 0 : floats;
+      if (memory_ == nullptr) throw std::bad_alloc();
+    }
+    return memory_.get();
+  }
+
+ private:
+  struct Free {
+    void operator()(float* memory) const { std::free(memory); }
+  };
+  std::unique_ptr<float, Free> memory_;
+  int64_t size_ = 0;
+};
+
+thread_local Workspace workspace;
+
+void check(const MlpInputs& in) {
+  int64_t before = 0;
+  for (int64_t c = 0; c <= in.k; ++c) {
+    if (in.offsets[c] < before || in.offsets[c] > in.n) {
+      throw std::invalid_argument("offsets must rise from 0 or more to at most the number of rows, " +
+                                  std::to_string(in.n) + ", got " + std::to_string(in.offsets[c]) + " for cell " +
+                                  std::to_string(c));
+    }
+    before = in.offsets[c];
+  }
+  if (in.direction_index == nullptr) return;
+  int32_t low = 0, high = -1;
+  for (int64_t i = 0; i < in.n; ++i) {
+    low = std::min(low, in.direction_index[i]);
+    high = std::max(high, in.direction_index[i]);
+  }
+  if (low < 0 || high >= in.r) {
+    throw std::invalid_argument("direction_index must be 0 to " + std::to_string(in.r - 1) + ", got " +
+                                std::to_string(low < 0 ? low : high));
+  }
+}
+
+Tasks split(const MlpInputs& in, int64_t target) {
+  Tasks result;
+  result.first_partial.assign(in.k + 1, 0);
+  int64_t partials = 0;
+  for (int64_t c = 0; c < in.k; ++c) {
+    const int64_t begin = in.offsets[c], rows = in.offsets[c + 1] - begin;
+    const int64_t count = ceil_div(rows, target);
+    const int64_t size = count > 1 ? ceil_div(ceil_div(rows, count), int64_t{48}) * 48 : rows;
+    for (int64_t start = 0; start < rows; start += size) {
+      result.tasks.push_back({c, begin + start, begin + std::min(rows, start + size), count > 1 ? partials++ : -1});
+    }
+    result.first_partial[c + 1] = partials;
+  }
+  return result;
+}
+
+// Rows of no cell.
+void zero_strays(const MlpInputs& in, int64_t width, float* out) {
+  std::fill(out, out + in.offsets[0] * width, 0.0f);
+  std::fill(out + in.offsets[in.k] * width, out + in.n * width, 0.0f);
+}
+
+void prepare(Isa isa, const MlpPlan& plan, float* own) { VN_FOR_ISA(isa, mlp_prepare(plan, own)) }
+void pack(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, float* own) {
+  VN_FOR_ISA(isa, mlp_pack(plan, data, cell, own))
+}
+void forward(Isa isa, const MlpPlan& plan, const MlpData& data, const Task& task, float* own) {
+  VN_FOR_ISA(isa, mlp_forward(plan, data, task.begin, task.end, own))
+}
+void backward(Isa isa, const MlpPlan& plan, const MlpData& data, const Task& task, float* own, float* partial) {
+  VN_FOR_ISA(isa, mlp_backward(plan, data, task.begin, task.end, own, partial))
+}
+void reduce(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t layer, float* partials, int64_t count) {
+  VN_FOR_ISA(isa, mlp_reduce(plan, data, cell, layer, partials, count))
+}
+
+// run(task, own workspace) for every task, a cell's weights packed.
+template <typename Run>
+void for_each_task(const Tasks& tasks, const MlpPlan& plan, const MlpData& data, float* memory, Isa isa, int threads,
+                   const Run& run) {
+  const int64_t count = static_cast<int64_t>(tasks.tasks.size());
+  const int64_t stride = ceil_div(plan.workspace, kGranule) * kGranule;
+  threads = static_cast<int>(std::min<int64_t>(threads, count));
+#pragma omp parallel num_threads(threads) if (threads > 1)
+  {
+    float* own = memory + omp_get_thread_num() * stride;
+    int64_t packed = -1;
+    prepare(isa, plan, own);
+#pragma omp for schedule(dynamic, 1)
+    for (int64_t i = 0; i < count; ++i) {
+      const Task& task = tasks.tasks[i];
+      if (task.cell != packed) pack(isa, plan, data, task.cell, own);
+      packed = task.cell;
+      run(task, own);
+    }
+  }
+}
+
+MlpData pointers(const MlpInputs& in) {
+  MlpData data;
+  data.positions = in.positions;
+  data.directions = in.directions;
+  data.direction_index = in.direction_index;
+  data.weights = in.weights;
+  data.biases = in.biases;
+  return data;
+}
+
+// Workspaces of the threads, then `extra` floats.
+float* take(const MlpPlan& plan, int threads, int64_t extra) {
+  return workspace.take(ceil_div(plan.workspace, kGranule) * kGranule * threads + extra);
+}
+
+}  // namespace
+
+void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa isa, int threads) {
+  check(in);
+  const MlpPlanner planner(table, in.direction_index != nullptr, {false, false, false});
+  const MlpPlan& plan = planner.plan();
+  zero_strays(in, plan.out_features, out);
+  const Tasks tasks = split(in, std::clamp(in.n / kTasks, kFewestRows, kMostRows));
+  if (tasks.tasks.empty()) return;
+  MlpData data = pointers(in);
+  data.out = out;
+  for_each_task(tasks, plan, data, take(plan, threads, 0), isa, threads,
+                [&](const Task& task, float* own) { forward(isa, plan, data, task, own); });
+}
+
+void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const MlpGradients& gradients, Isa isa,
+                              int threads) {
+  check(in);
+  const bool indexed = in.direction_index != nullptr;
+  const MlpWanted wanted{gradients.weights != nullptr, gradients.positions != nullptr, gradients.directions != nullptr};
+  const MlpPlanner planner(table, indexed, wanted);
+  const MlpPlan& plan = planner.plan();
+  const int64_t room = std::max<int64_t>(kPartialFloats / std::max<int64_t>(plan.partial, 1), 1);
+  const int64_t target = std::max(std::clamp(in.n / kTasks, kFewestGradientRows, kMostGradientRows), in.n / room);
+  const Tasks tasks = split(in, target);
+  const int64_t partials = wanted.parameters ? tasks.first_partial[in.k] : 0;
+  // Gradients of the samples' directions, before they are summed over each ray's samples.
+  const int64_t samples = wanted.directions && indexed ? in.n * table.directions : 0;
+  float* memory = take(plan, threads, partials * plan.partial + ceil_div(samples, kGranule) * kGranule);
+  float* partial = memory + ceil_div(plan.workspace, kGranule) * kGranule * threads;
+  float* sample_directions = partial + partials * plan.partial;
+
+  MlpData data = pointers(in);
+  data.grad_out = gradients.output;
+  data.grad_weights = gradients.weights;
+  data.grad_biases = gradients.biases;
+  data.grad_positions = gradients.positions;
+  data.grad_directions = indexed ? sample_directions : gradients.directions;
+  const auto clear = [&](float* out, int64_t width, bool used) {
+    if (used) {
+      zero_strays(in, width, out);
+    } else {
+      std::fill(out, out + in.n * width, 0.0f);
+    }
+  };
+  if (wanted.positions) clear(data.grad_positions, table.positions, plan.positions.used);
+  if (wanted.directions) clear(data.grad_directions, table.directions, plan.directions.used);
+
+  if (!tasks.tasks.empty()) {
+    for_each_task(tasks, plan, data, memory, isa, threads, [&](const Task& task, float* own) {
+      float* to = task.partial < 0 ? own + plan.own_partial : partial + task.partial * plan.partial;
+      backward(isa, plan, data, task, own, to);
+      if (task.partial >= 0 || !wanted.parameters) return;
+      for (int64_t l = 0; l < plan.layer_count; ++l) reduce(isa, plan, data, task.cell, l, to, 1);
+    });
+  }
+  if (wanted.parameters) {
+    const int64_t items = in.k * plan.layer_count;
+#pragma omp parallel for schedule(dynamic, 1) num_threads(threads) if (threads > 1 && partials > 0)
+    for (int64_t item = 0; item < items; ++item) {
+      const int64_t cell = item / plan.layer_count, l = item % plan.layer_count;
+      const int64_t first = tasks.first_partial[cell], count = tasks.first_partial[cell + 1] - first;
+      const bool empty = in.offsets[cell + 1] == in.offsets[cell];
+      if (count > 0 || empty) reduce(isa, plan, data, cell, l, partial + first * plan.partial, count);
+    }
+  }
+  if (wanted.directions && indexed) {
+    const int64_t q = table.directions;
+    std::fill(gradients.directions, gradients.directions + in.r * q, 0.0f);
+    for (int64_t i = 0; i < in.n; ++i) {
+      float* to = gradients.directions + in.direction_index[i] * q;
+      for (int64_t f = 0; f < q; ++f) to[f] += sample_directions[i * q + f];
+    }
+  }
+}
+
+}  // namespace voronerf

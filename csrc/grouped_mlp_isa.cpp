@@ -1,0 +1,311 @@
+// The CPU kernels of grouped_mlp, once for each instruction set.
+//
+// A tile of 48 or 96 samples goes through all layers while its values stay in the first two cache levels; nothing of the size
+// of n times a layer is ever written. A cell's weights are packed once by each thread that works on it, [inputs][outputs] in
+// panels of 64 columns, so that the products (gemm_tile.h) read them in order. The backward pass computes the tile's
+// activations again, then walks the layers from the last to the first: parameter gradients are summed over all tiles of a task
+// in one partial, which stays in cache as well.
+#include "frequency_encode_tile.h"
+#include "grouped_mlp_isa.h"
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+namespace {
+
+// Activation as in grouped_mlp.h, which a file compiled per instruction set cannot include: it uses the standard library.
+constexpr int kRelu = 1, kSoftplus = 2, kSigmoid = 3, kSine = 4;
+constexpr int kFromPositions = -1;
+
+VN_INLINE int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
+
+// weights [o][depth] -> panels [depth][<= 64 of o, padded to 16 with 0].
+void pack_forward(const float* weights, const float* bias, const MlpPlanLayer& layer, float* packed, float* packed_bias) {
+  for (int64_t first = 0; first < layer.padded; first += kPanel) {
+    const int64_t columns = smaller(kPanel, layer.padded - first);
+    for (int64_t group = 0; group < columns; group += kGranule) {
+      const int64_t o = first + group, count = smaller(kGranule, layer.width - o);
+      const float* from = weights + o * layer.depth;
+      float* to = packed + first * layer.depth + group;
+      if (count == kGranule) {
+        for (int64_t i = 0; i < layer.depth; ++i) {
+          for (int64_t c = 0; c < kGranule; ++c) to[i * columns + c] = from[c * layer.depth + i];
+        }
+      } else {
+        for (int64_t i = 0; i < layer.depth; ++i) {
+          for (int64_t c = 0; c < kGranule; ++c) to[i * columns + c] = c < count ? from[c * layer.depth + i] : 0.0f;
+        }
+      }
+    }
+  }
+  for (int64_t o = 0; o < layer.padded; ++o) packed_bias[o] = bias != nullptr && o < layer.width ? bias[o] : 0.0f;
+}
+
+// The inputs of one source: weights [o][depth] -> panels [o][<= 64 of its width, padded to 16 with 0].
+void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source, float* packed) {
+  const int64_t padded = (source.width + kGranule - 1) / kGranule * kGranule;
+  for (int64_t first = 0; first < padded; first += kPanel) {
+    const int64_t columns = smaller(kPanel, padded - first), count = smaller(columns, source.width - first);
+    for (int64_t o = 0; o < layer.width; ++o) {
+      const float* from = weights + o * layer.depth + source.row + first;
+      for (int64_t c = 0; c < count; ++c) packed[c] = from[c];
+      for (int64_t c = count; c < columns; ++c) packed[c] = 0.0f;
+      packed += columns;
+    }
+  }
+}
+
+// In place; sine leaves its cosine in `slope` where that is kept.
+void activate(const MlpPlanLayer& layer, int64_t rows, float* value, float* slope) {
+  const int64_t size = rows * layer.padded;
+  for (int64_t i = 0; i < size; i += kLanes) {
+    const F32 x = load(value + i);
+    if (layer.activation == kSoftplus) {
+      store(value + i, softplus(x));
+    } else if (layer.activation == kSigmoid) {
+      store(value + i, sigmoid(x));
+    } else if (beyond_sine(x)) {
+      for (int lane = 0; lane < kLanes; ++lane) {
+        const float angle = value[i + lane];
+        value[i + lane] = __builtin_sinf(angle);
+        if (slope != nullptr) slope[i + lane] = __builtin_cosf(angle);
+      }
+    } else {
+      store(value + i, sine(x, splat(0.0f)));
+      if (slope != nullptr) store(slope + i, sine(x, splat(0.5f)));
+    }
+  }
+}
+
+// gradient *= the activation's derivative, from its output or, for sine, from the cosine that was kept.
+void times_slope(const MlpPlanLayer& layer, int64_t rows, const float* value, const float* slope, float* gradient) {
+  const int64_t size = rows * layer.padded;
+  const F32 zero = splat(0.0f), one = splat(1.0f);
+  for (int64_t i = 0; i < size; i += kLanes) {
+    const F32 y = load(value + i), g = load(gradient + i);
+    F32 factor = one;
+    if (layer.activation == kRelu) factor = y > zero ? one : zero;
+    if (layer.activation == kSoftplus) factor = zero - exponential_minus_one(zero - y);
+    if (layer.activation == kSigmoid) factor = y * (one - y);
+    if (layer.activation == kSine) factor = load(slope + i);
+    store(gradient + i, g * factor);
+  }
+}
+
+// Rows of one tile: where its values are.
+struct Tile {
+  const MlpPlan& plan;
+  const MlpData& data;
+  float* workspace;
+  int64_t begin, rows;
+
+  float* at(const MlpBuffer& buffer) const { return workspace + buffer.offset; }
+
+  Source source(int from, int64_t width) const {
+    if (from >= 0) return {at(plan.layers[from].value), plan.layers[from].value.stride, width};
+    const MlpPlanInput& input = from == kFromPositions ? plan.positions : plan.directions;
+    if (input.copied) return {at(input.value), input.value.stride, width};
+    return {(from == kFromPositions ? data.positions : data.directions) + begin * input.raw, input.raw, width};
+  }
+
+  // Raw features, gathered by `index` where there is one, to what the layers read.
+  void read_input(const MlpPlanInput& input, const float* raw, const int32_t* index) const {
+    if (!input.used || !input.copied) return;
+    const bool encoded = input.octaves >= 0;
+    float* staged = encoded ? at(input.staged) : at(input.value);
+    const int64_t stride = encoded ? input.raw : input.value.stride;
+    for (int64_t row = 0; row < rows; ++row) {
+      const int64_t from = index == nullptr ? begin + row : index[begin + row];
+      for (int64_t f = 0; f < input.raw; ++f) staged[row * stride + f] = raw[from * input.raw + f];
+    }
+    if (encoded) {
+      encode(staged, workspace + input.table, rows, input.raw, input.octaves, at(input.value), input.value.stride);
+    }
+  }
+
+  void run_layers() const {
+    read_input(plan.positions, data.positions, nullptr);
+    read_input(plan.directions, data.directions, data.direction_index);
+    for (int64_t l = 0; l < plan.layer_count; ++l) {
+      const MlpPlanLayer& layer = plan.layers[l];
+      if (layer.live) run_layer(layer);
+    }
+  }
+
+  void run_layer(const MlpPlanLayer& layer) const {
+    constexpr int64_t kFew = 8;
+    float* value = at(layer.value);
+    // Sources in groups of kFew: a longer concatenation continues on its own result.
+    for (int64_t group = 0, row = 0; group < layer.source_count; group += kFew) {
+      Source sources[kFew];
+      const int64_t count = smaller(kFew, layer.source_count - group);
+      int64_t depth = 0;
+      for (int64_t s = 0; s < count; ++s) {
+        sources[s] = source(layer.sources[group + s].from, layer.sources[group + s].width);
+        depth += sources[s].depth;
+      }
+      const bool relu = layer.activation == kRelu && group + count == layer.source_count;
+      for (int64_t first = 0; first < layer.padded; first += kPanel) {
+        const int64_t columns = smaller(kPanel, layer.padded - first);
+        const float* b = workspace + layer.packed + first * layer.depth + row * columns;
+        multiply<false>({sources, count, b, columns, workspace + layer.bias + first, value + first, layer.padded, group > 0,
+                         relu ? Finish::relu : Finish::none, nullptr},
+                        rows, columns);
+      }
+      row += depth;
+    }
+    if (layer.activation > kRelu) {
+      activate(layer, rows, value, layer.slope_kept && plan.gradients ? at(layer.slope) : nullptr);
+    }
+  }
+
+  void write_outputs() const {
+    for (int64_t i = 0; i < plan.output_count; ++i) {
+      const MlpPlanLayer& layer = plan.layers[plan.outputs[i].layer];
+      const float* value = at(layer.value);
+      float* out = data.out + begin * plan.out_features + plan.outputs[i].column;
+      for (int64_t row = 0; row < rows; ++row, value += layer.padded, out += plan.out_features) {
+        for (int64_t c = 0; c < layer.width; ++c) out[c] = value[c];
+      }
+    }
+  }
+
+  void read_output_gradients() const {
+    for (int64_t l = 0; l < plan.layer_count; ++l) {
+      const MlpPlanLayer& layer = plan.layers[l];
+      if (!layer.from_output) continue;
+      float* gradient = at(layer.gradient);
+      for (int64_t i = 0; i < rows * layer.padded; ++i) gradient[i] = 0.0f;
+      for (int64_t i = 0; i < plan.output_count; ++i) {
+        if (plan.outputs[i].layer != l) continue;
+        const float* from = data.grad_out + begin * plan.out_features + plan.outputs[i].column;
+        for (int64_t row = 0; row < rows; ++row) {
+          for (int64_t c = 0; c < layer.width; ++c) gradient[row * layer.padded + c] += from[row * plan.out_features + c];
+        }
+      }
+    }
+  }
+
+  // Adds to the partial, or fills it if this is the task's first tile.
+  void parameter_gradients(const MlpPlanLayer& layer, float* partial, bool fill) const {
+    const float* gradient = at(layer.gradient);
+    float* bias = partial + layer.partial_bias;
+    for (int64_t first = 0; first < layer.padded; first += kLanes) {
+      F32 sum = fill ? splat(0.0f) : load(bias + first);
+      for (int64_t row = 0; row < rows; ++row) sum = sum + load(gradient + row * layer.padded + first);
+      store(bias + first, sum);
+    }
+    for (int64_t s = 0; s < layer.source_count; ++s) {
+      Source a = source(layer.sources[s].from, rows);
+      float* c = partial + layer.partial + layer.sources[s].row * layer.padded;
+      for (int64_t first = 0; first < layer.padded; first += kPanel) {
+        multiply<true>({&a, 1, gradient + first, layer.padded, nullptr, c + first, layer.padded, !fill, Finish::none, nullptr},
+                       layer.sources[s].width, smaller(kPanel, layer.padded - first));
+      }
+    }
+  }
+
+  void source_gradient(const MlpPlanLayer& layer, const MlpPlanSource& s) const {
+    const MlpBuffer& to = s.from >= 0               ? plan.layers[s.from].gradient
+                          : s.from == kFromPositions ? plan.positions.gradient
+                                                     : plan.directions.gradient;
+    const bool fused = s.last && s.from >= 0 && plan.layers[s.from].slope_fused;
+    const float* slope = fused ? at(plan.layers[s.from].value) : nullptr;
+    const Source a = {at(layer.gradient), layer.gradient.stride, layer.width};
+    for (int64_t first = 0; first < to.stride; first += kPanel) {
+      const int64_t columns = smaller(kPanel, to.stride - first);
+      multiply<false>({&a, 1, workspace + s.packed + first * layer.width, columns, nullptr, at(to) + first, to.stride,
+                       !s.first, fused ? Finish::relu_slope : Finish::none, fused ? slope + first : nullptr},
+                      rows, columns);
+    }
+  }
+
+  void run_gradients(float* partial, bool fill) const {
+    read_output_gradients();
+    for (int64_t l = plan.layer_count; l-- > 0;) {
+      const MlpPlanLayer& layer = plan.layers[l];
+      if (!layer.live) continue;
+      if (layer.activation > 0 && !layer.slope_fused) {
+        const float* slope = layer.slope_kept ? at(layer.slope) : nullptr;
+        times_slope(layer, rows, at(layer.value), slope, at(layer.gradient));
+      }
+      if (plan.parameter_gradients) parameter_gradients(layer, partial, fill);
+      for (int64_t s = 0; s < layer.source_count; ++s) {
+        if (layer.sources[s].gradient) source_gradient(layer, layer.sources[s]);
+      }
+    }
+    input_gradient(plan.positions, data.grad_positions);
+    input_gradient(plan.directions, data.grad_directions);
+  }
+
+  void input_gradient(const MlpPlanInput& input, float* out) const {
+    if (!input.gradient_wanted) return;
+    const float* value = input.octaves >= 0 ? at(input.value) : nullptr;
+    encode_backward(value, at(input.gradient), workspace + input.table, rows, input.raw,
+                    input.octaves >= 0 ? input.octaves : 0, input.gradient.stride, out + begin * input.raw);
+  }
+};
+
+}  // namespace
+
+void mlp_prepare(const MlpPlan& plan, float* workspace) {
+  const MlpPlanInput* inputs[] = {&plan.positions, &plan.directions};
+  for (const MlpPlanInput* input : inputs) {
+    if (input->used && input->octaves >= 0) {
+      encode_table(workspace + input->table, input->value.stride, input->raw, input->octaves);
+    }
+  }
+}
+
+void mlp_pack(const MlpPlan& plan, const MlpData& data, int64_t cell, float* workspace) {
+  for (int64_t l = 0; l < plan.layer_count; ++l) {
+    const MlpPlanLayer& layer = plan.layers[l];
+    if (!layer.live) continue;
+    const float* weights = data.weights[l] + cell * layer.width * layer.depth;
+    const float* bias = data.biases[l] == nullptr ? nullptr : data.biases[l] + cell * layer.width;
+    pack_forward(weights, bias, layer, workspace + layer.packed, workspace + layer.bias);
+    if (!plan.gradients) continue;
+    for (int64_t s = 0; s < layer.source_count; ++s) {
+      if (layer.sources[s].gradient) pack_backward(weights, layer, layer.sources[s], workspace + layer.sources[s].packed);
+    }
+  }
+}
+
+void mlp_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace) {
+  for (int64_t row = begin; row < end; row += plan.tile) {
+    const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
+    tile.run_layers();
+    tile.write_outputs();
+  }
+}
+
+void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace, float* partial) {
+  for (int64_t row = begin; row < end; row += plan.tile) {
+    const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
+    tile.run_layers();
+    tile.run_gradients(partial, row == begin);
+  }
+}
+
+void mlp_reduce(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t l, float* partials, int64_t count) {
+  const MlpPlanLayer& layer = plan.layers[l];
+  float* weights = data.grad_weights[l] + cell * layer.width * layer.depth;
+  float* bias = data.grad_biases[l] == nullptr ? nullptr : data.grad_biases[l] + cell * layer.width;
+  if (count == 0 || !layer.live) {
+    for (int64_t i = 0; i < layer.width * layer.depth; ++i) weights[i] = 0.0f;
+    for (int64_t o = 0; bias != nullptr && o < layer.width; ++o) bias[o] = 0.0f;
+    return;
+  }
+  float* sum = partials + layer.partial;
+  const int64_t size = (layer.depth + 1) * layer.padded;  // the bias follows the weights
+  for (int64_t part = 1; part < count; ++part) {
+    const float* next = sum + part * plan.partial;
+    for (int64_t i = 0; i < size; i += kLanes) store(sum + i, load(sum + i) + load(next + i));
+  }
+  for (int64_t o = 0; o < layer.width; ++o) {
+    for (int64_t i = 0; i < layer.depth; ++i) weights[o * layer.depth + i] = sum[i * layer.padded + o];
+  }
+  for (int64_t o = 0; bias != nullptr && o < layer.width; ++o) bias[o] = partials[layer.partial_bias + o];
+}
+
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf
