@@ -1,0 +1,331 @@
+"""Nested Voronoi diagrams against a slow descent, one point at a time."""
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+
+from voronerf.diagram import VoronoiDiagram, uniform_centres
+
+
+def slow_locate(diagram: VoronoiDiagram, point: torch.Tensor) -> int:
+    """Descends the tables of a diagram with Python numbers; ties to the first centre."""
+    offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
+    centres = diagram.centres.double().tolist()
+    power = [0.0] * len(centres) if diagram.power is None else diagram.power.double().tolist()
+    node = 0
+    while True:
+        rows = range(offsets[node], offsets[node + 1])
+        costs = [sum((float(a) - b) ** 2 for a, b in zip(point, centres[row])) - power[row] for row in rows]
+        row = rows[costs.index(min(costs))]
+        if child[row] < 0:
+            return -1 - child[row]
+        node = child[row]
+
+
+def uneven_diagram() -> VoronoiDiagram:
+    """Three levels, 4 + 3 - 1 + 5 - 1 = 10 leaves, integer coordinates so that ties are exact."""
+    generator = torch.Generator().manual_seed(3)
+
+    def centres(k: int) -> torch.Tensor:
+        return torch.randint(-8, 9, (k, 3), generator=generator).float()
+
+    first, _ = VoronoiDiagram(centres(4)).refine({2: centres(3)})
+    second, _ = first.refine({3: centres(5)})
+    return second
+
+
+def integer_points(n: int) -> torch.Tensor:
+    return torch.randint(-9, 10, (n, 3), generator=torch.Generator().manual_seed(5)).float()
+
+
+def test_flat_diagram_gives_the_nearest_centre_with_ties_to_the_first():
+    diagram = VoronoiDiagram(torch.tensor([[1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]))
+    cells = diagram.locate(torch.tensor([[2.0, 0, 0], [-2, 0, 0], [0, 5, 0]]))
+    assert cells.dtype == torch.int32
+    assert cells.tolist() == [0, 1, 0]
+    assert (diagram.depth, diagram.num_cells) == (1, 3)
+    assert torch.equal(diagram.leaf_centres, diagram.centres)
+
+
+def test_nested_locate_equals_a_slow_descent():
+    diagram, points = uneven_diagram(), integer_points(400)
+    assert (diagram.depth, diagram.num_cells) == (3, 10)
+    assert diagram.locate(points).tolist() == [slow_locate(diagram, point) for point in points]
+
+
+def test_locate_with_power_weights_on_some_levels_equals_a_slow_descent():
+    generator = torch.Generator().manual_seed(1)
+    root = VoronoiDiagram(torch.randint(-8, 9, (4, 3), generator=generator).float())
+    inner = VoronoiDiagram(
+        torch.randint(-8, 9, (3, 3), generator=generator).float(), weights=torch.tensor([30.0, 0.0, -12.0])
+    )
+    diagram, _ = root.refine({1: inner})
+    points = integer_points(300)
+    assert diagram.locate(points).tolist() == [slow_locate(diagram, point) for point in points]
+    plain, _ = root.refine({1: inner.centres})
+    assert not torch.equal(diagram.locate(points), plain.locate(points))
+
+
+def test_locate_keeps_leading_shapes_and_takes_any_layout_and_dtype():
+    diagram, points = uneven_diagram(), integer_points(24)
+    expected = diagram.locate(points)
+    assert torch.equal(diagram.locate(points.reshape(2, 3, 4, 3)), expected.reshape(2, 3, 4))
+    assert diagram.locate(points[0]).shape == ()
+    assert torch.equal(diagram.locate(points.T.contiguous().T), expected)
+    assert diagram.locate(torch.empty(0, 3)).shape == (0,)
+    assert diagram.locate(torch.empty(5, 0, 3)).shape == (5, 0)
+    for dtype in (torch.float16, torch.bfloat16, torch.float64):
+        assert torch.equal(diagram.locate(points.to(dtype)), expected)
+
+
+def test_points_that_are_not_finite_stay_in_range():
+    diagram = uneven_diagram()
+    points = torch.full((3, 3), float("nan"))
+    points[1] = float("inf")
+    points[2, 0] = 0.0
+    cells = diagram.locate(points)
+    assert bool(((cells >= 0) & (cells < diagram.num_cells)).all())
+    drawn = diagram.sample_cell(points, temperature=1.0)
+    assert bool(((drawn >= 0) & (drawn < diagram.num_cells)).all())
+
+
+def test_refine_keeps_the_other_cells_and_puts_children_in_place_of_their_parent():
+    diagram, points = VoronoiDiagram(integer_points(4)), integer_points(300)
+    refined, parents = diagram.refine({2: integer_points(3) + 1, 0: integer_points(2)})
+    assert parents.tolist() == [0, 0, 1, 2, 2, 2, 3]
+    assert parents.dtype == torch.int64
+    assert torch.equal(parents[refined.locate(points).long()], diagram.locate(points).long())
+    assert torch.equal(refined.leaf_centres[[2, 6]], diagram.centres[[1, 3]])
+    assert torch.equal(refined.leaf_centres[3:6], integer_points(3) + 1)
+    assert refined.paths().tolist() == [[0, 0], [0, 1], [1, -1], [2, 0], [2, 1], [2, 2], [3, -1]]
+
+    deeper, grandparents = refined.refine({4: integer_points(2)})
+    assert deeper.depth == 3
+    assert grandparents.tolist() == [0, 1, 2, 3, 4, 4, 5, 6]
+    assert torch.equal(grandparents[deeper.locate(points).long()], refined.locate(points).long())
+    assert deeper.paths()[4:6].tolist() == [[2, 1, 0], [2, 1, 1]]
+
+
+def test_refine_grafts_whole_diagrams():
+    inner, root, points = uneven_diagram(), VoronoiDiagram(integer_points(3)), integer_points(300)
+    grafted, parents = root.refine({1: inner})
+    assert (grafted.depth, grafted.num_cells) == (4, 12)
+    outer = root.locate(points)
+    expected = torch.where(outer == 1, 1 + inner.locate(points), torch.where(outer == 2, 11, 0))
+    assert torch.equal(grafted.locate(points), expected.int())
+    assert parents.tolist() == [0, *[1] * 10, 2]
+
+
+def test_a_diagram_of_one_cell_is_legal_and_is_replaced_when_refined():
+    single = VoronoiDiagram(torch.zeros(1, 3))
+    assert single.locate(integer_points(5)).tolist() == [0] * 5
+    refined, parents = single.refine({0: integer_points(6)})
+    assert (refined.depth, refined.num_cells, parents.tolist()) == (1, 6, [0] * 6)
+    nested, _ = single.refine({0: uneven_diagram()})
+    assert nested.depth == 3
+    same, parents = refined.refine({3: torch.zeros(1, 3)})
+    assert (same.depth, same.num_cells, parents.tolist()) == (1, 6, list(range(6)))
+    unchanged, parents = refined.refine({})
+    assert torch.equal(unchanged.centres, refined.centres)
+    assert parents.tolist() == list(range(6))
+
+
+def test_refine_leaves_the_diagram_it_is_called_on_alone():
+    centres = integer_points(4)
+    diagram = VoronoiDiagram(centres)
+    before = {name: table.clone() for name, table in diagram.state_dict().items()}
+    centres += 1
+    for children in ({}, {1: integer_points(2)}):
+        refined, _ = diagram.refine(children)
+        refined.centres.zero_()
+        refined.child.zero_()
+    single = VoronoiDiagram(torch.zeros(1, 3))
+    replaced, _ = single.refine({0: diagram})
+    replaced.centres.zero_()
+    for name, table in diagram.state_dict().items():
+        assert torch.equal(table, before[name])
+
+
+@pytest.mark.parametrize(
+    ("centres", "weights", "error", "message"),
+    [
+        (torch.zeros(0, 3), None, ValueError, "at least one centre"),
+        (torch.zeros(4, 2), None, ValueError, r"shape \[k, 3\], got \[4, 2\]"),
+        (torch.zeros(3), None, ValueError, r"shape \[k, 3\], got \[3\]"),
+        (torch.tensor([[0.0, float("nan"), 0.0]]), None, ValueError, "must be finite"),
+        (torch.zeros(4, 3, dtype=torch.int32), None, TypeError, "floating-point"),
+        ([[0.0, 0.0, 0.0]], None, TypeError, "floating-point tensor, got list"),
+        (torch.zeros(4, 3), torch.zeros(3), ValueError, r"weights must have shape \[4\], got \[3\]"),
+        (torch.zeros(2, 3), torch.tensor([0.0, float("inf")]), ValueError, "weights must be finite"),
+    ],
+)
+def test_what_is_no_diagram_is_refused(centres, weights, error, message):
+    with pytest.raises(error, match=message):
+        VoronoiDiagram(centres, weights=weights)
+
+
+def test_refine_refuses_what_is_no_leaf():
+    diagram = VoronoiDiagram(integer_points(4))
+    with pytest.raises(ValueError, match=r"leaves 0\.\.3, got 4"):
+        diagram.refine({4: integer_points(2)})
+    with pytest.raises(ValueError, match=r"got -1"):
+        diagram.refine({-1: integer_points(2)})
+    with pytest.raises(ValueError, match="each leaf once, got 1 twice"):
+        diagram.refine({1: integer_points(2), torch.tensor(1): integer_points(2)})
+    with pytest.raises(ValueError, match="at least one centre"):
+        diagram.refine({1: torch.zeros(0, 3)})
+    with pytest.raises(TypeError):
+        diagram.refine({1.5: integer_points(2)})
+
+
+def test_points_of_another_shape_or_type_are_refused():
+    diagram = uneven_diagram()
+    with pytest.raises(ValueError, match=r"points must have shape \[\.\.\., 3\], got \[4, 2\]"):
+        diagram.locate(torch.zeros(4, 2))
+    with pytest.raises(TypeError, match="floating-point, got torch"):
+        diagram.sample_cell(torch.zeros(4, 3, dtype=torch.int64), temperature=1.0)
+
+
+@pytest.mark.parametrize("weights", [None, torch.tensor([1.0, 2.0, 3.0])])
+def test_copies_pickles_and_states_are_the_same_diagram(weights):
+    inner = VoronoiDiagram(integer_points(3), weights=weights)
+    diagram, _ = uneven_diagram().refine({7: inner})
+    points = integer_points(200)
+    expected = diagram.locate(points)
+    other = VoronoiDiagram(torch.zeros(2, 3), weights=torch.zeros(2))
+    other.load_state_dict(diagram.state_dict())
+    holder = torch.nn.ModuleDict({"diagram": VoronoiDiagram(torch.zeros(1, 3))})
+    holder.load_state_dict({f"diagram.{name}": table for name, table in diagram.state_dict().items()})
+    file = io.BytesIO()
+    torch.save(diagram.state_dict(), file)
+    file.seek(0)
+    loaded = VoronoiDiagram.from_state(torch.load(file, weights_only=True))
+    prefixed = VoronoiDiagram.from_state(holder.state_dict(), "diagram.")
+    for same in (
+        copy.deepcopy(diagram),
+        pickle.loads(pickle.dumps(diagram)),
+        other,
+        holder["diagram"],
+        loaded,
+        prefixed,
+    ):
+        assert torch.equal(same.locate(points), expected)
+        assert (same.depth, same.num_cells) == (diagram.depth, diagram.num_cells)
+        assert (same.power is None) == (weights is None)
+
+
+def test_damaged_states_are_refused():
+    state = uneven_diagram().state_dict()
+    with pytest.raises(ValueError, match="state must hold child"):
+        VoronoiDiagram.from_state({name: state[name] for name in ("centres", "child_offsets")})
+    looped = dict(state, child=torch.where(state["child"] == 1, 0, state["child"]))
+    with pytest.raises(ValueError, match="refer to each diagram once"):
+        VoronoiDiagram.from_state(looped)
+    with pytest.raises(ValueError, match="number the leaves depth-first"):
+        VoronoiDiagram.from_state(dict(state, child=torch.where(state["child"] == -1, -2, state["child"])))
+    with pytest.raises(ValueError, match="cover all 12 centres"):
+        VoronoiDiagram.from_state(dict(state, child_offsets=state["child_offsets"][:-1]))
+    with pytest.raises(ValueError, match="must be finite"):
+        VoronoiDiagram.from_state(dict(state, centres=state["centres"] / 0))
+    with pytest.raises(ValueError, match="int32"):
+        VoronoiDiagram.from_state(dict(state, child=state["child"].long()))
+
+
+def test_centres_are_not_rounded_when_a_model_changes_its_dtype():
+    diagram = VoronoiDiagram(torch.rand(5, 3), weights=torch.rand(5))
+    centres, power = diagram.centres.clone(), diagram.power.clone()
+    for convert in (lambda d: d.half(), lambda d: d.to(torch.bfloat16), lambda d: d.double(), lambda d: d.to("cpu")):
+        moved = convert(diagram)
+        assert moved.centres.dtype == torch.float32
+        assert torch.equal(moved.centres, centres)
+        assert torch.equal(moved.power, power)
+
+
+def test_stochastic_assignment_follows_the_softmax_of_the_distances():
+    centres = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 3, 0]])
+    point, temperature, n = torch.tensor([0.2, 0.4, 0.1]), 0.7, 20_000
+    diagram = VoronoiDiagram(centres)
+    drawn = diagram.sample_cell(point.expand(n, 3), temperature=temperature, generator=torch.Generator().manual_seed(0))
+    expected = torch.softmax(-(point - centres).norm(dim=1) / temperature, 0)
+    frequencies = torch.bincount(drawn, minlength=3) / n
+    # Five standard deviations of a binomial frequency.
+    assert bool(((frequencies - expected).abs() < 5 * (expected * (1 - expected) / n).sqrt()).all())
+
+
+def test_stochastic_assignment_multiplies_along_the_path():
+    root = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
+    inner = torch.tensor([[1.0, 1, 0], [1, -1, 0], [2, 0, 0]])
+    diagram, _ = VoronoiDiagram(root).refine({1: inner})
+    point, n = torch.tensor([0.6, 0.3, 0.0]), 20_000
+    drawn = diagram.sample_cell(point.expand(n, 3), temperature=0.5, generator=torch.Generator().manual_seed(1))
+    level = [torch.softmax(-(point - centres).norm(dim=1) / 0.5, 0) for centres in (root, inner)]
+    expected = torch.cat([level[0][:1], level[0][1] * level[1]])
+    frequencies = torch.bincount(drawn, minlength=4) / n
+    assert bool(((frequencies - expected).abs() < 5 * (expected * (1 - expected) / n).sqrt()).all())
+
+
+def test_stochastic_assignment_becomes_the_nearest_cell_as_the_temperature_falls():
+    diagram = uneven_diagram()
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(2)) * 6
+    nearest = diagram.locate(points)
+    assert torch.equal(diagram.sample_cell(points, temperature=0.0), nearest)
+    drawn = diagram.sample_cell(points, temperature=1e-6)
+    assert drawn.dtype == torch.int32
+    assert int((drawn != nearest).sum()) <= 1
+    again = [diagram.sample_cell(points, temperature=9.0, generator=torch.Generator().manual_seed(4)) for _ in "ab"]
+    assert torch.equal(*again)
+    assert not torch.equal(again[0], nearest)
+    assert diagram.sample_cell(torch.empty(0, 2, 3), temperature=1.0).shape == (0, 2)
+    with pytest.raises(ValueError, match="temperature must be finite and at least 0, got -1"):
+        diagram.sample_cell(points, temperature=-1.0)
+
+
+def test_stochastic_assignment_with_power_weights():
+    centres, points = integer_points(6), torch.randn(300, 3) * 5
+    weights = torch.tensor([0.0, 5.0, -3.0, 2.0, 0.0, 9.0])
+    diagram = VoronoiDiagram(centres, weights=weights)
+    assert torch.equal(diagram.sample_cell(points, temperature=1e-6), diagram.locate(points))
+    equal = VoronoiDiagram(centres, weights=torch.full((6,), 7.0))
+    generators = [torch.Generator().manual_seed(6) for _ in "ab"]
+    plain = VoronoiDiagram(centres).sample_cell(points, temperature=1.0, generator=generators[0])
+    assert torch.equal(equal.sample_cell(points, temperature=1.0, generator=generators[1]), plain)
+
+
+@pytest.mark.parametrize(
+    ("k", "sides"), [(8, (2, 2, 2)), (27, (3, 3, 3)), (64, (4, 4, 4)), (12, (2, 2, 3)), (16, (4, 2, 2))]
+)
+def test_uniform_centres_of_a_cube_are_a_grid(k, sides):
+    box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+    axes = [(torch.arange(side) + 0.5) * 2 / side - 1 for side in sides]
+    expected = torch.cartesian_prod(*axes)
+    centres = uniform_centres(box, k)
+    assert torch.allclose(torch.cdist(centres, expected).amin(1), torch.zeros(k), atol=1e-3)
+    assert torch.unique(centres, dim=0).shape[0] == k
+
+
+@pytest.mark.parametrize("k", [1, 2, 5, 7, 11, 13, 100, 257])
+def test_uniform_centres_of_any_number_lie_apart_in_the_box(k):
+    box = torch.tensor([[0.0, -1, 2], [4, 1, 2.5]])
+    centres = uniform_centres(box, k)
+    assert centres.shape == (k, 3)
+    assert bool(((centres > box[0]) & (centres < box[1])).all())
+    assert torch.unique(centres, dim=0).shape[0] == k
+    # Each part of the box has the same volume, so uniform points fall into cells of about equal size.
+    points = box[0] + torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) * (box[1] - box[0])
+    counts = torch.bincount(VoronoiDiagram(centres).locate(points), minlength=k) * k / points.shape[0]
+    assert float(counts.max()) < 2.2
+    assert float(counts.min()) > 0.35
+
+
+def test_uniform_centres_of_a_flat_box_and_of_no_box():
+    flat = uniform_centres(torch.tensor([[0.0, 0, 1], [2, 2, 1]]), 4)
+    assert bool((flat[:, 2] == 1).all())
+    with pytest.raises(ValueError, match="k must be at least 1, got 0"):
+        uniform_centres(torch.zeros(2, 3), 0)
+    with pytest.raises(ValueError, match=r"shape \[2, 3\], got \[3, 2\]"):
+        uniform_centres(torch.zeros(3, 2), 4)
+    with pytest.raises(ValueError, match=r"box\[0\] <= box\[1\]"):
+        uniform_centres(torch.tensor([[1.0, 0, 0], [0, 1, 1]]), 4)
