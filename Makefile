@@ -31,7 +31,7 @@ check: $(VENV)/.built
 	@$(BIN)/pytest -q tests/test_layers.py
 
 cuda-check:
-	@$(PYTHON) csrc/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
+	@$(PYTHON) .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info voronerf/_C.*.so .mypy_cache .pytest_cache .ruff_cache

@@ -24,7 +24,7 @@ _VERSION: str = getattr(wp, "__version__", None) or wp.config.version
 if tuple(int(part) for part in _VERSION.split(".")[:2]) < MINIMUM:
     raise BackendUnavailable(f"NVIDIA Warp {_VERSION} is too old; {_REMEDY}")
 
-# The banner and the notes on compilation, silenced unless someone has asked for more; older releases call the option `quiet`.
+# The banner and the notes on compilation, silenced unless someone has asked for more. Older releases say `quiet`.
 if not hasattr(wp.config, "log_level"):
     wp.config.quiet = True
 elif wp.config.log_level == wp.LOG_INFO:

@@ -6,9 +6,9 @@ Shapes, dtypes and devices have been validated by ``voronerf.ops``. Importing th
 where the extension is missing.
 
 OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch
-has loaded. Linking it would not do: torch's wheels bring a libgomp of their own, named ``libgomp.so.1`` (CPU wheels; the
-loader would share it) or with a hash, such as ``libgomp-a34b3233.so.1`` (the loader would add the system's, a second
-pool of threads that competes with torch's, or fail where the system has none).
+has loaded. Linking it would not do: torch's wheels bring a libgomp of their own, named ``libgomp.so.1`` (CPU wheels;
+the loader would share it) or with a hash, such as ``libgomp-a34b3233.so.1`` (the loader would add the system's, a
+second pool of threads that competes with torch's, or fail where the system has none).
 """
 
 from __future__ import annotations

@@ -1,0 +1,84 @@
+"""Compile every .cu for every architecture, warnings as errors, without a GPU: ``cuda_check.py 80 90a ...``.
+
+Registers, spills and shared memory of every kernel are printed and kept in build/cuda-check/resources.json, so that a
+regression shows in a diff of two runs. The last architecture is compiled to PTX as well. The last line says in one
+sentence what was compiled and whether it held.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+OUT = ROOT / "build" / "cuda-check"
+FLAGS = ["-std=c++17", "-O3", "-Werror", "all-warnings", "-Xcompiler", "-Wall,-Wextra,-Werror", "-Xptxas", "-v"]
+KERNEL = re.compile(
+    r"Compiling entry function '(?P<name>\w+)' for '(?P<arch>\w+)'.*?"
+    r"(?P<stores>\d+) bytes spill stores, (?P<loads>\d+) bytes spill loads.*?"
+    r"Used (?P<registers>\d+) registers(?P<rest>[^\n]*)",
+    re.DOTALL,
+)
+
+
+def main(architectures: list[str]) -> int:
+    """Compile, print, and return the exit status."""
+    nvcc = shutil.which("nvcc") or shutil.which("nvcc", path="/usr/local/cuda/bin")
+    sources = sorted((ROOT / "csrc").glob("*.cu"))
+    if nvcc is None:
+        print("cuda-check: nothing was compiled, because nvcc is neither on PATH nor in /usr/local/cuda/bin.")
+        return 1
+    OUT.mkdir(parents=True, exist_ok=True)
+    generate = [f"-gencode=arch=compute_{arch},code=sm_{arch}" for arch in architectures]
+    generate.append(f"-gencode=arch=compute_{architectures[-1]},code=compute_{architectures[-1]}")
+
+    def compile_one(source: Path) -> subprocess.CompletedProcess[str]:
+        command = [nvcc, *FLAGS, *generate, "-c", str(source), "-o", str(OUT / f"{source.name}.o")]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        results = list(pool.map(compile_one, sources))
+    failed = [source.name for source, result in zip(sources, results) if result.returncode != 0]
+    kernels: dict[str, dict[str, dict[str, int]]] = {}
+    for source, result in zip(sources, results):
+        if result.returncode != 0:
+            print(f"{source.name}:\n{result.stdout}{result.stderr}")
+        for match in KERNEL.finditer(result.stderr):
+            shared = re.search(r"(\d+) bytes smem", match["rest"])
+            kernels.setdefault(f"{source.name}: {demangled(match['name'])}", {})[match["arch"]] = {
+                "registers": int(match["registers"]),
+                "spilled_bytes": int(match["stores"]) + int(match["loads"]),
+                "shared_bytes": int(shared[1]) if shared else 0,
+            }
+    for kernel, by_architecture in sorted(kernels.items()):
+        columns = {key: [row[key] for row in by_architecture.values()] for key in next(iter(by_architecture.values()))}
+        print(f"{kernel}: " + ", ".join(f"{key} {span(values)}" for key, values in columns.items()))
+    (OUT / "resources.json").write_text(json.dumps(kernels, indent=1, sort_keys=True) + "\n")
+    spilling = sum(row["spilled_bytes"] > 0 for rows in kernels.values() for row in rows.values())
+    targets = f"{', '.join(f'sm_{arch}' for arch in architectures)} and PTX of {architectures[-1]}"
+    outcome = f"failed in {', '.join(failed)}" if failed else f"held without a warning, {spilling} spilling"
+    print(f"cuda-check: {len(sources)} files, {len(kernels)} kernels compiled for {targets} {outcome}.")
+    return 1 if failed else 0
+
+
+def demangled(name: str) -> str:
+    """A kernel's name and template arguments, as far as c++filt is there to tell."""
+    if shutil.which("c++filt") is None:
+        return name
+    full = subprocess.run(["c++filt", name], capture_output=True, text=True, check=True).stdout.strip()
+    return full.replace("voronerf::", "").replace("(anonymous namespace)::", "")
+
+
+def span(values: list[int]) -> str:
+    """One number, or the range of several."""
+    return str(values[0]) if min(values) == max(values) else f"{min(values)}-{max(values)}"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
