@@ -1,0 +1,162 @@
+"""Selection of implementations, and what is said of those that are missing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from voronerf import backends
+from voronerf.backends import BackendUnavailable, resolve
+
+CPU = torch.device("cpu")
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment})
+
+
+@pytest.mark.parametrize("op", backends.OPS)
+def test_reference_is_there_for_every_op(op: str) -> None:
+    function = resolve(op, backend="reference", device=CPU, dtype=torch.float64)
+    assert function.__name__ == op
+
+
+def test_unknown_names_list_the_choices() -> None:
+    with pytest.raises(
+        ValueError, match=r"nearest_centre: backend must be one of 'auto' \| 'reference'.*got 'fastest'"
+    ):
+        resolve("nearest_centre", backend="fastest", device=CPU, dtype=torch.float32)
+    with pytest.raises(ValueError, match=r"op must be one of 'nearest_centre'.*got 'farthest_centre'"):
+        resolve("farthest_centre", backend="auto", device=CPU, dtype=torch.float32)
+
+
+def test_named_backend_never_falls_back() -> None:
+    with pytest.raises(BackendUnavailable, match=r"there is no warp implementation of resample; use backend="):
+        resolve("resample", backend="warp", device=CPU, dtype=torch.float32)
+    with pytest.raises(BackendUnavailable, match="takes 'int32', not int64"):
+        resolve("cell_sort", backend="native", device=CPU, dtype=torch.int64)
+    with pytest.raises(BackendUnavailable, match=r"runs on 'cpu' \| 'cuda', not on meta"):
+        resolve("nearest_centre", backend="native", device=torch.device("meta"), dtype=torch.float32)
+
+
+def test_auto_takes_what_supports_the_call() -> None:
+    function = resolve("cell_sort", backend="auto", device=CPU, dtype=torch.int64)
+    assert function.__module__ == "voronerf.reference.cell_sort"
+    function = resolve("nearest_centre", backend="auto", device=torch.device("meta"), dtype=torch.float32)
+    assert function.__module__ == "voronerf.reference.nearest_centre"
+
+
+@pytest.mark.native
+def test_auto_prefers_native_on_the_cpu() -> None:
+    assert resolve("nearest_centre", backend="auto", device=CPU, dtype=torch.float32).__module__ == "voronerf._native"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+@pytest.mark.parametrize("backend", backends.BACKENDS)
+def test_cuda_without_a_device_says_so(backend: str) -> None:
+    with pytest.raises(BackendUnavailable, match="torch sees no CUDA device; use device='cpu'"):
+        resolve("nearest_centre", backend=backend, device=torch.device("cuda"), dtype=torch.float32)
+
+
+def test_table_agrees_with_resolve() -> None:
+    rows = backends.table()
+    assert [(row.op, row.backend) for row in rows] == [(op, name) for op in backends.OPS for name in backends.BACKENDS]
+    for row in rows:
+        assert row.available or row.reason
+        assert "\n" not in row.reason
+        for dtype in row.dtypes:
+            for device in row.devices:
+                kind = torch.float32 if dtype == "any" else getattr(torch, dtype)
+                resolve(row.op, backend=row.backend, device=torch.device(device), dtype=kind)
+
+
+def test_describe_names_the_parts() -> None:
+    described = backends.describe()
+    assert described["torch"] == torch.__version__
+    assert described["threads"] == torch.get_num_threads()
+    for part in ("native", "warp"):
+        assert described[part]["available"] or described[part]["reason"]
+
+
+@pytest.mark.native
+def test_describe_records_the_build() -> None:
+    native = backends.describe()["native"]
+    assert native["instruction set"] in ("portable", "avx2", "avx512")
+    assert native["compiler"]
+    assert native["cuda"].startswith("built with")
+
+
+def test_import_needs_neither_extension_nor_warp() -> None:
+    code = """
+import sys
+sys.modules["voronerf._C"] = None  # as if it were not built
+import torch, voronerf
+assert "warp" not in sys.modules
+sys.modules["warp"] = None  # as if it were not installed
+from voronerf import backends
+points = torch.zeros(2, 3)
+run = backends.resolve("nearest_centre", backend="auto", device=points.device, dtype=points.dtype)
+assert run.__module__ == "voronerf.reference.nearest_centre", run
+for backend, remedy in (("native", "pip install -e ."), ("warp", "voronerf[warp]")):
+    try:
+        backends.resolve("nearest_centre", backend=backend, device=points.device, dtype=points.dtype)
+    except backends.BackendUnavailable as error:
+        assert remedy in str(error) and "\\n" not in str(error), error
+    else:
+        raise SystemExit(f"{backend} did not raise")
+rows = {(row.op, row.backend): row for row in backends.table()}
+assert not rows["nearest_centre", "native"].available
+assert not backends.describe()["native"]["available"]
+"""
+    result = run_python(code)
+    assert result.returncode == 0, result.stderr
+
+
+def test_an_old_warp_is_refused() -> None:
+    code = """
+import sys, types
+warp = types.ModuleType("warp")
+warp.__version__ = "1.9.2"
+sys.modules["warp"] = warp
+import torch
+from voronerf import backends
+reason = backends.missing("warp", torch.device("cpu"))
+assert reason.startswith("NVIDIA Warp 1.9.2 is too old; install it with `pip install 'voronerf[warp]'`"), reason
+"""
+    result = run_python(code)
+    assert result.returncode == 0, result.stderr
+
+
+def test_choice_is_traceable() -> None:
+    def choose(x: torch.Tensor) -> torch.Tensor:
+        run = resolve("frequency_encode", backend="reference", device=x.device, dtype=x.dtype)
+        encoded: torch.Tensor = run(x, 2)
+        return encoded
+
+    x = torch.randn(5, 3)
+    torch.testing.assert_close(torch.compile(choose, fullgraph=True, backend="eager")(x), choose(x))
+
+
+def test_require_turns_skips_into_failures(tmp_path: Path) -> None:
+    conftest = Path(__file__).with_name("conftest.py").read_text()
+    (tmp_path / "conftest.py").write_text(
+        conftest + '\nbackends.missing = lambda backend, device: None if backend == "reference" else "it is not here"\n'
+    )
+    (tmp_path / "test_it.py").write_text("def test_it(backend):\n    assert backend == 'reference'\n")
+    command = [sys.executable, "-m", "pytest", "-q", "-rA", "-p", "no:cacheprovider", str(tmp_path)]
+    skipped = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert skipped.returncode == 0, skipped.stdout
+    assert "1 passed, 2 skipped" in skipped.stdout
+    assert "native: it is not here" in skipped.stdout
+    required = subprocess.run([*command, "--require", "native"], capture_output=True, text=True, cwd=tmp_path)
+    assert required.returncode == 1
+    assert "1 passed, 1 skipped, 1 error" in required.stdout
+    assert "--require native: it is not here" in required.stdout
+    unknown = subprocess.run([*command, "--require", "metal"], capture_output=True, text=True, cwd=tmp_path)
+    assert "--require takes native,cuda,warp, got metal" in unknown.stderr + unknown.stdout

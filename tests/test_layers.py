@@ -1,0 +1,130 @@
+"""The rooms of the code and who may enter them, read from the sources: imports go down only."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# From the bottom up; a module may import its own layer and those below.
+LAYERS = (
+    {"backends", "checks", "layers"},
+    {"_native", "_native_mlp", "_C", "kernels", "reference"},
+    {"ops"},
+    {"router", "diagram", "balance", "transport", "subdivision"},
+    {"data", "rendering", "fields"},
+    {"training"},
+    {"cli", "viewer"},
+    {"__init__", "__main__"},
+)
+LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
+# What a layer may import from outside, where that is limited.
+OUTSIDE = {"kernels": {"warp", "torch"}}
+STANDARD_OF_ISA_FILES = {"cstdint", "cstddef", "immintrin.h"}
+
+SOURCES = sorted([*(ROOT / "voronerf").rglob("*.py"), *(ROOT / "kernels").rglob("*.py")])
+CORE = sorted((ROOT / "csrc").iterdir())
+
+
+def module_name(path: Path) -> str:
+    """Dotted name; files of kernels/ are installed as voronerf.kernels."""
+    parts = list(path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(parts if parts[0] == "voronerf" else ["voronerf", *parts])
+
+
+def room(module: str) -> str:
+    """The layer's member a module belongs to: voronerf.ops.resample -> ops, voronerf -> __init__."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "__init__"
+
+
+def imports(source: str, module: str) -> list[tuple[int, str]]:
+    """Line and dotted name of everything imported, at any depth of the file; names of a package count as modules."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                package = module.split(".")[: -node.level]
+                base = ".".join([*package, base] if base else package)
+            if base == "voronerf":
+                found += [(node.lineno, f"{base}.{alias.name}") for alias in node.names]
+            else:
+                found.append((node.lineno, base))
+    return found
+
+
+def faults(source: str, module: str) -> list[str]:
+    """What is wrong with the imports of one file."""
+    own, wrong = room(module), []
+    if own not in LEVEL:
+        return [f"{module} belongs to no layer; name it in LAYERS"]
+    for line, name in imports(source, module):
+        if name.split(".")[0] != "voronerf":
+            allowed = OUTSIDE.get(own)
+            top = name.split(".")[0]
+            if allowed is not None and top not in allowed | {"__future__", "typing", "collections", "functools"}:
+                wrong.append(f"{module}:{line} imports {top}; {own} may import {' and '.join(sorted(allowed))}")
+            continue
+        # A name of the package itself, such as __version__, is not a module.
+        target = room(name)
+        if name != "voronerf" and target.startswith("__") and target != "__main__":
+            continue
+        if target not in LEVEL:
+            wrong.append(f"{module}:{line} imports {name}, which belongs to no layer")
+        elif LEVEL[target] > LEVEL[own]:
+            wrong.append(f"{module}:{line} imports {name} from a layer above")
+        if target == "_C" and own != "_native":
+            wrong.append(f"{module}:{line} imports the compiled module, which only _native may")
+    return wrong
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_go_down(path: Path) -> None:
+    assert faults(path.read_text(), module_name(path)) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "module", "fault"),
+    [
+        ("from voronerf.router import VoronoiRouter", "voronerf.ops.nearest_centre", "from a layer above"),
+        ("def f():\n    import voronerf.cli.main", "voronerf.training.trainer", "from a layer above"),
+        ("from voronerf import diagram", "voronerf.reference.cell_sort", "from a layer above"),
+        ("from ..training import trainer", "voronerf.data.blender", "from a layer above"),
+        ("from voronerf import _C", "voronerf.ops.nearest_centre", "only _native may"),
+        ("import voronerf", "voronerf.ops.nearest_centre", "from a layer above"),
+        ("import torch", "voronerf.attic", "belongs to no layer"),
+        ("import numpy", "voronerf.kernels.nearest_centre", "kernels may import torch and warp"),
+    ],
+)
+def test_faults_are_found(source: str, module: str, fault: str) -> None:
+    assert any(fault in found for found in faults(source, module))
+
+
+@pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
+def test_core_knows_no_framework(path: Path) -> None:
+    includes = re.findall(r'^\s*#\s*include\s*[<"]([^>"]+)', path.read_text(), re.MULTILINE)
+    for include in includes:
+        assert include.split("/")[0] not in ("torch", "ATen", "c10"), f"{path.name} includes {include}"
+        assert not include.startswith(("pybind11", "Python.h")) or path.name.startswith("bindings")
+
+
+def test_instruction_set_files_share_no_inline_functions() -> None:
+    """A standard header's inline function compiled for AVX-512 could be what the linker keeps for every processor."""
+    waiting = [path for path in CORE if path.name.endswith("_isa.cpp")]
+    assert waiting
+    seen = set()
+    while waiting:
+        path = waiting.pop()
+        seen.add(path)
+        for bracket, include in re.findall(r'^\s*#\s*include\s*([<"])([^>"]+)', path.read_text(), re.MULTILINE):
+            if bracket == "<":
+                assert include in STANDARD_OF_ISA_FILES, f"{path.name} includes <{include}>"
+            elif (ROOT / "csrc" / include) not in seen:
+                waiting.append(ROOT / "csrc" / include)
