@@ -10,7 +10,9 @@ of a layer, k cells.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+import json
+from dataclasses import dataclass, field
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
 POSITIONS = "positions"
@@ -42,6 +44,7 @@ class MLP:
         position_octaves: octaves of the frequency encoding of the positions (the input itself is included: d -> d +
             2dL); None takes the positions as they come.
         direction_octaves: the same for the view directions.
+        text: the whole table as JSON, the form in which it passes through a ``torch.library`` operator; see ``parse``.
 
     Raises:
         ValueError: a table that cannot be evaluated: no layers or outputs, a source that is not an earlier layer, a
@@ -52,6 +55,7 @@ class MLP:
     outputs: tuple[int, ...]
     position_octaves: int | None = None
     direction_octaves: int | None = None
+    text: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.layers:
@@ -69,6 +73,17 @@ class MLP:
         ):
             if octaves is not None and octaves < 0:
                 raise ValueError(f"MLP: {name} must be None or at least 0, got {octaves}")
+        rows = [[list(layer.inputs), layer.width, layer.activation] for layer in self.layers]
+        table = [rows, list(self.outputs), self.position_octaves, self.direction_octaves]
+        object.__setattr__(self, "text", json.dumps(table))
+
+    @staticmethod
+    @functools.lru_cache(maxsize=256)
+    def parse(text: str) -> MLP:
+        """The table whose ``text`` this is."""
+        rows, outputs, position_octaves, direction_octaves = json.loads(text)
+        layers = tuple(Layer(tuple(inputs), width, activation) for inputs, width, activation in rows)
+        return MLP(layers, tuple(outputs), position_octaves, direction_octaves)
 
     @property
     def out_features(self) -> int:

@@ -6,69 +6,40 @@ Three operators closed under differentiation, each one loop over cells of dense 
     voronerf::grouped_outer    W[c] = sum over r of g[r] x[r]^T
     voronerf::grouped_sum      b[c] = sum over r of g[r]
 
-The gradients of each are the other two, so derivatives of every order exist. The loops, and the reading of ``offsets``
-on the host that they need, are inside the operators: ``torch.compile`` sees shapes alone.
+The gradients of each are the other two, so derivatives of every order exist. Where no second derivative is asked for,
+``voronerf::grouped_linear_backward`` takes all gradients of a layer in one pass. The loops, and the reading of
+``offsets`` on the host that they need, are inside the operators: ``torch.compile`` sees shapes alone.
 ``voronerf.reference.specification`` says the same in three lines.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from voronerf.reference.activation import FROM_OUTPUT, activate, activate_, times_derivative
-
-PIECE = 4096
-"""Most rows of one product: inputs and outputs of a piece stay in the second-level cache between product and
-activation."""
+from voronerf.reference.activation import FROM_OUTPUT, activate, activate_, times_derivative, times_derivative_
+from voronerf.reference.piecewise import add_product, compute_dtype, pieces, wide_dtype, zero_strays
 
 
 def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``."""
-    x, weight, bias = autocast(x, weight, bias)
+    x, weight, bias = autocast(x), autocast(weight), None if bias is None else autocast(bias)
     fused = activation if activation in FROM_OUTPUT else "none"
     y = torch.ops.voronerf.grouped_linear(x, offsets, weight, bias, fused)
     return y if fused == activation else activate(activation, y)
 
 
-def autocast(x: Tensor, weight: Tensor, bias: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The arguments in autocast's dtype, where it is on; float64 stays, as in torch's own layers."""
-    kind = x.device.type
-    if not torch.is_autocast_enabled(kind):
-        return x, weight, bias
-    dtype = torch.get_autocast_dtype(kind)
-    x, weight = (tensor if tensor.dtype == torch.float64 else tensor.to(dtype) for tensor in (x, weight))
-    return x, weight, None if bias is None else bias.to(weight.dtype)
-
-
-def pieces(offsets: Tensor, rows: int, size: int) -> Iterator[tuple[int, slice]]:
-    """Cells with samples, cut into slices of at most ``size`` rows. Reads ``offsets`` on the host."""
-    bounds = offsets.tolist()
-    if bounds[-1] > rows or any(low > high for low, high in itertools.pairwise(bounds)) or bounds[0] < 0:
-        raise ValueError(f"offsets must rise from 0 or more to at most the number of rows, {rows}, got {bounds}")
-    for cell, (low, high) in enumerate(itertools.pairwise(bounds)):
-        for start in range(low, high, size):
-            yield cell, slice(start, min(start + size, high))
-
-
-def zero_strays(y: Tensor, offsets: Tensor) -> None:
-    """Zeroes the rows that belong to no cell, before ``offsets[0]`` and from ``offsets[k]`` on."""
-    first, last = int(offsets[0]), int(offsets[-1])
-    y[:first].zero_()
-    y[last:].zero_()
-
-
-def compute_dtype(tensor: Tensor) -> torch.dtype:
-    """What products run in. On a CPU torch's float16 products take minutes where float32 takes milliseconds."""
-    if tensor.dtype == torch.float16 and tensor.device.type == "cpu":
-        return torch.float32
-    return tensor.dtype
+def autocast(tensor: Tensor) -> Tensor:
+    """The tensor in autocast's dtype, where it is on; float64 stays, as in torch's own layers."""
+    kind = tensor.device.type
+    if not torch.is_autocast_enabled(kind) or tensor.dtype == torch.float64:
+        return tensor
+    return tensor.to(torch.get_autocast_dtype(kind))
 
 
 @torch.library.custom_op("voronerf::grouped_linear", mutates_args=())
@@ -77,7 +48,7 @@ def _linear(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None, act
     y = x.new_empty(x.shape[0], weight.shape[1])
     transposed = weight.to(dtype).transpose(1, 2).unbind()
     biases = None if bias is None else bias.to(dtype).unbind()
-    for cell, rows in pieces(offsets, x.shape[0], PIECE):
+    for cell, rows in pieces(offsets, x.shape[0]):
         out = y[rows] if dtype == x.dtype else torch.empty_like(y[rows], dtype=dtype)
         if biases is None:
             torch.mm(x[rows].to(dtype), transposed[cell], out=out)
@@ -95,17 +66,47 @@ def _(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None, activatio
     return x.new_empty(x.shape[0], weight.shape[1])
 
 
+@torch.library.custom_op("voronerf::grouped_linear_backward", mutates_args=())
+def _linear_backward_op(
+    g: Tensor, x: Tensor, offsets: Tensor, weight: Tensor, output: Tensor | None, activation: str, needs: Sequence[bool]
+) -> list[Tensor]:
+    needs_x, needs_weight, needs_bias = needs
+    dtype, wide = compute_dtype(x), wide_dtype(x)
+    matrices = weight.to(dtype).unbind()
+    to_x = torch.empty_like(x, memory_format=torch.contiguous_format) if needs_x else None
+    to_weight = weight.new_zeros(weight.shape, dtype=wide) if needs_weight else None
+    to_bias = weight.new_zeros(weight.shape[:2], dtype=wide) if needs_bias else None
+    for cell, rows in pieces(offsets, x.shape[0]):
+        gradient = g[rows].to(dtype)
+        if output is not None:
+            gradient = times_derivative_(activation, gradient.clone(), output[rows].to(dtype))
+        if to_bias is not None:
+            to_bias[cell] += gradient.sum(dim=0, dtype=wide)
+        if to_weight is not None:
+            add_product(to_weight[cell], gradient.t(), x[rows].to(dtype))
+        if to_x is not None and dtype == x.dtype:
+            torch.mm(gradient, matrices[cell], out=to_x[rows])
+        elif to_x is not None:
+            to_x[rows] = torch.mm(gradient, matrices[cell])
+    if to_x is not None:
+        zero_strays(to_x, offsets)
+    return [total.to(x.dtype) for total in (to_x, to_weight, to_bias) if total is not None]
+
+
+@_linear_backward_op.register_fake
+def _(
+    g: Tensor, x: Tensor, offsets: Tensor, weight: Tensor, output: Tensor | None, activation: str, needs: Sequence[bool]
+) -> list[Tensor]:
+    shapes = (x.shape, weight.shape, weight.shape[:2])
+    return [x.new_empty(shape) for shape, need in zip(shapes, needs) if need]
+
+
 @torch.library.custom_op("voronerf::grouped_outer", mutates_args=())
 def _outer(g: Tensor, x: Tensor, offsets: Tensor) -> Tensor:
-    wide = torch.promote_types(x.dtype, torch.float32)
-    dtype = compute_dtype(x)
+    dtype, wide = compute_dtype(x), wide_dtype(x)
     total = x.new_zeros(offsets.shape[0] - 1, g.shape[1], x.shape[1], dtype=wide)
-    for cell, rows in pieces(offsets, x.shape[0], PIECE):
-        left, right = g[rows].to(dtype).t(), x[rows].to(dtype)
-        if dtype == wide:
-            total[cell].addmm_(left, right)
-        else:
-            total[cell] += torch.mm(left, right)
+    for cell, rows in pieces(offsets, x.shape[0]):
+        add_product(total[cell], g[rows].to(dtype).t(), x[rows].to(dtype))
     return total.to(x.dtype)
 
 
@@ -116,9 +117,9 @@ def _(g: Tensor, x: Tensor, offsets: Tensor) -> Tensor:
 
 @torch.library.custom_op("voronerf::grouped_sum", mutates_args=())
 def _sum(g: Tensor, offsets: Tensor) -> Tensor:
-    wide = torch.promote_types(g.dtype, torch.float32)
+    wide = wide_dtype(g)
     total = g.new_zeros(offsets.shape[0] - 1, g.shape[1], dtype=wide)
-    for cell, rows in pieces(offsets, g.shape[0], PIECE):
+    for cell, rows in pieces(offsets, g.shape[0]):
         total[cell] += g[rows].sum(dim=0, dtype=wide)
     return total.to(g.dtype)
 
@@ -136,10 +137,16 @@ def _linear_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 def _linear_backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
     x, offsets, weight, output = ctx.saved_tensors
-    if output is not None:
-        g = times_derivative(ctx.activation, g, output)
     needs_x, _, needs_weight, needs_bias, _ = ctx.needs_input_grad
     ops = torch.ops.voronerf
+    if not torch.is_grad_enabled():
+        needs = [needs_x, needs_weight, needs_bias]
+        found = iter(ops.grouped_linear_backward(g, x, offsets, weight, output, ctx.activation, needs))
+        to_x, to_weight, to_bias = (next(found) if need else None for need in needs)
+        return to_x, None, to_weight, to_bias, None
+    # To be differentiated again: the same from operators that can be.
+    if output is not None:
+        g = times_derivative(ctx.activation, g, output)
     return (
         ops.grouped_linear(g, offsets, weight.transpose(1, 2), None, "none") if needs_x else None,
         None,
