@@ -85,10 +85,10 @@ void nearest_centre(const double* points, const double* centres, const double* w
   for (int64_t i = 0; i < n; i += kRows) {
     const int rows = n - i < kRows ? static_cast<int>(n - i) : kRows;
     double x[kRows] = {}, y[kRows] = {}, z[kRows] = {}, best[kRows];
-    int64_t cell[kRows];
+    double cell[kRows];  // exact below 2^53, and as wide as what it is blended with
     for (int r = 0; r < kRows; ++r) {
       best[r] = 1.7976931348623157e308;
-      cell[r] = 0;
+      cell[r] = 0.0;
     }
     for (int r = 0; r < rows; ++r) {
       x[r] = points[3 * (i + r)];
@@ -96,10 +96,10 @@ void nearest_centre(const double* points, const double* centres, const double* w
       z[r] = points[3 * (i + r) + 2];
     }
     for (int64_t j = 0; j < k; ++j) {
-      const double w = weights == nullptr ? 0.0 : weights[j];
+      const double w = weights == nullptr ? 0.0 : weights[j], index = static_cast<double>(j);
       for (int r = 0; r < kRows; ++r) {
         const double v = power_distance(x[r], y[r], z[r], centres + 3 * j, w);
-        cell[r] = v < best[r] ? j : cell[r];
+        cell[r] = v < best[r] ? index : cell[r];
         best[r] = v < best[r] ? v : best[r];
       }
     }
