@@ -217,7 +217,7 @@ def test_frozen_parameters_stay_frozen(field: NeRF) -> None:
 
 def test_errors(field: NeRF, generator: torch.Generator) -> None:
     centres = torch.randn(3, 3, generator=generator)
-    with pytest.raises(TypeError, match="module must describe itself by a layer table.*got Linear"):
+    with pytest.raises(TypeError, match=r"module must describe itself by a layer table.*got Linear"):
         VoronoiRouter(nn.Linear(3, 4), centres)
     with pytest.raises(ValueError, match="centres must"):
         VoronoiRouter(field, torch.randn(8, 2))
@@ -237,7 +237,7 @@ def test_errors(field: NeRF, generator: torch.Generator) -> None:
     finer, parents = router.diagram.refine({0: torch.randn(2, 3)})
     with pytest.raises(ValueError, match=r"parents must have shape \[4\], got \[3\]"):
         router.subdivide(finer, parents[:3])
-    with pytest.raises(TypeError, match="parents must be int64, got torch.int32"):
+    with pytest.raises(TypeError, match=r"parents must be int64, got torch.int32"):
         router.subdivide(finer, parents.int())
     with pytest.raises(ValueError, match=r"parents must lie in 0\.\.2, got 0\.\.7"):
         router.subdivide(finer, torch.tensor([0, 1, 2, 7]))

@@ -31,7 +31,7 @@ def test_json_round_trip(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"out": null, "colour": 3}', '{"out": 3}'])
 def test_json_of_something_else(text: str) -> None:
-    with pytest.raises(ConfigError, match="run/config.json: not a configuration of this version"):
+    with pytest.raises(ConfigError, match=r"run/config.json: not a configuration of this version"):
         TrainConfig.from_json(text, "run/config.json")
 
 

@@ -1,0 +1,142 @@
+"""The command line as a user meets it: commands, files, and one line for everything that can go wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from voronerf.cli import main
+
+TINY = [
+    "--downscale", "6", "--steps", "16", "--cells", "3", "--split-at", "0.5", "--width", "8", "--depth", "2",
+    "--rays", "64", "--samples", "8", "--evaluations", "2", "--eval-views", "2", "--final-views", "2", "--panels", "1",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "tiny"
+    assert main(["train", "--data", "builtin", "--out", str(out), *TINY]) == 0
+    return out
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *args: str) -> str:
+    """The single line that a failing command prints; its exit status must not be 0."""
+    assert main(list(args)) != 0
+    text = capsys.readouterr().err
+    assert text.startswith("voronerf: error: ") and text.count("\n") == 1, text
+    return text
+
+
+def test_train_writes_the_run_directory(run: Path) -> None:
+    names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
+    assert {"config.json", "metrics.jsonl", "summary.json", "checkpoints/last.safetensors", "plots/psnr.png"} <= names
+    panels = list((run / "images").glob("*.png"))
+    assert len(panels) == 1
+    width, height = Image.open(panels[0]).size
+    assert width >= 5 * 16 and height >= 16
+    summary = json.loads((run / "summary.json").read_text())
+    assert {"psnr", "ssim", "seconds", "steps", "rays_per_second", "parameters", "stages"} <= summary.keys()
+
+
+def test_eval_scores_every_view(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", str(run), "--views", "3", "--panels", "2"]) == 0
+    result = json.loads((run / "eval.json").read_text())
+    assert len(result["views"]) == 3
+    assert result["psnr"] == pytest.approx(sum(v["psnr"] for v in result["views"]) / 3)
+    output = capsys.readouterr().out
+    assert all(v["name"] in output for v in result["views"])
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_render_makes_a_video(run: Path, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"turn{suffix}"
+    assert main(["render", str(run), "--frames", "3", "--samples", "4", "--out", str(path)]) == 0
+    assert path.stat().st_size > 100
+
+
+def test_info_names_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info"]) == 0
+    output = capsys.readouterr().out
+    for word in ("torch", "reference", "native", "warp", "nearest_centre", "grouped_mlp", "resample"):
+        assert word in output
+
+
+def test_resume_continues(run: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    longer = ["20" if word == "16" else word for word in TINY]
+    assert main(["train", "--data", "builtin", "--out", str(copy), "--resume", *longer]) == 0
+    assert json.loads((copy / "summary.json").read_text())["steps"] == 20
+
+
+def test_help_has_units(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "--help"])
+    assert stop.value.code == 0
+    output = capsys.readouterr().out
+    for flag in ("--data", "--downscale", "--budget", "--steps", "--out", "--seed", "--field", "--width", "--cells"):
+        assert flag in output
+    for flag in ("--split-at", "--backend", "--device"):
+        assert flag in output
+    assert "seconds" in output
+
+
+def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "out")
+    assert "there is no such folder" in error_of(capsys, "train", "--data", str(tmp_path / "none"), "--out", out)
+    assert "is no scene" in error_of(capsys, "train", "--data", str(tmp_path), "--out", out)
+    assert "--cells must be at least 2" in error_of(capsys, "train", "--cells", "0", "--out", out)
+    assert "--device must name a device" in error_of(capsys, "train", "--device", "gpu", "--out", out)
+    assert "must not hold a run already" in error_of(capsys, "train", "--out", str(run))
+    assert "--resume needs a checkpoint" in error_of(capsys, "train", "--resume", "--out", out)
+    assert "--resume needs --out" in error_of(capsys, "train", "--resume")
+    assert "there is no checkpoint" in error_of(capsys, "eval", str(tmp_path))
+    assert "--frames and --fps" in error_of(capsys, "render", str(run), "--frames", "0")
+    many = ["--cells", "4000"] + [w for w in TINY if w not in ("--cells", "3")]
+    assert "more cells than samples" in error_of(capsys, "train", "--data", "builtin", "--out", out, *many)
+    assert not Path(out, "summary.json").exists()
+
+
+def test_another_configuration_is_one_line(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["train", "--data", "builtin", "--out", str(run), "--resume", *TINY, "--lr", "0.1"]
+    assert "a checkpoint of another configuration: --lr " in error_of(capsys, *args)
+
+
+def test_a_full_disk_is_one_line(
+    run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    args = ["train", "--data", "builtin", "--out", str(tmp_path / "x"), *TINY]
+    assert "No space left on device" in error_of(capsys, *args)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGINT") or sys.platform == "win32", reason="needs POSIX signals")
+def test_ctrl_c_leaves_a_usable_checkpoint(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    endless = ["100000" if word == "16" else word for word in TINY]
+    command = [sys.executable, "-m", "voronerf.cli.main", "train", "--data", "builtin", "--out", str(out), *endless]
+    command += ["--checkpoint-every", "0.2"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    deadline = time.monotonic() + 90
+    while not (out / "checkpoints" / "last.safetensors").exists():
+        assert time.monotonic() < deadline and process.poll() is None, process.stdout and process.stdout.read()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output = process.communicate(timeout=60)[0].decode()
+    assert process.returncode == 130, output
+    assert "Traceback" not in output and "--resume" in output
+    assert not json.loads((out / "summary.json").read_text())["complete"]
+    assert main(["eval", str(out), "--views", "1", "--panels", "0"]) == 0
