@@ -78,32 +78,32 @@ void nearest_centre(const float* points, const float* centres, const float* weig
   }
 }
 
-// Float64 is the definition itself; the inner loop over the points of a tile is left to the compiler's vectoriser.
+// Float64 is the definition itself (power_distance, here on vectors), with the same layout.
 void nearest_centre(const double* points, const double* centres, const double* weights, float, int32_t* cells,
                     int64_t n, int64_t k) {
-  constexpr int kRows = 16;
+  constexpr int kVectors = 2, kRows = kVectors * kDoubles;
   for (int64_t i = 0; i < n; i += kRows) {
     const int rows = n - i < kRows ? static_cast<int>(n - i) : kRows;
-    double x[kRows] = {}, y[kRows] = {}, z[kRows] = {}, best[kRows];
-    double cell[kRows];  // exact below 2^53, and as wide as what it is blended with
-    for (int r = 0; r < kRows; ++r) {
-      best[r] = 1.7976931348623157e308;
-      cell[r] = 0.0;
-    }
+    F64 x[kVectors] = {}, y[kVectors] = {}, z[kVectors] = {}, best[kVectors];
+    I64 cell[kVectors] = {};
     for (int r = 0; r < rows; ++r) {
-      x[r] = points[3 * (i + r)];
-      y[r] = points[3 * (i + r) + 1];
-      z[r] = points[3 * (i + r) + 2];
+      x[r / kDoubles][r % kDoubles] = points[3 * (i + r)];
+      y[r / kDoubles][r % kDoubles] = points[3 * (i + r) + 1];
+      z[r / kDoubles][r % kDoubles] = points[3 * (i + r) + 2];
     }
+    for (int u = 0; u < kVectors; ++u) best[u] = F64{} + 1.7976931348623157e308;
     for (int64_t j = 0; j < k; ++j) {
-      const double w = weights == nullptr ? 0.0 : weights[j], index = static_cast<double>(j);
-      for (int r = 0; r < kRows; ++r) {
-        const double v = power_distance(x[r], y[r], z[r], centres + 3 * j, w);
-        cell[r] = v < best[r] ? index : cell[r];
-        best[r] = v < best[r] ? v : best[r];
+      const double* c = centres + 3 * j;
+      const double w = weights == nullptr ? 0.0 : weights[j];
+      for (int u = 0; u < kVectors; ++u) {
+        const F64 dx = x[u] - c[0], dy = y[u] - c[1], dz = z[u] - c[2];
+        const F64 v = dx * dx + dy * dy + dz * dz - w;
+        const I64 less = v < best[u];
+        cell[u] = less ? I64{} + j : cell[u];
+        best[u] = less ? v : best[u];
       }
     }
-    for (int r = 0; r < rows; ++r) cells[i + r] = static_cast<int32_t>(cell[r]);
+    for (int r = 0; r < rows; ++r) cells[i + r] = static_cast<int32_t>(cell[r / kDoubles][r % kDoubles]);
   }
 }
 

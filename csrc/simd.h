@@ -212,5 +212,11 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
 
 #endif
 
+// Float64 needs no more than operators: the compiler's own vectors, of this instruction set's width. A comparison gives
+// an I64 of ones and zeros, to be used as `mask ? a : b`.
+constexpr int kDoubles = kLanes / 2;
+typedef double F64 __attribute__((vector_size(4 * kLanes)));
+typedef int64_t I64 __attribute__((vector_size(4 * kLanes)));
+
 }  // namespace VN_ISA_NAMESPACE
 }  // namespace voronerf
