@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from voronerf.data.scene import Scene, Split
-from voronerf.data.solids import Box, Cylinder, Solid, Sphere, Texture, Torus, rotation
+from voronerf.data.solids import Box, Cylinder, Solid, Sphere, Texture, Torus, candidates, rotation
 from voronerf.rendering.cameras import Cameras, look_at
 from voronerf.rendering.rays import intersect_box
 
@@ -25,9 +25,9 @@ ANGLE_X = 0.6911112  # horizontal field of view of the Blender scenes, radians
 NEAR, FAR = 2.0, 6.0
 SUPERSAMPLES = 3  # on each side of a pixel
 CHUNK = 1 << 16
-FLOOR = -0.56  # height of the plinth's top
+FLOOR = -0.46  # height of the plinth's top
 LIGHT = (0.45, -0.55, 0.70)
-AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.30, 0.50, 0.62
+AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.36, 0.56, 0.58
 
 MOSAIC = ((0.93, 0.87, 0.74), (0.16, 0.42, 0.52), (0.80, 0.45, 0.30), (0.30, 0.62, 0.60), (0.95, 0.76, 0.42))
 
@@ -56,7 +56,7 @@ def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views
 def solids() -> tuple[Solid, ...]:
     """Everything in the scene."""
     parts: list[Solid] = [
-        Cylinder((0, 0, FLOOR - 0.08), _mosaic, 0.08, 10, radius=1.22, half_height=0.08),
+        Cylinder((0, 0, FLOOR - 0.08), _mosaic, 0.08, 10, radius=1.18, half_height=0.08),
         Sphere((0.62, 0.30, FLOOR + 0.36), _checker, 0.55, 40, rotation("x", 24), radius=0.36),
         Box((-0.60, 0.38, FLOOR + 0.30), _diagonals, 0.15, 12, rotation("z", 28), half=(0.27, 0.27, 0.30)),
         Cylinder((-0.02, -0.70, FLOOR + 0.21), _bricks, 0.10, 10, radius=0.31, half_height=0.21),
@@ -68,7 +68,7 @@ def solids() -> tuple[Solid, ...]:
     for index in range(count):
         azimuth = 2 * math.pi * (index + 0.5) / count
         colour = colorsys.hsv_to_rgb(index / count, 0.75, 0.92)
-        place = (1.09 * math.cos(azimuth), 1.09 * math.sin(azimuth), FLOOR + 0.075)
+        place = (1.06 * math.cos(azimuth), 1.06 * math.sin(azimuth), FLOOR + 0.075)
         parts.append(Sphere(place, _plain(colour), 0.6, 40, radius=0.075))
     return tuple(parts)
 
@@ -83,21 +83,26 @@ def cast(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """First hits of rays, and their light.
 
     Args:
-        origins: [r, 3].
+        origins: [r, 3], or [1, 3] where all rays start from the same point.
         directions: [r, 3], unit.
 
     Returns:
         (colour [r, 3] in 0..1, zero where nothing is hit; depth [r], infinite there).
     """
-    hits = torch.stack([solid.hit(origins, directions) for solid in solids()])
-    depth, which = hits.min(0)
-    colour = torch.zeros_like(origins)
+    depth = torch.full((len(directions),), float("inf"))
+    which = torch.zeros(len(directions), dtype=torch.int8)
+    for index, (solid, rows) in enumerate(zip(solids(), candidates(solids(), origins, directions))):
+        found = solid.hit(origins[rows] if len(origins) > 1 else origins, directions[rows])
+        closer = found < depth[rows]
+        depth[rows[closer]], which[rows[closer]] = found[closer], index
+    colour = torch.zeros_like(directions)
     rows = depth.isfinite().nonzero()[:, 0]
-    points = origins[rows] + depth[rows, None] * directions[rows]
+    points = (origins[rows] if len(origins) > 1 else origins) + depth[rows, None] * directions[rows]
+    which = which[rows]
     normals, albedo = torch.zeros_like(points), torch.zeros_like(points)
     gloss, sharpness = torch.zeros(len(rows)), torch.ones(len(rows))
     for index, solid in enumerate(solids()):
-        mine = (which[rows] == index).nonzero()[:, 0]
+        mine = (which == index).nonzero()[:, 0]
         if len(mine):
             normals[mine], albedo[mine] = solid.surface(points[mine])
             gloss[mine], sharpness[mine] = solid.gloss, solid.sharpness
@@ -113,11 +118,11 @@ def _shade(
     facing = (normals @ light).clamp_min(0)
     lit = (facing > 0).nonzero()[:, 0]
     start = points[lit] + 2e-3 * normals[lit]
-    free = torch.ones(len(lit), dtype=torch.bool)
-    for solid in solids():
-        free &= solid.hit(start, light.expand_as(start)).isinf()
     lamp = torch.zeros_like(facing)
-    lamp[lit] = free.float()
+    lamp[lit] = 1.0
+    for solid, rows in zip(solids(), candidates(solids(), start, light[None])):
+        shaded = solid.hit(start[rows], light[None]).isfinite()
+        lamp[lit[rows[shaded]]] = 0.0
     ambient = AMBIENT_DOWN + (AMBIENT_UP - AMBIENT_DOWN) * (0.5 + 0.5 * normals[:, 2])
     mirrored = 2 * (normals @ light)[:, None] * normals - light
     highlight = gloss * (-(mirrored * directions).sum(-1)).clamp_min(0) ** sharpness
@@ -144,7 +149,7 @@ def _render(cameras: Cameras, name: str) -> Split:
         rgba = torch.zeros(len(rays), 4)
         _, _, near_solids = intersect_box(rays.origins, rays.directions, box, 0.0, 2 * DISTANCE)
         for rows in near_solids.nonzero()[:, 0].split(CHUNK):
-            colour, depth = cast(rays.origins[rows], rays.directions[rows])
+            colour, depth = cast(rays.origins[:1], rays.directions[rows])
             rgba[rows] = torch.cat((colour, depth.isfinite().float()[:, None]), dim=-1)
         pixels = rgba.reshape(size, fine, size, fine, 4).mean(dim=(1, 3))
         pixels[..., :3] /= pixels[..., 3:].clamp_min(1e-6)
@@ -165,7 +170,7 @@ def _mosaic(points: Tensor, normals: Tensor) -> Tensor:
     """Rings of tiles in five colours; a band of stripes on the rim."""
     x, y, z = points.unbind(-1)
     turn = torch.atan2(y, x) / (2 * math.pi) + 0.5
-    ring = (torch.hypot(x, y) / 0.1356).floor()
+    ring = (torch.hypot(x, y) / 0.1312).floor()
     tiles = 6 * ring + 5
     sector = (turn * tiles).floor()
     top = _pick(MOSAIC, ring * 3 + sector * 2 + (ring * sector % 3))

@@ -7,7 +7,7 @@ start outside of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -69,16 +69,9 @@ class Solid:
         return torch.stack((centre - half, centre + half))
 
     def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Distance to the first hit of rays in the world, [r]."""
-        # most rays pass a small solid by: they are dropped before its own, costlier arithmetic
-        to_centre = torch.tensor(self.centre) - origins
-        along = (to_centre * directions).sum(-1)
-        beside = (to_centre * to_centre).sum(-1) - along * along
-        rows = (beside <= float(self.extent().square().sum())).nonzero()[:, 0]
-        result = torch.full_like(along, float("inf"))
-        if len(rows):
-            result[rows] = self.distance(-to_centre[rows] @ self.turn, directions[rows] @ self.turn)
-        return result
+        """Distance to the first hit of rays in the world, [r]; either argument may be [1, 3] for all rays."""
+        start, along = (origins - torch.tensor(self.centre)) @ self.turn, directions @ self.turn
+        return self.distance(*torch.broadcast_tensors(start, along))
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(normals [n, 3] in the world, colours [n, 3]) of points on the surface."""
@@ -191,3 +184,21 @@ class Torus(Solid):
         """Distance to the surface, [n]."""
         around = torch.hypot(points[:, 0], points[:, 1])
         return torch.hypot(around - self.ring, points[:, 2]) - self.tube
+
+
+def candidates(solids: Sequence[Solid], origins: Tensor, directions: Tensor) -> list[Tensor]:
+    """For each solid the rows of the rays that meet its bounding ball.
+
+    Most rays pass most solids by; they are dropped here, for all solids at once, before the solids' own costlier arithmetic.
+
+    Args:
+        solids: at least one.
+        origins: [r, 3], or [1, 3] where all rays start from the same point.
+        directions: [r, 3] unit, or [1, 3] where all rays are parallel.
+    """
+    centres = torch.tensor([solid.centre for solid in solids]).T
+    reach = torch.stack([solid.extent().square().sum() for solid in solids])[:, None] + 1e-3
+    along = (directions @ centres - (origins * directions).sum(-1, keepdim=True)).T
+    apart = ((origins * origins).sum(-1, keepdim=True) - 2 * origins @ centres + (centres * centres).sum(0)).T
+    meets = (apart - along * along <= reach) & (along >= -reach.sqrt())
+    return [row.nonzero()[:, 0] for row in meets]

@@ -112,19 +112,23 @@ class Cameras:
             self, intrinsics=self.intrinsics / factor, width=self.width // factor, height=self.height // factor
         )
 
-    def rays(self, image_index: Tensor, x: Tensor, y: Tensor) -> Rays:
+    def rays(self, image_index: Tensor | int, x: Tensor, y: Tensor) -> Rays:
         """Rays through pixels.
 
         Args:
-            image_index: integer [b], the camera of each pixel.
+            image_index: integer [b], the camera of each pixel, or one camera for all.
             x: [b] column. Integers name pixels (the ray goes through their centre), floats are positions in the image.
             y: [b] row, likewise.
         """
         u, v = self._image_plane(image_index, _position(x), _position(y))
         pose = self.poses[image_index]
         local = torch.stack((u, -v, -torch.ones_like(u)), dim=-1)
-        directions = (pose[:, :3, :3] @ local[:, :, None])[:, :, 0]
-        return Rays(pose[:, :3, 3], torch.nn.functional.normalize(directions, dim=-1))
+        if isinstance(image_index, int):
+            directions = local @ pose[:3, :3].T
+        else:
+            directions = (pose[:, :3, :3] * local[:, None, :]).sum(-1)
+        directions = torch.nn.functional.normalize(directions, dim=-1)
+        return Rays(pose[..., :3, 3].expand_as(directions), directions)
 
     def image_rays(self, index: int) -> Rays:
         """Rays through all pixel centres of one camera, row by row: [height * width]."""
@@ -132,7 +136,7 @@ class Cameras:
         y, x = torch.meshgrid(
             torch.arange(self.height, device=device), torch.arange(self.width, device=device), indexing="ij"
         )
-        return self.rays(torch.full_like(x.reshape(-1), index), x.reshape(-1), y.reshape(-1))
+        return self.rays(index, x.reshape(-1), y.reshape(-1))
 
     def project(self, points: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Where one camera sees points.
@@ -155,7 +159,7 @@ class Cameras:
         fx, fy, cx, cy = self.intrinsics[index].unbind(-1)
         return torch.stack((u * fx + cx, v * fy + cy), dim=-1), depth
 
-    def _image_plane(self, image_index: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    def _image_plane(self, image_index: Tensor | int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Undistorted image-plane coordinates of pixel positions; all [b]."""
         if self.distortion is None:
             fx, fy, cx, cy = self.intrinsics[image_index].unbind(-1)
