@@ -5,6 +5,7 @@
 
 #include <cstdint>
 
+#include "bindings_mlp.h"
 #include "build_info.h"
 #include "cell_sort.h"
 #include "common.h"
@@ -96,6 +97,8 @@ PYBIND11_MODULE(_C, module) {
 
   module.def("cell_sort", &cell_sort, no_gil);
   module.def("cell_sort_workspace", &voronerf::cell_sort_workspace);
+
+  bind_mlp(module);
 
 #ifdef VN_WITH_CUDA
   module.def("nearest_centre_cuda_float32", &nearest_centre_cuda<float>, no_gil);

@@ -1,4 +1,5 @@
-// grouped_mlp for Python: a layer table as a flat list of integers, addresses and sizes in, the GIL released while it runs.
+// grouped_mlp for Python: a layer table as a flat list of integers, addresses and sizes in, the GIL released while it
+// runs.
 #include "bindings_mlp.h"
 
 #include <pybind11/stl.h>
@@ -27,8 +28,8 @@ std::vector<T*> pointers(const std::vector<Address>& addresses) {
   return result;
 }
 
-// [p, q, position octaves, direction octaves, layers, outputs, then for each layer: width, activation, sources, the sources;
-// then the outputs], as voronerf/_native_mlp.py writes it.
+// [p, q, position octaves, direction octaves, layers, outputs, then for each layer: width, activation, sources, the
+// sources; then the outputs], as voronerf/_native_mlp.py writes it.
 voronerf::MlpTable read_table(const std::vector<int64_t>& flat) {
   size_t next = 0;
   const auto take = [&] {
@@ -47,7 +48,8 @@ voronerf::MlpTable read_table(const std::vector<int64_t>& flat) {
     layer.activation = static_cast<voronerf::Activation>(take());
     const int64_t sources = take();
     for (int64_t s = 0; s < sources; ++s) layer.inputs.push_back(static_cast<int>(take()));
-    for (const int from : layer.inputs) VN_CHECK(from >= -2 && from < l, "grouped_mlp: the layer table is out of order");
+    for (const int from : layer.inputs)
+      VN_CHECK(from >= -2 && from < l, "grouped_mlp: the layer table is out of order");
     table.layers.push_back(layer);
   }
   for (int64_t o = 0; o < outputs; ++o) {
@@ -82,7 +84,8 @@ void grouped_mlp(const std::vector<int64_t>& flat, const std::vector<Address>& a
                             static_cast<voronerf::Isa>(isa), threads);
 }
 
-// Gradients: those of the weights and of the biases (both lists empty: not wanted), of positions and directions (0: not wanted).
+// Gradients: those of the weights and of the biases (both lists empty: not wanted), of positions and directions (0: not
+// wanted).
 void grouped_mlp_backward(const std::vector<int64_t>& flat, const std::vector<Address>& arguments,
                           const std::vector<Address>& weights, const std::vector<Address>& biases, Address grad_out,
                           const std::vector<Address>& grad_weights, const std::vector<Address>& grad_biases,

@@ -12,17 +12,26 @@ typedef int32_t Bits __attribute__((vector_size(4 * kLanes)));
 
 // Adding 1.5 * 2^23 rounds to the nearest integer, which is then in the low bits of the sum.
 constexpr float kRound = 12582912.0f;
-// Largest angle of the vector sine: beyond it the multiple of pi is no longer certain, and the scalar function takes
-// over.
-constexpr float kLargestAngle = 65536.0f;
+// Largest angle of the vector sine: beyond it the reduction is no longer exact, and the scalar function takes over.
+constexpr float kLargestAngle = VN_ISA == 0 ? 8192.0f : 65536.0f;
+
+// angle - multiple * pi, for the multiples of 0.5 that belong to angles up to kLargestAngle.
+VN_INLINE F32 less_multiple_of_pi(F32 angle, F32 multiple) {
+#if VN_ISA == 0
+  // Without fused multiply-add: parts of pi so short that their products are exact.
+  const F32 r = angle - multiple * splat(3.140625f) - multiple * splat(9.67502593994140625e-4f);
+  return r - multiple * splat(1.509957990978376432e-7f);
+#else
+  return fma(multiple, splat(8.74227765734758577e-8f), fma(multiple, splat(-3.14159274101257324f), angle));
+#endif
+}
 
 // sin(angle + half * pi) for |angle| <= kLargestAngle, half 0 or 0.5 (the cosine). With angle = (m - half) pi + r,
-// |r| <= pi / 2, it is (-1)^m sin r; pi in two parts makes r exact to rounding. The polynomial's own error is 5e-9.
+// |r| <= pi / 2, it is (-1)^m sin r; pi in parts makes r exact to rounding. The polynomial's own error is 5e-9.
 VN_INLINE F32 sine(F32 angle, F32 half) {
   const F32 shifted = fma(angle, splat(0.318309886f), half) + splat(kRound);
   const F32 multiple = shifted - splat(kRound) - half;
-  F32 r = fma(multiple, splat(-3.14159274101257324f), angle);
-  r = fma(multiple, splat(8.74227765734758577e-8f), r);
+  const F32 r = less_multiple_of_pi(angle, multiple);
   const F32 u = r * r;
   F32 p = fma(u, splat(2.59944752e-06f), splat(-1.98063418e-04f));
   p = fma(u, p, splat(8.33301353e-03f));

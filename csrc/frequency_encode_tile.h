@@ -1,8 +1,8 @@
-// The frequency encoding of the rows of a tile, and its gradient: [x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...], each a block
-// of d features, as in voronerf/reference/frequency_encode.py.
+// The frequency encoding of the rows of a tile, and its gradient: [x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...], each
+// a block of d features, as in voronerf/reference/frequency_encode.py.
 //
-// A lane is a column of the encoding: a permutation brings it its feature, a table its octave and phase, and one sine with one
-// range reduction does the rest. So rows come out in the layout the products read, with no transposition.
+// A lane is a column of the encoding: a permutation brings it its feature, a table its octave and phase, and one sine
+// with one range reduction does the rest. So rows come out in the layout the products read, with no transposition.
 #pragma once
 
 #include "elementwise_math.h"
@@ -76,18 +76,17 @@ void encode(const float* x, const float* table, int64_t rows, int64_t d, int64_t
           __builtin_memcpy(&feature, table + column + lane, sizeof feature);
           features[lane] = feature < d ? x[feature] : 0.0f;
         }
-        store(out + column,
-              sine(load(features) * load(table + stride + column), load(table + 2 * stride + column)));
+        store(out + column, sine(load(features) * load(table + stride + column), load(table + 2 * stride + column)));
       }
     }
     for (int64_t f = 0; f < d; ++f) out[f] = x[f];
   }
 }
 
-// Gradient to the raw features, from that of the encoding and the encoding itself, whose sines and cosines are each other's
-// derivatives.
-void encode_backward(const float* value, const float* gradient, const float* table, int64_t rows, int64_t d, int64_t octaves,
-                     int64_t stride, float* out) {
+// Gradient to the raw features, from that of the encoding and the encoding itself, whose sines and cosines are each
+// other's derivatives.
+void encode_backward(const float* value, const float* gradient, const float* table, int64_t rows, int64_t d,
+                     int64_t octaves, int64_t stride, float* out) {
   for (int64_t row = 0; row < rows; ++row, value += stride, gradient += stride, out += d) {
     for (int64_t f = 0; f < d; ++f) out[f] = gradient[f];
     for (int64_t octave = 0; octave < octaves; ++octave) {

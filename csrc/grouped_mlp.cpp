@@ -1,6 +1,6 @@
-// Tasks of grouped_mlp over threads. A task is a cell and a range of its rows; which tasks there are depends on the sizes
-// alone, and partial weight gradients are summed in the order of the rows, so results do not depend on the number of threads
-// or on which thread took what.
+// Tasks of grouped_mlp over threads. A task is a cell and a range of its rows; which tasks there are depends on the
+// sizes alone, and partial weight gradients are summed in the order of the rows, so results do not depend on the number
+// of threads or on which thread took what.
 #include "grouped_mlp.h"
 
 #include <omp.h>
@@ -104,7 +104,9 @@ void zero_strays(const MlpInputs& in, int64_t width, float* out) {
   std::fill(out + in.offsets[in.k] * width, out + in.n * width, 0.0f);
 }
 
-void prepare(Isa isa, const MlpPlan& plan, float* own) { VN_FOR_ISA(isa, mlp_prepare(plan, own)) }
+void prepare(Isa isa, const MlpPlan& plan, float* own) {
+  VN_FOR_ISA(isa, mlp_prepare(plan, own))
+}
 void pack(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, float* own) {
   VN_FOR_ISA(isa, mlp_pack(plan, data, cell, own))
 }
@@ -114,7 +116,8 @@ void forward(Isa isa, const MlpPlan& plan, const MlpData& data, const Task& task
 void backward(Isa isa, const MlpPlan& plan, const MlpData& data, const Task& task, float* own, float* partial) {
   VN_FOR_ISA(isa, mlp_backward(plan, data, task.begin, task.end, own, partial))
 }
-void reduce(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t layer, float* partials, int64_t count) {
+void reduce(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t layer, float* partials,
+            int64_t count) {
   VN_FOR_ISA(isa, mlp_reduce(plan, data, cell, layer, partials, count))
 }
 

@@ -1,25 +1,30 @@
 // The CPU kernels of grouped_mlp, once for each instruction set.
 //
-// A tile of 48 or 96 samples goes through all layers while its values stay in the first two cache levels; nothing of the size
-// of n times a layer is ever written. A cell's weights are packed once by each thread that works on it, [inputs][outputs] in
-// panels of 64 columns, so that the products (gemm_tile.h) read them in order. The backward pass computes the tile's
-// activations again, then walks the layers from the last to the first: parameter gradients are summed over all tiles of a task
-// in one partial, which stays in cache as well.
-#include "frequency_encode_tile.h"
+// A tile of 48 or 96 samples goes through all layers while its values stay in the first two cache levels; nothing of
+// the size of n times a layer is ever written. A cell's weights are packed once by each thread that works on it,
+// [inputs][outputs] in panels of 64 columns, so that the products (gemm_tile.h) read them in order. The backward pass
+// computes the tile's activations again, then walks the layers from the last to the first: parameter gradients are
+// summed over all tiles of a task in one partial, which stays in cache as well.
 #include "grouped_mlp_isa.h"
+
+#include "frequency_encode_tile.h"
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// Activation as in grouped_mlp.h, which a file compiled per instruction set cannot include: it uses the standard library.
+// Activation as in grouped_mlp.h, which a file compiled per instruction set cannot include: it uses the standard
+// library.
 constexpr int kRelu = 1, kSoftplus = 2, kSigmoid = 3, kSine = 4;
 constexpr int kFromPositions = -1;
 
-VN_INLINE int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
+VN_INLINE int64_t smaller(int64_t a, int64_t b) {
+  return a < b ? a : b;
+}
 
 // weights [o][depth] -> panels [depth][<= 64 of o, padded to 16 with 0].
-void pack_forward(const float* weights, const float* bias, const MlpPlanLayer& layer, float* packed, float* packed_bias) {
+void pack_forward(const float* weights, const float* bias, const MlpPlanLayer& layer, float* packed,
+                  float* packed_bias) {
   for (int64_t first = 0; first < layer.padded; first += kPanel) {
     const int64_t columns = smaller(kPanel, layer.padded - first);
     for (int64_t group = 0; group < columns; group += kGranule) {
@@ -147,8 +152,8 @@ struct Tile {
       for (int64_t first = 0; first < layer.padded; first += kPanel) {
         const int64_t columns = smaller(kPanel, layer.padded - first);
         const float* b = workspace + layer.packed + first * layer.depth + row * columns;
-        multiply<false>({sources, count, b, columns, workspace + layer.bias + first, value + first, layer.padded, group > 0,
-                         relu ? Finish::relu : Finish::none, nullptr},
+        multiply<false>({sources, count, b, columns, workspace + layer.bias + first, value + first, layer.padded,
+                         group > 0, relu ? Finish::relu : Finish::none, nullptr},
                         rows, columns);
       }
       row += depth;
@@ -179,7 +184,8 @@ struct Tile {
         if (plan.outputs[i].layer != l) continue;
         const float* from = data.grad_out + begin * plan.out_features + plan.outputs[i].column;
         for (int64_t row = 0; row < rows; ++row) {
-          for (int64_t c = 0; c < layer.width; ++c) gradient[row * layer.padded + c] += from[row * plan.out_features + c];
+          for (int64_t c = 0; c < layer.width; ++c)
+            gradient[row * layer.padded + c] += from[row * plan.out_features + c];
         }
       }
     }
@@ -198,14 +204,15 @@ struct Tile {
       Source a = source(layer.sources[s].from, rows);
       float* c = partial + layer.partial + layer.sources[s].row * layer.padded;
       for (int64_t first = 0; first < layer.padded; first += kPanel) {
-        multiply<true>({&a, 1, gradient + first, layer.padded, nullptr, c + first, layer.padded, !fill, Finish::none, nullptr},
-                       layer.sources[s].width, smaller(kPanel, layer.padded - first));
+        multiply<true>(
+            {&a, 1, gradient + first, layer.padded, nullptr, c + first, layer.padded, !fill, Finish::none, nullptr},
+            layer.sources[s].width, smaller(kPanel, layer.padded - first));
       }
     }
   }
 
   void source_gradient(const MlpPlanLayer& layer, const MlpPlanSource& s) const {
-    const MlpBuffer& to = s.from >= 0               ? plan.layers[s.from].gradient
+    const MlpBuffer& to = s.from >= 0                ? plan.layers[s.from].gradient
                           : s.from == kFromPositions ? plan.positions.gradient
                                                      : plan.directions.gradient;
     const bool fused = s.last && s.from >= 0 && plan.layers[s.from].slope_fused;
@@ -265,7 +272,8 @@ void mlp_pack(const MlpPlan& plan, const MlpData& data, int64_t cell, float* wor
     pack_forward(weights, bias, layer, workspace + layer.packed, workspace + layer.bias);
     if (!plan.gradients) continue;
     for (int64_t s = 0; s < layer.source_count; ++s) {
-      if (layer.sources[s].gradient) pack_backward(weights, layer, layer.sources[s], workspace + layer.sources[s].packed);
+      if (layer.sources[s].gradient)
+        pack_backward(weights, layer, layer.sources[s], workspace + layer.sources[s].packed);
     }
   }
 }
@@ -278,7 +286,8 @@ void mlp_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_
   }
 }
 
-void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace, float* partial) {
+void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace,
+                  float* partial) {
   for (int64_t row = begin; row < end; row += plan.tile) {
     const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
     tile.run_layers();

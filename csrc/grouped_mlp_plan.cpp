@@ -53,7 +53,7 @@ void MlpPlanner::place_buffers() {
   std::vector<int64_t> first_gradient(count, end);
   int64_t position_gradient = end, direction_gradient = end;
   for (int64_t l = 0; l < count; ++l) {
-    last_use[l] = std::max(last_use[l], l + 1);
+    last_use[l] = std::max(last_use[l], layers_[l].from_output ? end : l + 1);  // outputs are written at the end
     if (!layers_[l].live) continue;
     for (const MlpPlanSource& s : sources_[l]) {
       const bool layer = s.from >= 0;

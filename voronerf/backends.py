@@ -81,6 +81,7 @@ class Row:
         return bool(self.devices)
 
 
+_FLOATS = (torch.float32, torch.float16, torch.bfloat16)
 _COORDINATES = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 
 _REGISTRY: dict[tuple[str, str], Implementation] = {
@@ -88,6 +89,8 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("nearest_centre", "native"): Implementation("voronerf._native:nearest_centre", ("cpu", "cuda"), _COORDINATES),
     ("locate_cell", "native"): Implementation("voronerf._native:locate_cell", ("cpu", "cuda"), _COORDINATES),
     ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
+    ("grouped_linear", "native"): Implementation("voronerf._native_mlp:grouped_linear", ("cpu",), _FLOATS),
+    ("grouped_mlp", "native"): Implementation("voronerf._native_mlp:grouped_mlp", ("cpu",), _FLOATS),
     ("nearest_centre", "warp"): Implementation(
         "voronerf.kernels.nearest_centre:nearest_centre", ("cpu", "cuda"), _COORDINATES
     ),

@@ -1,0 +1,322 @@
+"""Whole per-cell networks of the compiled module as PyTorch ops: ``grouped_mlp``, and ``grouped_linear`` as one layer.
+
+n samples, r rays, k cells, p and q features of a raw position and direction, i inputs and o outputs of a layer. Two
+custom ops, forward and backward, functional both: they make inputs contiguous, allocate outputs, and pass addresses.
+Products and sums are float32 whatever the storage: half types are cast on the way in and out, a cell having few
+weights. Second derivatives come from the reference formula. Shapes and dtypes have been validated by ``voronerf.ops``.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf import _native
+from voronerf.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.reference.frequency_encode import frequency_encode
+from voronerf.reference.grouped_mlp import grouped_mlp as _reference
+
+_HALF = (torch.float16, torch.bfloat16)
+_OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
+
+
+def grouped_mlp(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    *,
+    layers: MLP,
+    directions: Tensor | None = None,
+    direction_index: Tensor | None = None,
+) -> Tensor:
+    """Every sample through the network of its cell; see ``voronerf.ops.grouped_mlp``.
+
+    Under ``torch.autocast`` the products are still float32, and the result has autocast's dtype.
+    """
+    octaves = [layers.position_octaves, layers.direction_octaves]
+    if positions.dtype == torch.float64 and octaves[0] is not None:
+        positions, octaves[0] = frequency_encode(positions, octaves[0]), None
+    if directions is not None and directions.dtype == torch.float64 and octaves[1] is not None:
+        directions, octaves[1] = frequency_encode(directions, octaves[1]), None
+    table = [
+        positions.shape[1],
+        0 if directions is None else directions.shape[1],
+        *[-1 if count is None else count for count in octaves],
+        *_flatten(layers),
+    ]
+    return _run(positions, offsets, weights, biases, table, directions, direction_index)
+
+
+def grouped_linear(
+    x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
+) -> Tensor:
+    """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer."""
+    table = [x.shape[1], 0, -1, -1, 1, 1, weight.shape[1], ACTIVATIONS.index(activation), 1, _OUTSIDE[POSITIONS], 0]
+    return _run(x, offsets, [weight], [bias], table, None, None)
+
+
+def _run(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    table: list[int],
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+) -> Tensor:
+    """The op on float32 tensors, its result in the storage type (of autocast, where it is on)."""
+    dtype, kind = weights[0].dtype, positions.device.type
+    if torch.is_autocast_enabled(kind):
+        dtype = torch.get_autocast_dtype(kind)
+    out: Tensor = _forward(
+        positions.float(),
+        offsets,
+        [weight.float() for weight in weights],
+        # Autograd takes no list of optional tensors; an empty one stands for no bias.
+        [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in biases],
+        table,
+        None if directions is None else directions.float(),
+        direction_index,
+    )
+    return out.to(dtype)
+
+
+def _flatten(layers: MLP) -> list[int]:
+    """Layers and outputs of a table as csrc/bindings_mlp.cpp reads them, after the four numbers of the inputs."""
+    flat = [len(layers.layers), len(layers.outputs)]
+    for layer in layers.layers:
+        sources = [_OUTSIDE[source] if isinstance(source, str) else source for source in layer.inputs]
+        flat += [layer.width, ACTIVATIONS.index(layer.activation), len(sources), *sources]
+    return [*flat, *layers.outputs]
+
+
+@functools.lru_cache(maxsize=256)
+def _unflatten(flat: tuple[int, ...]) -> MLP:
+    """The table of a whole flat list."""
+    numbers = iter(flat[2:])
+    position_octaves, direction_octaves = (None if count < 0 else count for count in (next(numbers), next(numbers)))
+    count, outputs = next(numbers), next(numbers)
+    names = {number: name for name, number in _OUTSIDE.items()}
+    layers = []
+    for _ in range(count):
+        width, activation, sources = next(numbers), next(numbers), next(numbers)
+        inputs = [next(numbers) for _ in range(sources)]
+        layers.append(Layer(tuple(names.get(source, source) for source in inputs), width, ACTIVATIONS[activation]))
+    return MLP(tuple(layers), tuple(next(numbers) for _ in range(outputs)), position_octaves, direction_octaves)
+
+
+@torch.library.custom_op("voronerf::grouped_mlp_native", mutates_args=(), device_types="cpu")
+def _forward(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: Sequence[int],
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+) -> Tensor:
+    kept = _Arguments(positions, offsets, weights, biases, directions, direction_index)
+    out = _allocate(positions, table)
+    _native._C.grouped_mlp(
+        list(table), kept.inputs, kept.weights, kept.biases, out.data_ptr(), _native._ISA, torch.get_num_threads()
+    )
+    return out
+
+
+@torch.library.custom_op("voronerf::grouped_mlp_native_backward", mutates_args=(), device_types="cpu")
+def _backward(
+    gradient: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: Sequence[int],
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    wanted: Sequence[bool],
+) -> list[Tensor]:
+    kept = _Arguments(positions, offsets, weights, biases, directions, direction_index)
+    results = _allocate_gradients(positions, weights, biases, directions, wanted)
+    count, gradient = len(weights), gradient.contiguous()
+    addresses = [_address(result) for result in results]
+    _native._C.grouped_mlp_backward(
+        list(table),
+        kept.inputs,
+        kept.weights,
+        kept.biases,
+        gradient.data_ptr(),
+        addresses[:count] if wanted[0] else [],
+        addresses[count : 2 * count] if wanted[0] else [],
+        addresses[-2] if wanted[1] else 0,
+        addresses[-1] if wanted[2] else 0,
+        _native._ISA,
+        torch.get_num_threads(),
+    )
+    return results
+
+
+class _Arguments:
+    """Contiguous inputs of a call, kept alive, and their addresses in the order of csrc/bindings_mlp.cpp."""
+
+    def __init__(
+        self,
+        positions: Tensor,
+        offsets: Tensor,
+        weights: Sequence[Tensor],
+        biases: Sequence[Tensor],
+        directions: Tensor | None,
+        direction_index: Tensor | None,
+    ) -> None:
+        given = (positions, directions, direction_index, offsets, *weights, *biases)
+        self.tensors = [None if tensor is None else tensor.contiguous() for tensor in given]
+        addresses = [_address(tensor) for tensor in self.tensors]
+        if direction_index is not None and not addresses[2]:
+            addresses[2] = addresses[3]  # an index of no samples has no address, but it is there
+        rays = 0 if directions is None else directions.shape[0]
+        self.inputs = [*addresses[:4], positions.shape[0], rays, offsets.shape[0] - 1]
+        self.weights, self.biases = addresses[4 : 4 + len(weights)], addresses[4 + len(weights) :]
+
+
+def _address(tensor: Tensor | None) -> int:
+    return 0 if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
+
+
+def _allocate(positions: Tensor, table: Sequence[int]) -> Tensor:
+    return positions.new_empty(positions.shape[0], _unflatten(tuple(table)).out_features)
+
+
+def _allocate_gradients(
+    positions: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    directions: Tensor | None,
+    wanted: Sequence[bool],
+) -> list[Tensor]:
+    """Gradients of weights, biases, positions, directions; empty unless wanted: (parameters, positions, directions)."""
+    parameters = [torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in (*weights, *biases)]
+    nothing = positions.new_empty
+    return [
+        *(parameters if wanted[0] else [nothing(0) for _ in parameters]),
+        torch.empty_like(positions, memory_format=torch.contiguous_format) if wanted[1] else nothing(0),
+        torch.empty_like(directions, memory_format=torch.contiguous_format)
+        if directions is not None and wanted[2]
+        else nothing(0),
+    ]
+
+
+@_forward.register_fake
+def _(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: Sequence[int],
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+) -> Tensor:
+    return _allocate(positions, table)
+
+
+@_backward.register_fake
+def _(
+    gradient: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: Sequence[int],
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    wanted: Sequence[bool],
+) -> list[Tensor]:
+    return _allocate_gradients(positions, weights, biases, directions, wanted)
+
+
+def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    positions, offsets, weights, biases, ctx.table, directions, direction_index = inputs
+    ctx.count = len(weights)
+    ctx.save_for_backward(positions, offsets, directions, direction_index, *weights, *biases)
+
+
+def _forward_backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+    positions, offsets, directions, direction_index, *parameters = ctx.saved_tensors
+    weights, biases = parameters[: ctx.count], parameters[ctx.count :]
+    needs = ctx.needs_input_grad
+    wanted = [any(needs[2]) or any(needs[3]), needs[0], needs[5]]
+    results = _backward(gradient, positions, offsets, weights, biases, ctx.table, directions, direction_index, wanted)
+    return (
+        results[-2] if needs[0] else None,
+        None,
+        [result if need else None for result, need in zip(results, needs[2])],
+        [result if need else None for result, need in zip(results[ctx.count :], needs[3])],
+        None,
+        results[-1] if needs[5] else None,
+        None,
+    )
+
+
+def _backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
+    gradient, positions, offsets, weights, biases, ctx.table, directions, direction_index, ctx.wanted = inputs
+    ctx.count = len(weights)
+    ctx.save_for_backward(gradient, positions, offsets, directions, direction_index, *weights, *biases)
+
+
+def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
+    """Derivative of the gradients, through the reference formula."""
+    gradient, positions, offsets, directions, direction_index, *parameters = ctx.saved_tensors
+    count = ctx.count
+    with torch.enable_grad():
+        leaves = [
+            None if tensor is None else tensor.detach().requires_grad_()
+            for tensor in (*parameters, positions, directions, gradient)
+        ]
+        *inputs, gradient = leaves
+        out = _reference(
+            _given(leaves[-3]),
+            offsets,
+            [_given(weight) for weight in leaves[:count]],
+            [bias if _given(bias).numel() else None for bias in leaves[count : 2 * count]],
+            layers=_unflatten(tuple(ctx.table)),
+            directions=leaves[-2],
+            direction_index=direction_index,
+        )
+        chosen = [ctx.wanted[0]] * (2 * count) + [ctx.wanted[1], ctx.wanted[2]]
+        pairs = [
+            (tensor, cotangent)
+            for tensor, cotangent, want in zip(inputs, cotangents, chosen)
+            if want and tensor is not None and tensor.numel() and cotangent is not None
+        ]
+        firsts = torch.autograd.grad(
+            out, [tensor for tensor, _ in pairs], gradient, create_graph=True, allow_unused=True, materialize_grads=True
+        )
+        total = out.new_zeros(())
+        for first, (_, cotangent) in zip(firsts, pairs):
+            total = total + (first * cotangent).sum()
+        present = [leaf for leaf in leaves if leaf is not None]
+        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
+    results = [None if leaf is None else next(seconds) for leaf in leaves]
+    return (
+        results[-1],
+        results[-3],
+        None,
+        results[:count],
+        results[count : 2 * count],
+        None,
+        results[-2],
+        None,
+        None,
+    )
+
+
+def _given(tensor: Tensor | None) -> Tensor:
+    assert tensor is not None
+    return tensor
+
+
+_forward.register_autograd(_forward_backward, setup_context=_forward_setup)
+_backward.register_autograd(_backward_backward, setup_context=_backward_setup)
