@@ -96,6 +96,18 @@ def test_nearest_decides_in_float64_what_float32_cannot(isa: str) -> None:
         assert chosen(points, centres.flip(0)).eq(1).all()
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-20, 1e-22])
+def test_nearest_on_bisectors(isa: str, scale: float) -> None:
+    """Points as close to a border as float32 can put them; at the small scales the squares underflow in float32."""
+    for _ in range(20):
+        centres = 2 * torch.rand(2, 3, dtype=torch.float64) - 1
+        along = centres[1] - centres[0]
+        points = 2 * torch.rand(500, 3, dtype=torch.float64) - 1
+        points -= ((points - centres.mean(dim=0)) @ along / along.square().sum())[:, None] * along
+        cells = chosen((points * scale).float(), (centres * scale).float())
+        assert 0 < cells.sum() < 500
+
+
 def test_nearest_far_from_the_origin_and_at_the_ends_of_the_range(isa: str) -> None:
     for scale in (1e-42, 1e-38, 1e-30, 1e-19, 1e18, 1e19, 1e20, 3e38):
         points, centres = (2 * torch.rand(70, 3) - 1) * scale, (2 * torch.rand(33, 3) - 1) * scale
