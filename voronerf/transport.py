@@ -30,8 +30,9 @@ _COOLEST = 0.003  # last temperature, in squared typical distances of neighbouri
 _RIDGE = 0.01  # added to the Hessian, whose diagonal is about 1: cells that share no sample leave it singular
 _LONGEST = 4.0  # longest change of a weight in one step, in temperatures: beyond that the quadratic model says nothing
 
-_SWEEPS = 8
-_TRIALS = 128  # random changes tried of each centre in each sweep
+_MOVES = 2048  # centres visited in all, in sweeps over all of them ...
+_SWEEPS = (8, 32)  # ... of which there are no fewer and no more
+_TRIALS = 256  # random changes tried of each centre in each sweep
 _BORDER = 64  # samples nearest to its border that a change is judged by
 _TOLERANCE = 1e-3  # sweeps end at this root-mean-square deviation from equal cells
 
@@ -50,14 +51,27 @@ def transport(
     Returns:
         Centres float32 [k, 3] and power weights float32 [k] of mean 0, in squared units of the samples.
     """
-    k = centres.shape[0]
-    masses = masses * (k / masses.sum())
+    masses = masses / fair_share(masses, centres.shape[0])
     origin = samples.mean(0)
     scale = (samples - origin).square().sum(1).mean().sqrt().clamp(min=torch.finfo(torch.float32).tiny)
     samples, centres = (samples - origin) / scale, (centres - origin) / scale
     power = anneal(samples, masses, centres)
     centres, power = polish(samples, masses, centres, power, generator=generator)
     return centres * scale + origin, (power - power.mean()) * scale.square()
+
+
+def fair_share(masses: Tensor, k: int) -> float:
+    """The mass of a cell in the most equal division into k cells: the mean, less what heavier samples take away.
+
+    A sample that outweighs a cell has one to itself; the other cells share the rest, and so on.
+    """
+    heaviest = masses.topk(min(k, masses.shape[0])).values.tolist()
+    rest = float(masses.sum())
+    for cells, mass in zip(range(k, 1, -1), heaviest):
+        if mass * cells <= rest:
+            return rest / cells
+        rest -= mass
+    return rest
 
 
 def anneal(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
@@ -67,7 +81,8 @@ def anneal(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
     and the Hessian `-(diag(W) - P^T diag(m) P) / T`.
     """
     squared = _squared_distances(samples, centres).T.contiguous()
-    masses = masses.to(squared.dtype)
+    # A sample heavier than a cell would drive its centre's weight without end; it counts as one full cell.
+    masses = masses.clamp(max=1.0).to(squared.dtype)
     apart = torch.cdist(centres, centres).fill_diagonal_(float("inf")).amin(1).median()
     coolest = float((_COOLEST * apart.square()).clamp(1e-7, 0.1))
     power = torch.zeros_like(centres[:, 0])
@@ -90,8 +105,8 @@ def polish(
     cost = _squared_distances(samples, centres) - power[:, None]
     (best, second), (owner, runner_up) = cost.topk(2, dim=0, largest=False)
     weights = torch.bincount(owner, weights=masses, minlength=k)
-    reach = torch.logspace(-2, 0, _TRIALS, dtype=samples.dtype)
-    for _ in range(_SWEEPS):
+    reach = torch.logspace(-2, 1, _TRIALS, dtype=samples.dtype)
+    for _ in range(min(max(_MOVES // k, _SWEEPS[0]), _SWEEPS[1])):
         if float((weights - 1).square().mean()) <= _TOLERANCE**2:
             break
         for i in (weights - 1).abs().argsort(descending=True).tolist():
@@ -100,17 +115,19 @@ def polish(
             rival, rival_cell = torch.where(owned, second, best), torch.where(owned, runner_up, owner)
             gaps, border = (cost[i] - rival).abs().topk(min(_BORDER, samples.shape[0]), largest=False)
             near, mass, taker = samples[border], masses[border], rival_cell[border]
-            # Each trial shifts the cell's costs at its border by up to `reach` times the width of the border
-            # considered.
+            # Each trial shifts the cell's costs at its border by up to `reach` times the width of that border.
             radius = (near - centres[i]).norm(dim=1).max().clamp(min=1e-12)
             change = torch.randn(_TRIALS, 4, generator=generator)
             change *= (reach * gaps.max() / 2 / change.norm(dim=1))[:, None]
             moved, lifted = centres[i] + change[:, :3] / (2 * radius), power[i] + change[:, 3]
             won = _squared_distances(near, moved) - lifted[:, None] < rival[border]
             given = torch.where(owned[border], mass, 0.0) - torch.where(won, mass, 0.0)
-            tried = weights.repeat(_TRIALS, 1).index_add_(1, taker, given)
-            tried[:, i] -= given.sum(1)
-            choice = int(tried.square().sum(1).argmin())
+            kept = -given.sum(1)
+            takers, slot = taker.unique(return_inverse=True)
+            taken = given.new_zeros(_TRIALS, takers.shape[0]).index_add_(1, slot, given)
+            # (W + d)^2 - W^2, summed over the cells that a trial changes.
+            rise = (taken * (2 * weights[takers] + taken)).sum(1) + kept * (2 * weights[i] + kept)
+            choice = int(rise.argmin())
 
             row = _squared_distances(samples, moved[choice : choice + 1])[0] - lifted[choice]
             outcome = torch.bincount(torch.where(row < rival, i, rival_cell), weights=masses, minlength=k)
