@@ -7,6 +7,8 @@ BIN := $(VENV)/bin
 # Parts that must be there, such as REQUIRE=native,warp: their absence fails tests instead of skipping them.
 REQUIRE ?=
 TEST_ARGS ?=
+# Test cases are small: more threads than this wait for each other longer than they work. Some tests ask for their own.
+THREADS ?= 1
 # Every architecture nvcc 13 knows that a user may have; the last also as PTX.
 CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
 
@@ -18,7 +20,7 @@ demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
 
 test: $(VENV)/.built
-	@$(BIN)/pytest -q $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
+	@OMP_NUM_THREADS=$(THREADS) $(BIN)/pytest -q $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
 
 bench: $(VENV)/.built
 	@$(BIN)/python benchmarks/throughput.py
