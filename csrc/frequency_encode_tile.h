@@ -51,33 +51,53 @@ void encode_row_exactly(const float* x, const float* table, int64_t stride, int6
   }
 }
 
+// A row by lanes: d <= kLanes, all angles small.
+VN_INLINE void encode_row(const float* x, const float* table, Bits raw, int64_t stride, float* out) {
+  const F32 features = load(x);
+  for (int64_t column = 0; column < stride; column += kLanes) {
+    Bits index;
+    __builtin_memcpy(&index, table + column, sizeof index);
+    const F32 angle = permute(features, index) * load(table + stride + column);
+    F32 value = sine(angle, load(table + 2 * stride + column));
+    if (column == 0) value = raw ? angle : value;
+    store(out + column, value);
+  }
+}
+
+// Any number of features.
+void encode_row_slowly(const float* x, const float* table, int64_t stride, int64_t d, float* out) {
+  for (int64_t column = 0; column < stride; column += kLanes) {
+    float features[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      int32_t feature;
+      __builtin_memcpy(&feature, table + column + lane, sizeof feature);
+      features[lane] = feature < d ? x[feature] : 0.0f;
+    }
+    store(out + column, sine(load(features) * load(table + stride + column), load(table + 2 * stride + column)));
+  }
+}
+
+VN_INLINE bool all_small(const float* x, int64_t count, float largest) {
+  bool small = true;
+  for (int64_t i = 0; i < count; ++i) small &= __builtin_fabsf(x[i]) < largest;
+  return small;
+}
+
 // x [rows][d], with kLanes readable floats from every row's start -> out [rows][stride].
 void encode(const float* x, const float* table, int64_t rows, int64_t d, int64_t octaves, float* out, int64_t stride) {
   const int64_t width = d * (1 + 2 * octaves);
-  const float top = octaves > 0 ? table[stride + width - 1] : 1.0f;
+  const float largest = octaves > 0 ? kLargestAngle / table[stride + width - 1] : 0.0f;
+  if (octaves > 0 && d <= kLanes && all_small(x, rows * d, largest)) {
+    Bits raw;
+    for (int lane = 0; lane < kLanes; ++lane) raw[lane] = lane < d ? -1 : 0;
+    for (int64_t row = 0; row < rows; ++row) encode_row(x + row * d, table, raw, stride, out + row * stride);
+    return;
+  }
   for (int64_t row = 0; row < rows; ++row, x += d, out += stride) {
-    bool small = true;
-    for (int64_t f = 0; f < d; ++f) small = small && __builtin_fabsf(x[f]) * top < kLargestAngle;
-    if (octaves > 0 && !small) {
-      encode_row_exactly(x, table, stride, d, width, out);
-    } else if (octaves > 0 && d <= kLanes) {
-      const F32 features = load(x);
-      for (int64_t column = 0; column < stride; column += kLanes) {
-        Bits index;
-        __builtin_memcpy(&index, table + column, sizeof index);
-        store(out + column,
-              sine(permute(features, index) * load(table + stride + column), load(table + 2 * stride + column)));
-      }
+    if (octaves > 0 && all_small(x, d, largest)) {
+      encode_row_slowly(x, table, stride, d, out);
     } else if (octaves > 0) {
-      for (int64_t column = 0; column < stride; column += kLanes) {
-        float features[kLanes];
-        for (int lane = 0; lane < kLanes; ++lane) {
-          int32_t feature;
-          __builtin_memcpy(&feature, table + column + lane, sizeof feature);
-          features[lane] = feature < d ? x[feature] : 0.0f;
-        }
-        store(out + column, sine(load(features) * load(table + stride + column), load(table + 2 * stride + column)));
-      }
+      encode_row_exactly(x, table, stride, d, width, out);
     }
     for (int64_t f = 0; f < d; ++f) out[f] = x[f];
   }

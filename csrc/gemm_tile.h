@@ -46,13 +46,16 @@ struct Product {
   int64_t count;
   const float* b;  // [sum of depths][b_stride]
   int64_t b_stride;
-  const float* initial;  // one row to start from, or null: 0
+  const float* start;  // what to add to: rows of start_stride floats; C itself to accumulate, stride 0 for a bias
+  int64_t start_stride;
   float* c;
   int64_t c_stride;
-  bool accumulate;  // start from C instead
   Finish finish;
   const float* slope;  // relu_slope: C is multiplied by slope > 0, [rows][c_stride]
 };
+
+// A row to start from: nothing.
+alignas(64) constexpr float kZeros[kPanel] = {};
 
 // Rows of a block that fill the registers.
 template <int V>
@@ -63,52 +66,64 @@ constexpr int block_rows() {
 template <int R, int V, bool Transposed>
 void block(const Product& p, int64_t row, int64_t column) {
   F32 sum[R][V];
-  if (p.accumulate) {
-    for (int r = 0; r < R; ++r) {
-      for (int v = 0; v < V; ++v) sum[r][v] = load(p.c + (row + r) * p.c_stride + column + v * kLanes);
-    }
-  } else {
-    for (int v = 0; v < V; ++v) {
-      const F32 start = p.initial == nullptr ? splat(0.0f) : load(p.initial + column + v * kLanes);
-      for (int r = 0; r < R; ++r) sum[r][v] = start;
-    }
+  for (int r = 0; r < R; ++r) {
+    for (int v = 0; v < V; ++v) sum[r][v] = load(p.start + (row + r) * p.start_stride + column + v * kLanes);
   }
   const float* b = p.b + column;
   const int64_t b_stride = p.b_stride;
-  for (int64_t s = 0; s < p.count; ++s) {
-    const int64_t depth = p.sources[s].depth, stride = p.sources[s].stride;
+  const Source* source = p.sources;
+  const Source* const end = source + p.count;
+  // There is at least one source, and none is empty: loops that test at their end keep the sums in registers.
+  do {
+    const int64_t stride = source->stride;
+    int64_t depth = source->depth;
     if (Transposed) {
-      const float* a = p.sources[s].data + row;
-      for (int64_t k = 0; k < depth; ++k, a += stride, b += b_stride) {
+      const float* a = source->data + row;
+      do {
         F32 w[V];
         for (int v = 0; v < V; ++v) w[v] = load(b + v * kLanes);
         for (int r = 0; r < R; ++r) {
           const F32 x = splat(a[r]);
           for (int v = 0; v < V; ++v) sum[r][v] = fma(x, w[v], sum[r][v]);
         }
-      }
+        a += stride;
+        b += b_stride;
+      } while (--depth > 0);
     } else {
       const float* a[(R + 3) / 4];
-      for (int g = 0; g < (R + 3) / 4; ++g) a[g] = p.sources[s].data + (row + 4 * g) * stride;
-      for (int64_t k = 0; k < depth; ++k, b += b_stride) {
+      for (int g = 0; g < (R + 3) / 4; ++g) a[g] = source->data + (row + 4 * g) * stride;
+      do {
         F32 w[V];
         for (int v = 0; v < V; ++v) w[v] = load(b + v * kLanes);
         for (int r = 0; r < R; ++r) {
-          const F32 x = splat(a[r / 4][(r % 4) * stride + k]);
+          const F32 x = splat(a[r / 4][(r % 4) * stride]);
           for (int v = 0; v < V; ++v) sum[r][v] = fma(x, w[v], sum[r][v]);
         }
-      }
+        for (int g = 0; g < (R + 3) / 4; ++g) ++a[g];
+        b += b_stride;
+      } while (--depth > 0);
     }
-  }
-  for (int r = 0; r < R; ++r) {
-    for (int v = 0; v < V; ++v) {
-      const int64_t at = (row + r) * p.c_stride + column + v * kLanes;
-      F32 value = sum[r][v];
-      // Comparisons are written so that NaN passes, as in torch.
-      if (p.finish == Finish::relu) value = value < splat(0.0f) ? splat(0.0f) : value;
-      if (p.finish == Finish::relu_slope)
-        value = value * (load(p.slope + at) > splat(0.0f) ? splat(1.0f) : splat(0.0f));
-      store(p.c + at, value);
+  } while (++source != end);
+  // Every way to finish stores by itself: merging them would send the sums through the stack. Comparisons are written
+  // so that NaN passes, as in torch.
+  const F32 zero = splat(0.0f), one = splat(1.0f);
+  const int64_t c_stride = p.c_stride;
+  float* const c = p.c + row * c_stride + column;
+  if (p.finish == Finish::none) {
+    for (int r = 0; r < R; ++r) {
+      for (int v = 0; v < V; ++v) store(c + r * c_stride + v * kLanes, sum[r][v]);
+    }
+  } else if (p.finish == Finish::relu) {
+    for (int r = 0; r < R; ++r) {
+      for (int v = 0; v < V; ++v) store(c + r * c_stride + v * kLanes, sum[r][v] < zero ? zero : sum[r][v]);
+    }
+  } else {
+    const float* const slope = p.slope + row * c_stride + column;
+    for (int r = 0; r < R; ++r) {
+      for (int v = 0; v < V; ++v) {
+        const int64_t at = r * c_stride + v * kLanes;
+        store(c + at, sum[r][v] * (load(slope + at) > zero ? one : zero));
+      }
     }
   }
 }

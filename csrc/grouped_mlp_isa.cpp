@@ -22,22 +22,40 @@ VN_INLINE int64_t smaller(int64_t a, int64_t b) {
   return a < b ? a : b;
 }
 
+// Four rows of `from` become the four columns of `to`; by fours, since weights of small networks are packed often.
+VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t count, float* to, int64_t to_stride) {
+  int64_t i = 0;
+#if VN_ISA > 0
+  for (; i + 4 <= count; i += 4) {
+    __m128 a = _mm_loadu_ps(from + i), b = _mm_loadu_ps(from + from_stride + i);
+    __m128 c = _mm_loadu_ps(from + 2 * from_stride + i), d = _mm_loadu_ps(from + 3 * from_stride + i);
+    _MM_TRANSPOSE4_PS(a, b, c, d);
+    _mm_storeu_ps(to + i * to_stride, a);
+    _mm_storeu_ps(to + (i + 1) * to_stride, b);
+    _mm_storeu_ps(to + (i + 2) * to_stride, c);
+    _mm_storeu_ps(to + (i + 3) * to_stride, d);
+  }
+#endif
+  for (; i < count; ++i) {
+    for (int64_t row = 0; row < 4; ++row) to[i * to_stride + row] = from[row * from_stride + i];
+  }
+}
+
 // weights [o][depth] -> panels [depth][<= 64 of o, padded to 16 with 0].
 void pack_forward(const float* weights, const float* bias, const MlpPlanLayer& layer, float* packed,
                   float* packed_bias) {
   for (int64_t first = 0; first < layer.padded; first += kPanel) {
     const int64_t columns = smaller(kPanel, layer.padded - first);
-    for (int64_t group = 0; group < columns; group += kGranule) {
-      const int64_t o = first + group, count = smaller(kGranule, layer.width - o);
-      const float* from = weights + o * layer.depth;
-      float* to = packed + first * layer.depth + group;
-      if (count == kGranule) {
-        for (int64_t i = 0; i < layer.depth; ++i) {
-          for (int64_t c = 0; c < kGranule; ++c) to[i * columns + c] = from[c * layer.depth + i];
-        }
-      } else {
-        for (int64_t i = 0; i < layer.depth; ++i) {
-          for (int64_t c = 0; c < kGranule; ++c) to[i * columns + c] = c < count ? from[c * layer.depth + i] : 0.0f;
+    float* panel = packed + first * layer.depth;
+    for (int64_t column = 0; column < columns; column += 4) {
+      const int64_t o = first + column;
+      if (o + 4 <= layer.width) {
+        transpose_four(weights + o * layer.depth, layer.depth, layer.depth, panel + column, columns);
+        continue;
+      }
+      for (int64_t i = 0; i < layer.depth; ++i) {
+        for (int64_t c = 0; c < 4; ++c) {
+          panel[i * columns + column + c] = o + c < layer.width ? weights[(o + c) * layer.depth + i] : 0.0f;
         }
       }
     }
@@ -57,6 +75,17 @@ void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPla
       packed += columns;
     }
   }
+}
+
+// Few outputs, as heads have, are not worth a call of memcpy.
+VN_INLINE void copy_row(const float* from, int64_t width, float* to) {
+  if (width == 4) {
+    __builtin_memcpy(to, from, 4 * sizeof(float));
+    return;
+  }
+  int64_t c = 0;
+  for (; c + kLanes <= width; c += kLanes) store(to + c, load(from + c));
+  for (; c < width; ++c) to[c] = from[c];
 }
 
 // In place; sine leaves its cosine in `slope` where that is kept.
@@ -118,9 +147,13 @@ struct Tile {
     const bool encoded = input.octaves >= 0;
     float* staged = encoded ? at(input.staged) : at(input.value);
     const int64_t stride = encoded ? input.raw : input.value.stride;
-    for (int64_t row = 0; row < rows; ++row) {
-      const int64_t from = index == nullptr ? begin + row : index[begin + row];
-      for (int64_t f = 0; f < input.raw; ++f) staged[row * stride + f] = raw[from * input.raw + f];
+    if (index == nullptr && stride == input.raw) {
+      __builtin_memcpy(staged, raw + begin * input.raw, sizeof(float) * rows * input.raw);
+    } else {
+      for (int64_t row = 0; row < rows; ++row) {
+        const int64_t from = index == nullptr ? begin + row : index[begin + row];
+        for (int64_t f = 0; f < input.raw; ++f) staged[row * stride + f] = raw[from * input.raw + f];
+      }
     }
     if (encoded) {
       encode(staged, workspace + input.table, rows, input.raw, input.octaves, at(input.value), input.value.stride);
@@ -152,8 +185,9 @@ struct Tile {
       for (int64_t first = 0; first < layer.padded; first += kPanel) {
         const int64_t columns = smaller(kPanel, layer.padded - first);
         const float* b = workspace + layer.packed + first * layer.depth + row * columns;
-        multiply<false>({sources, count, b, columns, workspace + layer.bias + first, value + first, layer.padded,
-                         group > 0, relu ? Finish::relu : Finish::none, nullptr},
+        const float* start = group > 0 ? value + first : workspace + layer.bias + first;
+        multiply<false>({sources, count, b, columns, start, group > 0 ? layer.padded : 0, value + first, layer.padded,
+                         relu ? Finish::relu : Finish::none, nullptr},
                         rows, columns);
       }
       row += depth;
@@ -169,7 +203,7 @@ struct Tile {
       const float* value = at(layer.value);
       float* out = data.out + begin * plan.out_features + plan.outputs[i].column;
       for (int64_t row = 0; row < rows; ++row, value += layer.padded, out += plan.out_features) {
-        for (int64_t c = 0; c < layer.width; ++c) out[c] = value[c];
+        copy_row(value, layer.width, out);
       }
     }
   }
@@ -204,9 +238,9 @@ struct Tile {
       Source a = source(layer.sources[s].from, rows);
       float* c = partial + layer.partial + layer.sources[s].row * layer.padded;
       for (int64_t first = 0; first < layer.padded; first += kPanel) {
-        multiply<true>(
-            {&a, 1, gradient + first, layer.padded, nullptr, c + first, layer.padded, !fill, Finish::none, nullptr},
-            layer.sources[s].width, smaller(kPanel, layer.padded - first));
+        multiply<true>({&a, 1, gradient + first, layer.padded, fill ? kZeros : c + first, fill ? 0 : layer.padded,
+                        c + first, layer.padded, Finish::none, nullptr},
+                       layer.sources[s].width, smaller(kPanel, layer.padded - first));
       }
     }
   }
@@ -220,9 +254,11 @@ struct Tile {
     const Source a = {at(layer.gradient), layer.gradient.stride, layer.width};
     for (int64_t first = 0; first < to.stride; first += kPanel) {
       const int64_t columns = smaller(kPanel, to.stride - first);
-      multiply<false>({&a, 1, workspace + s.packed + first * layer.width, columns, nullptr, at(to) + first, to.stride,
-                       !s.first, fused ? Finish::relu_slope : Finish::none, fused ? slope + first : nullptr},
-                      rows, columns);
+      float* c = at(to) + first;
+      multiply<false>(
+          {&a, 1, workspace + s.packed + first * layer.width, columns, s.first ? kZeros : c, s.first ? 0 : to.stride, c,
+           to.stride, fused ? Finish::relu_slope : Finish::none, fused ? slope + first : nullptr},
+          rows, columns);
     }
   }
 
