@@ -44,26 +44,21 @@ def check_shape(
         ValueError: another shape.
     """
     check_tensor(op, name, tensor)
-    sizes = {} if sizes is None else sizes
+    known = {} if sizes is None else sizes
+    found = dict(known)
     wanted = [str(entry) for entry in shape]
     fits = tensor.dim() == len(wanted)
     if fits:
-        for entry, size in zip(shape, tensor.shape, strict=True):
-            if isinstance(entry, int):
-                fits = fits and size == entry
-                continue
-            letter, extra = (entry[:-2], 1) if entry.endswith("+1") else (entry, 0)
-            if letter in sizes:
-                fits = fits and size == sizes[letter] + extra
-            elif size < extra:
-                fits = False
-            else:
-                sizes[letter] = size - extra
+        for entry, size in zip(shape, tensor.shape):
+            letter, extra = (entry[:-2], 1) if isinstance(entry, str) and entry.endswith("+1") else (entry, 0)
+            expected = letter if isinstance(letter, int) else found.setdefault(letter, size - extra)
+            fits = fits and size == expected + extra and size >= extra
     if not fits:
-        letters = [entry.removesuffix("+1") for entry in wanted if not entry.isdigit()]
-        bound = ", ".join(f"{letter} = {sizes[letter]}" for letter in dict.fromkeys(letters) if letter in sizes)
+        letters = dict.fromkeys(entry.removesuffix("+1") for entry in wanted)
+        bound = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in known)
         rule = f"[{', '.join(wanted)}]" + (f" with {bound}" if bound else "")
         raise ValueError(f"{op}: {name} must have shape {rule}, got {list(tensor.shape)}")
+    known.update(found)
 
 
 def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATS) -> None:

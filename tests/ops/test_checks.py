@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import refused
+
+from voronerf import checks
+
+
+def test_shape_binds_letters() -> None:
+    sizes: dict[str, int] = {}
+    checks.check_shape("op", "a", torch.zeros(4, 3), ("n", 3), sizes)
+    checks.check_shape("op", "b", torch.zeros(5), ("n+1",), sizes)
+    checks.check_shape("op", "c", torch.zeros(0), ("m",), sizes)
+    assert sizes == {"n": 4, "m": 0}
+
+
+@pytest.mark.parametrize(
+    ("shape", "rule", "message"),
+    [
+        ((8, 2), ("k", 3), r"op: x must have shape \[k, 3\], got \[8, 2\]"),
+        ((8,), ("k", 3), r"op: x must have shape \[k, 3\], got \[8\]"),
+        ((3, 3), ("n", 3), r"op: x must have shape \[n, 3\] with n = 4, got \[3, 3\]"),
+        ((4,), ("n+1",), r"op: x must have shape \[n\+1\] with n = 4, got \[4\]"),
+        ((0,), ("k+1",), r"op: x must have shape \[k\+1\], got \[0\]"),
+    ],
+)
+def test_shape_errors(shape: tuple[int, ...], rule: tuple[int | str, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        checks.check_shape("op", "x", torch.zeros(shape), rule, {"n": 4})
+
+
+def test_tensor_and_dtype_errors() -> None:
+    with refused(TypeError, "op: x must be a tensor, got list"):
+        checks.check_shape("op", "x", [1.0], ("n",))  # type: ignore[arg-type]
+    with refused(TypeError, "op: x must have dtype float16, bfloat16, float32 or float64, got int64"):
+        checks.check_dtype("op", "x", torch.zeros(1, dtype=torch.int64))
+    with refused(TypeError, "op: i must have dtype int32, got int64"):
+        checks.check_dtype("op", "i", torch.zeros(1, dtype=torch.int64), checks.INDEX)
+    with refused(TypeError, "op: b must have the dtype of a, float32, got float64"):
+        checks.check_same_dtype("op", n=None, a=torch.zeros(1), m=None, b=torch.zeros(1, dtype=torch.float64))
+
+
+def test_device_errors() -> None:
+    checks.check_same_device("op", a=torch.zeros(1), b=None, c=torch.zeros(2))
+    with refused(ValueError, "op: c must be on the device of a, cpu, got meta"):
+        checks.check_same_device("op", a=torch.zeros(1), b=None, c=torch.zeros(2, device="meta"))
+
+
+def test_counts_and_integers() -> None:
+    checks.check_count("op", "x", 2**31 - 1)
+    with refused(ValueError, "op: x must have fewer than 2**31 rows, got 2147483648: split the batch"):
+        checks.check_count("op", "x", 2**31)
+    with refused(ValueError, "op: k must be at least 1, got 0"):
+        checks.check_integer("op", "k", 0, 1)
+    for value in (1.0, True, "1"):
+        with refused(TypeError, "op: k must be an integer, got ..."):
+            checks.check_integer("op", "k", value, 1)  # type: ignore[arg-type]
+    with refused(ValueError, "op: a must be one of x, y, got 'z'"):
+        checks.check_choice("op", "a", "z", ("x", "y"))
+
+
+def test_a_batch_too_large_for_its_index_is_refused_before_it_is_touched() -> None:
+    from voronerf.ops import cell_sort, nearest_centre
+
+    many = torch.zeros(1, dtype=torch.int32).expand(2**31)
+    with refused(ValueError, "cell_sort: cells must have fewer than 2**31 rows, got 2147483648: split the batch"):
+        cell_sort(many, 2)
+    with refused(ValueError, "nearest_centre: points must have fewer than 2**31 rows, got 2147483648: split the batch"):
+        nearest_centre(torch.zeros(1, 3).expand(2**31, 3), torch.zeros(1, 3))

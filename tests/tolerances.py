@@ -1,0 +1,38 @@
+"""The one table of tolerances: how far a result may be from the same computed in float64.
+
+The error of a result is its largest absolute difference from the float64 result, divided by the largest magnitude
+there. It may be twice that of plain PyTorch in the same dtype, plus a floor: the rounding of the result itself, and for
+float32 and float64 some 30 roundings more: plain PyTorch may be lucky, and sums may be taken in any order.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+FLOOR = {
+    torch.float64: 1e-14,
+    torch.float32: 2e-6,
+    torch.float16: 2.0**-11,
+    torch.bfloat16: 2.0**-8,
+}
+"""bfloat16 has half of a unit in the last place, 2^-9, for the result and the same for one intermediate."""
+
+
+def error(result: Tensor, exact: Tensor) -> float:
+    """Largest difference from the float64 result, relative to its largest magnitude."""
+    assert exact.dtype == torch.float64
+    if exact.numel() == 0:
+        return 0.0
+    difference = (result.detach().double().cpu() - exact.detach().cpu()).abs().max().item()
+    scale = exact.abs().max().item()
+    return difference / scale if scale > 0 else difference
+
+
+def assert_as_exact(result: Tensor, plain: Tensor, exact: Tensor) -> None:
+    """Fails unless ``result`` is within twice the error of ``plain``, which has the same dtype, plus the floor."""
+    assert result.shape == plain.shape == exact.shape
+    assert result.dtype == plain.dtype
+    allowed = 2 * error(plain, exact) + FLOOR[result.dtype]
+    found = error(result, exact)
+    assert found <= allowed, f"error {found:.3g} is above {allowed:.3g} (plain PyTorch has {error(plain, exact):.3g})"
