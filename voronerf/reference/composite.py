@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+_OPAQUE = 1e30
+"""Stands for infinite density: as opaque over any length but 0, and 0 times it is 0."""
 
 
 class Composite(NamedTuple):
@@ -37,50 +40,72 @@ def composite(
     storage = rgb.dtype
     wide = torch.promote_types(storage, torch.float32)
     sigma, rgb, depths, deltas = (tensor.to(wide) for tensor in (sigma, rgb, depths, deltas))
-    # An opaque sample is infinite density; a finite one that lets nothing through gives the same, and 0 x inf nowhere.
-    optical = sigma.clamp(max=torch.finfo(torch.float32).max) * deltas
+    optical = sigma.clamp(max=_OPAQUE) * deltas
     if ray_offsets is None:
-        weights = _transmittance(optical) * -torch.expm1(-optical)
+        weights = _in_front(optical) * -torch.expm1(-optical)
         colour = (weights[:, None, :] @ rgb)[:, 0]
         opacity = weights.sum(dim=1)
         depth = (weights * depths).sum(dim=1)
     else:
-        ray = _ray_of_sample(ray_offsets, sigma.shape[0])
-        weights = _packed_transmittance(optical, ray_offsets, ray) * -torch.expm1(-optical)
-        # Colour, opacity and depth are one sum, over columns side by side. The last row takes samples of no ray.
+        rays = ray_offsets.shape[0] - 1
+        row = torch.arange(sigma.shape[0], device=sigma.device)
+        # One more than the ray of each sample: 0 and rays + 1 are for samples of no ray.
+        ray = torch.searchsorted(ray_offsets.long(), row, right=True)
+        inside = (ray > 0) & (ray <= rays)
+        first = torch.where(inside, ray_offsets[(ray - 1).clamp(0, rays)], row)
+        last = torch.where(inside, ray_offsets[ray.clamp(0, rays)], row + 1)
+        weights = _packed_in_front(optical, first, last) * -torch.expm1(-optical)
+        weights = torch.where(inside, weights, 0)
+        # Colour, opacity and depth are one sum, over columns side by side.
         columns = torch.cat([rgb, torch.ones_like(depths)[:, None], depths[:, None]], dim=1) * weights[:, None]
-        total = columns.new_zeros(ray_offsets.shape[0] + 1, columns.shape[1]).index_add(0, ray, columns)[1:-1]
+        total = columns.new_zeros(rays + 2, columns.shape[1]).index_add(0, ray, columns)[1:-1]
         colour, opacity, depth = total[:, :-2], total[:, -2], total[:, -1]
     if background is not None:
         colour = colour + (1 - opacity)[:, None] * background.to(wide)
     return Composite(colour.to(storage), opacity.to(storage), depth.to(storage), weights.to(storage))
 
 
-def _transmittance(optical: Tensor) -> Tensor:
-    """exp of minus the optical depth in front of each sample [r, s]; the shift keeps inf - inf out of it."""
+def _in_front(optical: Tensor) -> Tensor:
+    """Transmittance in front of each sample [r, s]: exp of minus the optical depth up to there.
+
+    The sum is shifted rather than having its last term taken off again, which for an opaque sample would be inf - inf.
+    """
     before = torch.nn.functional.pad(optical[:, :-1], (1, 0))
     return torch.exp(-before.cumsum(dim=1))
 
 
-def _ray_of_sample(ray_offsets: Tensor, samples: int) -> Tensor:
-    """One more than the ray of each packed sample; 0 and r + 1 for samples outside all rays."""
-    index = torch.arange(samples, dtype=torch.int32, device=ray_offsets.device)
-    return torch.searchsorted(ray_offsets, index, right=True)
+def _packed_in_front(optical: Tensor, first: Tensor, last: Tensor) -> Tensor:
+    """The same for packed samples [m], whose ray has samples ``first`` to ``last``.
 
-
-def _packed_transmittance(optical: Tensor, ray_offsets: Tensor, ray: Tensor) -> Tensor:
-    """The same for packed samples: one running sum over all rays, less its value where the ray starts.
-
-    Float64 carries the running sum of millions of samples. One sample counts for at most ``limit``, where nothing
-    visible passes, so that an opaque ray costs the rays behind it no digits; what is not a number counts for nothing
-    outside its own ray.
+    One sample counts for at most ``limit``, where nothing visible passes: an opaque ray then costs the rays behind it
+    no digits of the running sum.
     """
     limit = 128.0 if optical.dtype == torch.float32 else 768.0
-    bad = optical.detach().isnan()
-    depth = optical.double().masked_fill(bad, 0).clamp(max=limit)
-    start = ray_offsets.long()[(ray - 1).clamp(0, ray_offsets.shape[0] - 1)]
-    running = torch.nn.functional.pad(depth.cumsum(dim=0), (1, 0))
-    before = running[:-1] - running[start]
-    spoiled = torch.nn.functional.pad(bad.cumsum(dim=0), (1, 0))
-    transmittance = torch.exp(-before).to(optical.dtype)
-    return transmittance.masked_fill(spoiled[:-1] > spoiled[start], torch.nan)
+    before = _RaySum.apply(optical.double().clamp(max=limit), first, last, False)
+    return torch.exp(-before).to(optical.dtype)
+
+
+class _RaySum(torch.autograd.Function):
+    """Sum over the samples of the same ray in front of each sample or, with ``behind``, behind it. Each is the other's
+    adjoint.
+
+    One running sum over all rays, less its value where the ray begins or ends; float64 carries millions of samples.
+    What is not finite is left out of it and spoils, as it should, the later sums of its own ray only: forward and
+    backward.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, first: Tensor, last: Tensor, behind: bool) -> Tensor:
+        ctx.save_for_backward(first, last)
+        ctx.behind = behind
+        bad = ~x.isfinite()
+        running = torch.nn.functional.pad(x.masked_fill(bad, 0).cumsum(dim=0), (1, 0))
+        spoiled = torch.nn.functional.pad(bad.cumsum(dim=0), (1, 0))
+        if behind:
+            return (running[last] - running[1:]).masked_fill(spoiled[last] > spoiled[1:], torch.nan)
+        return (running[:-1] - running[first]).masked_fill(spoiled[:-1] > spoiled[first], torch.nan)
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None, None, None]:
+        first, last = ctx.saved_tensors
+        return _RaySum.apply(g, first, last, not ctx.behind), None, None, None

@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from op_cases import FLOATS, need, offsets_of, refused, strided
+from tolerances import assert_as_exact
+from torch import Tensor
+
+from voronerf.ops import Composite, composite
+
+pytestmark = pytest.mark.op("composite")
+
+INF, NAN = math.inf, math.nan
+
+
+def slow(sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, background: Tensor | None = None) -> Composite:
+    """One sample at a time, in float64."""
+    rays = []
+    for ray in range(sigma.shape[0]):
+        light, colour, opacity, depth, weights = 1.0, rgb.new_zeros(rgb.shape[2], dtype=torch.float64), 0.0, 0.0, []
+        for density, value, at, length in zip(
+            sigma[ray].tolist(), rgb[ray], depths[ray].tolist(), deltas[ray].tolist()
+        ):
+            passed = math.exp(-density * length) if length > 0 else 1.0
+            weight = light * (1 - passed)
+            light *= passed
+            colour = colour + weight * value.double()
+            opacity += weight
+            depth += weight * at
+            weights.append(weight)
+        if background is not None:
+            colour = colour + (1 - opacity) * (background if background.dim() == 1 else background[ray]).double()
+        rays.append((colour, opacity, depth, weights))
+    return Composite(
+        torch.stack([ray[0] for ray in rays]),
+        *(torch.tensor([ray[part] for ray in rays], dtype=torch.float64) for part in (1, 2, 3)),
+    )
+
+
+def rays(r: int, s: int, c: int = 3, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    sigma = 5 * torch.rand(r, s) * (torch.rand(r, s) > 0.3)
+    return tuple(  # type: ignore[return-value]
+        tensor.to(dtype) for tensor in (sigma, torch.rand(r, s, c), torch.rand(r, s).cumsum(1), torch.rand(r, s) / 2)
+    )
+
+
+def pack(tensors: tuple[Tensor, ...], counts: list[int]) -> tuple[Tensor, ...]:
+    return tuple(torch.cat([tensor[ray, :count] for ray, count in enumerate(counts)]) for tensor in tensors)
+
+
+@pytest.mark.parametrize(("r", "s", "c"), [(1, 1, 3), (5, 33, 3), (3, 64, 1), (2, 7, 5)])
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("form", ["dense", "packed"])
+def test_matches_a_slow_loop(
+    device: torch.device, backend: str, form: str, dtype: torch.dtype, r: int, s: int, c: int
+) -> None:
+    need("composite", backend, device, dtype)
+    inputs = rays(r, s, c, dtype)
+    background = torch.rand(r, c).to(dtype)
+    exact = slow(*inputs, background=background)
+    ray_offsets = None if form == "dense" else offsets_of([s] * r, device)
+    given = inputs if form == "dense" else tuple(tensor.flatten(0, 1) for tensor in inputs)
+    found = composite(
+        *(tensor.to(device) for tensor in given),
+        ray_offsets=ray_offsets,
+        background=background.to(device),
+        backend=backend,
+    )
+    for part, expected in zip(found, exact):
+        assert_as_exact(part.reshape(expected.shape), expected.to(dtype), expected)
+
+
+@pytest.mark.parametrize("counts", [[], [0], [0, 0, 0], [1], [3, 0, 17, 1, 0], [0, 200, 1]])
+@pytest.mark.parametrize("with_background", [False, True])
+def test_packed_rays_of_any_length_equal_each_ray_alone(
+    device: torch.device, backend: str, counts: list[int], with_background: bool
+) -> None:
+    inputs = rays(len(counts), max(counts, default=0))
+    background = torch.tensor([0.2, 0.5, 1.0]) if with_background else None
+    packed = pack(inputs, counts) if counts else tuple(tensor.flatten(0, 1) for tensor in inputs)
+    found = composite(
+        *(strided(tensor.to(device)) for tensor in packed),
+        ray_offsets=offsets_of(counts, device),
+        background=None if background is None else background.to(device),
+        backend=backend,
+    )
+    assert found.colour.shape == (len(counts), 3)
+    assert found.opacity.shape == found.depth.shape == (len(counts),)
+    assert found.weights.shape == (sum(counts),)
+    for ray, count in enumerate(counts):
+        exact = slow(*(tensor[ray : ray + 1, :count] for tensor in inputs), background=background)
+        torch.testing.assert_close(found.colour[ray].double().cpu(), exact.colour[0], rtol=0, atol=1e-6)
+        torch.testing.assert_close(found.opacity[ray].double().cpu(), exact.opacity[0], rtol=0, atol=1e-6)
+        torch.testing.assert_close(found.depth[ray].double().cpu(), exact.depth[0], rtol=1e-6, atol=1e-6)
+
+
+def test_rays_without_samples_show_the_background(device: torch.device, backend: str) -> None:
+    inputs = tuple(tensor.to(device) for tensor in rays(4, 0))
+    background = torch.rand(4, 3, device=device)
+    found = composite(*inputs, background=background, backend=backend)
+    assert torch.equal(found.colour, background)
+    assert found.opacity.tolist() == found.depth.tolist() == [0, 0, 0, 0]
+    assert composite(*(tensor[:0] for tensor in inputs), backend=backend).colour.shape == (0, 3)
+
+
+def test_samples_outside_all_rays_count_for_nothing(device: torch.device, backend: str) -> None:
+    inputs = tuple(tensor.to(device) for tensor in pack(rays(1, 9), [9]))
+    offsets = torch.tensor([2, 5, 7], dtype=torch.int32, device=device)
+    found = composite(*inputs, ray_offsets=offsets, backend=backend)
+    alone = composite(*(tensor[2:7] for tensor in inputs), ray_offsets=offsets - 2, backend=backend)
+    torch.testing.assert_close(found.colour, alone.colour, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.opacity, alone.opacity, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", ["dense", "packed"])
+def test_infinite_density_is_opaque_and_hides_what_follows(device: torch.device, backend: str, form: str) -> None:
+    sigma = torch.tensor([[1.0, INF, INF, 2.0], [INF, INF, 0.0, 1.0]])
+    deltas = torch.tensor([[0.5, 0.5, 0.5, 0.5], [0.0, 1e30, 1.0, 1.0]])
+    rgb, depths = torch.rand(2, 4, 3), torch.arange(8.0).reshape(2, 4)
+    inputs = [tensor.to(device).requires_grad_() for tensor in (sigma, rgb, depths, deltas)]
+    given = inputs if form == "dense" else [tensor.flatten(0, 1) for tensor in inputs]
+    ray_offsets = None if form == "dense" else offsets_of([4, 4], device)
+    found = composite(*given, ray_offsets=ray_offsets, backend=backend)
+    first = 1 - math.exp(-0.5)
+    expected = torch.tensor([[first, 1 - first, 0, 0], [0, 1, 0, 0]])
+    torch.testing.assert_close(found.weights.reshape(2, 4).cpu(), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.opacity.cpu(), torch.ones(2), rtol=0, atol=1e-6)
+    sum(part.sum() for part in found).backward()
+    assert all(tensor.grad.isfinite().all() for tensor in inputs)
+
+
+@pytest.mark.parametrize("form", ["dense", "packed"])
+def test_an_opaque_ray_costs_the_rays_behind_it_no_digits(device: torch.device, backend: str, form: str) -> None:
+    inputs = rays(40, 30)
+    inputs[0][::2] = 1e30
+    exact = slow(*inputs)
+    given = inputs if form == "dense" else tuple(tensor.flatten(0, 1) for tensor in inputs)
+    ray_offsets = None if form == "dense" else offsets_of([30] * 40, device)
+    found = composite(*(tensor.to(device) for tensor in given), ray_offsets=ray_offsets, backend=backend)
+    torch.testing.assert_close(found.weights.reshape(40, 30).double().cpu(), exact.weights, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", ["dense", "packed"])
+@pytest.mark.parametrize("where", [0, 1, 2, 3])
+def test_what_is_not_a_number_spoils_its_own_ray_alone(
+    device: torch.device, backend: str, form: str, where: int
+) -> None:
+    clean = rays(5, 6)
+    spoiled = tuple(tensor.clone() for tensor in clean)
+    spoiled[0][2, 3] = spoiled[3][2, 3] = 1
+    spoiled[where][2, 3] = NAN
+    found = []
+    for inputs in (clean, spoiled):
+        leaves = [tensor.to(device).requires_grad_() for tensor in inputs]
+        given = leaves if form == "dense" else [tensor.flatten(0, 1) for tensor in leaves]
+        ray_offsets = None if form == "dense" else offsets_of([6] * 5, device)
+        result = composite(*given, ray_offsets=ray_offsets, background=torch.ones(3, device=device), backend=backend)
+        sum(part.sum() for part in result).backward()
+        parts = [part.detach().reshape(5, -1) for part in result] + [leaf.grad.reshape(5, -1) for leaf in leaves]
+        found.append(torch.cat(parts, dim=1).cpu())
+    others = [0, 1, 3, 4]
+    torch.testing.assert_close(found[1][others], found[0][others], rtol=1e-5, atol=1e-6)
+    assert found[1][2].isnan().any()
+
+
+@pytest.mark.parametrize("form", ["dense", "packed"])
+def test_a_spoiled_density_spoils_the_weights_from_there_on(device: torch.device, backend: str, form: str) -> None:
+    sigma, rgb, depths, deltas = rays(1, 5)
+    sigma[0, 2] = NAN
+    inputs = (sigma, rgb, depths, deltas) if form == "dense" else (sigma[0], rgb[0], depths[0], deltas[0])
+    ray_offsets = None if form == "dense" else offsets_of([5], device)
+    weights = composite(*(tensor.to(device) for tensor in inputs), ray_offsets=ray_offsets, backend=backend).weights
+    assert weights.flatten().isnan().tolist() == [False, False, True, True, True]
+
+
+def test_gradcheck() -> None:
+    inputs = [tensor.requires_grad_() for tensor in rays(2, 4, 2, torch.float64)]
+    background = torch.rand(2, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda *a: composite(*a[:4], background=a[4]), (*inputs, background))
+    assert torch.autograd.gradgradcheck(lambda *a: composite(*a[:4], background=a[4]), (*inputs, background))
+    packed = [tensor.detach().requires_grad_() for tensor in pack(tuple(inputs), [3, 2])]
+    ray_offsets = offsets_of([3, 2])
+    run = lambda *a: composite(*a[:4], ray_offsets=ray_offsets, background=a[4])  # noqa: E731
+    assert torch.autograd.gradcheck(run, (*packed, background))
+    assert torch.autograd.gradgradcheck(run, (*packed, background))
+
+
+@pytest.mark.parametrize("form", ["dense", "packed"])
+def test_gradients_of_the_backend(device: torch.device, backend: str, form: str) -> None:
+    inputs = [*rays(7, 19), torch.rand(7, 3)]
+    cotangents = [torch.randn(7, 3), torch.randn(7), torch.randn(7), torch.randn(7, 19)]
+
+    def gradients(dtype: torch.dtype, device: torch.device, backend: str) -> list[Tensor]:
+        leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
+        given = leaves[:4] if form == "dense" else [leaf.flatten(0, 1) for leaf in leaves[:4]]
+        ray_offsets = None if form == "dense" else offsets_of([19] * 7, device)
+        found = composite(*given, ray_offsets=ray_offsets, background=leaves[4], backend=backend)
+        weighed = sum((part * g.to(part).reshape(part.shape)).sum() for part, g in zip(found, cotangents))
+        return list(torch.autograd.grad(weighed, leaves))
+
+    exact = gradients(torch.float64, torch.device("cpu"), "reference")
+    plain = gradients(torch.float32, torch.device("cpu"), "reference")
+    for found, same, right in zip(gradients(torch.float32, device, backend), plain, exact):
+        assert_as_exact(found, same, right)
+
+
+def test_compiles(device: torch.device, backend: str) -> None:
+    inputs = [tensor.to(device).requires_grad_() for tensor in rays(4, 9)]
+    packed = [tensor.detach().flatten(0, 1).requires_grad_() for tensor in inputs]
+    ray_offsets = offsets_of([9, 0, 20, 7], device)
+    background = torch.ones(3, device=device)
+    dense = lambda *a: composite(*a, background=background, backend=backend)  # noqa: E731
+    sparse = lambda *a: composite(*a, ray_offsets=ray_offsets, backend=backend)  # noqa: E731
+    for run, leaves in ((dense, inputs), (sparse, packed)):
+        found = torch.compile(run, fullgraph=True, backend="aot_eager")(*leaves)
+        for part, expected in zip(found, run(*leaves)):
+            torch.testing.assert_close(part, expected, rtol=1e-5, atol=1e-6)
+        assert all(
+            gradient.isfinite().all() for gradient in torch.autograd.grad(found[0].sum(), leaves, allow_unused=False)
+        )
+
+
+def test_errors() -> None:
+    sigma, rgb, depths, deltas = rays(4, 5)
+    with refused(ValueError, "composite: sigma must have shape [r, s], got [20]"):
+        composite(sigma.flatten(), rgb, depths, deltas)
+    with pytest.raises(
+        ValueError, match=r"^composite: rgb must have shape \[r, s, c\] with r = 4, s = 5, got \[4, 5\]$"
+    ):
+        composite(sigma, depths, depths, deltas)
+    with pytest.raises(
+        ValueError, match=r"^composite: depths must have shape \[r, s\] with r = 4, s = 5, got \[4, 4\]$"
+    ):
+        composite(sigma, rgb, depths[:, 1:], deltas)
+    with pytest.raises(
+        ValueError, match=r"^composite: deltas must have shape \[r, s\] with r = 4, s = 5, got \[3, 5\]$"
+    ):
+        composite(sigma, rgb, depths, deltas[1:])
+    with refused(ValueError, "composite: sigma must have shape [m], got [4, 5]"):
+        composite(sigma, rgb, depths, deltas, ray_offsets=offsets_of([5] * 4))
+    with refused(ValueError, "composite: background must have shape [c] with c = 3, got [4]"):
+        composite(sigma, rgb, depths, deltas, background=torch.zeros(4))
+    with pytest.raises(
+        ValueError, match=r"^composite: background must have shape \[r, c\] with r = 4, c = 3, got \[5, 3\]$"
+    ):
+        composite(sigma, rgb, depths, deltas, background=torch.zeros(5, 3))
+    with refused(TypeError, "composite: rgb must have the dtype of sigma, float32, got float64"):
+        composite(sigma, rgb.double(), depths, deltas)
+    with refused(TypeError, "composite: sigma must have dtype ... or float64, got int64"):
+        composite(sigma.long(), rgb, depths, deltas)
+    packed = pack((sigma, rgb, depths, deltas), [5] * 4)
+    with refused(TypeError, "composite: ray_offsets must have dtype int32, got int64"):
+        composite(*packed, ray_offsets=offsets_of([5] * 4).long())
+    with refused(ValueError, "composite: depths must be on the device of sigma, cpu, got meta"):
+        composite(sigma, rgb, depths.to("meta"), deltas)
