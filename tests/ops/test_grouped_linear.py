@@ -1,0 +1,261 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from op_cases import COUNTS, FLOATS, HALVES, need, offsets_of, refused, strided
+from tolerances import assert_as_exact
+from torch import Tensor
+
+from voronerf.layers import ACTIVATIONS
+from voronerf.ops import grouped_linear
+from voronerf.reference import specification
+
+pytestmark = pytest.mark.op("grouped_linear")
+
+WIDTHS = [(1, 1), (63, 64), (90, 3), (3, 90)]
+
+
+def layer(counts: list[int], i: int, o: int, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    """Samples, weight and bias of one layer."""
+    k = len(counts)
+    tensors = torch.randn(sum(counts), i), torch.randn(k, o, i) / i**0.5, torch.randn(k, o)
+    return [tensor.to(dtype) for tensor in tensors]
+
+
+def results(
+    linear: Callable[..., Tensor],
+    inputs: list[Tensor],
+    offsets: Tensor,
+    dtype: torch.dtype,
+    device: torch.device,
+    g: Tensor,
+    **options: str,
+) -> list[Tensor]:
+    """Output and gradients in a dtype, on a device."""
+    leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
+    x, weight, bias = leaves
+    y = linear(x, offsets.to(device), weight, bias, **options)
+    return [y, *torch.autograd.grad(y, leaves, g.to(device, dtype))]
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("counts", COUNTS.values(), ids=COUNTS)
+def test_output_and_gradients_match_a_plain_loop(
+    device: torch.device, backend: str, counts: list[int], activation: str
+) -> None:
+    inputs, offsets = layer(counts, 17, 9), offsets_of(counts)
+    g = torch.randn(sum(counts), 9)
+    exact = results(
+        specification.grouped_linear, inputs, offsets, torch.float64, torch.device("cpu"), g, activation=activation
+    )
+    if activation == "relu":
+        # Two correct float32 results may fall on either side of the kink.
+        g = g * (exact[0] == 0).logical_or(exact[0] > 1e-4)
+    cpu = torch.device("cpu")
+    exact = results(specification.grouped_linear, inputs, offsets, torch.float64, cpu, g, activation=activation)
+    plain = results(specification.grouped_linear, inputs, offsets, torch.float32, cpu, g, activation=activation)
+    found = results(grouped_linear, inputs, offsets, torch.float32, device, g, activation=activation, backend=backend)
+    for part, same, right in zip(found, plain, exact):
+        assert_as_exact(part, same, right)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize(("i", "o"), WIDTHS)
+def test_dtypes_and_widths(device: torch.device, backend: str, i: int, o: int, dtype: torch.dtype) -> None:
+    need("grouped_linear", backend, device, dtype)
+    counts = COUNTS["odd"]
+    inputs, offsets, g = layer(counts, i, o, dtype), offsets_of(counts), torch.randn(sum(counts), o).to(dtype)
+    cpu = torch.device("cpu")
+    exact = results(specification.grouped_linear, inputs, offsets, torch.float64, cpu, g)
+    plain = results(specification.grouped_linear, inputs, offsets, dtype, cpu, g)
+    found = results(grouped_linear, inputs, offsets, dtype, device, g, backend=backend)
+    for part, same, right in zip(found, plain, exact):
+        assert_as_exact(part, same, right)
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+def test_sums_over_many_samples_are_wide(device: torch.device, backend: str, dtype: torch.dtype) -> None:
+    need("grouped_linear", backend, device, dtype)
+    n = 9000
+    weight = torch.zeros(1, 1, 1, dtype=dtype, device=device, requires_grad=True)
+    bias = torch.zeros(1, 1, dtype=dtype, device=device, requires_grad=True)
+    x = torch.ones(n, 1, dtype=dtype, device=device)
+    y = grouped_linear(x, offsets_of([n], device), weight, bias, backend=backend)
+    y.backward(torch.ones_like(y))
+    # A sum held in a half type would stop at 256 or 2,048.
+    assert weight.grad.item() == bias.grad.item() == torch.tensor(float(n), dtype=dtype).item()
+
+
+def test_without_bias(device: torch.device, backend: str) -> None:
+    counts = COUNTS["odd"]
+    x, weight, _ = (tensor.to(device) for tensor in layer(counts, 5, 4))
+    offsets = offsets_of(counts, device)
+    found = grouped_linear(x, offsets, weight, backend=backend)
+    expected = grouped_linear(x, offsets, weight, torch.zeros(len(counts), 4, device=device), backend=backend)
+    torch.testing.assert_close(found, expected)
+
+
+def test_identical_cells_are_one_layer(device: torch.device, backend: str) -> None:
+    counts = COUNTS["unequal"]
+    x, weight, bias = (tensor.to(device) for tensor in layer(counts, 31, 8))
+    weight, bias = weight[:1].expand(4, -1, -1), bias[:1].expand(4, -1)
+    found = grouped_linear(x, offsets_of(counts, device), weight, bias, backend=backend)
+    torch.testing.assert_close(found, torch.nn.functional.linear(x, weight[0], bias[0]), rtol=1e-5, atol=1e-5)
+
+
+def test_layouts(device: torch.device, backend: str) -> None:
+    counts = COUNTS["odd"]
+    x, weight, bias = (tensor.to(device) for tensor in layer(counts, 6, 5))
+    offsets = offsets_of(counts, device)
+    expected = grouped_linear(x, offsets, weight, bias, backend=backend)
+    wide = [strided(tensor).requires_grad_() for tensor in (x, weight, bias)]
+    found = grouped_linear(wide[0], strided(offsets), *wide[1:], backend=backend)
+    torch.testing.assert_close(found, expected)
+    flipped = weight.transpose(1, 2).contiguous().transpose(1, 2)
+    columns = grouped_linear(x.t().contiguous().t(), offsets, flipped, bias, backend=backend)
+    torch.testing.assert_close(columns, expected)
+    # The gradient of a sum is one number seen everywhere.
+    found.sum().backward()
+    assert all(tensor.grad is not None and tensor.grad.isfinite().all() for tensor in wide)
+
+
+def test_rows_of_no_cell_are_zero(device: torch.device, backend: str) -> None:
+    x, weight, bias = (tensor.to(device).requires_grad_() for tensor in layer([3, 4, 5], 4, 2))
+    offsets = torch.tensor([2, 5, 9], dtype=torch.int32, device=device)
+    y = grouped_linear(x, offsets, weight[:2], bias[:2], activation="sigmoid", backend=backend)
+    assert (y[:2] == 0).all() and (y[9:] == 0).all() and (y[2:9] != 0).all()
+    y.sum().backward()
+    assert (x.grad[:2] == 0).all() and (x.grad[9:] == 0).all() and (x.grad[2:9] != 0).any()
+
+
+def test_what_is_not_a_number_stays_in_its_cell(device: torch.device, backend: str) -> None:
+    counts = [4, 5, 6]
+    x, weight, bias = (tensor.to(device) for tensor in layer(counts, 4, 3))
+    x[6, 2], weight[1, 0, 1] = torch.nan, torch.inf
+    leaves = [tensor.requires_grad_() for tensor in (x, weight, bias)]
+    y = grouped_linear(leaves[0], offsets_of(counts, device), *leaves[1:], backend=backend)
+    y.sum().backward()
+    rows = [*range(4), *range(9, 15)]
+    assert y[rows].isfinite().all() and x.grad[rows].isfinite().all()
+    assert weight.grad[[0, 2]].isfinite().all() and bias.grad.isfinite().all()
+    assert not y[6].isfinite().any()
+
+
+def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> None:
+    counts = COUNTS["odd"]
+    offsets = offsets_of(counts, device)
+    for wanted in range(3):
+        inputs = [tensor.to(device) for tensor in layer(counts, 4, 3)]
+        inputs[wanted].requires_grad_()
+        grouped_linear(inputs[0], offsets, *inputs[1:], activation="relu", backend=backend).sum().backward()
+        assert [tensor.grad is not None for tensor in inputs] == [index == wanted for index in range(3)]
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_gradcheck(activation: str) -> None:
+    counts = [2, 0, 1, 3]
+    inputs = [tensor.requires_grad_() for tensor in layer(counts, 2, 3, torch.float64)]
+    offsets = offsets_of(counts)
+    run = lambda x, w, b: grouped_linear(x, offsets, w, b, activation=activation, backend="reference")  # noqa: E731
+    assert torch.autograd.gradcheck(run, inputs)
+    assert torch.autograd.gradgradcheck(run, inputs)
+
+
+def test_second_derivatives_match_the_specification(device: torch.device, backend: str) -> None:
+    counts = COUNTS["odd"]
+    offsets = offsets_of(counts)
+    inputs = layer(counts, 4, 3)
+
+    def penalty(
+        linear: Callable[..., Tensor], device: torch.device, dtype: torch.dtype, **options: str
+    ) -> list[Tensor]:
+        leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
+        y = linear(leaves[0], offsets.to(device), *leaves[1:], activation="softplus", **options)
+        (slope,) = torch.autograd.grad(y.sum(), leaves[0], create_graph=True)
+        return list(torch.autograd.grad(slope.square().sum(), leaves))
+
+    exact = penalty(specification.grouped_linear, torch.device("cpu"), torch.float64)
+    plain = penalty(specification.grouped_linear, torch.device("cpu"), torch.float32)
+    for part, same, right in zip(penalty(grouped_linear, device, torch.float32, backend=backend), plain, exact):
+        assert_as_exact(part, same, right)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_opcheck(dtype: torch.dtype) -> None:
+    counts = [2, 0, 1, 3]
+    x, weight, bias = layer(counts, 2, 3, dtype)
+    offsets, g, ops = offsets_of(counts), torch.randn(6, 3).to(dtype), torch.ops.voronerf
+    leaves = [tensor.requires_grad_() for tensor in (x, weight, bias, g)]
+    x, weight, bias, g = leaves
+    torch.library.opcheck(ops.grouped_linear, (x, offsets, weight, bias, "softplus"))
+    torch.library.opcheck(ops.grouped_linear, (x, offsets, weight, None, "none"))
+    torch.library.opcheck(ops.grouped_outer, (g, x, offsets))
+    torch.library.opcheck(ops.grouped_sum, (g, offsets))
+    x, weight, g = (tensor.detach() for tensor in (x, weight, g))
+    output = torch.rand(6, 3).to(dtype)
+    torch.library.opcheck(ops.grouped_linear_backward, (g, x, offsets, weight, output, "sigmoid", [True, False, True]))
+
+
+def test_autocast(device: torch.device, backend: str) -> None:
+    counts = COUNTS["odd"]
+    x, weight, bias = (tensor.to(device).requires_grad_() for tensor in layer(counts, 7, 5))
+    offsets = offsets_of(counts, device)
+    with torch.autocast(device.type, torch.bfloat16):
+        y = grouped_linear(x, offsets, weight, bias, backend=backend)
+        mixed = grouped_linear(x.bfloat16(), offsets, weight, bias, backend=backend)
+    assert y.dtype == mixed.dtype == torch.bfloat16
+    expected = grouped_linear(x, offsets, weight, bias, backend=backend)
+    torch.testing.assert_close(y.float(), expected, rtol=0.05, atol=0.05)
+    y.sum().backward()
+    assert weight.grad.dtype == bias.grad.dtype == x.grad.dtype == torch.float32
+
+
+def test_compiles(device: torch.device, backend: str) -> None:
+    counts = COUNTS["odd"]
+    leaves = [tensor.to(device).requires_grad_() for tensor in layer(counts, 7, 5)]
+    offsets = offsets_of(counts, device)
+
+    def run(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        return grouped_linear(x, offsets, weight, bias, activation="sigmoid", backend=backend).square()
+
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(*leaves), run(*leaves))
+    found, expected = (torch.autograd.grad(each(*leaves).sum(), leaves) for each in (compiled, run))
+    for part, other in zip(found, expected):
+        torch.testing.assert_close(part, other)
+
+
+def test_errors() -> None:
+    x, weight, bias = layer([2, 3], 4, 5)
+    offsets = offsets_of([2, 3])
+    with refused(ValueError, "grouped_linear: x must have shape [n, i], got [5]"):
+        grouped_linear(x[:, 0], offsets, weight, bias)
+    with refused(ValueError, "grouped_linear: weight must have shape [k, o, i] with i = 3, got [2, 5, 4]"):
+        grouped_linear(x[:, :3], offsets, weight, bias)
+    with refused(ValueError, "grouped_linear: offsets must have shape [k+1] with k = 2, got [2]"):
+        grouped_linear(x, offsets[1:], weight, bias)
+    with refused(ValueError, "grouped_linear: bias must have shape [k, o] with k = 2, o = 5, got [2, 4]"):
+        grouped_linear(x, offsets, weight, bias[:, 1:])
+    with refused(ValueError, "grouped_linear: weight must have no empty dimension, got [2, 0, 4]"):
+        grouped_linear(x, offsets, weight[:, :0])
+    with refused(ValueError, "grouped_linear: activation must be one of none, relu, ..., sine, got 'tanh'"):
+        grouped_linear(x, offsets, weight, activation="tanh")
+    with refused(TypeError, "grouped_linear: offsets must have dtype int32, got int64"):
+        grouped_linear(x, offsets.long(), weight)
+    with refused(TypeError, "grouped_linear: weight must have the dtype of x, float32, got float64"):
+        grouped_linear(x, offsets, weight.double())
+    with refused(TypeError, "grouped_linear: bias must have the dtype of x, float32, got float16"):
+        grouped_linear(x, offsets, weight, bias.half())
+    with refused(TypeError, "grouped_linear: x must have dtype ..., got int32"):
+        grouped_linear(x.int(), offsets, weight)
+    with refused(ValueError, "grouped_linear: weight must be on the device of x, cpu, got meta"):
+        grouped_linear(x, offsets, weight.to("meta"))
+
+
+@pytest.mark.parametrize("bad", [[0, 2, 6], [0, 4, 3], [-1, 2, 5]])
+def test_offsets_that_are_no_offsets_are_refused(bad: list[int]) -> None:
+    x, weight, bias = layer([2, 3], 4, 5)
+    with pytest.raises(ValueError, match="offsets must rise from at least 0 to at most the number of rows, 5, got"):
+        grouped_linear(x, torch.tensor(bad, dtype=torch.int32), weight, bias, backend="reference")

@@ -1,0 +1,336 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from op_cases import COUNTS, FLOATS, need, offsets_of, refused, strided
+from tolerances import assert_as_exact, error
+from torch import Tensor
+
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops import frequency_encode, grouped_mlp
+from voronerf.reference import specification
+
+pytestmark = pytest.mark.op("grouped_mlp")
+
+CPU = torch.device("cpu")
+TABLES = {
+    "one layer": MLP((Layer((POSITIONS,), 1),), (0,)),
+    "plain": MLP((Layer((POSITIONS,), 9, "softplus"), Layer((0,), 4)), (1,), position_octaves=4),
+    # Skip connection, density head, branch that sees the direction: the original architecture in small.
+    "nerf": MLP(
+        (
+            Layer((POSITIONS,), 16, "sine"),
+            Layer((0,), 16, "softplus"),
+            Layer((POSITIONS, 1), 16, "softplus"),
+            Layer((2,), 1, "softplus"),
+            Layer((2,), 8),
+            Layer((4, DIRECTIONS), 7, "sine"),
+            Layer((5,), 3, "sigmoid"),
+        ),
+        outputs=(6, 3),
+        position_octaves=3,
+        direction_octaves=2,
+    ),
+    # A layer read three times, one that is an output and an input, one that nothing reads, one output twice.
+    "tangled": MLP(
+        (
+            Layer((DIRECTIONS, POSITIONS, DIRECTIONS), 5, "sigmoid"),
+            Layer((0, 0, POSITIONS), 3, "sine"),
+            Layer((1,), 2, "relu"),
+            Layer((0, 1), 4),
+        ),
+        outputs=(3, 0, 3),
+        direction_octaves=1,
+    ),
+}
+
+
+@dataclass
+class Case:
+    """A network, its samples, and what is asked of it."""
+
+    table: MLP
+    offsets: Tensor
+    inputs: list[Tensor]
+    """Positions, directions, then weights, then biases."""
+    direction_index: Tensor | None
+    bias: list[bool]
+
+    @classmethod
+    def make(cls, name: str, counts: list[int], dtype: torch.dtype = torch.float32, rays: int | None = 5) -> Case:
+        table, n, k = TABLES[name], sum(counts), len(counts)
+        positions = 2 * torch.rand(n, 3) - 1
+        directions = torch.nn.functional.normalize(torch.randn(n if rays is None else rays, 3), dim=1)
+        index = None if rays is None else torch.randint(0, rays, (n,), dtype=torch.int32)
+        weights = [torch.randn(k, o, i) / i**0.5 for o, i in table.weight_shapes(3, 3)]
+        bias = [index != 1 for index in range(len(weights))]
+        biases = [torch.randn(k, weight.shape[1]) for weight, has in zip(weights, bias) if has]
+        inputs = [tensor.to(dtype) for tensor in (positions, directions, *weights, *biases)]
+        return cls(table, offsets_of(counts), inputs, index, bias)
+
+    def run(self, mlp: Callable[..., Tensor], leaves: list[Tensor], **options: str) -> Tensor:
+        positions, directions, *parameters = leaves
+        biases = iter(parameters[len(self.bias) :])
+        index = self.direction_index
+        return mlp(
+            positions,
+            self.offsets.to(positions.device),
+            parameters[: len(self.bias)],
+            [next(biases) if has else None for has in self.bias],
+            layers=self.table,
+            directions=directions if self.table.uses_directions else None,
+            direction_index=index.to(positions.device) if index is not None and self.table.uses_directions else None,
+            **options,
+        )
+
+    def leaves(self, dtype: torch.dtype, device: torch.device = CPU) -> list[Tensor]:
+        return [tensor.to(device, dtype).requires_grad_() for tensor in self.inputs]
+
+    def results(
+        self, mlp: Callable[..., Tensor], dtype: torch.dtype, device: torch.device = CPU, **options: str
+    ) -> list[Tensor]:
+        leaves = self.leaves(dtype, device)
+        y = self.run(mlp, leaves, **options)
+        g = torch.randn(y.shape, generator=torch.Generator().manual_seed(1)).to(device, dtype)
+        return [y, *torch.autograd.grad(y, leaves, g, allow_unused=True, materialize_grads=True)]
+
+
+@pytest.mark.parametrize("counts", COUNTS.values(), ids=COUNTS)
+@pytest.mark.parametrize("name", TABLES)
+def test_output_and_gradients_match_the_specification(
+    device: torch.device, backend: str, name: str, counts: list[int]
+) -> None:
+    case = Case.make(name, counts)
+    exact = case.results(specification.grouped_mlp, torch.float64)
+    plain = case.results(specification.grouped_mlp, torch.float32)
+    found = case.results(grouped_mlp, torch.float32, device, backend=backend)
+    for part, same, right in zip(found, plain, exact):
+        assert_as_exact(part, same, right)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("name", TABLES)
+def test_dtypes(device: torch.device, backend: str, name: str, dtype: torch.dtype) -> None:
+    need("grouped_mlp", backend, device, dtype)
+    case = Case.make(name, COUNTS["odd"], dtype)
+    exact = case.results(specification.grouped_mlp, torch.float64)
+    plain = case.results(specification.grouped_mlp, dtype)
+    found = case.results(grouped_mlp, dtype, device, backend=backend)
+    for part, same, right in zip(found, plain, exact):
+        assert_as_exact(part, same, right)
+
+
+def test_directions_of_each_sample_and_of_each_ray_agree(device: torch.device, backend: str) -> None:
+    case = Case.make("nerf", COUNTS["odd"])
+    leaves = case.leaves(torch.float32, device)
+    by_ray = case.run(grouped_mlp, leaves, backend=backend)
+    index = case.direction_index
+    assert index is not None
+    case.direction_index = None
+    by_sample = case.run(grouped_mlp, [leaves[0], leaves[1][index.to(device)], *leaves[2:]], backend=backend)
+    torch.testing.assert_close(by_ray, by_sample, rtol=1e-5, atol=1e-6)
+    found, expected = (torch.autograd.grad(y.sum(), leaves[1])[0] for y in (by_ray, by_sample))
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_encoded_and_raw_positions_agree(device: torch.device, backend: str) -> None:
+    case = Case.make("plain", COUNTS["odd"])
+    leaves = case.leaves(torch.float32, device)
+    raw = case.run(grouped_mlp, leaves, backend=backend)
+    case.table = MLP(case.table.layers, case.table.outputs)
+    encoded = case.run(grouped_mlp, [frequency_encode(leaves[0], 4), *leaves[1:]], backend=backend)
+    torch.testing.assert_close(raw, encoded, rtol=1e-5, atol=1e-5)
+
+
+def test_identical_cells_are_one_chain_of_layers(device: torch.device, backend: str) -> None:
+    case = Case.make("plain", COUNTS["unequal"])
+    leaves = [tensor.to(device) for tensor in case.inputs]
+    leaves[2:] = [tensor[:1].expand_as(tensor) for tensor in leaves[2:]]
+    first, second, bias = (tensor[0] for tensor in leaves[2:])
+    hidden = torch.nn.functional.softplus(torch.nn.functional.linear(frequency_encode(leaves[0], 4), first, bias))
+    torch.testing.assert_close(
+        case.run(grouped_mlp, leaves, backend=backend), torch.nn.functional.linear(hidden, second), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_wide_positions_with_half_weights_keep_their_octaves(device: torch.device, backend: str) -> None:
+    need("grouped_mlp", backend, device, torch.bfloat16)
+    case = Case.make("plain", COUNTS["odd"])
+    case.table = MLP(case.table.layers, case.table.outputs, position_octaves=10)
+    case.inputs[2] = torch.randn(len(COUNTS["odd"]), 9, 63) / 8
+    halves = [case.inputs[0], case.inputs[1], *(tensor.bfloat16() for tensor in case.inputs[2:])]
+    exact = case.run(specification.grouped_mlp, [tensor.double() for tensor in halves])
+    found = case.run(grouped_mlp, [tensor.to(device) for tensor in halves], backend=backend)
+    assert found.dtype == torch.bfloat16
+    # Rounded to bfloat16 before they are encoded, positions would be wrong by 512 / 256 radians.
+    assert error(found, exact) < 0.02
+
+
+def test_layouts(device: torch.device, backend: str) -> None:
+    case = Case.make("nerf", COUNTS["odd"])
+    leaves = [tensor.to(device) for tensor in case.inputs]
+    expected = case.run(grouped_mlp, leaves, backend=backend)
+    case.offsets, case.direction_index = strided(case.offsets), strided(case.direction_index)
+    found = case.run(grouped_mlp, [strided(tensor).requires_grad_() for tensor in leaves], backend=backend)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+    found.sum().backward()
+
+
+def test_rows_of_no_cell_are_zero(device: torch.device, backend: str) -> None:
+    case = Case.make("nerf", [4, 4, 4])
+    case.offsets = torch.tensor([2, 5, 5, 9], dtype=torch.int32)
+    leaves = case.leaves(torch.float32, device)
+    y = case.run(grouped_mlp, leaves, backend=backend)
+    assert (y[:2] == 0).all() and (y[9:] == 0).all() and (y[2:9] != 0).all()
+    y.sum().backward()
+    assert (leaves[0].grad[:2] == 0).all() and (leaves[0].grad[9:] == 0).all()
+    assert all((leaf.grad[1] == 0).all() for leaf in leaves[2:])
+
+
+def test_what_is_not_a_number_stays_in_its_cell(device: torch.device, backend: str) -> None:
+    case = Case.make("nerf", [4, 5, 6], rays=None)
+    case.inputs[0][6, 1] = torch.nan
+    leaves = case.leaves(torch.float32, device)
+    y = case.run(grouped_mlp, leaves, backend=backend)
+    y.sum().backward()
+    others = [row for row in range(15) if row != 6]
+    assert y[others].isfinite().all() and not y[6].isfinite().any()
+    assert leaves[0].grad[others].isfinite().all() and leaves[1].grad[others].isfinite().all()
+    assert all(leaf.grad[[0, 2]].isfinite().all() for leaf in leaves[2:])
+
+
+def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> None:
+    case = Case.make("nerf", COUNTS["odd"])
+    every = [tensor.to(device) for tensor in case.inputs]
+    for wanted in range(len(every)):
+        leaves = [tensor.clone().requires_grad_(index == wanted) for index, tensor in enumerate(every)]
+        case.run(grouped_mlp, leaves, backend=backend).sum().backward()
+        assert [leaf.grad is not None for leaf in leaves] == [index == wanted for index in range(len(leaves))]
+    with torch.no_grad():
+        assert not case.run(grouped_mlp, leaves, backend=backend).requires_grad
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_gradcheck(name: str) -> None:
+    case = Case.make(name, [2, 0, 1], torch.float64, rays=2)
+    if name == "tangled":
+        # Off the kink of its ReLU.
+        case.inputs[4] = case.inputs[4].abs() + 0.5
+    run = lambda *leaves: case.run(grouped_mlp, list(leaves), backend="reference")  # noqa: E731
+    leaves = case.leaves(torch.float64)
+    used = leaves if case.table.uses_directions else [leaves[0], *leaves[2:]]
+    call = run if case.table.uses_directions else lambda first, *rest: run(first, leaves[1], *rest)
+    # Thousands of parameters: one random direction through them rather than each in turn.
+    assert torch.autograd.gradcheck(call, used, fast_mode=name != "one layer")
+
+
+def test_second_derivatives(device: torch.device, backend: str) -> None:
+    case = Case.make("nerf", [3, 0, 2])
+
+    def penalty(mlp: Callable[..., Tensor], dtype: torch.dtype, device: torch.device, **options: str) -> list[Tensor]:
+        leaves = case.leaves(dtype, device)
+        (slope,) = torch.autograd.grad(case.run(mlp, leaves, **options).sum(), leaves[0], create_graph=True)
+        return list(torch.autograd.grad(slope.square().sum(), leaves, allow_unused=True, materialize_grads=True))
+
+    exact = penalty(specification.grouped_mlp, torch.float64, CPU)
+    plain = penalty(specification.grouped_mlp, torch.float32, CPU)
+    for part, same, right in zip(penalty(grouped_mlp, torch.float32, device, backend=backend), plain, exact):
+        assert_as_exact(part, same, right)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+@pytest.mark.parametrize("keep", [True, False])
+def test_opcheck(keep: bool, dtype: torch.dtype) -> None:
+    case = Case.make("nerf", [2, 0, 3], dtype)
+    positions, directions, *parameters = case.leaves(dtype)
+    network = (positions, directions, case.direction_index, case.offsets, parameters, case.bias, case.table.text)
+    torch.library.opcheck(torch.ops.voronerf.grouped_mlp, (*network, keep))
+    with torch.no_grad():
+        out, hidden = torch.ops.voronerf.grouped_mlp(*network, True)
+        arguments = [[tensor.detach() for tensor in each] if each is parameters else each for each in network]
+        arguments[:2] = positions.detach(), directions.detach()
+        needs = [True] * (2 + len(parameters))
+        torch.library.opcheck(
+            torch.ops.voronerf.grouped_mlp_backward, (torch.randn(out.shape).to(dtype), *arguments, hidden, needs)
+        )
+
+
+def test_autocast(device: torch.device, backend: str) -> None:
+    case = Case.make("nerf", COUNTS["odd"])
+    leaves = case.leaves(torch.float32, device)
+    with torch.autocast(device.type, torch.bfloat16):
+        y = case.run(grouped_mlp, leaves, backend=backend)
+    assert y.dtype == torch.bfloat16
+    torch.testing.assert_close(y.float(), case.run(grouped_mlp, leaves, backend=backend), rtol=0.1, atol=0.1)
+    y.sum().backward()
+    assert all(leaf.grad.dtype == torch.float32 for leaf in leaves)
+
+
+def test_compiles(device: torch.device, backend: str) -> None:
+    case = Case.make("nerf", COUNTS["odd"])
+    leaves = case.leaves(torch.float32, device)
+    run = lambda *leaves: case.run(grouped_mlp, list(leaves), backend=backend).square()  # noqa: E731
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    found, expected = ([y, *torch.autograd.grad(y.sum(), leaves)] for y in (compiled(*leaves), run(*leaves)))
+    for part, other in zip(found, expected):
+        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
+    with torch.no_grad():
+        torch.testing.assert_close(compiled(*leaves), run(*leaves))
+
+
+def test_errors() -> None:
+    case = Case.make("nerf", [2, 3])
+    positions, directions, *parameters = case.inputs
+    count = len(case.bias)
+    good = {
+        "positions": positions,
+        "offsets": case.offsets,
+        "weights": parameters[:count],
+        "biases": [None] * count,
+        "layers": case.table,
+        "directions": directions,
+        "direction_index": case.direction_index,
+    }
+
+    def call(**changed: object) -> Tensor:
+        return grouped_mlp(**{**good, **changed})
+
+    assert call().shape == (5, 4)
+    weights, op = parameters[:count], "grouped_mlp"
+    with refused(ValueError, f"{op}: positions must have shape [n, p], got [5]"):
+        call(positions=positions[:, 0])
+    with refused(TypeError, f"{op}: positions must have dtype ..., got int32"):
+        call(positions=positions.int())
+    with refused(TypeError, f"{op}: offsets must have dtype int32, got int64"):
+        call(offsets=case.offsets.long())
+    with refused(ValueError, f"{op}: offsets must have at least two entries, got [1]"):
+        call(offsets=case.offsets[:1])
+    with refused(ValueError, f"{op}: directions must be given for layers that read them, got None"):
+        call(directions=None, direction_index=None)
+    with refused(ValueError, f"{op}: direction_index must come with directions, got no directions"):
+        call(directions=None, layers=TABLES["plain"])
+    with refused(ValueError, f"{op}: directions must have shape [n, q] with n = 5, got [4, 3]"):
+        call(directions=directions[:4], direction_index=None)
+    with refused(TypeError, f"{op}: directions must have dtype ..., got bool"):
+        call(directions=directions > 0)
+    with refused(ValueError, f"{op}: direction_index must have shape [n] with n = 5, got [4]"):
+        call(direction_index=case.direction_index[1:])
+    with refused(TypeError, f"{op}: direction_index must have dtype int32, got int64"):
+        call(direction_index=case.direction_index.long())
+    with refused(ValueError, f"{op}: weights must have one entry for each of 7 layers, got 6"):
+        call(weights=weights[1:])
+    with refused(ValueError, f"{op}: biases must have one entry for each of 7 layers, got 0"):
+        call(biases=[])
+    with refused(ValueError, f"{op}: weights[2] must have shape [k, 16, 37] with k = 2, got [2, 16, 16]"):
+        call(weights=[*weights[:2], weights[1], *weights[3:]])
+    with refused(TypeError, f"{op}: weights[1] must have dtype float32, got float64"):
+        call(weights=[weights[0], *(weight.double() for weight in weights[1:])])
+    with refused(ValueError, f"{op}: biases[0] must have shape [k, 16] with k = 2, got [2, 15]"):
+        call(biases=[torch.zeros(2, 15), *[None] * 6])
+    with refused(TypeError, f"{op}: biases[0] must have the dtype of weights[0], float32, got float16"):
+        call(biases=[torch.zeros(2, 16).half(), *[None] * 6])
+    with refused(ValueError, f"{op}: weights[0] must be on the device of positions, cpu, got meta"):
+        call(weights=[weights[0].to("meta"), *weights[1:]])

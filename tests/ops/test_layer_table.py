@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import pytest
+
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+
+SOURCES = "MLP: layer 0 must read 'positions', 'directions' or an earlier layer"
+
+NERF = MLP(
+    (
+        Layer((POSITIONS,), 64, "relu"),
+        Layer((POSITIONS, 0), 64, "relu"),
+        Layer((1,), 1, "softplus"),
+        Layer((1, DIRECTIONS), 32, "relu"),
+        Layer((3,), 3, "sigmoid"),
+    ),
+    outputs=(4, 2),
+    position_octaves=10,
+    direction_octaves=4,
+)
+
+
+def test_widths() -> None:
+    assert NERF.out_features == 4
+    assert NERF.uses_directions
+    assert NERF.weight_shapes(3, 3) == [(64, 63), (64, 127), (1, 64), (32, 91), (3, 32)]
+    assert NERF.input_width(3, 3, 3) == 64 + 27
+    plain = MLP((Layer((POSITIONS,), 2), Layer((0, POSITIONS, 0), 5)), (1, 1))
+    assert plain.weight_shapes(7) == [(2, 7), (5, 11)]
+    assert plain.out_features == 10
+    assert not plain.uses_directions
+
+
+def test_text_round_trip() -> None:
+    assert MLP.parse(NERF.text) == NERF
+    assert MLP.parse(NERF.text) is MLP.parse(NERF.text)
+    assert hash(MLP.parse(NERF.text)) == hash(NERF)
+    encoded = MLP((Layer((POSITIONS,), 1),), (0,), None, 0)
+    assert MLP.parse(encoded.text) == encoded
+
+
+@pytest.mark.parametrize(
+    ("layers", "outputs", "octaves", "message"),
+    [
+        ((), (0,), None, "MLP: layers must hold at least one layer, got none"),
+        ((Layer((POSITIONS,), 4),), (), None, "MLP: outputs must name at least one layer, got none"),
+        ((Layer((POSITIONS,), 4),), (1,), None, "MLP: outputs must be layer indices 0 to 0, got 1"),
+        ((Layer((POSITIONS,), 4),), (-1,), None, "MLP: outputs must be layer indices 0 to 0, got -1"),
+        ((Layer((POSITIONS,), 4),), (0,), -1, "MLP: position_octaves must be None or at least 0, got -1"),
+        ((Layer((), 4),), (0,), None, "MLP: layer 0 must have at least one input, got none"),
+        ((Layer((0,), 4),), (0,), None, f"{SOURCES}, got 0"),
+        ((Layer(("x",), 4),), (0,), None, f"{SOURCES}, got 'x'"),
+        ((Layer((POSITIONS,), 0),), (0,), None, "MLP: layer 0 must have a width of at least 1, got 0"),
+        (
+            (Layer((POSITIONS,), 1, "tanh"),),
+            (0,),
+            None,
+            "MLP: layer 0 must have an activation of none, relu, softplus, sigmoid, sine, got 'tanh'",
+        ),
+    ],
+)
+def test_errors(layers: tuple[Layer, ...], outputs: tuple[int, ...], octaves: int | None, message: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        MLP(layers, outputs, octaves)
+    assert str(caught.value) == message
