@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import refused, strided
+from torch import Tensor
+
+from voronerf.ops import locate_cell, nearest_centre
+
+pytestmark = pytest.mark.op("locate_cell")
+
+# Diagram 0 has three centres: the first a leaf, the second refined by diagram 1, the third by diagram 2, whose second
+# centre is refined by diagram 3. Leaves are numbered depth first.
+CHILD_OFFSETS = torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32)
+CHILD = torch.tensor([-1, 1, 2, -2, -3, -4, 3, -5, -6, -7], dtype=torch.int32)
+DEPTH = 3
+
+
+def slow(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Down the tree, one point at a time."""
+    leaves = []
+    for point in points:
+        diagram = 0
+        while diagram >= 0:
+            rows = slice(int(CHILD_OFFSETS[diagram]), int(CHILD_OFFSETS[diagram + 1]))
+            distance = (point.double() - centres[rows].double()).square().sum(-1)
+            if weights is not None:
+                distance = distance - weights[rows].double()
+            diagram = int(CHILD[rows][int(distance.argmin())])
+        leaves.append(-diagram - 1)
+    return torch.tensor(leaves, dtype=torch.int32)
+
+
+@pytest.mark.parametrize("n", [0, 1, 257])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_uneven_tree_matches_a_slow_descent(device: torch.device, backend: str, n: int, weighted: bool) -> None:
+    points, centres = torch.randint(-3, 4, (n, 3)).float(), torch.randint(-3, 4, (10, 3)).float()
+    weights = torch.randint(0, 3, (10,)).float() if weighted else None
+    leaf = locate_cell(
+        points.to(device),
+        centres.to(device),
+        CHILD_OFFSETS.to(device),
+        CHILD.to(device),
+        depth=DEPTH,
+        weights=None if weights is None else weights.to(device),
+        backend=backend,
+    )
+    assert leaf.dtype == torch.int32
+    assert torch.equal(leaf.cpu(), slow(points, centres, weights))
+
+
+def test_flat_tree_is_nearest_centre(device: torch.device, backend: str) -> None:
+    points, centres = strided(torch.rand(1001, 3, device=device)), torch.rand(9, 3, device=device)
+    offsets = torch.tensor([0, 9], dtype=torch.int32, device=device)
+    child = -torch.arange(9, dtype=torch.int32, device=device) - 1
+    leaf = locate_cell(points, centres, offsets, child, depth=1, backend=backend)
+    assert torch.equal(leaf, nearest_centre(points, centres))
+
+
+def test_many_points_cross_the_pieces(device: torch.device, backend: str) -> None:
+    centres = torch.rand(10, 3)
+    points = centres[torch.randint(0, 10, (30000,))] + 0.2 * torch.rand(30000, 3)
+    tables = (CHILD_OFFSETS.to(device), CHILD.to(device))
+    leaf = locate_cell(points.to(device), centres.to(device), *tables, depth=DEPTH, backend=backend)
+    assert torch.equal(leaf[::97].cpu(), slow(points[::97], centres))
+
+
+def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device: torch.device, backend: str) -> None:
+    points = torch.tensor([[float("nan"), 0, 0], [0, float("inf"), 0]], device=device)
+    centres = torch.rand(10, 3, device=device)
+    # Here the first centre of the root is refined too.
+    child = torch.tensor([1, -1, 2, -6, -3, -4, 3, -5, -2, -7], dtype=torch.int32, device=device)
+    leaf = locate_cell(points, centres, CHILD_OFFSETS.to(device), child, depth=DEPTH, backend=backend)
+    assert leaf.tolist() == [5, 5]
+
+
+def test_compiles(device: torch.device, backend: str) -> None:
+    points, centres = torch.rand(501, 3, device=device), torch.rand(10, 3, device=device)
+    offsets, child = CHILD_OFFSETS.to(device), CHILD.to(device)
+
+    def run(points: Tensor) -> Tensor:
+        return locate_cell(points, centres, offsets, child, depth=DEPTH, backend=backend)
+
+    assert torch.equal(torch.compile(run, fullgraph=True, backend="aot_eager")(points), run(points))
+
+
+def test_errors() -> None:
+    points, centres = torch.rand(4, 3), torch.rand(10, 3)
+    tables = (CHILD_OFFSETS, CHILD)
+    with refused(ValueError, "locate_cell: points must have shape [n, 3], got [3]"):
+        locate_cell(points[0], centres, *tables, depth=3)
+    with refused(ValueError, "locate_cell: centres must have shape [m, 3], got [10, 2]"):
+        locate_cell(points, centres[:, :2], *tables, depth=3)
+    with refused(ValueError, "locate_cell: child must have shape [m] with m = 9, got [10]"):
+        locate_cell(points, centres[:9], *tables, depth=3)
+    with refused(ValueError, "locate_cell: child_offsets must have shape [g+1], got [0]"):
+        locate_cell(points, centres, CHILD_OFFSETS[:0], CHILD, depth=3)
+    with refused(ValueError, "locate_cell: weights must have shape [m] with m = 10, got [1]"):
+        locate_cell(points, centres, *tables, depth=3, weights=torch.zeros(1))
+    with refused(ValueError, "locate_cell: depth must be at least 1, got 0"):
+        locate_cell(points, centres, *tables, depth=0)
+    with refused(ValueError, "locate_cell: centres must hold ... got 0 centres in 4 diagrams"):
+        locate_cell(points, centres[:0], CHILD_OFFSETS, CHILD[:0], depth=1)
+    with refused(TypeError, "locate_cell: child must have dtype int32, got int64"):
+        locate_cell(points, centres, CHILD_OFFSETS, CHILD.long(), depth=3)
+    with refused(TypeError, "locate_cell: child_offsets must have dtype int32, got int64"):
+        locate_cell(points, centres, CHILD_OFFSETS.long(), CHILD, depth=3)
+    with refused(TypeError, "locate_cell: depth must be an integer, got float"):
+        locate_cell(points, centres, *tables, depth=1.0)  # type: ignore[arg-type]
+    with refused(ValueError, "locate_cell: child must be on the device of points, cpu, got meta"):
+        locate_cell(points, centres, CHILD_OFFSETS, CHILD.to("meta"), depth=3)

@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import FLOATS, HALVES, need, refused, strided
+from torch import Tensor
+
+from voronerf.backends import BackendUnavailable
+from voronerf.ops import nearest_centre
+
+pytestmark = pytest.mark.op("nearest_centre")
+
+
+def slow(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
+    """One point and one centre at a time, in float64."""
+    cells = []
+    for point in points.double().tolist():
+        distances = [sum((a - b) ** 2 for a, b in zip(point, centre)) for centre in centres.double().tolist()]
+        if weights is not None:
+            distances = [distance - weight for distance, weight in zip(distances, weights.double().tolist())]
+        cells.append(distances.index(min(distances)))
+    return torch.tensor(cells, dtype=torch.int32)
+
+
+@pytest.mark.parametrize("k", [1, 2, 17])
+@pytest.mark.parametrize("n", [0, 1, 63, 130])
+def test_matches_a_slow_loop_on_integers_ties_included(device: torch.device, backend: str, n: int, k: int) -> None:
+    points = torch.randint(-2, 3, (n, 3)).float()
+    centres = torch.randint(-2, 3, (k, 3)).float()
+    weights = torch.randint(0, 3, (k,)).float()
+    for w in (None, weights):
+        on_device = None if w is None else w.to(device)
+        cells = nearest_centre(points.to(device), centres.to(device), weights=on_device, backend=backend)
+        assert cells.dtype == torch.int32
+        assert cells.device.type == device.type
+        assert torch.equal(cells.cpu(), slow(points, centres, w))
+
+
+@pytest.mark.parametrize("shift", [0.0, 10.0, 1000.0])
+@pytest.mark.parametrize("k", [16, 300])
+def test_chosen_centre_is_nearest_in_float64_wherever_the_scene_is(
+    device: torch.device, backend: str, k: int, shift: float
+) -> None:
+    points, centres = torch.rand(3001, 3) + shift, torch.rand(k, 3) + shift
+    cells = nearest_centre(points.to(device), centres.to(device), backend=backend).cpu().long()
+    distances = (points.double()[:, None] - centres.double()[None]).square().sum(-1)
+    chosen = distances.gather(1, cells[:, None])[:, 0]
+    # float32 may not tell apart two centres whose distances differ by less than its rounding.
+    bound = 8 * 2.0**-24 * distances.min(dim=1).values
+    assert (chosen <= distances.min(dim=1).values + bound).all()
+
+
+def test_weights_make_a_power_diagram(device: torch.device, backend: str) -> None:
+    points = torch.tensor([[0.4, 0, 0], [0.6, 0, 0]], device=device)
+    centres = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]], device=device)
+    assert nearest_centre(points, centres, backend=backend).tolist() == [0, 1]
+    # The plane between two centres one apart moves by half the difference of their weights.
+    weights = torch.tensor([0.0, 0.3], device=device)
+    assert nearest_centre(points, centres, weights=weights, backend=backend).tolist() == [1, 1]
+
+
+def test_points_that_are_not_finite_go_to_cell_0(device: torch.device, backend: str) -> None:
+    nan, inf = float("nan"), float("inf")
+    points = torch.tensor([[nan, 1, 1], [inf, 1, 1], [1, -inf, 1], [inf, -inf, nan], [1, 1, 1]], device=device)
+    centres = torch.tensor([[9.0, 9, 9], [5, 5, 5], [1, 1, 1]], device=device)
+    weights = torch.tensor([0.0, 4.0, 0.0], device=device)
+    assert nearest_centre(points, centres, backend=backend).tolist() == [0, 0, 0, 0, 2]
+    assert nearest_centre(points, centres, weights=weights, backend=backend).tolist() == [0, 0, 0, 0, 2]
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_dtypes(device: torch.device, backend: str, dtype: torch.dtype) -> None:
+    need("nearest_centre", backend, device, dtype)
+    points, centres = torch.rand(257, 3).to(dtype), torch.rand(9, 3).to(dtype)
+    cells = nearest_centre(points.to(device), centres.to(device), backend=backend)
+    if dtype in HALVES:
+        assert torch.equal(cells.cpu(), slow(points, centres))
+    mixed = nearest_centre(points.to(device), centres.double().to(device), backend=backend)
+    assert torch.equal(mixed.cpu(), slow(points, centres))
+
+
+def test_layouts(device: torch.device, backend: str) -> None:
+    points, centres, weights = torch.rand(101, 3), torch.rand(7, 3), torch.rand(7) / 10
+    expected = slow(points, centres, weights)
+    points, centres, weights = (strided(tensor.to(device)) for tensor in (points, centres, weights))
+    assert torch.equal(nearest_centre(points, centres, weights=weights, backend=backend).cpu(), expected)
+    columns = points.t().contiguous().t()
+    assert torch.equal(nearest_centre(columns, centres, weights=weights, backend=backend).cpu(), expected)
+
+
+def test_is_not_differentiable(device: torch.device, backend: str) -> None:
+    points = torch.rand(5, 3, device=device, requires_grad=True)
+    centres = torch.rand(2, 3, device=device, requires_grad=True)
+    assert not nearest_centre(points, centres, backend=backend).requires_grad
+
+
+def test_compiles(device: torch.device, backend: str) -> None:
+    points, centres = torch.rand(20000, 3, device=device), torch.rand(16, 3, device=device)
+    compiled = torch.compile(
+        lambda p, c: nearest_centre(p, c, backend=backend) + 1, fullgraph=True, backend="aot_eager"
+    )
+    assert torch.equal(compiled(points, centres), nearest_centre(points, centres, backend=backend) + 1)
+
+
+def test_errors() -> None:
+    points, centres = torch.rand(4, 3), torch.rand(2, 3)
+    with refused(ValueError, "nearest_centre: points must have shape [n, 3], got [4, 2]"):
+        nearest_centre(points[:, :2], centres)
+    with refused(ValueError, "nearest_centre: centres must have shape [k, 3], got [3]"):
+        nearest_centre(points, centres[0])
+    with refused(ValueError, "nearest_centre: centres must hold at least one centre, got none"):
+        nearest_centre(points, centres[:0])
+    with refused(ValueError, "nearest_centre: weights must have shape [k] with k = 2, got [3]"):
+        nearest_centre(points, centres, weights=torch.zeros(3))
+    with refused(TypeError, "nearest_centre: points must have dtype ... or float64, got int64"):
+        nearest_centre(points.long(), centres)
+    with refused(TypeError, "nearest_centre: centres must have dtype ... or float64, got int64"):
+        nearest_centre(points, centres.long())
+    with refused(TypeError, "nearest_centre: weights must have dtype ... or float64, got bool"):
+        nearest_centre(points, centres, weights=torch.zeros(2, dtype=torch.bool))
+    with refused(ValueError, "nearest_centre: centres must be on the device of points, cpu, got meta"):
+        nearest_centre(points, centres.to("meta"))
+    with pytest.raises((ValueError, BackendUnavailable), match="nearest_centre: backend"):
+        nearest_centre(points, centres, backend="fastest")

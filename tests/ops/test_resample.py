@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from op_cases import FLOATS, need, refused, strided
+from torch import Tensor
+
+from voronerf.ops import resample
+
+pytestmark = pytest.mark.op("resample")
+
+
+def slow(weights: list[float], edges: list[float], targets: list[float]) -> list[float]:
+    """Walks along one ray until the mass in front exceeds each target."""
+    if sum(weights) == 0:
+        weights = [1.0] * len(weights)
+    total, depths = sum(weights), []
+    for target in sorted(targets):
+        left, index = target * total, 0
+        while left > weights[index] or weights[index] == 0:
+            left -= weights[index]
+            index += 1
+        depths.append(edges[index] + (edges[index + 1] - edges[index]) * left / weights[index])
+    return depths
+
+
+def rays(r: int, s: int) -> tuple[Tensor, Tensor]:
+    weights = torch.rand(r, s) * (torch.rand(r, s) > 0.4)
+    return weights, (0.1 + torch.rand(r, s + 1)).cumsum(dim=1)
+
+
+@pytest.mark.parametrize(("r", "s", "count"), [(1, 1, 1), (9, 2, 3), (5, 63, 17), (3, 64, 128)])
+@pytest.mark.parametrize("given", [False, True])
+def test_matches_a_slow_walk(device: torch.device, backend: str, r: int, s: int, count: int, given: bool) -> None:
+    weights, edges = rays(r, s)
+    uniforms = torch.rand(r, count)
+    depths = resample(
+        weights.to(device), edges.to(device), count, uniforms=uniforms.to(device) if given else None, backend=backend
+    ).cpu()
+    assert depths.shape == (r, count)
+    midpoints = [(index + 0.5) / count for index in range(count)]
+    for ray in range(r):
+        targets = uniforms[ray].tolist() if given else midpoints
+        expected = slow(weights[ray].tolist(), edges[ray].tolist(), targets)
+        # Rounding of the running mass moves a depth by its share of a bin, and a light bin is long for its mass.
+        share = weights[ray].sum() / weights[ray][weights[ray] > 0].min() if weights[ray].sum() > 0 else 1
+        tolerance = float(1e-6 * s * max(1, share) * edges[ray].max())
+        torch.testing.assert_close(depths[ray], torch.tensor(expected), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_depths_rise_and_stay_in_bins_that_have_mass(device: torch.device, backend: str, dtype: torch.dtype) -> None:
+    need("resample", backend, device, dtype)
+    weights, edges = (tensor.to(device, dtype) for tensor in rays(50, 20))
+    weights[:, 7] = 0
+    uniforms = torch.rand(50, 40, device=device).to(dtype)
+    uniforms[:, 0], uniforms[:, 1] = 0, 1
+    depths = resample(strided(weights), strided(edges), 40, uniforms=strided(uniforms), backend=backend)
+    assert depths.dtype == dtype
+    assert (depths.diff(dim=1) >= 0).all()
+    assert (depths >= edges[:, :1]).all() and (depths <= edges[:, -1:]).all()
+    inside = (depths > edges[:, 7:8]) & (depths < edges[:, 8:9])
+    assert not inside[weights.sum(dim=1) > 0].any()
+
+
+def test_converges_to_the_density(device: torch.device, backend: str) -> None:
+    weights = torch.tensor([[1.0, 0.0, 3.0]], device=device)
+    edges = torch.tensor([[0.0, 1.0, 2.0, 4.0]], device=device)
+    depths = resample(weights, edges, 4000, backend=backend)
+    # A quarter of the mass in the first bin, three quarters in the last, spread evenly in each.
+    assert (depths < 1).double().mean().item() == pytest.approx(0.25, abs=1e-3)
+    assert (depths > 3).double().mean().item() == pytest.approx(0.375, abs=1e-3)
+    assert depths.mean().item() == pytest.approx(0.25 * 0.5 + 0.75 * 3, abs=1e-3)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_rays_without_weight_are_drawn_evenly_over_the_bins(device: torch.device, backend: str, value: float) -> None:
+    weights = torch.full((1, 4), value, device=device)
+    edges = torch.tensor([[0.0, 1.0, 2.0, 4.0, 8.0]], device=device)
+    depths = resample(weights, edges, 4, backend=backend)
+    torch.testing.assert_close(depths.cpu(), torch.tensor([[0.5, 1.5, 3.0, 6.0]]))
+
+
+def test_weights_that_are_no_weights_count_as_zero(device: torch.device, backend: str) -> None:
+    weights = torch.tensor([[math.nan, 1.0, -3.0, math.inf]], device=device)
+    edges = torch.arange(5.0, device=device)[None]
+    depths = resample(weights, edges, 2, backend=backend)
+    torch.testing.assert_close(depths.cpu(), torch.tensor([[1.25, 1.75]]))
+
+
+def test_no_rays(device: torch.device, backend: str) -> None:
+    weights, edges = (tensor.to(device) for tensor in rays(0, 5))
+    assert resample(weights, edges, 7, backend=backend).shape == (0, 7)
+
+
+def test_carries_no_gradient(device: torch.device, backend: str) -> None:
+    weights, edges = (tensor.to(device).requires_grad_() for tensor in rays(2, 5))
+    assert not resample(weights, edges, 3, backend=backend).requires_grad
+
+
+def test_compiles(device: torch.device, backend: str) -> None:
+    weights, edges = (tensor.to(device) for tensor in rays(6, 5))
+    run = lambda w, e: resample(w, e, 8, backend=backend)  # noqa: E731
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(weights, edges), run(weights, edges))
+
+
+def test_errors() -> None:
+    weights, edges = rays(4, 5)
+    with refused(ValueError, "resample: weights must have shape [r, s], got [5]"):
+        resample(weights[0], edges, 3)
+    with pytest.raises(
+        ValueError, match=r"^resample: edges must have shape \[r, s\+1\] with r = 4, s = 5, got \[4, 5\]$"
+    ):
+        resample(weights, edges[:, 1:], 3)
+    with pytest.raises(
+        ValueError, match=r"^resample: uniforms must have shape \[r, count\] with r = 4, count = 3, got"
+    ):
+        resample(weights, edges, 3, uniforms=torch.rand(4, 2))
+    with refused(ValueError, "resample: count must be at least 1, got 0"):
+        resample(weights, edges, 0)
+    with refused(ValueError, "resample: weights must have at least one bin, got none"):
+        resample(weights[:, :0], edges[:, :1], 3)
+    with refused(TypeError, "resample: edges must have the dtype of weights, float32, got float64"):
+        resample(weights, edges.double(), 3)
+    with refused(TypeError, "resample: weights must have dtype ... or float64, got int64"):
+        resample(weights.long(), edges, 3)
+    with refused(ValueError, "resample: edges must be on the device of weights, cpu, got meta"):
+        resample(weights, edges.to("meta"), 3)
