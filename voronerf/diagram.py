@@ -49,6 +49,7 @@ class VoronoiDiagram(nn.Module):
     power: Tensor | None
     depth: int
     num_cells: int
+    _widest: int
 
     def __init__(self, centres: Tensor, *, weights: Tensor | None = None) -> None:
         """Makes a flat diagram; a single centre is legal and means one cell, all of space.
@@ -78,6 +79,8 @@ class VoronoiDiagram(nn.Module):
 
     def _set_tables(self, centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None) -> None:
         self.depth, self.num_cells = _check_tree(centres, child_offsets, child, power)
+        # Kept as a number, so that drawing cells inside a training loop does not wait for the device.
+        self._widest = int(child_offsets.diff().max())
         self.register_buffer("centres", centres)
         self.register_buffer("child_offsets", child_offsets)
         self.register_buffer("child", child)
@@ -196,15 +199,12 @@ class VoronoiDiagram(nn.Module):
         if temperature == 0.0:
             return self.locate(points)
         flat = self._flatten("sample_cell", points).to(torch.float32)
-        widest = int((self.child_offsets[1:] - self.child_offsets[:-1]).max())
-        pieces = flat.split(max(1, _CHUNK_ELEMENTS // (3 * widest)))
-        cells = [self._sample_piece(piece, widest, temperature, generator) for piece in pieces]
+        pieces = flat.split(max(1, _CHUNK_ELEMENTS // (3 * self._widest)))
+        cells = [self._sample_piece(piece, temperature, generator) for piece in pieces]
         return torch.cat(cells).reshape(points.shape[:-1]) if cells else flat.new_empty(0, dtype=torch.int32)
 
-    def _sample_piece(
-        self, points: Tensor, widest: int, temperature: float, generator: torch.Generator | None
-    ) -> Tensor:
-        column = torch.arange(widest, device=points.device)
+    def _sample_piece(self, points: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
+        column = torch.arange(self._widest, device=points.device)
         last = self.centres.shape[0] - 1
         child = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
         for _ in range(self.depth):
