@@ -50,7 +50,7 @@ bool cell_sort(Address cells, Address order, Address offsets, Address workspace,
 template <typename T>
 void nearest_centre_cuda(Address points, Address centres, Address weights, Address cells, int64_t n, int64_t k,
                          int device, Address stream) {
-  voronerf::cuda_set_device(device);
+  const voronerf::CudaDevice current(device);
   voronerf::nearest_centre_cuda(at<const T>(points), at<const T>(centres), at<const T>(weights), at<int32_t>(cells), n,
                                 k, at<void>(stream));
 }
@@ -58,7 +58,7 @@ void nearest_centre_cuda(Address points, Address centres, Address weights, Addre
 template <typename T>
 void locate_cell_cuda(Address points, Address centres, Address weights, Address child_offsets, Address child,
                       Address leaves, int64_t n, int depth, int device, Address stream) {
-  voronerf::cuda_set_device(device);
+  const voronerf::CudaDevice current(device);
   voronerf::locate_cell_cuda(at<const T>(points), at<const T>(centres), at<const T>(weights),
                              at<const int32_t>(child_offsets), at<const int32_t>(child), at<int32_t>(leaves), n, depth,
                              at<void>(stream));
@@ -66,7 +66,7 @@ void locate_cell_cuda(Address points, Address centres, Address weights, Address 
 
 void cell_sort_cuda(Address cells, Address order, Address offsets, Address workspace, int64_t n, int64_t k, int device,
                     Address stream) {
-  voronerf::cuda_set_device(device);
+  const voronerf::CudaDevice current(device);
   voronerf::cell_sort_cuda(at<const int32_t>(cells), at<int32_t>(order), at<int32_t>(offsets), at<int32_t>(workspace),
                            n, k, at<void>(stream));
 }

@@ -6,8 +6,18 @@
 
 namespace voronerf {
 
-// Makes a device current for this thread, so that the static runtime launches where the caller's stream lives.
-void cuda_set_device(int device);
+// Makes a device current for this thread while it lives, so that launches go where the caller's stream is. The static
+// runtime here and torch's own share the driver's contexts, and with them what is current: it is put back.
+class CudaDevice {
+ public:
+  explicit CudaDevice(int device);
+  ~CudaDevice();
+  CudaDevice(const CudaDevice&) = delete;
+  CudaDevice& operator=(const CudaDevice&) = delete;
+
+ private:
+  int device_, before_;
+};
 
 template <typename T>
 void nearest_centre_cuda(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
