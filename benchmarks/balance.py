@@ -1,7 +1,7 @@
 """How evenly a diagram's cells share the importance: std(W / max W) before and after, by method and number of cells.
 
     python benchmarks/balance.py                                        separate objects computed here
-    python benchmarks/balance.py --samples runs/lego/samples/level-0.npz   what a training run kept for its split
+    python benchmarks/balance.py --samples runs/lego/samples/level-1.npz   what a training run kept for its split
 
 Every method draws its first centres with seeds 0, 1, ...; medians over the seeds are printed, with the worst seed and
 the time of one call. "heaviest" is the heaviest single sample in units of a cell's fair share: a sample cannot be
