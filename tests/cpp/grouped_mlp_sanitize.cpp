@@ -1,0 +1,190 @@
+// Every path of grouped_mlp over random layer tables and cells, for a build with sanitizers:
+//
+//   tests/cpp/sanitize.sh
+//
+// Numbers are compared in Python (tests/test_native_mlp.py); here every array has exactly its size, outputs start
+// poisoned and must come out finite, and one and three threads must agree bit for bit.
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <random>
+#include <vector>
+
+#include "grouped_mlp.h"
+
+namespace {
+
+using voronerf::Activation;
+using voronerf::MlpTable;
+using Array = std::vector<float>;
+
+std::mt19937 generator(0);
+
+int64_t below(int64_t n) {
+  return static_cast<int64_t>(generator() % static_cast<uint32_t>(n));
+}
+
+Array uniform(int64_t size) {
+  Array values(size);
+  for (float& value : values) value = static_cast<float>(generator()) / 4294967296.0f * 2.0f - 1.0f;
+  return values;
+}
+
+// Heap memory of exactly this size, so that AddressSanitizer guards its ends.
+Array poisoned(int64_t size) {
+  Array values(size, std::nanf(""));
+  values.shrink_to_fit();
+  return values;
+}
+
+int64_t encoded(int64_t d, int octaves) {
+  return octaves < 0 ? d : d * (1 + 2 * octaves);
+}
+
+MlpTable random_table() {
+  const int64_t widths[] = {1, 3, 4, 5, 15, 16, 17, 33, 48, 63, 64, 65, 90};
+  MlpTable table;
+  table.positions = 1 + below(20);
+  table.directions = 1 + below(4);
+  table.position_octaves = static_cast<int>(below(6)) - 1;
+  table.direction_octaves = static_cast<int>(below(4)) - 1;
+  const int64_t layers = 1 + below(5);
+  for (int64_t l = 0; l < layers; ++l) {
+    MlpTable::Layer layer;
+    layer.width = widths[below(13)];
+    layer.activation = static_cast<Activation>(below(5));
+    const int64_t sources = 1 + below(10) / 3 + (below(20) == 0 ? 9 : 0);
+    for (int64_t s = 0; s < sources; ++s) layer.inputs.push_back(static_cast<int>(below(l + 2)) - 2);
+    table.layers.push_back(layer);
+  }
+  const int64_t outputs = 1 + below(3);
+  for (int64_t o = 0; o < outputs; ++o) table.outputs.push_back(static_cast<int>(below(layers)));
+  return table;
+}
+
+struct Result {
+  Array out, positions, directions;
+  std::vector<Array> weights, biases;
+
+  bool finite() const {
+    for (const Array* array : all()) {
+      for (const float value : *array) {
+        if (!std::isfinite(value)) return false;
+      }
+    }
+    return true;
+  }
+
+  bool operator==(const Result& other) const {
+    const auto mine = all(), theirs = other.all();
+    for (size_t i = 0; i < mine.size(); ++i) {
+      if (mine[i]->size() != theirs[i]->size()) return false;
+      if (!mine[i]->empty() && std::memcmp(mine[i]->data(), theirs[i]->data(), mine[i]->size() * sizeof(float)) != 0) {
+        return false;
+      }
+    }
+    return true;
+  }
+
+  std::vector<const Array*> all() const {
+    std::vector<const Array*> arrays = {&out, &positions, &directions};
+    for (const Array& array : weights) arrays.push_back(&array);
+    for (const Array& array : biases) arrays.push_back(&array);
+    return arrays;
+  }
+};
+
+struct Case {
+  MlpTable table = random_table();
+  std::vector<int32_t> offsets, index;
+  Array positions, directions, gradient;
+  std::vector<Array> weights, biases;
+  int64_t n, rays, k, width = 0;
+  bool bias = below(3) > 0;
+
+  Case() {
+    k = 1 + below(6);
+    n = below(4);
+    for (int64_t c = 0; c <= k; ++c) {
+      offsets.push_back(static_cast<int32_t>(n));
+      const int64_t sizes[] = {0, 1, below(60), below(500), 1300};
+      if (c < k) n += sizes[below(5)];
+    }
+    n += below(4);  // rows of no cell
+    const bool indexed = below(2) == 0;
+    rays = indexed ? 1 + below(20) : n;
+    for (int64_t i = 0; indexed && i < n; ++i) index.push_back(static_cast<int32_t>(below(rays)));
+    positions = uniform(n * table.positions);
+    directions = uniform(rays * table.directions);
+    std::vector<int64_t> depths;
+    for (const MlpTable::Layer& layer : table.layers) {
+      int64_t depth = 0;
+      for (const int from : layer.inputs) {
+        depth += from >= 0                          ? table.layers[from].width
+                 : from == voronerf::kFromPositions ? encoded(table.positions, table.position_octaves)
+                                                    : encoded(table.directions, table.direction_octaves);
+      }
+      weights.push_back(uniform(k * layer.width * depth));
+      for (float& weight : weights.back()) weight /= static_cast<float>(depth);
+      biases.push_back(uniform(bias ? k * layer.width : 0));
+    }
+    for (const int output : table.outputs) width += table.layers[output].width;
+    gradient = uniform(n * width);
+  }
+
+  Result run(voronerf::Isa isa, int threads, bool parameters, bool inputs) const {
+    std::vector<const float*> w, b;
+    std::vector<float*> grad_w, grad_b;
+    Result result;
+    for (size_t l = 0; l < weights.size(); ++l) {
+      w.push_back(weights[l].data());
+      b.push_back(bias ? biases[l].data() : nullptr);
+      result.weights.push_back(poisoned(parameters ? weights[l].size() : 0));
+      result.biases.push_back(poisoned(parameters ? biases[l].size() : 0));
+      grad_w.push_back(result.weights[l].data());
+      grad_b.push_back(bias ? result.biases[l].data() : nullptr);
+    }
+    result.out = poisoned(n * width);
+    result.positions = poisoned(inputs ? positions.size() : 0);
+    result.directions = poisoned(inputs ? directions.size() : 0);
+    const voronerf::MlpInputs in{positions.data(),
+                                 directions.data(),
+                                 index.empty() ? nullptr : index.data(),
+                                 offsets.data(),
+                                 w.data(),
+                                 b.data(),
+                                 n,
+                                 rays,
+                                 k};
+    voronerf::grouped_mlp_cpu(table, in, result.out.data(), isa, threads);
+    const voronerf::MlpGradients gradients{gradient.data(), parameters ? grad_w.data() : nullptr, grad_b.data(),
+                                           inputs ? result.positions.data() : nullptr,
+                                           inputs ? result.directions.data() : nullptr};
+    voronerf::grouped_mlp_backward_cpu(table, in, gradients, isa, threads);
+    return result;
+  }
+};
+
+}  // namespace
+
+int main(int count, char** arguments) {
+  const int cases = count > 1 ? std::atoi(arguments[1]) : 60;
+  for (int i = 0; i < cases; ++i) {
+    const Case one;
+    for (const voronerf::Isa isa : {voronerf::Isa::portable, voronerf::Isa::avx2, voronerf::Isa::avx512}) {
+      if (!voronerf::isa_supported(isa)) continue;
+      const Result alone = one.run(isa, 1, true, true), together = one.run(isa, 3, true, true);
+      const bool finite = alone.finite(), same = alone == together;
+      if (!finite || !same) {
+        std::printf("case %d, instruction set %d: %s\n", i, static_cast<int>(isa),
+                    finite ? "threads disagree" : "an output was not written");
+        return 1;
+      }
+      one.run(isa, 2, i % 2 == 0, i % 2 == 1);
+    }
+  }
+  std::printf("%d cases\n", cases);
+  return 0;
+}
