@@ -1,6 +1,5 @@
-#include "cuda.h"
-
 #include "common.h"
+#include "cuda.h"
 
 namespace voronerf {
 
