@@ -18,7 +18,7 @@ def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
     """Loads a scene.
 
     Args:
-        source: "builtin", or a folder with `transforms_train.json` (Blender synthetic) or `transforms.json` (a capture).
+        source: "builtin", or a folder with `transforms_train.json` (Blender synthetic) or `transforms.json` (capture).
         downscale: factor by which images are made smaller, >= 1. Divides the built-in scene's 100 pixels too.
 
     Raises:

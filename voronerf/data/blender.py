@@ -30,8 +30,8 @@ def load_blender(folder: Path, downscale: int) -> Scene:
         downscale: factor by which images are made smaller, averaging areas of the composited image.
 
     Returns:
-        The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of the
-        training views; without alpha the box is None.
+        The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
+        the training views; without alpha the box is None.
 
     Raises:
         SceneError: a file is missing, broken or inconsistent.
@@ -40,7 +40,9 @@ def load_blender(folder: Path, downscale: int) -> Scene:
     choices = [folder / "transforms_test.json", folder / "transforms_val.json"]
     test_file = next((path for path in choices if path.is_file()), None)
     if test_file is None:
-        raise SceneError(f"{folder}: has transforms_train.json but neither transforms_test.json nor transforms_val.json")
+        raise SceneError(
+            f"{folder}: has transforms_train.json but neither transforms_test.json nor transforms_val.json"
+        )
     entries, train_frames = read_transforms(train_file)
     test_entries, test_frames = read_transforms(test_file)
 

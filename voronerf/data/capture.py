@@ -20,7 +20,7 @@ from voronerf.data.transforms import Frame, number, read_transforms
 from voronerf.rendering.cameras import Cameras, distort, focus_point, undistort
 
 HOLD_OUT = 8
-# of the distance from the focus to the nearest camera: what is closer to a camera than this was not photographed sharply
+# share of the distance from the focus to the nearest camera: what is closer than this was not photographed sharply
 NEAR = 0.3
 FAR = 8.0
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")

@@ -1,7 +1,7 @@
 """A tight box around an object, from its silhouettes (space carving; Kutulakos and Seitz 2000, without colours).
 
-c images of h x w pixels, n voxels. The work is NumPy's, a view a thread: parallel sections inside of small array operations
-would cost more than the operations on a busy machine.
+c images of h x w pixels, n voxels. The work is NumPy's, a view a thread: parallel sections inside of small array
+operations would cost more than the operations on a busy machine.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ OUTSIDE = 1e-3  # share of the masks' pixels whose rays may miss the box
 def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tensor | None:
     """The bounding box of the space that all masks leave.
 
-    A voxel stays unless views see it entirely outside of their mask. It is compared with the mask widened by the voxel's own
-    size in pixels, so that the box never cuts what a mask shows; it is larger than the object by about a voxel (a fortieth
-    of the object's size) and by what no silhouette can carve.
+    A voxel stays unless two views see it entirely outside of their mask. It is compared with the mask widened by the
+    voxel's own size in pixels, so that the box does not cut what a mask shows; it is larger than the object by a voxel
+    or two (a fortieth of the object's size each) and by what no silhouette can carve.
 
     Args:
         cameras: c cameras without lens distortion that look at the object from around it.
@@ -42,8 +42,8 @@ def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tenso
         far: distance behind which there is nothing; the search covers a cube of half side (far - near) / 2.
 
     Returns:
-        float32 [2, 3], or None where there is no such box: nothing or everything is opaque, the lens distorts, the cameras have
-        no common focus, or the box would miss more than a thousandth of what the masks show.
+        float32 [2, 3], or None where there is no such box: nothing or everything is opaque, the lens distorts, the
+        cameras have no common focus, or the box would miss more than a thousandth of what the masks show.
     """
     every = -(-len(cameras) // VIEWS)
     cameras, visible = cameras[::every], (alpha[::every] > 0).numpy()
@@ -125,7 +125,8 @@ def _block_any(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
     """Whether any pixel of each block is set; incomplete blocks at the right and bottom count."""
     height, width = mask.shape
     padded = np.pad(mask, ((0, -height % size), (0, -width % size)))
-    return padded.reshape(padded.shape[0] // size, size, padded.shape[1] // size, size).any(axis=(1, 3))
+    blocks = padded.reshape(padded.shape[0] // size, size, padded.shape[1] // size, size)
+    return np.asarray(blocks.any(axis=(1, 3)))
 
 
 def _widen(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

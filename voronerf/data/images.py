@@ -25,8 +25,8 @@ def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """Averages blocks of `factor` x `factor` pixels; columns and rows that fill no block are dropped.
 
     With alpha the average is taken of premultiplied colours, which is the average of the image composited on any
-    background, and given back as straight colour and alpha. Rounding both to 8 bits moves the composited colour by at most
-    one level.
+    background, and given back as straight colour and alpha. Rounding both to 8 bits moves the composited colour by at
+    most one level.
 
     Args:
         image: [h, w, 3] or [h, w, 4].

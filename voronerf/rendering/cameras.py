@@ -3,8 +3,8 @@
 c cameras, r rays, b chosen pixels, n points.
 
 Frames. A pose maps camera to world coordinates; camera axes are OpenGL's: x right, y up, the camera looks along -z. The
-world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel is
-at (0.5, 0.5). Distortion is OpenCV's radial-tangential model with (k1, k2, p1, p2), on image-plane coordinates
+world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel
+is at (0.5, 0.5). Distortion is OpenCV's radial-tangential model with (k1, k2, p1, p2), on image-plane coordinates
 u = (x - cx) / fx, v = (y - cy) / fy.
 """
 
@@ -39,6 +39,7 @@ class Rays:
         return Rays(self.origins[index], self.directions[index])
 
     def to(self, device: torch.device | str) -> Rays:
+        """The same rays on a device."""
         return Rays(self.origins.to(device), self.directions.to(device))
 
 
@@ -90,16 +91,15 @@ class Cameras:
         return -self.poses[:, :3, 2]
 
     def to(self, device: torch.device | str) -> Cameras:
+        """The same cameras on a device."""
         distortion = None if self.distortion is None else self.distortion.to(device)
-        return replace(
-            self, poses=self.poses.to(device), intrinsics=self.intrinsics.to(device), distortion=distortion
-        )
+        return replace(self, poses=self.poses.to(device), intrinsics=self.intrinsics.to(device), distortion=distortion)
 
     def downscaled(self, factor: int) -> Cameras:
         """Cameras of the images averaged over blocks of `factor` x `factor` pixels.
 
-        Columns and rows that fill no whole block are dropped at the right and at the bottom, so that focal lengths and the
-        principal point are exactly divided by `factor`.
+        Columns and rows that fill no whole block are dropped at the right and at the bottom, so that focal lengths and
+        the principal point are exactly divided by `factor`.
 
         Raises:
             ValueError: `factor` is below 1, or no whole block is left.
@@ -146,8 +146,8 @@ class Cameras:
             index: the camera.
 
         Returns:
-            (pixels [n, 2], depth [n]): positions (x, y) in the image, and distance along the optical axis in world units.
-            Points with depth <= 0 are behind the camera; their pixels mean nothing.
+            (pixels [n, 2], depth [n]): positions (x, y) in the image, and distance along the optical axis in world
+            units. Points with depth <= 0 are behind the camera; their pixels mean nothing.
         """
         pose = self.poses[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]

@@ -25,20 +25,21 @@ def stratified_depths(
         samples: s, >= 1.
         jitter: uniformly random inside each stratum, else in its middle (the middle in disparity, where that is the
             spacing).
-        spacing: "linear": strata of equal length; "disparity": equal steps of 1 / distance, dense near the camera, for scenes
-            with a far background.
+        spacing: "linear": strata of equal length; "disparity": equal steps of 1 / distance, dense near the camera, for
+            scenes with a far background.
         generator: of the jitter; on the rays' device.
 
     Returns:
-        (depths [r, s] ascending, deltas [r, s], edges [r, s + 1]). A sample stands for its whole stratum: deltas are the
-        widths of the strata, and sum to far - near.
+        (depths [r, s] ascending, deltas [r, s], edges [r, s + 1]). A sample stands for its whole stratum: deltas are
+        the widths of the strata, and sum to far - near.
 
     Raises:
         ValueError: shapes, an unknown spacing, no samples.
     """
     if near.dim() != 1 or near.shape != far.shape:
         raise ValueError(
-            f"stratified_depths: near and far must have the same shape [r], got {list(near.shape)} and {list(far.shape)}"
+            "stratified_depths: near and far must have the same shape [r], "
+            f"got {list(near.shape)} and {list(far.shape)}"
         )
     if samples < 1:
         raise ValueError(f"stratified_depths: samples must be >= 1, got {samples}")

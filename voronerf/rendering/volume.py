@@ -52,8 +52,8 @@ class RenderedImage(NamedTuple):
         colour: [h, w, 3], the background included.
         opacity: [h, w].
         depth: [h, w], as in `Rendered`.
-        heaviest: [h, w, 3], position of each ray's heaviest sample: whose cell the pixel shows. Rays without samples have
-            the point at their far end (opacity 0).
+        heaviest: [h, w, 3], position of each ray's heaviest sample: whose cell the pixel shows. Rays without samples
+            have the point at their far end (opacity 0).
     """
 
     colour: Tensor
@@ -94,8 +94,9 @@ def render_rays(
     positions = rays.origins[:, None, :] + depths[:, :, None] * rays.directions[:, None, :]
     index = torch.arange(len(rays), device=positions.device, dtype=torch.int32).repeat_interleave(samples)
     rgb, sigma = field(positions.reshape(-1, 3), rays.directions, index)
-    rgb = rgb.reshape(len(rays), samples, 3)
-    sigma = sigma.reshape(len(rays), samples)
+    # a field under autocast answers in a half type: the sums along a ray are float32's
+    rgb = rgb.reshape(len(rays), samples, 3).to(depths.dtype)
+    sigma = sigma.reshape(len(rays), samples).to(depths.dtype)
     result = composite(sigma, rgb, depths, deltas, background=background, backend=backend)
     seen = result.opacity > 0
     depth = torch.where(seen, result.depth / torch.where(seen, result.opacity, 1), far)
