@@ -284,12 +284,16 @@ assert len(loaded) == 1 or (not loaded and not _native._C.openmp), loaded
     run_python(code, OMP_NUM_THREADS="2", VORONERF_ISA="portable")
 
 
-def test_an_unknown_instruction_set_is_refused() -> None:
+def test_an_unknown_instruction_set_is_an_error_whatever_the_backend() -> None:
     code = """
 import torch
 from voronerf import backends
-reason = backends.missing("native", torch.device("cpu"))
-assert reason.startswith("VORONERF_ISA must be one this processor supports (portable"), reason
-assert reason.endswith("got 'sse9'; unset it"), reason
+try:
+    backends.resolve("nearest_centre", backend="auto", device=torch.device("cpu"), dtype=torch.float32)
+except ValueError as error:
+    assert str(error).startswith("VORONERF_ISA must be one this processor supports (portable"), error
+    assert str(error).endswith("got 'sse9'"), error
+else:
+    raise SystemExit("nothing was raised")
 """
     run_python(code, VORONERF_ISA="sse9")

@@ -58,7 +58,8 @@ def _choose_isa() -> int:
         return supported[-1]
     if wanted not in ISAS or ISAS.index(wanted) not in supported:
         here = ", ".join(ISAS[isa] for isa in supported)
-        raise BackendUnavailable(f"VORONERF_ISA must be one this processor supports ({here}), got {wanted!r}; unset it")
+        # No BackendUnavailable, which backend="auto" would pass over in silence.
+        raise ValueError(f"VORONERF_ISA must be one this processor supports ({here}), got {wanted!r}")
     return ISAS.index(wanted)
 
 
