@@ -23,6 +23,8 @@ namespace {
 // Rows of a task: enough to pay for packing the weights, few enough to keep every thread busy to the end.
 constexpr int64_t kFewestRows = 96, kMostRows = 2048, kFewestGradientRows = 384, kMostGradientRows = 4096;
 constexpr int64_t kTasks = 64;
+// ... in whole tiles or halves of one.
+constexpr int64_t kTaskUnit = 48;
 // Partial weight gradients of one call, in floats: wide networks get longer tasks instead of more memory.
 constexpr int64_t kPartialFloats = int64_t{1} << 24;
 constexpr int64_t kAlign = 64;
@@ -89,7 +91,7 @@ Tasks split(const MlpInputs& in, int64_t target) {
   for (int64_t c = 0; c < in.k; ++c) {
     const int64_t begin = in.offsets[c], rows = in.offsets[c + 1] - begin;
     const int64_t count = ceil_div(rows, target);
-    const int64_t size = count > 1 ? ceil_div(ceil_div(rows, count), int64_t{48}) * 48 : rows;
+    const int64_t size = count > 1 ? ceil_div(ceil_div(rows, count), kTaskUnit) * kTaskUnit : rows;
     for (int64_t start = 0; start < rows; start += size) {
       result.tasks.push_back({c, begin + start, begin + std::min(rows, start + size), count > 1 ? partials++ : -1});
     }

@@ -1,6 +1,6 @@
 // The CPU kernels of grouped_mlp, once for each instruction set.
 //
-// A tile of 48 or 96 samples goes through all layers while its values stay in the first two cache levels; nothing of
+// A tile of 96 samples goes through all layers while its values stay in the first two cache levels; nothing of
 // the size of n times a layer is ever written. A cell's weights are packed once by each thread that works on it,
 // [inputs][outputs] in panels of 64 columns, so that the products (gemm_tile.h) read them in order. The backward pass
 // computes the tile's activations again, then walks the layers from the last to the first: parameter gradients are

@@ -7,6 +7,9 @@ namespace voronerf {
 
 namespace {
 
+// Rows of a tile: a multiple of all blocks of rows (6, 8, 12), and the fastest of 48, 96, 144 and 192 at every width.
+constexpr int64_t kTile = 96;
+
 int64_t pad(int64_t width) {
   return ceil_div(width, kGranule) * kGranule;
 }
@@ -159,14 +162,12 @@ MlpPlanner::MlpPlanner(const MlpTable& table, bool indexed_directions, const Mlp
   plan_.positions = input(table.positions, table.position_octaves, false, wanted.positions);
   plan_.directions = input(table.directions, table.direction_octaves, indexed_directions, wanted.directions);
 
-  int64_t widest = 1;
   for (size_t l = 0; l < layers_.size(); ++l) {
     MlpPlanLayer& layer = layers_[l];
     layer.activation = static_cast<int>(table.layers[l].activation);
     layer.width = table.layers[l].width;
     layer.padded = pad(layer.width);
     layer.slope_kept = table.layers[l].activation == Activation::sine;
-    widest = std::max(widest, layer.padded);
     for (const int from : table.layers[l].inputs) {
       MlpPlanSource s{};
       s.from = from;
@@ -193,7 +194,7 @@ MlpPlanner::MlpPlanner(const MlpTable& table, bool indexed_directions, const Mlp
   plan_.positions.gradient_wanted &= plan_.positions.used;
   plan_.directions.gradient_wanted &= plan_.directions.used;
   order_gradients();
-  plan_.tile = widest >= 64 ? 48 : 96;
+  plan_.tile = kTile;
   place_buffers();
   plan_.layers = layers_.data();
   plan_.outputs = outputs_.data();
