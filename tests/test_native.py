@@ -297,3 +297,16 @@ else:
     raise SystemExit("nothing was raised")
 """
     run_python(code, VORONERF_ISA="sse9")
+
+
+@pytest.mark.parametrize(
+    ("architectures", "runs", "fails"),
+    [
+        (["75", "80", "90"], [75, 80, 86, 89, 90, 100, 120], [70, 72]),
+        (["90a"], [90], [80, 89, 100, 103]),
+        (["80", "90a"], [80, 86, 90], [75, 100]),
+    ],
+)
+def test_devices_of_a_cuda_build(architectures: list[str], runs: list[int], fails: list[int]) -> None:
+    assert all(_native._runs_on(architectures, capability) for capability in runs)
+    assert not any(_native._runs_on(architectures, capability) for capability in fails)

@@ -73,9 +73,7 @@ def missing(device: torch.device) -> str | None:
     if not _C.cuda:
         return f"{_C.cuda_outcome}; install the CUDA toolkit and rebuild with VORONERF_CUDA=1 `pip install -e .`"
     major, minor = torch.cuda.get_device_capability(device)
-    built = [_capability(architecture) for architecture in _C.cuda_architectures.split(";")]
-    # Machine code runs on later minor versions of its major one; the PTX of the last on everything from there on.
-    if any(major == a and minor >= b for a, b in built) or (major, minor) >= built[-1]:
+    if _runs_on(_C.cuda_architectures.split(";"), 10 * major + minor):
         return None
     return (
         f"built with CUDA for {_C.cuda_architectures}, the device is {major}{minor}; "
@@ -220,6 +218,17 @@ def _stream(tensor: Tensor) -> tuple[int, int]:
     return index, torch.cuda.current_stream(index).cuda_stream
 
 
-def _capability(architecture: str) -> tuple[int, int]:
-    number = int(architecture.rstrip("af"))
-    return number // 10, number % 10
+def _runs_on(architectures: list[str], capability: int) -> bool:
+    """Whether code for these architectures, and PTX of the last, runs on a device (86 for compute capability 8.6).
+
+    Machine code runs on later minor versions of its major one, PTX on everything from its version on; those of an
+    architecture-specific target such as 90a on that version alone.
+    """
+    for position, architecture in enumerate(architectures):
+        number = int(architecture.rstrip("af"))
+        if number == capability:
+            return True
+        portable = architecture.isdigit() and capability > number
+        if portable and (capability // 10 == number // 10 or position == len(architectures) - 1):
+            return True
+    return False
