@@ -58,7 +58,7 @@ def _mlp(
     has_bias: Sequence[bool],
     layers: str,
     keep: bool,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, list[Tensor]]:
     network = Network(MLP.parse(layers), positions, directions, direction_index, offsets, parameters, has_bias)
     return forward(network, keep)
 
@@ -73,11 +73,12 @@ def _(
     has_bias: Sequence[bool],
     layers: str,
     keep: bool,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, list[Tensor]]:
     table, n = MLP.parse(layers), positions.shape[0]
     out = parameters[0].new_empty(n, table.out_features)
-    width = sum(kept_widths(table, positions.shape[1])) if keep else 0
-    return out, parameters[0].new_empty(n * width, dtype=compute_dtype(parameters[0]))
+    widths = kept_widths(table, positions.shape[1]) if keep else []
+    dtype = compute_dtype(parameters[0])
+    return out, [positions.new_empty(n, width, dtype=dtype) for width in widths]
 
 
 @torch.library.custom_op("voronerf::grouped_mlp_backward", mutates_args=())
@@ -90,7 +91,7 @@ def _mlp_backward(
     parameters: Sequence[Tensor],
     has_bias: Sequence[bool],
     layers: str,
-    hidden: Tensor,
+    hidden: Sequence[Tensor],
     needs: Sequence[bool],
 ) -> list[Tensor]:
     network = Network(MLP.parse(layers), positions, directions, direction_index, offsets, parameters, has_bias)
@@ -107,24 +108,25 @@ def _(
     parameters: Sequence[Tensor],
     has_bias: Sequence[bool],
     layers: str,
-    hidden: Tensor,
+    hidden: Sequence[Tensor],
     needs: Sequence[bool],
 ) -> list[Tensor]:
     inputs = [positions, directions, *parameters]
     return [tensor.new_empty(tensor.shape) for tensor, need in zip(inputs, needs) if need and tensor is not None]
 
 
-def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-    positions, directions, direction_index, offsets, parameters, has_bias, layers, keep = inputs
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, list[Tensor]]) -> None:
+    positions, directions, direction_index, offsets, parameters, has_bias, layers, _keep = inputs
     _, hidden = output
-    ctx.has_bias, ctx.layers, ctx.keep = has_bias, layers, keep
-    ctx.mark_non_differentiable(hidden)
+    ctx.has_bias, ctx.layers, ctx.kept = has_bias, layers, len(hidden)
+    ctx.mark_non_differentiable(*hidden)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(positions, directions, direction_index, offsets, hidden, *parameters)
+    ctx.save_for_backward(positions, directions, direction_index, offsets, *hidden, *parameters)
 
 
 def _backward(ctx: Any, g: Tensor | None, _: None) -> tuple[Any, ...]:
-    positions, directions, direction_index, offsets, hidden, *parameters = ctx.saved_tensors
+    positions, directions, direction_index, offsets, *rest = ctx.saved_tensors
+    hidden, parameters = rest[: ctx.kept], rest[ctx.kept :]
     needs = [ctx.needs_input_grad[0], ctx.needs_input_grad[1], *ctx.needs_input_grad[4]]
     if g is None:
         return (None, None, None, None, [None] * len(parameters), None, None, None)
@@ -132,7 +134,7 @@ def _backward(ctx: Any, g: Tensor | None, _: None) -> tuple[Any, ...]:
         found = _differentiable(ctx, g, needs)
     else:
         network = (positions, directions, direction_index, offsets, parameters, ctx.has_bias, ctx.layers)
-        if not ctx.keep:
+        if not hidden:
             _, hidden = torch.ops.voronerf.grouped_mlp(*network, True)
         found = torch.ops.voronerf.grouped_mlp_backward(g, *network, hidden, needs)
     gradients = iter(found)
@@ -142,7 +144,8 @@ def _backward(ctx: Any, g: Tensor | None, _: None) -> tuple[Any, ...]:
 
 def _differentiable(ctx: Any, g: Tensor, needs: list[bool]) -> Sequence[Tensor]:
     """The gradients as functions that can be differentiated again."""
-    positions, directions, direction_index, offsets, _, *parameters = ctx.saved_tensors
+    positions, directions, direction_index, offsets, *rest = ctx.saved_tensors
+    parameters = rest[ctx.kept :]
     weights, biases = split_parameters(parameters, ctx.has_bias)
     out = specification.grouped_mlp(
         positions,

@@ -20,7 +20,7 @@ from voronerf.reference.activation import activate_, times_derivative_
 from voronerf.reference.specification import encode
 
 PIECE = 4096
-"""Most rows of a piece. 1,024 to 8,192 differ by a few per cent; fewer pay for the calls."""
+"""Most rows of a piece. Fewer pay for the calls (a tenth more time at 1,024 rows), more gain nothing."""
 
 
 def pieces(offsets: Tensor, rows: int) -> Iterator[tuple[int, slice]]:
@@ -118,35 +118,31 @@ class Network:
 
 
 class Kept:
-    """Views into one array of what the backward reads: encoded positions, outputs of layers, slopes of sines."""
+    """What the backward reads, by name: encoded positions, outputs of layers, slopes of sines."""
 
-    def __init__(self, network: Network, hidden: Tensor, rows: int) -> None:
-        widths = kept_widths(network.table, network.positions.shape[1])
-        views = [
-            part.view(rows, width) for part, width in zip(hidden.split([rows * width for width in widths]), widths)
-        ]
-        layers = network.table.layers
-        self.encoded = views.pop(0) if network.table.position_octaves is not None else None
-        self.values = views[: len(layers)]
-        rest = iter(views[len(layers) :])
-        self.slopes = [next(rest) if layer.activation == "sine" else None for layer in layers]
+    def __init__(self, table: MLP, arrays: Sequence[Tensor]) -> None:
+        rest = iter(arrays)
+        self.encoded = None if table.position_octaves is None else next(rest)
+        self.values = [next(rest) for _ in table.layers]
+        self.slopes = [next(rest) if layer.activation == "sine" else None for layer in table.layers]
 
 
 def kept_widths(table: MLP, positions_d: int) -> list[int]:
-    """Columns of each part of ``Kept``."""
+    """Columns of each array in ``Kept``, in order. One large array would be fresh memory every time."""
     encoded = [] if table.position_octaves is None else [encoded_width(positions_d, table.position_octaves)]
     slopes = [layer.width for layer in table.layers if layer.activation == "sine"]
     return encoded + [layer.width for layer in table.layers] + slopes
 
 
-def forward(network: Network, keep: bool) -> tuple[Tensor, Tensor]:
-    """Output [n, out], and what the backward reads: one array, empty without ``keep``."""
+def forward(network: Network, keep: bool) -> tuple[Tensor, list[Tensor]]:
+    """Output [n, out], and the arrays that the backward reads, none without ``keep``."""
     table, positions = network.table, network.positions
     n = positions.shape[0]
     out = positions.new_empty(n, table.out_features, dtype=network.storage)
     held = n if keep else min(n, PIECE)
-    hidden = positions.new_empty(held * sum(kept_widths(table, positions.shape[1])), dtype=network.dtype)
-    kept = Kept(network, hidden, held)
+    widths = kept_widths(table, positions.shape[1])
+    hidden = [positions.new_empty(held, width, dtype=network.dtype) for width in widths]
+    kept = Kept(table, hidden)
     for cell, rows in pieces(network.offsets, n):
         at = rows if keep else slice(0, rows.stop - rows.start)
         encoded = None
@@ -162,13 +158,13 @@ def forward(network: Network, keep: bool) -> tuple[Tensor, Tensor]:
             sources[index] = activate_(layer.activation, y)
         for output, columns in network.outputs:
             out[rows, columns] = sources[output]
-    return zero_strays(out, network.offsets), hidden if keep else hidden.new_empty(0)
+    return zero_strays(out, network.offsets), hidden if keep else []
 
 
-def backward(network: Network, g: Tensor, hidden: Tensor, needs: list[bool]) -> list[Tensor]:
+def backward(network: Network, g: Tensor, hidden: Sequence[Tensor], needs: list[bool]) -> list[Tensor]:
     """Gradients of positions, directions and parameters, as many of them as ``needs`` says, in this order."""
     table, positions, directions = network.table, network.positions, network.directions
-    kept = Kept(network, hidden, positions.shape[0])
+    kept = Kept(table, hidden)
     to_positions, to_directions, *to_parameters = needs
     wanted: set[int | str] = set(range(len(table.layers)))
     totals = [
@@ -184,12 +180,12 @@ def backward(network: Network, g: Tensor, hidden: Tensor, needs: list[bool]) -> 
         wanted.add(DIRECTIONS)
         assert network.encoded_directions is not None
         direction_total = torch.zeros_like(network.encoded_directions, dtype=wide_dtype(network.encoded_directions))
-    scratch: dict[int | str, Tensor] = {}
+    flow = _Flow(network)
 
     for cell, rows in pieces(network.offsets, positions.shape[0]):
         sources = network.sources(rows, None if kept.encoded is None else kept.encoded[rows])
         sources.update((index, values[rows]) for index, values in enumerate(kept.values))
-        flow = _Flow(scratch, rows.stop - rows.start)
+        flow.begin(rows.stop - rows.start)
         for output, columns in network.outputs:
             flow.add(output, g[rows, columns].to(network.dtype))
         for index in reversed(range(len(table.layers))):
@@ -207,6 +203,7 @@ def backward(network: Network, g: Tensor, hidden: Tensor, needs: list[bool]) -> 
                     add_product(weight_total[cell, :, columns], gradient.t(), sources[source])
                 if source in wanted:
                     flow.add_product(source, gradient, network.weights[index][number][cell])
+            flow.done(index)
         if position_total is not None and POSITIONS in flow.gradients:
             position_total[rows] = encode_backward(
                 flow.gradients[POSITIONS], sources[POSITIONS], table.position_octaves
@@ -227,28 +224,48 @@ def backward(network: Network, g: Tensor, hidden: Tensor, needs: list[bool]) -> 
 
 
 class _Flow:
-    """Gradients flowing back through one piece, by source, in arrays that the next piece uses again."""
+    """Gradients flowing back through a piece, by source, in few arrays used again and again: what is small stays
+    cached."""
 
-    def __init__(self, scratch: dict[int | str, Tensor], rows: int) -> None:
+    def __init__(self, network: Network) -> None:
         self.gradients: dict[int | str, Tensor] = {}
-        self._scratch, self._rows = scratch, rows
+        self._like = network.positions.new_empty(0, dtype=network.dtype)
+        self._most = min(network.positions.shape[0], PIECE)
+        self._rows = 0
+        self._taken: dict[int | str, Tensor] = {}
+        self._idle: dict[int, list[Tensor]] = {}
+
+    def begin(self, rows: int) -> None:
+        """Starts on a piece of so many rows, with no gradients."""
+        for source in list(self.gradients):
+            self.done(source)
+        self._rows = rows
+
+    def done(self, source: int | str) -> None:
+        """Drops a gradient that has been passed on."""
+        del self.gradients[source]
+        array = self._taken.pop(source)
+        self._idle.setdefault(array.shape[1], []).append(array)
 
     def add(self, source: int | str, gradient: Tensor) -> None:
+        """Adds to the gradient of a source."""
         if source in self.gradients:
             self.gradients[source].add_(gradient)
         else:
-            self.gradients[source] = self._take(source, gradient, gradient.shape[1]).copy_(gradient)
+            self._take(source, gradient.shape[1]).copy_(gradient)
 
     def add_product(self, source: int | str, left: Tensor, right: Tensor) -> None:
+        """Adds a matrix product to the gradient of a source."""
         if source in self.gradients:
             self.gradients[source].addmm_(left, right)
         else:
-            self.gradients[source] = torch.mm(left, right, out=self._take(source, left, right.shape[1]))
+            torch.mm(left, right, out=self._take(source, right.shape[1]))
 
-    def _take(self, source: int | str, like: Tensor, width: int) -> Tensor:
-        if source not in self._scratch or self._scratch[source].shape[0] < self._rows:
-            self._scratch[source] = like.new_empty(self._rows, width)
-        return self._scratch[source][: self._rows]
+    def _take(self, source: int | str, width: int) -> Tensor:
+        idle = self._idle.get(width)
+        self._taken[source] = idle.pop() if idle else self._like.new_empty(self._most, width)
+        self.gradients[source] = self._taken[source][: self._rows]
+        return self.gradients[source]
 
 
 def encode_backward(gradient: Tensor, encoded: Tensor, octaves: int | None) -> Tensor:
