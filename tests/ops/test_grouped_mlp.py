@@ -241,6 +241,18 @@ def test_second_derivatives(device: torch.device, backend: str) -> None:
         assert_as_exact(part, same, right)
 
 
+def test_second_derivatives_where_one_input_is_computed_from_another() -> None:
+    case = Case.make("nerf", [3, 0, 2], torch.float64, rays=None)
+
+    def penalty(mlp: Callable[..., Tensor]) -> Tensor:
+        positions, _, *parameters = case.leaves(torch.float64)
+        y = case.run(mlp, [positions, positions.square(), *parameters])
+        (slope,) = torch.autograd.grad(y.sum(), positions, create_graph=True)
+        return torch.cat([slope, *torch.autograd.grad(slope.square().sum(), positions)])
+
+    torch.testing.assert_close(penalty(grouped_mlp), penalty(specification.grouped_mlp))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 @pytest.mark.parametrize("keep", [True, False])
 def test_opcheck(keep: bool, dtype: torch.dtype) -> None:

@@ -145,7 +145,9 @@ def _backward(ctx: Any, g: Tensor | None, _: None) -> tuple[Any, ...]:
 def _differentiable(ctx: Any, g: Tensor, needs: list[bool]) -> Sequence[Tensor]:
     """The gradients as functions that can be differentiated again."""
     positions, directions, direction_index, offsets, *rest = ctx.saved_tensors
-    parameters = rest[ctx.kept :]
+    # Aliases: where one input was computed from another, that path is the caller's, not this function's.
+    positions, *parameters = (tensor.view_as(tensor) for tensor in (positions, *rest[ctx.kept :]))
+    directions = None if directions is None else directions.view_as(directions)
     weights, biases = split_parameters(parameters, ctx.has_bias)
     out = specification.grouped_mlp(
         positions,
