@@ -18,6 +18,10 @@ namespace {
 constexpr int kRelu = 1, kSoftplus = 2, kSigmoid = 3, kSine = 4;
 constexpr int kFromPositions = -1;
 
+VN_INLINE int64_t padded_width(const MlpPlanSource& source) {
+  return (source.width + kGranule - 1) / kGranule * kGranule;
+}
+
 VN_INLINE int64_t smaller(int64_t a, int64_t b) {
   return a < b ? a : b;
 }
@@ -65,7 +69,7 @@ void pack_forward(const float* weights, const float* bias, const MlpPlanLayer& l
 
 // The inputs of one source: weights [o][depth] -> panels [o][<= 64 of its width, padded to 16 with 0].
 void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source, float* packed) {
-  const int64_t padded = (source.width + kGranule - 1) / kGranule * kGranule;
+  const int64_t padded = padded_width(source);
   for (int64_t first = 0; first < padded; first += kPanel) {
     const int64_t columns = smaller(kPanel, padded - first), count = smaller(columns, source.width - first);
     for (int64_t o = 0; o < layer.width; ++o) {
@@ -160,12 +164,13 @@ struct Tile {
     }
   }
 
-  void run_layers() const {
+  // The values of all layers that reach an output; `heads` false leaves out those that only do.
+  void run_layers(bool heads) const {
     read_input(plan.positions, data.positions, nullptr);
     read_input(plan.directions, data.directions, data.direction_index);
     for (int64_t l = 0; l < plan.layer_count; ++l) {
       const MlpPlanLayer& layer = plan.layers[l];
-      if (layer.live) run_layer(layer);
+      if (layer.live && (heads || !layer.only_output)) run_layer(layer);
     }
   }
 
@@ -234,14 +239,24 @@ struct Tile {
       for (int64_t row = 0; row < rows; ++row) sum = sum + load(gradient + row * layer.padded + first);
       store(bias + first, sum);
     }
-    for (int64_t s = 0; s < layer.source_count; ++s) {
-      Source a = source(layer.sources[s].from, rows);
-      float* c = partial + layer.partial + layer.sources[s].row * layer.padded;
-      for (int64_t first = 0; first < layer.padded; first += kPanel) {
-        multiply<true>({&a, 1, gradient + first, layer.padded, fill ? kZeros : c + first, fill ? 0 : layer.padded,
-                        c + first, layer.padded, Finish::none, nullptr},
-                       layer.sources[s].width, smaller(kPanel, layer.padded - first));
+    for (int64_t i = 0; i < layer.source_count; ++i) {
+      const MlpPlanSource& s = layer.sources[i];
+      const Source input = source(s.from, rows), output = {gradient, layer.padded, rows};
+      float* c = partial + layer.partial + s.row * layer.padded;
+      if (s.by_outputs) {
+        weight_gradient(output, layer.width, input, padded_width(s), c, fill);
+      } else {
+        weight_gradient(input, s.width, output, layer.padded, c, fill);
       }
+    }
+  }
+
+  // c [a_width][b_width] = sum over the rows of a's values times b's, b_width padded.
+  static void weight_gradient(const Source& a, int64_t a_width, const Source& b, int64_t b_width, float* c, bool fill) {
+    for (int64_t first = 0; first < b_width; first += kPanel) {
+      multiply<true>({&a, 1, b.data + first, b.stride, fill ? kZeros : c + first, fill ? 0 : b_width, c + first,
+                      b_width, Finish::none, nullptr},
+                     a_width, smaller(kPanel, b_width - first));
     }
   }
 
@@ -317,7 +332,7 @@ void mlp_pack(const MlpPlan& plan, const MlpData& data, int64_t cell, float* wor
 void mlp_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace) {
   for (int64_t row = begin; row < end; row += plan.tile) {
     const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
-    tile.run_layers();
+    tile.run_layers(true);
     tile.write_outputs();
   }
 }
@@ -326,7 +341,7 @@ void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64
                   float* partial) {
   for (int64_t row = begin; row < end; row += plan.tile) {
     const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
-    tile.run_layers();
+    tile.run_layers(false);
     tile.run_gradients(partial, row == begin);
   }
 }
@@ -346,8 +361,14 @@ void mlp_reduce(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t 
     const float* next = sum + part * plan.partial;
     for (int64_t i = 0; i < size; i += kLanes) store(sum + i, load(sum + i) + load(next + i));
   }
-  for (int64_t o = 0; o < layer.width; ++o) {
-    for (int64_t i = 0; i < layer.depth; ++i) weights[o * layer.depth + i] = sum[i * layer.padded + o];
+  for (int64_t i = 0; i < layer.source_count; ++i) {
+    const MlpPlanSource& s = layer.sources[i];
+    const float* from = sum + s.row * layer.padded;
+    float* to = weights + s.row;
+    const int64_t by_o = s.by_outputs ? padded_width(s) : 1, by_input = s.by_outputs ? 1 : layer.padded;
+    for (int64_t o = 0; o < layer.width; ++o) {
+      for (int64_t c = 0; c < s.width; ++c) to[o * layer.depth + c] = from[c * by_input + o * by_o];
+    }
   }
   for (int64_t o = 0; bias != nullptr && o < layer.width; ++o) bias[o] = partials[layer.partial_bias + o];
 }

@@ -10,6 +10,9 @@ namespace {
 // Rows of a tile: a multiple of all blocks of rows (6, 8, 12), and the fastest of 48, 96, 144 and 192 at every width.
 constexpr int64_t kTile = 96;
 
+// Outputs that a row of 16 lanes wastes most of: at most a block's rows, and [outputs][inputs] then fits [inputs][16].
+constexpr int64_t kFewOutputs = 6;
+
 int64_t pad(int64_t width) {
   return ceil_div(width, kGranule) * kGranule;
 }
@@ -113,19 +116,24 @@ void MlpPlanner::order_gradients() {
   for (int64_t l = count; l-- > 0;) {
     if (!layers_[l].live) continue;
     for (MlpPlanSource& s : sources_[l]) {
+      const bool few = layers_[l].width <= kFewOutputs && s.width > kGranule;
       if (s.from >= 0) {
         s.gradient = true;
+        s.by_outputs = few;
         s.first = seen[s.from] == nullptr && !layers_[s.from].from_output;
         seen[s.from] = latest[s.from] = &s;
       } else {
         bool& before = s.from == kFromPositions ? positions_seen : directions_seen;
-        s.gradient = (s.from == kFromPositions ? plan_.positions : plan_.directions).gradient_wanted;
+        const MlpPlanInput& input = s.from == kFromPositions ? plan_.positions : plan_.directions;
+        s.gradient = input.gradient_wanted;
+        s.by_outputs = few && input.copied;  // a tile's buffer is padded, the caller's array is not
         s.first = !before;
         before = true;
       }
     }
   }
   for (int64_t l = 0; l < count; ++l) {
+    layers_[l].only_output = latest[l] == nullptr && layers_[l].activation == static_cast<int>(Activation::none);
     if (latest[l] == nullptr) continue;
     latest[l]->last = true;
     layers_[l].slope_fused = layers_[l].activation == static_cast<int>(Activation::relu);

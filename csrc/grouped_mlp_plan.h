@@ -21,6 +21,7 @@ struct MlpPlanSource {
   bool first;          // ... as the first contribution to its buffer
   bool last;           // ... as the last one, after which the gradient is complete
   int64_t packed;      // [o][width] in panels, in the workspace
+  bool by_outputs;  // weight gradient as [o][width, padded] instead of [width][o, padded]: less waste for few outputs
 };
 
 struct MlpPlanLayer {
@@ -34,7 +35,8 @@ struct MlpPlanLayer {
   bool slope_kept;                // sine: its cosine is kept for the backward pass
   bool slope_fused;               // relu: applied by the product that completes the gradient
   bool from_output;               // part of the network's output
-  int64_t partial, partial_bias;  // gradients [depth][padded] and [padded], in a partial
+  bool only_output;               // linear and read by no layer: the backward pass needs its gradient, not its value
+  int64_t partial, partial_bias;  // gradients [depth][padded] (by_outputs: as said there) and [padded], in a partial
 };
 
 struct MlpPlanOutput {
