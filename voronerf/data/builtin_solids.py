@@ -32,7 +32,9 @@ def _pick(colours: tuple[Colour, ...], index: Array) -> Array:
 
 def _azimuth(points: Array) -> Array:
     """Angle around the z axis as a share of the full turn, 0..1, [n]."""
-    return np.arctan2(points[:, 1], points[:, 0]) / (2 * math.pi) + 0.5
+    x, y, _ = points.T
+    turn: Array = np.arctan2(y, x) / np.float32(2 * math.pi)
+    return turn + np.float32(0.5)
 
 
 def _plain(colour: Colour) -> Texture:

@@ -1,0 +1,194 @@
+"""Loading good scenes: cameras fit their images, normalisation, splits."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from voronerf.data import Scene, builtin_scene, load_scene
+from voronerf.data.capture import normalise_poses
+from voronerf.rendering.cameras import Cameras, focus_point, orbit_cameras
+
+DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
+
+
+def needs(name: str) -> Path:
+    folder = DATA / name
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not there; set VORONERF_DATA to a folder that holds {name}")
+    return folder
+
+
+def write_blender(folder: Path, scene: Scene, angle: float) -> None:
+    """Writes a scene the way Blender's are stored."""
+    for name, split in (("train", scene.train), ("test", scene.test)):
+        (folder / name).mkdir(parents=True)
+        frames = []
+        for index, pose in enumerate(split.cameras.poses):
+            Image.fromarray(split.images[index].numpy()).save(folder / name / f"r_{index}.png")
+            frames.append({"file_path": f"./{name}/r_{index}", "transform_matrix": pose.tolist()})
+        (folder / f"transforms_{name}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+
+
+def write_capture(folder: Path, cameras: Cameras, **entries: Any) -> None:
+    folder.mkdir(exist_ok=True)
+    frames = []
+    for index, pose in enumerate(cameras.poses):
+        Image.fromarray(np.full((cameras.height, cameras.width, 3), index, dtype=np.uint8)).save(
+            folder / f"{index:02d}.png"
+        )
+        frames.append({"file_path": f"{index:02d}.png", "transform_matrix": pose.tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 20.0, **entries, "frames": frames[::-1]}))
+
+
+def test_blender_round_trip(tmp_path: Path) -> None:
+    original = builtin_scene(24, train_views=6, test_views=2)
+    write_blender(tmp_path / "toys", original, 0.6911112)
+    scene = load_scene(tmp_path / "toys")
+    assert (scene.name, scene.near, scene.far, scene.spacing, scene.background) == ("toys", 2, 6, "linear", "white")
+    assert scene.train.names == tuple(f"r_{index}" for index in range(6))
+    assert torch.equal(scene.train.images, original.train.images)
+    assert torch.equal(scene.test.images, original.test.images)
+    torch.testing.assert_close(scene.train.cameras.poses, original.train.cameras.poses)
+    torch.testing.assert_close(scene.train.cameras.intrinsics, original.train.cameras.intrinsics)
+    half = load_scene(tmp_path / "toys", downscale=2)
+    assert (half.train.cameras.width, half.train.images.shape[1:]) == (12, (12, 12, 4))
+    torch.testing.assert_close(half.train.cameras.intrinsics, original.train.cameras.intrinsics / 2)
+    white = torch.ones(3)
+    averaged = original.train.truth(0, white).reshape(12, 2, 12, 2, 3).mean(dim=(1, 3))
+    torch.testing.assert_close(half.train.truth(0, white), averaged, atol=1.01 / 255, rtol=0)
+
+
+def test_blender_without_alpha_has_no_box(tmp_path: Path) -> None:
+    original = builtin_scene(12, train_views=5, test_views=1)
+    write_blender(tmp_path, original, 0.69)
+    for path in tmp_path.glob("*/*.png"):
+        Image.open(path).convert("RGB").save(path)
+    scene = load_scene(tmp_path)
+    assert scene.box is None and scene.train.images.shape[-1] == 3
+    assert torch.equal(scene.train.truth(0, torch.ones(3)), scene.train.images[0] / 255)
+
+
+def test_val_stands_in_for_test(tmp_path: Path) -> None:
+    write_blender(tmp_path, builtin_scene(8, train_views=4, test_views=3), 0.69)
+    (tmp_path / "transforms_test.json").rename(tmp_path / "transforms_val.json")
+    assert len(load_scene(tmp_path).test) == 3
+
+
+def test_truth_composites() -> None:
+    split = builtin_scene(10, train_views=1, test_views=1).test
+    colour, alpha = split.images[0, ..., :3] / 255, split.images[0, ..., 3:] / 255
+    torch.testing.assert_close(
+        split.truth(0, torch.tensor((0.0, 0.5, 1.0)))[..., 1:2], colour[..., 1:2] * alpha + 0.5 * (1 - alpha)
+    )
+    torch.testing.assert_close(split.truth(0, None), colour * alpha)
+
+
+def test_capture(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    orbit = orbit_cameras(20, radius=7, elevation=15, width=12, height=10, focal=20, centre=(5, -2, 3))
+    write_capture(tmp_path / "room", orbit, cx=5.5, cy=6.5, k1=0.02, p2=-0.001)
+    for index in (3, 4):
+        (tmp_path / "room" / f"{index:02d}.png").unlink()
+    with caplog.at_level(logging.WARNING):
+        scene = load_scene(tmp_path / "room")
+    assert [record.getMessage().split(": ")[1] for record in caplog.records] == [
+        "2 of 20 listed images are missing and are skipped"
+    ]
+    assert scene.test.names == ("00", "10", "18")
+    assert len(scene.train) == 15 and "10" not in scene.train.names
+    # images stay with their cameras through sorting and splitting
+    for split in (scene.train, scene.test):
+        for name, image in zip(split.names, split.images):
+            assert (image == int(name)).all()
+    assert (scene.background, scene.box, scene.spacing) == (None, None, "disparity")
+    assert 0 < scene.near < 1 < scene.far
+    cameras = scene.train.cameras
+    torch.testing.assert_close(cameras.intrinsics[0], torch.tensor((20.0, 20.0, 5.5, 6.5)))
+    assert cameras.distortion is not None
+    torch.testing.assert_close(cameras.distortion[0], torch.tensor((0.02, 0, 0, -0.001)))
+    torch.testing.assert_close(cameras.origins.norm(dim=-1), torch.ones(15), atol=1e-4, rtol=0)
+    # neighbours of the orbit stay 18 degrees apart: the turn is rigid
+    by_name = dict(zip(scene.train.names, cameras.forward))
+    angle = math.degrees(math.acos(float(by_name["01"] @ by_name["02"])))
+    before = math.degrees(math.acos(float(orbit.forward[1] @ orbit.forward[2])))
+    assert angle == pytest.approx(before, abs=0.05)
+
+
+def test_capture_without_missing_images_is_silent(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_capture(tmp_path, orbit_cameras(3, radius=2, elevation=5, width=4, height=4, focal=4))
+    load_scene(tmp_path)
+    assert not caplog.records
+
+
+def test_capture_intrinsics_per_frame_and_from_angles(tmp_path: Path) -> None:
+    write_capture(tmp_path, orbit_cameras(3, radius=2, elevation=5, width=12, height=10, focal=4))
+    path = tmp_path / "transforms.json"
+    contents = json.loads(path.read_text())
+    del contents["fl_x"]
+    contents["camera_angle_x"] = 2 * math.atan(0.5)
+    contents["frames"][0] |= {"fl_x": 30.0, "fl_y": 31.0, "cx": 1.0, "k1": 0.05}  # the last by name
+    path.write_text(json.dumps(contents))
+    train = load_scene(tmp_path).train
+    torch.testing.assert_close(train.cameras.intrinsics, torch.tensor([[12.0, 12, 6, 5], [30, 31, 1, 5]]))
+    assert train.cameras.distortion is not None
+    assert train.cameras.distortion[:, 0].tolist() == pytest.approx([0, 0.05])
+
+
+def test_capture_with_alpha_is_an_object_on_white(tmp_path: Path) -> None:
+    original = builtin_scene(20, train_views=12, test_views=1)
+    write_capture(tmp_path, original.train.cameras, camera_angle_x=0.6911112, fl_x=None)
+    for index, image in enumerate(original.train.images):
+        Image.fromarray(image.numpy()).save(tmp_path / f"{index:02d}.png")
+    scene = load_scene(tmp_path)
+    assert (scene.background, scene.spacing) == ("white", "linear")
+    assert scene.box is not None and float(scene.box.abs().max()) < 1
+
+
+def test_normalise_poses() -> None:
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2)))[0].double()
+    turn *= torch.linalg.det(turn)
+    poses = orbit_cameras(9, radius=6, elevation=30, width=1, height=1, focal=1, centre=(1, 2, 3)).poses.double()
+    moved = poses.clone()
+    moved[:, :3] = turn @ moved[:, :3]
+    result = normalise_poses(moved)
+    cameras = Cameras(result.float(), torch.ones(9, 4), 1, 1)
+    focus = focus_point(cameras)
+    assert focus is not None and float(focus.abs().max()) < 1e-3
+    assert float(cameras.origins.norm(dim=-1).max()) == pytest.approx(1, abs=1e-4)
+    torch.testing.assert_close(cameras.origins[:, 2], torch.full((9,), 0.5), atol=1e-3, rtol=0)  # upright again
+    rotation = result[:, :3, :3]
+    torch.testing.assert_close(rotation.mT @ rotation, torch.eye(3).double().expand(9, 3, 3), atol=1e-5, rtol=0)
+
+
+def test_normalise_degenerate_poses() -> None:
+    one_place = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    assert normalise_poses(one_place).isfinite().all()
+    row = one_place.clone()
+    row[:, 0, 3] = torch.arange(3)
+    assert float(normalise_poses(row)[:, :3, 3].norm(dim=-1).max()) == pytest.approx(1)
+
+
+@pytest.mark.data
+def test_lego() -> None:
+    scene = load_scene(needs("lego"), downscale=4)
+    assert scene.train.images.shape == (100, 100, 100, 4) and scene.test.images.shape == (200, 100, 100, 4)
+    assert scene.box is not None
+    assert float(scene.box[0].max()) < -0.5 and float(scene.box[1].min()) > 0.7 and float(scene.box.abs().max()) < 1.4
+
+
+@pytest.mark.data
+def test_fox(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        scene = load_scene(needs("fox"), downscale=8)
+    assert "17 of 67 listed images are missing" in caplog.text
+    assert scene.train.images.shape == (43, 240, 135, 3) and scene.test.images.shape == (7, 240, 135, 3)
+    assert scene.train.cameras.distortion is not None

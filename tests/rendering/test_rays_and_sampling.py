@@ -1,0 +1,121 @@
+"""Box intersection and stratified sampling, against slow loops and their properties."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from voronerf.rendering.rays import intersect_box
+from voronerf.rendering.sampling import stratified_depths
+
+BOX = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 0.5, 2.0]])
+
+
+def slow_interval(origin, direction, box, near, far):
+    """Scans the ray in small steps."""
+    steps = torch.linspace(near, far, 20001, dtype=torch.float64)
+    points = origin.double() + steps[:, None] * direction.double()
+    inside = ((points >= box[0].double()) & (points <= box[1].double())).all(-1)
+    return (float(steps[inside][0]), float(steps[inside][-1])) if inside.any() else None
+
+
+def test_box_against_slow_loop() -> None:
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.randn(60, 3, generator=generator) * 2
+    origins[:5] *= 0.1  # some start inside
+    directions = torch.nn.functional.normalize(torch.randn(60, 3, generator=generator) - 0.5 * origins, dim=-1)
+    near, far, hit = intersect_box(origins, directions, BOX, 0.25, 6.0)
+    assert 10 < int(hit.sum()) < 60
+    for i in range(60):
+        expected = slow_interval(origins[i], directions[i], BOX, 0.25, 6.0)
+        if expected is None:
+            assert not hit[i] or float(far[i] - near[i]) < 1e-3
+        else:
+            assert hit[i] or expected[1] - expected[0] < 1e-3
+            assert (float(near[i]), float(far[i])) == pytest.approx(expected, abs=1e-3)
+
+
+def test_box_axis_parallel_rays_and_origin_on_a_face() -> None:
+    origins = torch.tensor([[-3.0, 0, 1], [-3, 0.6, 1], [-1, 0, 1], [0, 0.5, 1], [-3, 0.5, 2], [0, 0, -1]])
+    directions = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, -0.0, 1]])
+    near, far, hit = intersect_box(origins, directions, BOX, 0.0, 10.0)
+    assert hit.tolist() == [True, False, True, True, True, True]
+    assert near[hit].tolist() == [2, 0, 0, 2, 1]
+    assert far[hit].tolist() == [4, 0.5, 1, 4, 3]
+    assert near[1] == far[1]
+    assert not near.isnan().any() and not far.isnan().any()
+
+
+def test_box_that_is_behind_or_beyond_is_missed() -> None:
+    origins, directions = torch.tensor([[5.0, 0, 1], [-9, 0, 1]]), torch.tensor([[1.0, 0, 0], [1, 0, 0]])
+    near, far, hit = intersect_box(origins, directions, BOX, 1.0, 6.0)
+    assert not hit.any()
+    assert torch.equal(near, far)
+
+
+def test_no_box_no_rays_and_errors() -> None:
+    origins = torch.zeros(4, 3)
+    near, far, hit = intersect_box(origins, origins + 1, None, 2.0, 6.0)
+    assert near.tolist() == [2] * 4 and far.tolist() == [6] * 4 and hit.all()
+    assert intersect_box(origins[:0], origins[:0], BOX, 2.0, 6.0)[0].shape == (0,)
+    with pytest.raises(ValueError, match="0 <= near < far, got 3 and 3"):
+        intersect_box(origins, origins, BOX, 3, 3)
+    with pytest.raises(ValueError, match=r"same shape \[r, 3\]"):
+        intersect_box(origins, origins[:2], BOX, 1, 3)
+    with pytest.raises(ValueError, match=r"box must have shape \[2, 3\], got \[3, 2\]"):
+        intersect_box(origins, origins, BOX.T, 1, 3)
+
+
+@pytest.mark.parametrize("spacing", ["linear", "disparity"])
+@pytest.mark.parametrize("samples", [1, 7, 64])
+def test_strata(spacing: str, samples: int) -> None:
+    near = torch.tensor([2.0, 0.05, 1.0, 3.0])
+    far = torch.tensor([6.0, 20.0, 1.0, 3.5])
+    generator = torch.Generator().manual_seed(1)
+    depths, deltas, edges = stratified_depths(near, far, samples, jitter=True, spacing=spacing, generator=generator)
+    assert depths.shape == deltas.shape == (4, samples) and edges.shape == (4, samples + 1)
+    torch.testing.assert_close(deltas.sum(-1), far - near, atol=1e-5, rtol=1e-5)
+    assert torch.equal(edges[:, 0], near) and torch.equal(edges[:, -1], far)
+    assert (depths >= edges[:, :-1]).all() and (depths <= edges[:, 1:]).all()
+    assert (deltas >= 0).all()
+    middle, _, same_edges = stratified_depths(near, far, samples, jitter=False, spacing=spacing)
+    assert torch.equal(edges, same_edges)
+    assert torch.equal(middle, stratified_depths(near, far, samples, jitter=False, spacing=spacing)[0])
+
+
+def test_spacing_against_slow_loop() -> None:
+    near, far, samples = 0.5, 8.0, 5
+    for spacing in ("linear", "disparity"):
+        depths, _, edges = stratified_depths(
+            torch.tensor([near]), torch.tensor([far]), samples, jitter=False, spacing=spacing
+        )
+        for i in range(samples + 1):
+            f = i / samples
+            expected = near + f * (far - near) if spacing == "linear" else 1 / ((1 - f) / near + f / far)
+            assert float(edges[0, i]) == pytest.approx(expected, rel=1e-6)
+        for i in range(samples):
+            f = (i + 0.5) / samples
+            expected = near + f * (far - near) if spacing == "linear" else 1 / ((1 - f) / near + f / far)
+            assert float(depths[0, i]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_jitter_is_uniform_and_reproducible() -> None:
+    near, far = torch.zeros(4000), torch.full((4000,), 4.0)
+    first = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
+    again = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
+    assert torch.equal(first, again)
+    inside = first - torch.arange(4.0)
+    assert float(inside.mean()) == pytest.approx(0.5, abs=0.01)
+    assert float(inside.var()) == pytest.approx(1 / 12, abs=0.003)
+
+
+def test_no_rays_and_errors() -> None:
+    none = torch.zeros(0)
+    assert [tuple(t.shape) for t in stratified_depths(none, none, 3, jitter=True)] == [(0, 3), (0, 3), (0, 4)]
+    one = torch.ones(1)
+    with pytest.raises(ValueError, match="samples must be >= 1, got 0"):
+        stratified_depths(one, one, 0, jitter=False)
+    with pytest.raises(ValueError, match="spacing must be one of linear, disparity, got 'log'"):
+        stratified_depths(one, one, 2, jitter=False, spacing="log")
+    with pytest.raises(ValueError, match=r"same shape \[r\], got \[1\] and \[2\]"):
+        stratified_depths(one, torch.ones(2), 2, jitter=False)
