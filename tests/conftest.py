@@ -26,6 +26,8 @@ from voronerf import backends
 
 PARTS = ("native", "cuda", "warp")
 
+pytest_plugins = ("pytester",)
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--require", default="", help=f"parts that must be present, from {','.join(PARTS)}")

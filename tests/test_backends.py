@@ -143,20 +143,18 @@ def test_choice_is_traceable() -> None:
     torch.testing.assert_close(torch.compile(choose, fullgraph=True, backend="eager")(x), choose(x))
 
 
-def test_require_turns_skips_into_failures(tmp_path: Path) -> None:
-    conftest = Path(__file__).with_name("conftest.py").read_text()
-    (tmp_path / "conftest.py").write_text(
-        conftest + '\nbackends.missing = lambda backend, device: None if backend == "reference" else "it is not here"\n'
-    )
-    (tmp_path / "test_it.py").write_text("def test_it(backend):\n    assert backend == 'reference'\n")
-    command = [sys.executable, "-m", "pytest", "-q", "-rA", "-p", "no:cacheprovider", str(tmp_path)]
-    skipped = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
-    assert skipped.returncode == 0, skipped.stdout
-    assert "1 passed, 2 skipped" in skipped.stdout
-    assert "native: it is not here" in skipped.stdout
-    required = subprocess.run([*command, "--require", "native"], capture_output=True, text=True, cwd=tmp_path)
-    assert required.returncode == 1
-    assert "1 passed, 1 skipped, 1 error" in required.stdout
-    assert "--require native: it is not here" in required.stdout
-    unknown = subprocess.run([*command, "--require", "metal"], capture_output=True, text=True, cwd=tmp_path)
-    assert "--require takes native,cuda,warp, got metal" in unknown.stderr + unknown.stdout
+def test_require_turns_skips_into_failures(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(backend: str, device: torch.device) -> str | None:
+        return None if backend == "reference" else "it is not here"
+
+    monkeypatch.setattr(backends, "missing", missing)
+    pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text())
+    pytester.makepyfile("def test_it(backend):\n    assert backend == 'reference'\n")
+    skipped = pytester.runpytest_inprocess("-rs")
+    skipped.assert_outcomes(passed=1, skipped=2)
+    skipped.stdout.fnmatch_lines("*native: it is not here*")
+    required = pytester.runpytest_inprocess("--require", "native")
+    required.assert_outcomes(passed=1, skipped=1, errors=1)
+    required.stdout.fnmatch_lines("*--require native: it is not here*")
+    unknown = pytester.runpytest_inprocess("--require", "metal")
+    unknown.stderr.fnmatch_lines("*--require takes native,cuda,warp, got metal*")
