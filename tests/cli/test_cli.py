@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import imageio_ffmpeg
 import pytest
 from PIL import Image
 
@@ -57,11 +58,12 @@ def test_eval_scores_every_view(run: Path, capsys: pytest.CaptureFixture[str]) -
     assert all(v["name"] in output for v in result["views"])
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
-def test_render_makes_a_video(run: Path, tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"turn{suffix}"
+def test_render_makes_a_video(run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "turn.mp4"
     assert main(["render", str(run), "--frames", "3", "--samples", "4", "--out", str(path)]) == 0
-    assert path.stat().st_size > 100
+    frames = imageio_ffmpeg.read_frames(str(path))
+    assert next(frames)["size"] == (16, 16)
+    assert len(list(frames)) == 3
 
 
 def test_info_names_every_backend(capsys: pytest.CaptureFixture[str]) -> None:

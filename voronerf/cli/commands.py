@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
@@ -124,7 +125,7 @@ def render(
 
     Args:
         run: The run directory.
-        out: The video file, .mp4 or .gif; default turntable.mp4 in the run directory.
+        out: The video file, .mp4; default turntable.mp4 in the run directory.
         frames: Frames of one turn.
         fps: Frames per second.
         data: Scene folder, where it has moved since training.
@@ -161,11 +162,24 @@ def render(
 def info() -> int:
     """Show what this installation can use: build, instruction set, backends, and why something is missing."""
     for name, value in backends.describe().items():
-        console.print(f"{name:14} {value}", highlight=False, markup=False)
-    table = Table("op", "backend", "runs on", "dtypes", "why not elsewhere")
-    for row in backends.table():
-        table.add_row(row.op, row.backend, ", ".join(row.devices), ", ".join(row.dtypes), row.reason)
+        values = value if isinstance(value, dict) else {"": value}
+        for key, entry in values.items():
+            text = ", ".join(map(str, entry)) or "none" if isinstance(entry, list) else str(entry)
+            console.print(f"{f'{name} {key}'.strip():26} {text}", highlight=False, markup=False)
+    rows = {(row.op, row.backend): row for row in backends.table()}
+    missing = dict.fromkeys(row.reason for row in rows.values() if row.dtypes and row.reason)
+    numbers = {reason: number for number, reason in enumerate(missing, 1)}
+    table = Table("op", *backends.BACKENDS, title="where each implementation runs, and for which dtypes")
+    for op in backends.OPS:
+        texts = []
+        for row in (rows[op, backend] for backend in backends.BACKENDS):
+            where = f"{', '.join(row.devices)}: {', '.join(row.dtypes)}" if row.devices else ""
+            note = f" [{numbers[row.reason]}]" if row.reason in numbers else ""
+            texts.append(escape((where + note).strip() or "-"))
+        table.add_row(op, *texts)
     console.print(table)
+    for reason, number in numbers.items():
+        console.print(f"[{number}] {reason}", highlight=False, markup=False)
     return 0
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from voronerf.backends import BackendUnavailable
 from voronerf.cli import commands, demo
+from voronerf.training.config import ConfigError
 from voronerf.training.trainer import TrainingError
 
 
@@ -37,10 +38,10 @@ def main(args: list[str] | None = None) -> int:
             prog="voronerf",
             description="Adaptive Voronoi NeRFs: one small network per Voronoi cell, trained and run as one.",
             args=args,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff),
+            config=(tyro.conf.OmitArgPrefixes,),
         )
-    except (ValueError, OSError, BackendUnavailable, TrainingError) as error:
-        # ValueError includes the project's own SceneError, ConfigError and CheckpointError.
+    except (ConfigError, ValueError, OSError, ImportError, BackendUnavailable, TrainingError) as error:
+        # ValueError includes the project's own SceneError and CheckpointError.
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
         text = " ".join(str(error).split()) or type(error).__name__

@@ -15,8 +15,11 @@ from voronerf.backends import BACKENDS
 FieldName = Literal["nerf"]
 
 
-class ConfigError(ValueError):
-    """A setting that cannot be used; the message names it, the rule and the value."""
+class ConfigError(Exception):
+    """A setting that cannot be used; the message names it, the rule and the value.
+
+    No ValueError, because the command line's parser takes those for its own and explains them at length.
+    """
 
 
 @dataclass(frozen=True)
