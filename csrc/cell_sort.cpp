@@ -1,16 +1,27 @@
 // Stable counting sort on the CPU: a histogram a chunk, one scan over (cell, chunk), a scatter a chunk. Every row has
 // one possible place in a stable order, so neither the chunks nor the threads can change the result.
+//
+// A thread takes kRun neighbouring chunks at a time: their histograms, and the places of their rows within a cell, lie
+// side by side, and a cache line shared between threads costs more than the counting (5.9 ns a row for single chunks at
+// k = 256, against 1.5 on one thread).
 #include "cell_sort.h"
 
 #include <algorithm>
 
 namespace voronerf {
 
+namespace {
+
+constexpr int kRun = 16;
+
+}  // namespace
+
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
                    int threads) {
   const int64_t rows = cell_sort_chunk_rows(k), chunks = cell_sort_chunks(n, k);
   bool valid = true;
-#pragma omp parallel for schedule(dynamic) num_threads(threads) reduction(&& : valid) if (threads > 1 && chunks > 1)
+#pragma omp parallel for schedule(dynamic, kRun) num_threads(threads) \
+    reduction(&& : valid) if (threads > 1 && chunks > kRun)
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     int32_t* count = workspace + chunk * k;
     std::fill(count, count + k, 0);
@@ -43,7 +54,7 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32
     }
   }
 
-#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1 && chunks > 1)
+#pragma omp parallel for schedule(dynamic, kRun) num_threads(threads) if (threads > 1 && chunks > kRun)
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     int32_t* place = workspace + chunk * k;
     for (int64_t i = chunk * rows, end = std::min(n, i + rows); i < end; ++i) {
