@@ -21,8 +21,8 @@ from voronerf.rendering.cameras import Cameras, distort, focus_point, undistort
 
 HOLD_OUT = 8
 # share of the distance from the focus to the nearest camera: what is closer than this was not photographed sharply
-NEAR = 0.3
-FAR = 8.0
+NEAR = 0.35
+FAR = 4.0
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
 UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 
@@ -30,7 +30,7 @@ UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 def load_capture(folder: Path, downscale: int) -> Scene:
     """Loads a capture; every 8th image in the order of their names is held out for testing.
 
-    Rays of an opaque capture reach from near the cameras to eight times their distance, sampled in disparity: a plain
+    Rays of an opaque capture reach from near the cameras to four times their distance, sampled in disparity: a plain
     network in such coordinates learns the object and, coarsely, the room. With alpha it is an object on white, in a box
     carved from the masks.
 
