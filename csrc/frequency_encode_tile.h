@@ -1,8 +1,11 @@
-// The frequency encoding of the rows of a tile, and its gradient: [x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...], each
-// a block of d features, as in voronerf/reference/frequency_encode.py.
+// The frequency encoding of the rows of a tile, and its gradient: [x, sin x,
+// cos x, sin 2x, cos 2x, sin 4x, ...], each a block of d features, as in
+// voronerf/reference/frequency_encode.py.
 //
-// A lane is a column of the encoding: a permutation brings it its feature, a table its octave and phase, and one sine
-// with one range reduction does the rest. So rows come out in the layout the products read, with no transposition.
+// A lane is a column of the encoding: a permutation brings it its feature, a
+// table its octave and phase, and one sine with one range reduction does the
+// rest. So rows come out in the layout the products read, with no
+// transposition.
 #pragma once
 
 #include "elementwise_math.h"
@@ -15,7 +18,8 @@ namespace {
 // Lane i of the result is lane index[i] of x.
 VN_INLINE F32 permute(F32 x, Bits index) {
 #if VN_ISA == 2
-  return _mm512_maskz_permutexvar_ps(0xffff, reinterpret_cast<__m512i>(index), x);  // maskz: gcc 12 warns of the other
+  return _mm512_maskz_permutexvar_ps(0xffff, reinterpret_cast<__m512i>(index),
+                                     x);  // maskz: gcc 12 warns of the other
 #elif VN_ISA == 1
   return _mm256_permutevar8x32_ps(x, reinterpret_cast<__m256i>(index));
 #else
@@ -23,8 +27,9 @@ VN_INLINE F32 permute(F32 x, Bits index) {
 #endif
 }
 
-// table [3][stride]: source feature (as an integer), scale and phase of each column.
-void encode_table(float* table, int64_t stride, int64_t d, int64_t octaves) {
+// table [3][stride]: source feature (as an integer), scale and phase of each
+// column.
+VN_INLINE void encode_table(float* table, int64_t stride, int64_t d, int64_t octaves) {
   for (int64_t column = 0; column < stride; ++column) {
     int32_t feature = static_cast<int32_t>(column);
     float scale = 1.0f, phase = 0.0f;
@@ -41,7 +46,8 @@ void encode_table(float* table, int64_t stride, int64_t d, int64_t octaves) {
   }
 }
 
-// Angles too large for the vector sine, and what is not finite: the C library's functions.
+// Angles too large for the vector sine, and what is not finite: the C library's
+// functions.
 void encode_row_exactly(const float* x, const float* table, int64_t stride, int64_t d, int64_t width, float* out) {
   for (int64_t column = d; column < width; ++column) {
     int32_t feature;
@@ -83,7 +89,8 @@ VN_INLINE bool all_small(const float* x, int64_t count, float largest) {
   return small;
 }
 
-// x [rows][d], with kLanes readable floats from every row's start -> out [rows][stride].
+// x [rows][d], with kLanes readable floats from every row's start -> out
+// [rows][stride].
 void encode(const float* x, const float* table, int64_t rows, int64_t d, int64_t octaves, float* out, int64_t stride) {
   const int64_t width = d * (1 + 2 * octaves);
   const float largest = octaves > 0 ? kLargestAngle / table[stride + width - 1] : 0.0f;
@@ -103,8 +110,8 @@ void encode(const float* x, const float* table, int64_t rows, int64_t d, int64_t
   }
 }
 
-// Gradient to the raw features, from that of the encoding and the encoding itself, whose sines and cosines are each
-// other's derivatives.
+// Gradient to the raw features, from that of the encoding and the encoding
+// itself, whose sines and cosines are each other's derivatives.
 void encode_backward(const float* value, const float* gradient, const float* table, int64_t rows, int64_t d,
                      int64_t octaves, int64_t stride, float* out) {
   for (int64_t row = 0; row < rows; ++row, value += stride, gradient += stride, out += d) {

@@ -11,10 +11,16 @@
 //
 // A concatenation is a list of sources, walked one after the other with the same accumulators. What is left of the rows
 // runs in a block of exactly its size: nothing outside `rows` is read or written. Columns come in whole blocks of 16;
-// B, C and `initial` must be padded to that.
+// B, C and `start` must be padded to that.
 #pragma once
 
+#include "bfloat16_tile.h"
+#include "memory_tile.h"
 #include "simd.h"
+
+#ifndef VN_HALF
+#error "define VN_HALF: 0 for float32 operands, 1 for a pair of bfloat16 in the place of each float"
+#endif
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
@@ -22,14 +28,13 @@ namespace {
 
 constexpr int64_t kPanel = 64;  // columns of a packed panel of B
 
-VN_INLINE F32 load(const float* from) {
-  F32 a;
-  __builtin_memcpy(&a, from, sizeof a);
-  return a;
-}
-
-VN_INLINE void store(float* to, F32 a) {
-  __builtin_memcpy(to, &a, sizeof a);
+// The step along k: one product, or with bfloat16 operands the two of a pair.
+VN_INLINE F32 multiply_add(F32 a, F32 b, F32 sum) {
+#if VN_HALF
+  return _mm512_dpbf16_ps(sum, (__m512bh)a, (__m512bh)b);
+#else
+  return fma(a, b, sum);
+#endif
 }
 
 // One source of a concatenated A: `depth` values of k, in rows of `stride` floats.
@@ -52,6 +57,10 @@ struct Product {
   int64_t c_stride;
   Finish finish;
   const float* slope;  // relu_slope: C is multiplied by slope > 0, [rows][c_stride]
+  // bfloat16 operands, columns a multiple of 32, finish none or relu: C as pairs as well, [rows][pairs_stride], and c
+  // may be null.
+  float* pairs;
+  int64_t pairs_stride;
 };
 
 // A row to start from: nothing.
@@ -84,7 +93,7 @@ void block(const Product& p, int64_t row, int64_t column) {
         for (int v = 0; v < V; ++v) w[v] = load(b + v * kLanes);
         for (int r = 0; r < R; ++r) {
           const F32 x = splat(a[r]);
-          for (int v = 0; v < V; ++v) sum[r][v] = fma(x, w[v], sum[r][v]);
+          for (int v = 0; v < V; ++v) sum[r][v] = multiply_add(x, w[v], sum[r][v]);
         }
         a += stride;
         b += b_stride;
@@ -97,7 +106,7 @@ void block(const Product& p, int64_t row, int64_t column) {
         for (int v = 0; v < V; ++v) w[v] = load(b + v * kLanes);
         for (int r = 0; r < R; ++r) {
           const F32 x = splat(a[r / 4][(r % 4) * stride]);
-          for (int v = 0; v < V; ++v) sum[r][v] = fma(x, w[v], sum[r][v]);
+          for (int v = 0; v < V; ++v) sum[r][v] = multiply_add(x, w[v], sum[r][v]);
         }
         for (int g = 0; g < (R + 3) / 4; ++g) ++a[g];
         b += b_stride;
@@ -108,7 +117,26 @@ void block(const Product& p, int64_t row, int64_t column) {
   // so that NaN passes, as in torch.
   const F32 zero = splat(0.0f), one = splat(1.0f);
   const int64_t c_stride = p.c_stride;
-  float* const c = p.c + row * c_stride + column;
+  float* const c = p.c == nullptr ? nullptr : p.c + row * c_stride + column;
+#if VN_HALF
+  if (V % 2 == 0 && p.pairs != nullptr) {
+    const F32 lowest = p.finish == Finish::relu ? zero : splat(-__builtin_huge_valf());
+    const int64_t pairs_stride = p.pairs_stride;
+    float* const pairs = p.pairs + row * pairs_stride + column / 2;
+    for (int r = 0; r < R; ++r) {
+      for (int v = 0; v + 1 < V; v += 2) {
+        const F32 low = sum[r][v] < lowest ? lowest : sum[r][v];
+        const F32 high = sum[r][v + 1] < lowest ? lowest : sum[r][v + 1];
+        store(pairs + r * pairs_stride + v * kLanes / 2, joined(low, high));
+        if (c != nullptr) {
+          store(c + r * c_stride + v * kLanes, low);
+          store(c + r * c_stride + (v + 1) * kLanes, high);
+        }
+      }
+    }
+    return;
+  }
+#endif
   if (p.finish == Finish::none) {
     for (int r = 0; r < R; ++r) {
       for (int v = 0; v < V; ++v) store(c + r * c_stride + v * kLanes, sum[r][v]);

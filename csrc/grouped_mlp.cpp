@@ -106,16 +106,33 @@ void zero_strays(const MlpInputs& in, int64_t width, float* out) {
   std::fill(out + in.offsets[in.k] * width, out + in.n * width, 0.0f);
 }
 
+bool use_half(const MlpTable& table, Isa isa) {
+#if VN_HAS_HALF
+  return table.half && isa == Isa::avx512 && __builtin_cpu_supports("avx512bf16");
+#else
+  return false && table.half && isa == Isa::avx512;
+#endif
+}
+
 void prepare(Isa isa, const MlpPlan& plan, float* own) {
   VN_FOR_ISA(isa, mlp_prepare(plan, own))
 }
 void pack(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, float* own) {
+#if VN_HAS_HALF
+  if (plan.half) return avx512::mlp_half_pack(plan, data, cell, own);
+#endif
   VN_FOR_ISA(isa, mlp_pack(plan, data, cell, own))
 }
 void forward(Isa isa, const MlpPlan& plan, const MlpData& data, const Task& task, float* own) {
+#if VN_HAS_HALF
+  if (plan.half) return avx512::mlp_half_forward(plan, data, task.begin, task.end, own);
+#endif
   VN_FOR_ISA(isa, mlp_forward(plan, data, task.begin, task.end, own))
 }
 void backward(Isa isa, const MlpPlan& plan, const MlpData& data, const Task& task, float* own, float* partial) {
+#if VN_HAS_HALF
+  if (plan.half) return avx512::mlp_half_backward(plan, data, task.begin, task.end, own, partial);
+#endif
   VN_FOR_ISA(isa, mlp_backward(plan, data, task.begin, task.end, own, partial))
 }
 void reduce(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t layer, float* partials,
@@ -164,7 +181,7 @@ float* take(const MlpPlan& plan, int threads, int64_t extra) {
 
 void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa isa, int threads) {
   check(in);
-  const MlpPlanner planner(table, in.direction_index != nullptr, {false, false, false});
+  const MlpPlanner planner(table, in.direction_index != nullptr, {false, false, false, use_half(table, isa)});
   const MlpPlan& plan = planner.plan();
   zero_strays(in, plan.out_features, out);
   const Tasks tasks = split(in, std::clamp(in.n / kTasks, kFewestRows, kMostRows));
@@ -179,7 +196,8 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
                               int threads) {
   check(in);
   const bool indexed = in.direction_index != nullptr;
-  const MlpWanted wanted{gradients.weights != nullptr, gradients.positions != nullptr, gradients.directions != nullptr};
+  const MlpWanted wanted{gradients.weights != nullptr, gradients.positions != nullptr, gradients.directions != nullptr,
+                         use_half(table, isa)};
   const MlpPlanner planner(table, indexed, wanted);
   const MlpPlan& plan = planner.plan();
   const int64_t room = std::max<int64_t>(kPartialFloats / std::max<int64_t>(plan.partial, 1), 1);

@@ -4,6 +4,13 @@
 #include "grouped_mlp_plan.h"
 #include "isa.h"
 
+// Whether the build has bfloat16 products: gcc's target pragma gives them to one file.
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#define VN_HAS_HALF 1
+#else
+#define VN_HAS_HALF 0
+#endif
+
 namespace voronerf {
 
 // Fills the encoding tables of a workspace; once for each thread and call.
@@ -19,6 +26,16 @@ VN_DECLARE_FOR_ISA(void mlp_forward(const MlpPlan& plan, const MlpData& data, in
 // Their gradients; those of the parameters fill `partial`.
 VN_DECLARE_FOR_ISA(void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end,
                                      float* workspace, float* partial))
+
+// The same with bfloat16 products.
+#if VN_HAS_HALF
+namespace avx512 {
+void mlp_half_pack(const MlpPlan& plan, const MlpData& data, int64_t cell, float* workspace);
+void mlp_half_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace);
+void mlp_half_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace,
+                       float* partial);
+}  // namespace avx512
+#endif
 
 // Gradients of a cell's layer: the sum of `count` partials in their order.
 VN_DECLARE_FOR_ISA(void mlp_reduce(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t layer,

@@ -59,7 +59,8 @@ void MlpPlanner::place_buffers() {
   std::vector<int64_t> first_gradient(count, end);
   int64_t position_gradient = end, direction_gradient = end;
   for (int64_t l = 0; l < count; ++l) {
-    last_use[l] = std::max(last_use[l], layers_[l].from_output ? end : l + 1);  // outputs are written at the end
+    last_use[l] = std::max(last_use[l],
+                           layers_[l].from_output ? end : l + 1);  // outputs are written at the end
     if (!layers_[l].live) continue;
     for (const MlpPlanSource& s : sources_[l]) {
       const bool layer = s.from >= 0;
@@ -75,12 +76,17 @@ void MlpPlanner::place_buffers() {
     const int64_t stride = pad(width);
     return MlpBuffer{arena.take(stride * plan_.tile, from, to), stride};
   };
+  const auto pairs = [&](int64_t width, int64_t from, int64_t to) {
+    const int64_t stride = pad(width) / 2;
+    return MlpBuffer{arena.take(stride * plan_.tile, from, to), stride};
+  };
   const auto place_input = [&](MlpPlanInput& input, int64_t last, int64_t first_contribution) {
     if (!input.used) return;
     input.table = arena.take(3 * pad(input.width), 0, end);
     // One vector more, since the encoder loads a whole one for each row.
     input.staged = {arena.take(pad(input.raw * plan_.tile) + 2 * kGranule, 0, end), input.raw};
     if (input.copied) input.value = buffer(input.width, 0, plan_.gradients ? end : last);
+    if (plan_.half) input.narrow = pairs(input.width, 0, plan_.gradients ? end : last);
     if (input.gradient_wanted) input.gradient = buffer(input.width, first_contribution, end);
   };
   place_input(plan_.positions, last_position, position_gradient);
@@ -88,7 +94,10 @@ void MlpPlanner::place_buffers() {
   for (int64_t l = 0; l < count; ++l) {
     MlpPlanLayer& layer = layers_[l];
     if (!layer.live) continue;
-    layer.value = buffer(layer.width, l + 1, plan_.gradients ? end : last_use[l]);
+    // With bfloat16 operands a value that is no output is read only while it is narrowed.
+    const int64_t last = plan_.gradients ? end : plan_.half && !layer.from_output ? l + 1 : last_use[l];
+    layer.value = buffer(layer.width, l + 1, last);
+    if (plan_.half) layer.narrow = pairs(layer.width, l + 1, plan_.gradients ? end : last_use[l]);
     if (!plan_.gradients) continue;
     if (layer.slope_kept) layer.slope = buffer(layer.width, 0, end);
     layer.gradient = buffer(layer.width, layer.from_output ? count + 1 : first_gradient[l], turn(l));
@@ -96,12 +105,23 @@ void MlpPlanner::place_buffers() {
   for (int64_t l = 0; l < count; ++l) {
     MlpPlanLayer& layer = layers_[l];
     if (!layer.live) continue;
-    layer.packed = arena.take(layer.depth * layer.padded, 0, end);
+    layer.packed = arena.take(layer.packed_depth * layer.padded, 0, end);
     layer.bias = arena.take(layer.padded, 0, end);
     if (!plan_.gradients) continue;
     for (MlpPlanSource& s : sources_[l]) {
-      if (s.gradient) s.packed = arena.take(layer.width * pad(s.width), 0, end);
+      if (s.gradient) s.packed = arena.take(layer.packed_width * pad(s.width), 0, end);
     }
+  }
+  if (plan_.half) {
+    int64_t widest = 0, packing = 0;
+    for (int64_t l = 0; l < count; ++l) {
+      widest = std::max(widest, layers_[l].padded);
+      packing = std::max(packing, 4 * (layers_[l].packed_depth + kGranule));
+      for (const MlpPlanSource& s : sources_[l]) widest = std::max(widest, pad(s.width));
+    }
+    const int64_t size = pad(std::max(widest * plan_.tile / 2, packing));
+    plan_.scratch_input = arena.take(size, 0, end);
+    plan_.scratch_output = arena.take(size, 0, end);
   }
   if (plan_.parameter_gradients) plan_.own_partial = arena.take(plan_.partial, 0, end);
   plan_.workspace = arena.total();
@@ -133,6 +153,7 @@ void MlpPlanner::order_gradients() {
     }
   }
   for (int64_t l = 0; l < count; ++l) {
+    layers_[l].read = latest[l] != nullptr;
     layers_[l].only_output = latest[l] == nullptr && layers_[l].activation == static_cast<int>(Activation::none);
     if (latest[l] == nullptr) continue;
     latest[l]->last = true;
@@ -156,14 +177,15 @@ MlpPlanner::MlpPlanner(const MlpTable& table, bool indexed_directions, const Mlp
   plan_.layer_count = static_cast<int64_t>(table.layers.size());
   plan_.gradients = wanted.parameters || wanted.positions || wanted.directions;
   plan_.parameter_gradients = wanted.parameters;
+  plan_.half = wanted.half;
   layers_.resize(table.layers.size());
   sources_.resize(table.layers.size());
-  const auto input = [](int64_t raw, int octaves, bool gather, bool gradient) {
+  const auto input = [&wanted](int64_t raw, int octaves, bool gather, bool gradient) {
     MlpPlanInput it{};
     it.raw = raw;
     it.octaves = octaves;
     it.width = octaves < 0 ? raw : raw * (1 + 2 * octaves);
-    it.copied = octaves >= 0 || gather;
+    it.copied = octaves >= 0 || gather || wanted.half;
     it.gradient_wanted = gradient;
     return it;
   };
@@ -175,6 +197,7 @@ MlpPlanner::MlpPlanner(const MlpTable& table, bool indexed_directions, const Mlp
     layer.activation = static_cast<int>(table.layers[l].activation);
     layer.width = table.layers[l].width;
     layer.padded = pad(layer.width);
+    layer.packed_width = wanted.half ? ceil_div(layer.width, int64_t{2}) : layer.width;
     layer.slope_kept = table.layers[l].activation == Activation::sine;
     for (const int from : table.layers[l].inputs) {
       MlpPlanSource s{};
@@ -183,7 +206,9 @@ MlpPlanner::MlpPlanner(const MlpTable& table, bool indexed_directions, const Mlp
                 : from == kFromPositions ? plan_.positions.width
                                          : plan_.directions.width;
       s.row = layer.depth;
+      s.packed_row = layer.packed_depth;
       layer.depth += s.width;
+      layer.packed_depth += wanted.half ? ceil_div(s.width, int64_t{2}) : s.width;
       sources_[l].push_back(s);
     }
     layer.sources = sources_[l].data();

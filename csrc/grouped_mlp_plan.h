@@ -21,6 +21,7 @@ struct MlpPlanSource {
   bool first;          // ... as the first contribution to its buffer
   bool last;           // ... as the last one, after which the gradient is complete
   int64_t packed;      // [o][width] in panels, in the workspace
+  int64_t packed_row;  // as row, in pairs with bfloat16 operands
   bool by_outputs;  // weight gradient as [o][width, padded] instead of [width][o, padded]: less waste for few outputs
 };
 
@@ -30,8 +31,11 @@ struct MlpPlanLayer {
   int64_t width, padded, depth;  // outputs, padded to kGranule; inputs
   const MlpPlanSource* sources;
   int64_t source_count;
-  int64_t packed, bias;  // weights [depth][padded] in panels, bias [padded], in the workspace
+  int64_t packed_depth, packed_width;  // depth and width, in pairs with bfloat16 operands
+  int64_t packed, bias;                // weights [depth][padded] in panels, bias [padded], in the workspace
   MlpBuffer value, slope, gradient;
+  MlpBuffer narrow;               // the value as pairs of bfloat16, stride in pairs
+  bool read;                      // by another layer
   bool slope_kept;                // sine: its cosine is kept for the backward pass
   bool slope_fused;               // relu: applied by the product that completes the gradient
   bool from_output;               // part of the network's output
@@ -48,7 +52,7 @@ struct MlpPlanOutput {
 struct MlpPlanInput {
   int64_t raw, octaves, width;  // octaves -1: none
   bool used, copied;            // copied: values lie in `value`, otherwise they are read where they are
-  MlpBuffer staged, value, gradient;
+  MlpBuffer staged, value, narrow, gradient;
   int64_t table;  // lanes of the encoding, in the workspace: [3][value.stride] source feature, scale, phase
   bool gradient_wanted;
 };
@@ -59,12 +63,14 @@ struct MlpPlan {
   int64_t layer_count;
   const MlpPlanOutput* outputs;
   int64_t output_count, out_features;
-  int64_t tile;              // rows
-  int64_t workspace;         // floats a thread needs
-  int64_t partial;           // floats of one partial weight gradient
-  int64_t own_partial;       // a thread's own partial, in its workspace
-  bool gradients;            // made for the backward pass
-  bool parameter_gradients;  // weights and biases wanted
+  int64_t tile;                           // rows
+  int64_t workspace;                      // floats a thread needs
+  int64_t partial;                        // floats of one partial weight gradient
+  int64_t own_partial;                    // a thread's own partial, in its workspace
+  int64_t scratch_input, scratch_output;  // bfloat16 operands in other orders; rows of weights while packing
+  bool half;                              // bfloat16 operands
+  bool gradients;                         // made for the backward pass
+  bool parameter_gradients;               // weights and biases wanted
 };
 
 // Pointers of one call.

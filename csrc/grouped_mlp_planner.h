@@ -10,6 +10,7 @@ namespace voronerf {
 
 struct MlpWanted {
   bool parameters, positions, directions;  // gradients; none: a forward pass
+  bool half;                               // bfloat16 operands
 };
 
 class MlpPlanner {

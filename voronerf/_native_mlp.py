@@ -2,8 +2,10 @@
 
 n samples, r rays, k cells, p and q features of a raw position and direction, i inputs and o outputs of a layer. Two
 custom ops, forward and backward, functional both: they make inputs contiguous, allocate outputs, and pass addresses.
-Products and sums are float32 whatever the storage: half types are cast on the way in and out, a cell having few
-weights. Second derivatives come from the reference formula. Shapes and dtypes have been validated by ``voronerf.ops``.
+Tensors are cast to float32 on the way in and back on the way out, a cell having few weights. With bfloat16 storage, or
+under autocast to it, products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16), and
+float32 ones elsewhere; sums are float32 always. Second derivatives come from the reference formula. Shapes and dtypes
+have been validated by ``voronerf.ops``.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ def grouped_mlp(
 ) -> Tensor:
     """Every sample through the network of its cell; see ``voronerf.ops.grouped_mlp``.
 
-    Under ``torch.autocast`` the products are still float32, and the result has autocast's dtype.
+    Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
     """
     octaves = [layers.position_octaves, layers.direction_octaves]
     if positions.dtype == torch.float64 and octaves[0] is not None:
@@ -69,10 +71,14 @@ def _run(
     directions: Tensor | None,
     direction_index: Tensor | None,
 ) -> Tensor:
-    """The op on float32 tensors, its result in the storage type (of autocast, where it is on)."""
+    """The op on float32 tensors, its result in the storage type (of autocast, where it is on).
+
+    ``table`` begins with p, q and the octaves of both; what follows them here is whether to multiply in bfloat16.
+    """
     dtype, kind = weights[0].dtype, positions.device.type
     if torch.is_autocast_enabled(kind):
         dtype = torch.get_autocast_dtype(kind)
+    table = [*table[:4], int(dtype == torch.bfloat16), *table[4:]]
     out: Tensor = _forward(
         positions.float(),
         offsets,
@@ -87,7 +93,7 @@ def _run(
 
 
 def _flatten(layers: MLP) -> list[int]:
-    """Layers and outputs of a table as csrc/bindings_mlp.cpp reads them, after the four numbers of the inputs."""
+    """Layers and outputs of a table as csrc/bindings_mlp.cpp reads them, after the five numbers of the inputs."""
     flat = [len(layers.layers), len(layers.outputs)]
     for layer in layers.layers:
         sources = [_OUTSIDE[source] if isinstance(source, str) else source for source in layer.inputs]
@@ -98,8 +104,8 @@ def _flatten(layers: MLP) -> list[int]:
 @functools.lru_cache(maxsize=256)
 def _unflatten(flat: tuple[int, ...]) -> MLP:
     """The table of a whole flat list."""
-    numbers = iter(flat[2:])
-    position_octaves, direction_octaves = (None if count < 0 else count for count in (next(numbers), next(numbers)))
+    position_octaves, direction_octaves = (None if count < 0 else count for count in flat[2:4])
+    numbers = iter(flat[5:])
     count, outputs = next(numbers), next(numbers)
     names = {number: name for name, number in _OUTSIDE.items()}
     layers = []

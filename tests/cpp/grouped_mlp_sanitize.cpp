@@ -50,6 +50,7 @@ MlpTable random_table() {
   table.directions = 1 + below(4);
   table.position_octaves = static_cast<int>(below(6)) - 1;
   table.direction_octaves = static_cast<int>(below(4)) - 1;
+  table.half = below(2) == 0;
   const int64_t layers = 1 + below(5);
   for (int64_t l = 0; l < layers; ++l) {
     MlpTable::Layer layer;

@@ -8,8 +8,10 @@ flags=(-std=c++17 -O1 -g -fopenmp -ffp-contract=off -Wall -Wextra -Icsrc -fsanit
   -fno-sanitize-recover=all)
 objects=()
 compile() { # name, flags
-  "${CXX:-g++}" "${flags[@]}" "${@:2}" -c csrc/grouped_mlp_isa.cpp -o "$build/$1.o" &
-  objects+=("$build/$1.o")
+  for source in grouped_mlp_isa grouped_mlp_half_isa; do
+    "${CXX:-g++}" "${flags[@]}" "${@:2}" -c "csrc/$source.cpp" -o "$build/$source.$1.o" &
+    objects+=("$build/$source.$1.o")
+  done
 }
 compile portable -DVN_ISA=0
 if [ "$(uname -m)" = x86_64 ]; then

@@ -1,0 +1,317 @@
+// A tile of samples through the network of a cell, forward and backward; see grouped_mlp_isa.cpp.
+#pragma once
+
+#include "frequency_encode_tile.h"
+#include "grouped_mlp_pack.h"
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+namespace {
+
+// Activation as in grouped_mlp.h, which a file compiled per instruction set cannot include: it uses the standard
+// library.
+constexpr int kRelu = 1, kSoftplus = 2, kSigmoid = 3, kSine = 4;
+constexpr int kFromPositions = -1;
+
+// Few outputs, as heads have, are not worth a call of memcpy.
+VN_INLINE void copy_row(const float* from, int64_t width, float* to) {
+  if (width == 4) {
+    __builtin_memcpy(to, from, 4 * sizeof(float));
+    return;
+  }
+  int64_t c = 0;
+  for (; c + kLanes <= width; c += kLanes) store(to + c, load(from + c));
+  for (; c < width; ++c) to[c] = from[c];
+}
+
+// In place; sine leaves its cosine in `slope` where that is kept.
+void activate(const MlpPlanLayer& layer, int64_t rows, float* value, float* slope) {
+  const int64_t size = rows * layer.padded;
+  for (int64_t i = 0; i < size; i += kLanes) {
+    const F32 x = load(value + i);
+    if (layer.activation == kSoftplus) {
+      store(value + i, softplus(x));
+    } else if (layer.activation == kSigmoid) {
+      store(value + i, sigmoid(x));
+    } else if (beyond_sine(x)) {
+      for (int lane = 0; lane < kLanes; ++lane) {
+        const float angle = value[i + lane];
+        value[i + lane] = __builtin_sinf(angle);
+        if (slope != nullptr) slope[i + lane] = __builtin_cosf(angle);
+      }
+    } else {
+      store(value + i, sine(x, splat(0.0f)));
+      if (slope != nullptr) store(slope + i, sine(x, splat(0.5f)));
+    }
+  }
+}
+
+// gradient *= the activation's derivative, from its output or, for sine, from the cosine that was kept.
+void times_slope(const MlpPlanLayer& layer, int64_t rows, const float* value, const float* slope, float* gradient) {
+  const int64_t size = rows * layer.padded;
+  const F32 zero = splat(0.0f), one = splat(1.0f);
+  for (int64_t i = 0; i < size; i += kLanes) {
+    const F32 y = load(value + i), g = load(gradient + i);
+    F32 factor = one;
+    if (layer.activation == kRelu) factor = y > zero ? one : zero;
+    if (layer.activation == kSoftplus) factor = zero - exponential_minus_one(zero - y);
+    if (layer.activation == kSigmoid) factor = y * (one - y);
+    if (layer.activation == kSine) factor = load(slope + i);
+    store(gradient + i, g * factor);
+  }
+}
+
+// Rows of one tile: where its values are.
+struct Tile {
+  const MlpPlan& plan;
+  const MlpData& data;
+  float* workspace;
+  int64_t begin, rows;
+
+  float* at(const MlpBuffer& buffer) const { return workspace + buffer.offset; }
+
+  // A row of k for every sample: floats, or pairs.
+  Source source(int from, int64_t width) const {
+#if VN_HALF
+    const MlpBuffer& pairs = from >= 0                ? plan.layers[from].narrow
+                             : from == kFromPositions ? plan.positions.narrow
+                                                      : plan.directions.narrow;
+    return {at(pairs), pairs.stride, (width + 1) / 2};
+#else
+    if (from >= 0) return {at(plan.layers[from].value), plan.layers[from].value.stride, width};
+    const MlpPlanInput& input = from == kFromPositions ? plan.positions : plan.directions;
+    if (input.copied) return {at(input.value), input.value.stride, width};
+    return {(from == kFromPositions ? data.positions : data.directions) + begin * input.raw, input.raw, width};
+#endif
+  }
+
+  // Raw features, gathered by `index` where there is one, to what the layers read.
+  void read_input(const MlpPlanInput& input, const float* raw, const int32_t* index) const {
+    if (!input.used || !input.copied) return;
+    const bool encoded = input.octaves >= 0;
+    float* staged = encoded ? at(input.staged) : at(input.value);
+    const int64_t stride = encoded ? input.raw : input.value.stride;
+    if (index == nullptr && stride == input.raw) {
+      __builtin_memcpy(staged, raw + begin * input.raw, sizeof(float) * rows * input.raw);
+    } else {
+      for (int64_t row = 0; row < rows; ++row) {
+        const int64_t from = index == nullptr ? begin + row : index[begin + row];
+        for (int64_t f = 0; f < input.raw; ++f) staged[row * stride + f] = raw[from * input.raw + f];
+      }
+    }
+    if (encoded) {
+      encode(staged, workspace + input.table, rows, input.raw, input.octaves, at(input.value), input.value.stride);
+    }
+#if VN_HALF
+    narrow(at(input.value), input.value.stride, input.width, rows, at(input.narrow));
+#endif
+  }
+
+  // The values of all layers that reach an output; `heads` false leaves out those that only do.
+  void run_layers(bool heads) const {
+    read_input(plan.positions, data.positions, nullptr);
+    read_input(plan.directions, data.directions, data.direction_index);
+    for (int64_t l = 0; l < plan.layer_count; ++l) {
+      const MlpPlanLayer& layer = plan.layers[l];
+      if (layer.live && (heads || !layer.only_output)) run_layer(layer);
+    }
+  }
+
+  void run_layer(const MlpPlanLayer& layer) const {
+    constexpr int64_t kFew = 8;
+    float* value = at(layer.value);
+    // What layers read leaves the product as pairs where whole vectors of them fit; else it is narrowed afterwards.
+    const bool narrowed = VN_HALF && layer.read && layer.activation <= kRelu && layer.padded % (2 * kGranule) == 0;
+    // Sources in groups of kFew: a longer concatenation continues on its own result.
+    for (int64_t group = 0, row = 0; group < layer.source_count; group += kFew) {
+      Source sources[kFew];
+      const int64_t count = smaller(kFew, layer.source_count - group);
+      int64_t depth = 0;
+      for (int64_t s = 0; s < count; ++s) {
+        sources[s] = source(layer.sources[group + s].from, layer.sources[group + s].width);
+        depth += sources[s].depth;
+      }
+      const bool last = group + count == layer.source_count;
+      const bool pairs = narrowed && last;
+      const bool kept = !pairs || plan.gradients || layer.from_output;
+      for (int64_t first = 0; first < layer.padded; first += kPanel) {
+        const int64_t columns = smaller(kPanel, layer.padded - first);
+        const float* b = workspace + layer.packed + first * layer.packed_depth + row * columns;
+        const float* start = group > 0 ? value + first : workspace + layer.bias + first;
+        multiply<false>(
+            {sources, count, b, columns, start, group > 0 ? layer.padded : 0, kept ? value + first : nullptr,
+             layer.padded, last && layer.activation == kRelu ? Finish::relu : Finish::none, nullptr,
+             pairs ? at(layer.narrow) + first / 2 : nullptr, layer.narrow.stride},
+            rows, columns);
+      }
+      row += depth;
+    }
+    if (layer.activation > kRelu) {
+      activate(layer, rows, value, layer.slope_kept && plan.gradients ? at(layer.slope) : nullptr);
+    }
+#if VN_HALF
+    if (layer.read && !narrowed) narrow(value, layer.padded, layer.width, rows, at(layer.narrow));
+#endif
+  }
+
+  void write_outputs() const {
+    for (int64_t i = 0; i < plan.output_count; ++i) {
+      const MlpPlanLayer& layer = plan.layers[plan.outputs[i].layer];
+      const float* value = at(layer.value);
+      float* out = data.out + begin * plan.out_features + plan.outputs[i].column;
+      for (int64_t row = 0; row < rows; ++row, value += layer.padded, out += plan.out_features) {
+        copy_row(value, layer.width, out);
+      }
+    }
+  }
+
+  void read_output_gradients() const {
+    for (int64_t l = 0; l < plan.layer_count; ++l) {
+      const MlpPlanLayer& layer = plan.layers[l];
+      if (!layer.from_output) continue;
+      float* gradient = at(layer.gradient);
+      for (int64_t i = 0; i < rows * layer.padded; ++i) gradient[i] = 0.0f;
+      for (int64_t i = 0; i < plan.output_count; ++i) {
+        if (plan.outputs[i].layer != l) continue;
+        const float* from = data.grad_out + begin * plan.out_features + plan.outputs[i].column;
+        for (int64_t row = 0; row < rows; ++row) {
+          for (int64_t c = 0; c < layer.width; ++c)
+            gradient[row * layer.padded + c] += from[row * plan.out_features + c];
+        }
+      }
+    }
+  }
+
+  // Adds to the partial, or fills it if this is the task's first tile.
+  void parameter_gradients(const MlpPlanLayer& layer, float* partial, bool fill) const {
+    const float* gradient = at(layer.gradient);
+    float* bias = partial + layer.partial_bias;
+    for (int64_t first = 0; first < layer.padded; first += kLanes) {
+      F32 sum = fill ? splat(0.0f) : load(bias + first);
+      for (int64_t row = 0; row < rows; ++row) sum = sum + load(gradient + row * layer.padded + first);
+      store(bias + first, sum);
+    }
+    Source output = {gradient, layer.padded, rows};
+#if VN_HALF
+    interleave_rows(gradient, layer.padded, rows, workspace + plan.scratch_output);
+    output = {workspace + plan.scratch_output, layer.padded, (rows + 1) / 2};
+#endif
+    for (int64_t i = 0; i < layer.source_count; ++i) {
+      const MlpPlanSource& s = layer.sources[i];
+      const Source input = by_samples(s);
+      float* c = partial + layer.partial + s.row * layer.padded;
+      if (s.by_outputs) {
+        weight_gradient(output, layer.width, input, padded_width(s), c, fill);
+      } else {
+        weight_gradient(input, s.width, output, layer.padded, c, fill);
+      }
+    }
+  }
+
+  // A source's values with the samples as k.
+  Source by_samples(const MlpPlanSource& s) const {
+#if VN_HALF
+    const MlpBuffer& value = s.from >= 0                ? plan.layers[s.from].value
+                             : s.from == kFromPositions ? plan.positions.value
+                                                        : plan.directions.value;
+    interleave_rows(at(value), value.stride, rows, workspace + plan.scratch_input);
+    return {workspace + plan.scratch_input, value.stride, (rows + 1) / 2};
+#else
+    return source(s.from, rows);
+#endif
+  }
+
+  // c [a_width][b_width] = sum over the rows of a's values times b's, b_width padded.
+  static void weight_gradient(const Source& a, int64_t a_width, const Source& b, int64_t b_width, float* c, bool fill) {
+    for (int64_t first = 0; first < b_width; first += kPanel) {
+      multiply<true>({&a, 1, b.data + first, b.stride, fill ? kZeros : c + first, fill ? 0 : b_width, c + first,
+                      b_width, Finish::none, nullptr, nullptr, 0},
+                     a_width, smaller(kPanel, b_width - first));
+    }
+  }
+
+  // `a`: the layer's gradient, a row of k for every sample.
+  void source_gradient(const MlpPlanLayer& layer, const MlpPlanSource& s, const Source& a) const {
+    const MlpBuffer& to = s.from >= 0                ? plan.layers[s.from].gradient
+                          : s.from == kFromPositions ? plan.positions.gradient
+                                                     : plan.directions.gradient;
+    const bool fused = s.last && s.from >= 0 && plan.layers[s.from].slope_fused;
+    const float* slope = fused ? at(plan.layers[s.from].value) : nullptr;
+    for (int64_t first = 0; first < to.stride; first += kPanel) {
+      const int64_t columns = smaller(kPanel, to.stride - first);
+      float* c = at(to) + first;
+      multiply<false>({&a, 1, workspace + s.packed + first * layer.packed_width, columns, s.first ? kZeros : c,
+                       s.first ? 0 : to.stride, c, to.stride, fused ? Finish::relu_slope : Finish::none,
+                       fused ? slope + first : nullptr, nullptr, 0},
+                      rows, columns);
+    }
+  }
+
+  void run_gradients(float* partial, bool fill) const {
+    read_output_gradients();
+    for (int64_t l = plan.layer_count; l-- > 0;) {
+      const MlpPlanLayer& layer = plan.layers[l];
+      if (!layer.live) continue;
+      if (layer.activation > 0 && !layer.slope_fused) {
+        const float* slope = layer.slope_kept ? at(layer.slope) : nullptr;
+        times_slope(layer, rows, at(layer.value), slope, at(layer.gradient));
+      }
+      if (plan.parameter_gradients) parameter_gradients(layer, partial, fill);
+      Source a = {at(layer.gradient), layer.gradient.stride, layer.width};
+#if VN_HALF
+      narrow(a.data, a.stride, layer.width, rows, workspace + plan.scratch_output);
+      a = {workspace + plan.scratch_output, a.stride / 2, (layer.width + 1) / 2};
+#endif
+      for (int64_t s = 0; s < layer.source_count; ++s) {
+        if (layer.sources[s].gradient) source_gradient(layer, layer.sources[s], a);
+      }
+    }
+    input_gradient(plan.positions, data.grad_positions);
+    input_gradient(plan.directions, data.grad_directions);
+  }
+
+  void input_gradient(const MlpPlanInput& input, float* out) const {
+    if (!input.gradient_wanted) return;
+    const float* value = input.octaves >= 0 ? at(input.value) : nullptr;
+    encode_backward(value, at(input.gradient), workspace + input.table, rows, input.raw,
+                    input.octaves >= 0 ? input.octaves : 0, input.gradient.stride, out + begin * input.raw);
+  }
+};
+
+void pack_cell(const MlpPlan& plan, const MlpData& data, int64_t cell, float* workspace) {
+  for (int64_t l = 0; l < plan.layer_count; ++l) {
+    const MlpPlanLayer& layer = plan.layers[l];
+    if (!layer.live) continue;
+    const float* weights = data.weights[l] + cell * layer.width * layer.depth;
+    const float* bias = data.biases[l] == nullptr ? nullptr : data.biases[l] + cell * layer.width;
+    pack_forward(weights, layer, workspace + layer.packed, workspace + plan.scratch_input);
+    float* packed_bias = workspace + layer.bias;
+    for (int64_t o = 0; o < layer.padded; ++o) packed_bias[o] = bias != nullptr && o < layer.width ? bias[o] : 0.0f;
+    if (!plan.gradients) continue;
+    for (int64_t s = 0; s < layer.source_count; ++s) {
+      if (layer.sources[s].gradient)
+        pack_backward(weights, layer, layer.sources[s], workspace + layer.sources[s].packed);
+    }
+  }
+}
+
+void run_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace) {
+  for (int64_t row = begin; row < end; row += plan.tile) {
+    const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
+    tile.run_layers(true);
+    tile.write_outputs();
+  }
+}
+
+void run_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace,
+                  float* partial) {
+  for (int64_t row = begin; row < end; row += plan.tile) {
+    const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
+    tile.run_layers(false);
+    tile.run_gradients(partial, row == begin);
+  }
+}
+
+}  // namespace
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf
