@@ -27,7 +27,7 @@ ANGLE_X = 0.6911112  # horizontal field of view of the Blender scenes, radians
 NEAR, FAR = 2.0, 6.0
 SUPERSAMPLES = 3  # on each side of a pixel
 LIGHT = normalised(np.array(((0.45, -0.55, 0.70),), dtype=np.float32))
-AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.36, 0.56, 0.58
+AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.46, 0.64, 0.50
 BAND = 1 << 15  # rays at a time, so that their arrays stay in the cache
 LIFT = 2e-3  # a shadow's ray starts this far above the surface
 
