@@ -43,7 +43,7 @@ def _plain(colour: Colour) -> Texture:
 
 def _mosaic(points: Array, normals: Array) -> Array:
     """Rings of tiles in five colours; a striped band on the rim."""
-    x, y, z = points.T
+    x, y, _ = points.T
     ring = np.floor(np.hypot(x, y) / 0.1686)
     sector = np.floor(_azimuth(points) * (6 * ring + 5))
     top = _pick(MOSAIC, ring * 3 + sector * 2 + ring * sector % 3)
