@@ -99,6 +99,7 @@ PYBIND11_MODULE(_C, module) {
   module.def("cell_sort_workspace", &voronerf::cell_sort_workspace);
 
   bind_mlp(module);
+  bind_composite(module);
 
 #ifdef VN_WITH_CUDA
   module.def("nearest_centre_cuda_float32", &nearest_centre_cuda<float>, no_gil);

@@ -91,6 +91,7 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
     ("grouped_linear", "native"): Implementation("voronerf._native_mlp:grouped_linear", ("cpu",), _FLOATS),
     ("grouped_mlp", "native"): Implementation("voronerf._native_mlp:grouped_mlp", ("cpu",), _FLOATS),
+    ("composite", "native"): Implementation("voronerf._native_composite:composite", ("cpu",), _FLOATS),
     ("nearest_centre", "warp"): Implementation(
         "voronerf.kernels.nearest_centre:nearest_centre", ("cpu", "cuda"), _COORDINATES
     ),

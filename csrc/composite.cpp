@@ -1,0 +1,77 @@
+// Rays over threads: each is summed by one thread in the order of its samples, so results do not depend on their
+// number.
+#include "composite.h"
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+#include "composite_isa.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kRays = 32;  // of a task
+
+void ray_forward(Isa isa, const CompositeInputs& in, const CompositeOutputs& out, int64_t ray, int64_t begin,
+                 int64_t end) {
+  VN_FOR_ISA(isa, composite_ray(in, out, ray, begin, end))
+}
+
+void ray_backward(Isa isa, const CompositeInputs& in, const CompositeOutputs& out, const CompositeGradients& gradients,
+                  int64_t ray, int64_t begin, int64_t end) {
+  VN_FOR_ISA(isa, composite_ray_backward(in, out, gradients, ray, begin, end))
+}
+
+void check(const CompositeInputs& in) {
+  if (in.offsets == nullptr) return;
+  int64_t before = 0;
+  for (int64_t i = 0; i <= in.r; ++i) {
+    if (in.offsets[i] < before || in.offsets[i] > in.m) {
+      throw std::invalid_argument("composite: ray_offsets must rise from 0 or more to at most the number of samples, " +
+                                  std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " +
+                                  std::to_string(i));
+    }
+    before = in.offsets[i];
+  }
+}
+
+int64_t first_sample(const CompositeInputs& in, int64_t ray) {
+  return in.offsets == nullptr ? ray * in.s : in.offsets[ray];
+}
+
+template <typename Run>
+void for_each_ray(const CompositeInputs& in, int threads, const Run& run) {
+#pragma omp parallel for schedule(dynamic, kRays) num_threads(threads) if (threads > 1 && in.r > kRays)
+  for (int64_t ray = 0; ray < in.r; ++ray) run(ray, first_sample(in, ray), first_sample(in, ray + 1));
+}
+
+// Samples of no ray.
+void zero_strays(const CompositeInputs& in, int64_t width, float* values) {
+  if (in.offsets == nullptr) return;
+  std::fill(values, values + in.offsets[0] * width, 0.0f);
+  std::fill(values + in.offsets[in.r] * width, values + in.m * width, 0.0f);
+}
+
+}  // namespace
+
+void composite_cpu(const CompositeInputs& in, const CompositeOutputs& out, Isa isa, int threads) {
+  check(in);
+  zero_strays(in, 1, out.weights);
+  for_each_ray(in, threads,
+               [&](int64_t ray, int64_t begin, int64_t end) { ray_forward(isa, in, out, ray, begin, end); });
+}
+
+void composite_backward_cpu(const CompositeInputs& in, const CompositeOutputs& out, const CompositeGradients& gradients,
+                            Isa isa, int threads) {
+  check(in);
+  float* const of_samples[] = {gradients.sigma, gradients.depths, gradients.deltas};
+  for (float* values : of_samples) zero_strays(in, 1, values);
+  zero_strays(in, in.c, gradients.rgb);
+  for_each_ray(in, threads, [&](int64_t ray, int64_t begin, int64_t end) {
+    ray_backward(isa, in, out, gradients, ray, begin, end);
+  });
+}
+
+}  // namespace voronerf
