@@ -14,7 +14,7 @@ CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
 
 SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
 
-.PHONY: demo test bench check cuda-check clean
+.PHONY: demo test bench check cuda-check sanitize clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -34,6 +34,10 @@ check: $(VENV)/.built
 
 cuda-check:
 	@$(PYTHON) .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
+
+# The C++ of grouped_mlp under AddressSanitizer and UndefinedBehaviorSanitizer, with random networks and cells.
+sanitize:
+	@tests/cpp/sanitize.sh
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info voronerf/_C.*.so .mypy_cache .pytest_cache .ruff_cache
