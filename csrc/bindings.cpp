@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "bindings_mlp.h"
+#include "bindings_sampling.h"
 #include "build_info.h"
 #include "cell_sort.h"
 #include "common.h"
@@ -100,6 +101,7 @@ PYBIND11_MODULE(_C, module) {
 
   bind_mlp(module);
   bind_composite(module);
+  bind_sampling(module);
 
 #ifdef VN_WITH_CUDA
   module.def("nearest_centre_cuda_float32", &nearest_centre_cuda<float>, no_gil);

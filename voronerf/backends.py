@@ -92,6 +92,9 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("grouped_linear", "native"): Implementation("voronerf._native_mlp:grouped_linear", ("cpu",), _FLOATS),
     ("grouped_mlp", "native"): Implementation("voronerf._native_mlp:grouped_mlp", ("cpu",), _FLOATS),
     ("composite", "native"): Implementation("voronerf._native_composite:composite", ("cpu",), _FLOATS),
+    ("frequency_encode", "native"): Implementation("voronerf._native_sampling:frequency_encode", ("cpu",), _FLOATS),
+    ("integrated_encode", "native"): Implementation("voronerf._native_sampling:integrated_encode", ("cpu",), _FLOATS),
+    ("resample", "native"): Implementation("voronerf._native_sampling:resample", ("cpu",), _FLOATS),
     ("nearest_centre", "warp"): Implementation(
         "voronerf.kernels.nearest_centre:nearest_centre", ("cpu", "cuda"), _COORDINATES
     ),

@@ -1,0 +1,55 @@
+// The encodings and resample for Python: addresses and sizes in, the GIL released while they run.
+#include "bindings_sampling.h"
+
+#include <cstdint>
+
+#include "encode.h"
+#include "resample.h"
+
+namespace py = pybind11;
+
+namespace {
+
+using Address = std::uintptr_t;
+
+template <typename T>
+T* at(Address address) {
+  return reinterpret_cast<T*>(address);
+}
+
+voronerf::Encoding encoding(Address x, Address variances, int64_t n, int64_t d, int64_t octaves, bool include_input) {
+  const int64_t width = d * (2 * octaves + (include_input ? 1 : 0));
+  return {at<const float>(x), at<const float>(variances), n, d, octaves, include_input, width};
+}
+
+// variances: 0 for the plain frequency encoding.
+void encode(Address x, Address variances, Address out, Address workspace, int64_t n, int64_t d, int64_t octaves,
+            bool include_input, int isa, int threads) {
+  voronerf::encode_cpu(encoding(x, variances, n, d, octaves, include_input), at<float>(out), at<float>(workspace),
+                       static_cast<voronerf::Isa>(isa), threads);
+}
+
+void encode_backward(Address gradient, Address x, Address variances, Address grad_x, Address grad_variances,
+                     Address workspace, int64_t n, int64_t d, int64_t octaves, bool include_input, int isa,
+                     int threads) {
+  voronerf::encode_backward_cpu(encoding(x, variances, n, d, octaves, include_input), at<const float>(gradient),
+                                at<float>(grad_x), at<float>(grad_variances), at<float>(workspace),
+                                static_cast<voronerf::Isa>(isa), threads);
+}
+
+// uniforms: 0 for the midpoints of equal strata.
+void resample(Address weights, Address edges, Address uniforms, Address depths, int64_t r, int64_t s, int64_t count,
+              int threads) {
+  voronerf::resample_cpu(at<const float>(weights), at<const float>(edges), at<const float>(uniforms), at<float>(depths),
+                         r, s, count, threads);
+}
+
+}  // namespace
+
+void bind_sampling(py::module_& module) {
+  const auto no_gil = py::call_guard<py::gil_scoped_release>();
+  module.def("encode_workspace", &voronerf::encode_workspace);
+  module.def("encode", &encode, no_gil);
+  module.def("encode_backward", &encode_backward, no_gil);
+  module.def("resample", &resample, no_gil);
+}

@@ -1,0 +1,12 @@
+// Hierarchical sampling: weights [r,s], edges [r,s+1], uniforms [r,count] or null (midpoints of equal strata) -> depths
+// [r,count], rising along a ray. s, count >= 1; r = 0 is legal. As in voronerf/reference/resample.py.
+#pragma once
+
+#include <cstdint>
+
+namespace voronerf {
+
+void resample_cpu(const float* weights, const float* edges, const float* uniforms, float* depths, int64_t r, int64_t s,
+                  int64_t count, int threads);
+
+}  // namespace voronerf

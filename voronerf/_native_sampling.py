@@ -1,0 +1,154 @@
+"""Drawing and encoding samples with the compiled module, as PyTorch ops: ``frequency_encode``, ``integrated_encode``,
+``resample``.
+
+n points, d features, L octaves, r rays, s bins of a ray. The ops are functional: they make inputs contiguous, allocate
+outputs and workspace, and pass addresses. The arithmetic is float32; half types are cast on the way in and out. Second
+derivatives come from the reference formulas. Shapes and dtypes have been validated by ``voronerf.ops``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf import _native
+from voronerf.reference.frequency_encode import frequency_encode as _frequency_reference
+from voronerf.reference.integrated_encode import integrated_encode as _integrated_reference
+
+
+def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True) -> Tensor:
+    """``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``; see ``voronerf.ops.frequency_encode``."""
+    encoded: Tensor = _encode(x.float(), None, octaves, include_input)
+    return encoded.to(x.dtype)
+
+
+def integrated_encode(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
+    """Expected encoding of a Gaussian; see ``voronerf.ops.integrated_encode``."""
+    encoded: Tensor = _encode(means.float(), variances.float(), octaves, False)
+    return encoded.to(means.dtype)
+
+
+def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None) -> Tensor:
+    """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
+    if uniforms is not None:
+        uniforms = uniforms.detach().float()
+    depths: Tensor = _resample(weights.detach().float(), edges.detach().float(), count, uniforms)
+    return depths.to(edges.dtype)
+
+
+@torch.library.custom_op("voronerf::encode_native", mutates_args=(), device_types="cpu")
+def _encode(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Tensor:
+    """The frequency encoding or, with variances, the integrated one."""
+    out = _allocate(x, octaves, include_input)
+    kept = [x.contiguous(), None if variances is None else variances.contiguous()]
+    workspace = _workspace(x, octaves)
+    addresses = [_address(tensor) for tensor in (*kept, out, workspace)]
+    _native._C.encode(*addresses, *_rest(x, octaves, include_input))
+    return out
+
+
+@torch.library.custom_op("voronerf::encode_native_backward", mutates_args=(), device_types="cpu")
+def _encode_backward(
+    gradient: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool
+) -> list[Tensor]:
+    """Gradients to x and to the variances, the second empty without them."""
+    results = _allocate_gradients(x, variances)
+    kept = [gradient.contiguous(), x.contiguous(), None if variances is None else variances.contiguous()]
+    workspace = _workspace(x, octaves)
+    addresses = [_address(tensor) for tensor in (*kept, *results, workspace)]
+    _native._C.encode_backward(*addresses, *_rest(x, octaves, include_input))
+    return results
+
+
+@torch.library.custom_op("voronerf::resample_native", mutates_args=(), device_types="cpu")
+def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
+    depths = _allocate_depths(edges, count)
+    kept = [weights.contiguous(), edges.contiguous(), None if uniforms is None else uniforms.contiguous()]
+    addresses = [_address(tensor) for tensor in (*kept, depths)]
+    _native._C.resample(*addresses, *weights.shape, count, torch.get_num_threads())
+    return depths
+
+
+def _workspace(x: Tensor, octaves: int) -> Tensor:
+    return x.new_empty(_native._C.encode_workspace(x.shape[1], octaves, torch.get_num_threads()))
+
+
+def _rest(x: Tensor, octaves: int, include_input: bool) -> tuple[int, ...]:
+    """What follows the addresses in csrc/bindings_sampling.cpp."""
+    return *x.shape, octaves, include_input, _native._ISA, torch.get_num_threads()
+
+
+def _address(tensor: Tensor | None) -> int:
+    return 0 if tensor is None else tensor.data_ptr()
+
+
+def _allocate(x: Tensor, octaves: int, include_input: bool) -> Tensor:
+    return x.new_empty(x.shape[0], x.shape[1] * (include_input + 2 * octaves))
+
+
+def _allocate_gradients(x: Tensor, variances: Tensor | None) -> list[Tensor]:
+    return [x.new_empty(x.shape), x.new_empty(0 if variances is None else variances.shape)]
+
+
+def _allocate_depths(edges: Tensor, count: int) -> Tensor:
+    return edges.new_empty(edges.shape[0], count)
+
+
+@_encode.register_fake
+def _(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Tensor:
+    return _allocate(x, octaves, include_input)
+
+
+@_encode_backward.register_fake
+def _(gradient: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> list[Tensor]:
+    return _allocate_gradients(x, variances)
+
+
+@_resample.register_fake
+def _(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
+    return _allocate_depths(edges, count)
+
+
+def _encode_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    x, variances, ctx.octaves, ctx.include_input = inputs
+    ctx.save_for_backward(x, variances)
+
+
+def _encode_gradients(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    x, variances = ctx.saved_tensors
+    of_x, of_variances = _encode_backward(gradient, x, variances, ctx.octaves, ctx.include_input)
+    return of_x, None if variances is None else of_variances, None, None
+
+
+def _encode_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
+    gradient, x, variances, ctx.octaves, ctx.include_input = inputs
+    ctx.save_for_backward(gradient, x, variances)
+
+
+def _encode_second(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | None, ...]:
+    """Derivative of the gradients, through the reference formulas."""
+    with torch.enable_grad():
+        leaves = [None if tensor is None else tensor.detach().requires_grad_() for tensor in ctx.saved_tensors]
+        gradient, x, variances = leaves
+        assert x is not None
+        if variances is None:
+            out = _frequency_reference(x, ctx.octaves, include_input=ctx.include_input)
+            inputs = [x]
+        else:
+            out = _integrated_reference(x, variances, ctx.octaves)
+            inputs = [x, variances]
+        if not out.requires_grad:
+            return (None,) * 5
+        firsts = torch.autograd.grad(out, inputs, gradient, create_graph=True)
+        total = out.new_zeros(())
+        for first, cotangent in zip(firsts, cotangents):
+            total = total + (first * cotangent).sum()
+        present = [leaf for leaf in leaves if leaf is not None]
+        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
+    return (*(None if leaf is None else next(seconds) for leaf in leaves), None, None)
+
+
+_encode.register_autograd(_encode_gradients, setup_context=_encode_setup)
+_encode_backward.register_autograd(_encode_second, setup_context=_encode_backward_setup)
