@@ -26,17 +26,17 @@ struct CompositeOutputs {
   float* weights;  // [m]
 };
 
-// Every element is written. The incoming gradients are those of CompositeOutputs; `background` is [r,c], or null.
+// The first four are the gradients of CompositeOutputs, null for zero; the rest receive those of the inputs, null where
+// not wanted. That to sigma is always there: it holds intermediate results. Every element is written.
 struct CompositeGradients {
   const float *colour, *opacity, *depth, *weights;
-  float *sigma, *rgb, *depths, *deltas, *background;
+  float *sigma, *rgb, *depths, *deltas;
+  float* background;  // like the input
+  float* left;        // [r], workspace; there if the input has a background
 };
 
-// Throws std::invalid_argument for offsets that fall or exceed m.
+// Throw std::invalid_argument for offsets that fall or exceed m.
 void composite_cpu(const CompositeInputs& in, const CompositeOutputs& out, Isa isa, int threads);
-
-// `out`: what the forward pass gave.
-void composite_backward_cpu(const CompositeInputs& in, const CompositeOutputs& out, const CompositeGradients& gradients,
-                            Isa isa, int threads);
+void composite_backward_cpu(const CompositeInputs& in, const CompositeGradients& gradients, Isa isa, int threads);
 
 }  // namespace voronerf

@@ -1,7 +1,8 @@
-"""Volume rendering of the compiled module as PyTorch ops. r rays, s samples of a ray, m samples in all, c channels.
+"""Volume rendering of the compiled module as PyTorch ops.
 
-Two custom ops, forward and backward, functional both. Everything is float32 inside; half types are cast on the way in
-and out. Second derivatives come from the reference formula. Arguments have been validated by ``voronerf.ops``.
+r rays, s samples of a ray, m samples of all rays (packed), c channels. A custom op each way, functional both: they make
+inputs contiguous, allocate outputs, and pass addresses. The arithmetic is float32; half types are cast on the way in
+and out. Second derivatives come from the reference formula. Shapes and dtypes have been validated by ``voronerf.ops``.
 """
 
 from __future__ import annotations
@@ -27,148 +28,171 @@ def composite(
     background: Tensor | None = None,
 ) -> Composite:
     """Absorption and emission along rays; see ``voronerf.ops.composite``."""
-    results = _forward(
-        sigma.float(),
-        rgb.float(),
-        depths.float(),
-        deltas.float(),
-        ray_offsets,
-        None if background is None else background.float(),
-    )
-    return Composite(*(result.to(rgb.dtype) for result in results))
+    if background is not None:
+        background = background.float()
+    parts = _forward(sigma.float(), rgb.float(), depths.float(), deltas.float(), ray_offsets, background)
+    return Composite(*(part.to(rgb.dtype) for part in parts))
 
 
 @torch.library.custom_op("voronerf::composite_native", mutates_args=(), device_types="cpu")
 def _forward(
-    sigma: Tensor,
-    rgb: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor | None,
-    background: Tensor | None,
+    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    inputs = _contiguous(sigma, rgb, depths, deltas, ray_offsets, background)
     results = _allocate(sigma, rgb, ray_offsets)
-    _call([sigma, rgb, depths, deltas, ray_offsets, background, *results])
+    _native._C.composite(
+        _addresses(inputs), _sizes(sigma, rgb, ray_offsets, background), _addresses(results), *_machine()
+    )
     return results
 
 
 @torch.library.custom_op("voronerf::composite_native_backward", mutates_args=(), device_types="cpu")
 def _backward(
-    gradients: Sequence[Tensor],
-    results: Sequence[Tensor],
+    colour: Tensor | None,
+    opacity: Tensor | None,
+    depth: Tensor | None,
+    weights: Tensor | None,
     sigma: Tensor,
     rgb: Tensor,
     depths: Tensor,
     deltas: Tensor,
     ray_offsets: Tensor | None,
     background: Tensor | None,
+    wanted: Sequence[bool],
 ) -> list[Tensor]:
-    found = _allocate_gradients(gradients, sigma, rgb, depths, deltas, background)
-    of_background = None if background is None else torch.empty_like(results[0])
-    inputs = [sigma, rgb, depths, deltas, ray_offsets, background]
-    _call([*inputs, *results, *gradients, *found[:4], of_background])
-    if background is not None and of_background is not None:
-        found[4] = of_background if background.dim() == 2 else of_background.sum(dim=0)
-    return found
+    """Gradients to sigma, rgb, depths, deltas and background, empty where not wanted; that to sigma is always there.
+
+    The first four arguments are the gradients of the outputs, None for zero.
+    """
+    inputs = _contiguous(sigma, rgb, depths, deltas, ray_offsets, background)
+    gradients = _contiguous(colour, opacity, depth, weights)
+    workspace = sigma.new_empty(0 if background is None else _rays(sigma, ray_offsets))
+    results = _allocate_gradients(sigma, rgb, depths, deltas, background, wanted)
+    _native._C.composite_backward(
+        _addresses(inputs),
+        _sizes(sigma, rgb, ray_offsets, background),
+        _addresses(gradients),
+        [
+            *(address if want else 0 for address, want in zip(_addresses(results), [True, *wanted[1:]])),
+            workspace.data_ptr(),
+        ],
+        *_machine(),
+    )
+    return results
 
 
-def _call(tensors: list[Tensor | None]) -> None:
-    """Passes inputs, results and gradients in the order of csrc/bindings_composite.cpp."""
-    kept = [None if tensor is None else tensor.contiguous() for tensor in tensors]
-    sigma, rgb, ray_offsets, background, colour = kept[0], kept[1], kept[4], kept[5], kept[6]
-    assert sigma is not None and rgb is not None and colour is not None
-    s = 0 if ray_offsets is not None else sigma.shape[1]
+def _machine() -> tuple[int, int]:
+    return _native._ISA, torch.get_num_threads()
+
+
+def _contiguous(*tensors: Tensor | None) -> list[Tensor | None]:
+    return [None if tensor is None else tensor.contiguous() for tensor in tensors]
+
+
+def _addresses(tensors: Sequence[Tensor | None]) -> list[int]:
+    return [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
+
+
+def _sizes(sigma: Tensor, rgb: Tensor, ray_offsets: Tensor | None, background: Tensor | None) -> list[int]:
+    """r, s, m, c and whether the background is per ray, as csrc/bindings_composite.cpp reads them."""
     per_ray = background is not None and background.dim() == 2
-    sizes = [colour.shape[0], s, sigma.numel(), rgb.shape[-1], int(per_ray)]
-    addresses = [0 if tensor is None else tensor.data_ptr() for tensor in kept]
-    _native._C.composite(addresses, sizes, _native._ISA, torch.get_num_threads())
+    s = sigma.shape[1] if ray_offsets is None else 0
+    return [_rays(sigma, ray_offsets), s, sigma.numel(), rgb.shape[-1], int(per_ray)]
+
+
+def _rays(sigma: Tensor, ray_offsets: Tensor | None) -> int:
+    return sigma.shape[0] if ray_offsets is None else ray_offsets.shape[0] - 1
 
 
 def _allocate(sigma: Tensor, rgb: Tensor, ray_offsets: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    rays = sigma.shape[0] if ray_offsets is None else ray_offsets.shape[0] - 1
-    new = sigma.new_empty
-    return new(rays, rgb.shape[-1]), new(rays), new(rays), new(sigma.shape)
+    r = _rays(sigma, ray_offsets)
+    return rgb.new_empty(r, rgb.shape[-1]), sigma.new_empty(r), sigma.new_empty(r), sigma.new_empty(sigma.shape)
 
 
 def _allocate_gradients(
-    gradients: Sequence[Tensor], sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, background: Tensor | None
+    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, background: Tensor | None, wanted: Sequence[bool]
 ) -> list[Tensor]:
-    """Gradients of sigma, rgb, depths, deltas and background, the last empty if there is none."""
-    shapes = [tensor.shape for tensor in (sigma, rgb, depths, deltas)]
     return [
-        *(sigma.new_empty(shape) for shape in shapes),
-        sigma.new_empty(0 if background is None else background.shape),
+        sigma.new_empty(0 if tensor is None or not want else tensor.shape)
+        for tensor, want in zip((sigma, rgb, depths, deltas, background), [True, *wanted[1:]])
     ]
 
 
 @_forward.register_fake
 def _(
-    sigma: Tensor,
-    rgb: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor | None,
-    background: Tensor | None,
+    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return _allocate(sigma, rgb, ray_offsets)
 
 
 @_backward.register_fake
 def _(
-    gradients: Sequence[Tensor],
-    results: Sequence[Tensor],
+    colour: Tensor | None,
+    opacity: Tensor | None,
+    depth: Tensor | None,
+    weights: Tensor | None,
     sigma: Tensor,
     rgb: Tensor,
     depths: Tensor,
     deltas: Tensor,
     ray_offsets: Tensor | None,
     background: Tensor | None,
+    wanted: Sequence[bool],
 ) -> list[Tensor]:
-    return _allocate_gradients(gradients, sigma, rgb, depths, deltas, background)
+    return _allocate_gradients(sigma, rgb, depths, deltas, background, wanted)
 
 
 def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    ctx.save_for_backward(*inputs, *output)
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*inputs)
 
 
-def _forward_backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-    inputs, results = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
-    *of_samples, of_background = _backward(list(gradients), list(results), *inputs)
-    return (*of_samples, None, None if inputs[5] is None else of_background)
+def _forward_backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    inputs = ctx.saved_tensors
+    needs = ctx.needs_input_grad
+    if all(gradient is None for gradient in gradients):
+        return (None,) * len(inputs)
+    wanted = [*needs[:4], needs[5]]
+    results = _backward(*gradients, *inputs, wanted)
+    found = [result if need else None for result, need in zip(results, wanted)]
+    return (*found[:4], None, found[4])
 
 
 def _backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
-    gradients, _, *rest = inputs
-    ctx.save_for_backward(*gradients, *rest)
+    *tensors, ctx.wanted = inputs
+    ctx.save_for_backward(*tensors)
 
 
-def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
+def _backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tuple[Tensor | None, ...]:
     """Derivative of the gradients, through the reference formula."""
     saved = ctx.saved_tensors
     ray_offsets = saved[8]
     with torch.enable_grad():
         leaves = [
-            None if tensor is None or tensor is ray_offsets else tensor.detach().requires_grad_() for tensor in saved
+            None if tensor is None or i == 8 else tensor.detach().requires_grad_() for i, tensor in enumerate(saved)
         ]
         gradients, inputs = leaves[:4], [*leaves[4:8], leaves[9]]
-        results = _reference(*inputs[:4], ray_offsets=ray_offsets, background=inputs[4])  # type: ignore[arg-type]
-        pairs = [(leaf, cotangent) for leaf, cotangent in zip(inputs, cotangents) if leaf is not None]
+        parts = _reference(*inputs[:4], ray_offsets=ray_offsets, background=inputs[4])  # type: ignore[arg-type]
+        outputs = [(part, gradient) for part, gradient in zip(parts, gradients) if gradient is not None]
+        pairs = [
+            (tensor, cotangent)
+            for tensor, cotangent, want in zip(inputs, cotangents, ctx.wanted)
+            if want and tensor is not None and cotangent is not None
+        ]
         firsts = torch.autograd.grad(
-            results,
-            [leaf for leaf, _ in pairs],
-            gradients,
+            [part for part, _ in outputs],
+            [tensor for tensor, _ in pairs],
+            [gradient for _, gradient in outputs],
             create_graph=True,
             allow_unused=True,
             materialize_grads=True,
         )
-        total = results[0].new_zeros(())
+        total = saved[4].new_zeros(())
         for first, (_, cotangent) in zip(firsts, pairs):
             total = total + (first * cotangent).sum()
         present = [leaf for leaf in leaves if leaf is not None]
-        found = iter(torch.autograd.grad(total, present, allow_unused=True))
-    seconds = [None if leaf is None else next(found) for leaf in leaves]
-    # The results are functions of the inputs, which the reference has followed; they get no gradient of their own.
-    return (seconds[:4], [None] * 4, *seconds[4:8], None, seconds[9])
+        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
+    return (*(None if leaf is None else next(seconds) for leaf in leaves), None)
 
 
 _forward.register_autograd(_forward_backward, setup_context=_forward_setup)
