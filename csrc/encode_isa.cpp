@@ -55,7 +55,7 @@ VN_INLINE void lay_out(const Encoding& in, const Workspace& parts, int64_t strid
     float* to = parts.blur + row * stride;
     for (int64_t f = 0; f < skipped; ++f) to[f] = 0.0f;
     if (in.variances == nullptr) {
-      __builtin_memcpy(to + skipped, gradient, sizeof(float) * in.width);
+      for (int64_t column = 0; column < in.width; ++column) to[skipped + column] = gradient[column];
     } else {
       for (int64_t column = 0; column < in.width; ++column) to[skipped + column] *= gradient[column];
     }
@@ -90,7 +90,7 @@ void encode_rows(const Encoding& in, float* out, float* workspace, int64_t strid
       float* to = out + (first + row) * in.width;
       const float *value = parts.value + row * stride + skipped, *blur = parts.blur + row * stride + skipped;
       if (in.variances == nullptr) {
-        __builtin_memcpy(to, value, sizeof(float) * in.width);
+        for (int64_t column = 0; column < in.width; ++column) to[column] = value[column];
       } else {
         for (int64_t column = 0; column < in.width; ++column) to[column] = value[column] * blur[column];
       }
