@@ -5,7 +5,7 @@ so a build is parallel and redoes only what has changed, headers included. Files
 for each instruction set (csrc/isa.h); the choice among them is made at run time.
 
 Environment:
-    CXX, CXXFLAGS                the C++ compiler (default c++, else g++) and flags to add
+    CXX, CXXFLAGS                the C++ compiler and its flags (default c++, else g++); "ccache g++" works too
     VORONERF_CUDA                auto (default): with CUDA where nvcc is found; 1: fail without it; 0: never
     VORONERF_CUDA_ARCHITECTURES  such as "80;90": machine code for each, and PTX of the last for what comes after it
     CUDA_HOME, MAX_JOBS          where CUDA is; parallel jobs
@@ -32,6 +32,7 @@ X86_ISAS = {
     "avx2": ["-DVN_ISA=1", "-mavx2", "-mfma"],
     "avx512": ["-DVN_ISA=2", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma"],
 }
+LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
 # Short, for the sake of build time: 8.x runs the code of 80, and what comes after 9.0 compiles the PTX of 90.
 DEFAULT_ARCHITECTURES = "75;80;90"
 
@@ -93,9 +94,16 @@ def find_cuda() -> Cuda:
     return Cuda(f"built with CUDA for {';'.join(architectures)} by {found}", Path(found), architectures)
 
 
-def compiler() -> str:
-    """The C++ compiler."""
-    return os.environ.get("CXX") or shutil.which("c++") or "g++"
+def compiler() -> list[str]:
+    """The command of the C++ compiler: a launcher, if any, the program, and arguments."""
+    return shlex.split(os.environ.get("CXX", "")) or [shutil.which("c++") or "g++"]
+
+
+def host_compiler() -> list[str]:
+    """Flags of nvcc for the C++ compiler. It takes one program: no launcher, and arguments are passed on to it."""
+    words = compiler()
+    program, *arguments = words[1:] if Path(words[0]).name in LAUNCHERS and len(words) > 1 else words
+    return ["-ccbin", program, *(part for argument in arguments for part in ("-Xcompiler", argument))]
 
 
 def ninja() -> list[str]:
@@ -110,13 +118,13 @@ def ninja() -> list[str]:
 
 def isas() -> dict[str, list[str]]:
     """Instruction sets of this architecture and their flags."""
-    x86 = platform.machine().lower() in ("x86_64", "amd64") and "aarch64" not in compiler()
+    x86 = platform.machine().lower() in ("x86_64", "amd64") and "aarch64" not in " ".join(compiler())
     return X86_ISAS if x86 else {"portable": X86_ISAS["portable"]}
 
 
 def build_info(cuda: Cuda) -> str:
     """A header that records the build."""
-    version = subprocess.run([*shlex.split(compiler()), "--version"], check=True, capture_output=True, text=True).stdout
+    version = subprocess.run([*compiler(), "--version"], check=True, capture_output=True, text=True).stdout
     values = {
         "VN_COMPILER": f'"{version.splitlines()[0]}"',
         "VN_OPENMP": str(int(sys.platform != "darwin")),
@@ -140,14 +148,14 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     if cuda.nvcc is not None:
         # nvcc knows where its static runtime is. With that, the module loads on a machine without CUDA.
         common.append("-DVN_WITH_CUDA")
-        linker = [str(cuda.nvcc), "-shared", "-cudart=static", "-ccbin", compiler(), "-Xlinker", "--exclude-libs,ALL"]
+        linker = [str(cuda.nvcc), "-shared", "-cudart=static", *host_compiler(), "-Xlinker", "--exclude-libs,ALL"]
     elif sys.platform == "darwin":
-        linker = [compiler(), "-bundle", "-undefined", "dynamic_lookup"]
+        linker = [*compiler(), "-bundle", "-undefined", "dynamic_lookup"]
     else:
-        linker = [compiler(), "-shared", "-Wl,--exclude-libs,ALL"]
+        linker = [*compiler(), "-shared", "-Wl,--exclude-libs,ALL"]
     lines = [
         "rule cxx",
-        f"  command = {compiler()} {join(common + openmp + includes + extra)} $flags -MMD -MF $out.d -c $in -o $out",
+        f"  command = {join(compiler() + common + openmp + includes + extra)} $flags -MMD -MF $out.d -c $in -o $out",
         "  depfile = $out.d",
         "  deps = gcc",
         "  description = $out",
@@ -156,7 +164,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
         "  description = $out",
     ]
     if cuda.nvcc is not None:
-        host = join(["-Xcompiler", "-fPIC,-fvisibility=hidden,-ffp-contract=off", "-ccbin", compiler()])
+        host = join(["-Xcompiler", "-fPIC,-fvisibility=hidden,-ffp-contract=off", *host_compiler()])
         flags = join(["-std=c++17", "-O3", "-cudart=static", *cuda.flags(), f"-I{SOURCES}", "-I."])
         lines += [
             "rule nvcc",

@@ -1,0 +1,59 @@
+"""The build script: commands of build.ninja, from compilers of more than one word."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture
+def build(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The functions of setup.py, which is run without its last call."""
+    if not (ROOT / "setup.py").is_file():
+        pytest.skip("setup.py is not there: the tests are not in the source tree")
+    pytest.importorskip("pybind11")
+    setuptools = pytest.importorskip("setuptools")
+    monkeypatch.setattr(setuptools, "setup", lambda **_: None)
+    monkeypatch.delenv("CXXFLAGS", raising=False)
+    return runpy.run_path(str(ROOT / "setup.py"), run_name="voronerf_setup")
+
+
+def commands(build: dict[str, Any], cuda: Any) -> dict[str, str]:
+    """Command of every rule."""
+    lines = build["ninja_file"](Path("_C.so"), cuda).splitlines()
+    rules = [line.removeprefix("rule ") for line in lines if line.startswith("rule ")]
+    texts = [line.removeprefix("  command = ") for line in lines if line.startswith("  command = ")]
+    return dict(zip(rules, texts, strict=True))
+
+
+def test_a_launcher_before_the_compiler(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "ccache g++")
+    rules = commands(build, build["Cuda"]("built without CUDA"))
+    assert rules["cxx"].startswith("ccache g++ -std=c++17 ")
+    assert rules["link"].startswith("ccache g++ -")
+
+
+def test_nvcc_gets_one_program_and_the_arguments(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    cuda = build["Cuda"]("built with CUDA", Path("/cuda/bin/nvcc"), ("80",))
+    monkeypatch.setenv("CXX", "/usr/bin/ccache 'the compilers/g++' -m64")
+    rules = commands(build, cuda)
+    assert rules["cxx"].startswith("/usr/bin/ccache 'the compilers/g++' -m64 -std=c++17 ")
+    for rule in ("link", "nvcc"):
+        assert rules[rule].startswith("/cuda/bin/nvcc ")
+        assert " -ccbin 'the compilers/g++' -Xcompiler -m64 " in rules[rule]
+        assert "ccache" not in rules[rule]
+
+
+def test_one_word_and_none(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "ccache")
+    assert build["host_compiler"]() == ["-ccbin", "ccache"]
+    for empty in ("", " "):
+        monkeypatch.setenv("CXX", empty)
+        assert len(build["compiler"]()) == 1
+    monkeypatch.delenv("CXX")
+    assert len(build["compiler"]()) == 1
