@@ -19,6 +19,10 @@ namespace py = pybind11;
 
 namespace {
 
+// Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
+// goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
+constexpr int INTERFACE = 1;
+
 using Address = std::uintptr_t;
 
 template <typename T>
@@ -79,6 +83,7 @@ void cell_sort_cuda(Address cells, Address order, Address offsets, Address works
 PYBIND11_MODULE(_C, module) {
   const auto no_gil = py::call_guard<py::gil_scoped_release>();
 
+  module.attr("interface") = INTERFACE;
   module.attr("compiler") = VN_COMPILER;
   module.attr("openmp") = static_cast<bool>(VN_OPENMP);
   module.attr("cuda") = static_cast<bool>(VN_CUDA);

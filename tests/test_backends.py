@@ -133,6 +133,27 @@ assert reason.startswith("NVIDIA Warp 1.9.2 is too old; install it with `pip ins
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.parametrize("stale", ["", "module.interface = 0"])
+def test_a_compiled_module_of_another_version_is_refused(stale: str) -> None:
+    code = f"""
+import sys, types
+module = types.ModuleType("voronerf._C")
+{stale}
+sys.modules["voronerf._C"] = module
+import torch
+from voronerf import backends
+reason = backends.missing("native", torch.device("cpu"))
+assert reason is not None and reason.startswith("the compiled module is of another version of voronerf"), reason
+assert reason.endswith("build it again with `pip install -e .`"), reason
+points = torch.zeros(2, 3)
+run = backends.resolve("nearest_centre", backend="auto", device=points.device, dtype=points.dtype)
+assert run.__module__ == "voronerf.reference.nearest_centre", run
+assert backends.describe()["native"]["reason"] == reason
+"""
+    result = run_python(code)
+    assert result.returncode == 0, result.stderr
+
+
 def test_choice_is_traceable() -> None:
     def choose(x: torch.Tensor) -> torch.Tensor:
         run = resolve("frequency_encode", backend="reference", device=x.device, dtype=x.dtype)

@@ -2,6 +2,7 @@
 from collections.abc import Callable
 from typing import Any
 
+interface: int
 compiler: str
 openmp: bool
 cuda: bool

@@ -3,7 +3,7 @@
 n points, k cells, m centres of a tree, g diagrams. Each entry is a functional ``torch.library`` custom op that makes
 its inputs contiguous, allocates outputs and workspace, and passes addresses, sizes, and a thread count or a stream.
 Shapes, dtypes and devices have been validated by ``voronerf.ops``. Importing this module raises ``BackendUnavailable``
-where the extension is missing.
+where the extension is missing or was built for other sources than these.
 
 OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch
 has loaded. Linking it would not do: torch's wheels bring a libgomp of their own, named ``libgomp.so.1`` (CPU wheels;
@@ -26,6 +26,8 @@ from torch import Tensor
 from voronerf.backends import BackendUnavailable
 
 ISAS = ("portable", "avx2", "avx512")
+# Number of csrc/bindings.cpp that this file and its companions are written for.
+INTERFACE = 1
 
 _REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
 
@@ -48,6 +50,11 @@ try:
     from voronerf import _C
 except (ImportError, OSError) as error:
     raise BackendUnavailable(f"the compiled extension voronerf._C cannot be loaded ({error}); {_REMEDY}") from error
+# A module of before there was the number has none.
+if getattr(_C, "interface", None) != INTERFACE:
+    raise BackendUnavailable(
+        "the compiled module is of another version of voronerf; build it again with `pip install -e .`"
+    )
 
 
 def _choose_isa() -> int:
