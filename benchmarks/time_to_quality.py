@@ -13,8 +13,9 @@ from __future__ import annotations
 import json
 import platform
 import re
+import sys
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ import torch
 import tyro
 
 from voronerf import __version__, backends
+from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
-from voronerf.training.checkpoint import write_text
 from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.files import write_text
 from voronerf.training.plots import plot_curves
 from voronerf.training.runs import read_metrics, write_panels
 from voronerf.training.trainer import Trainer
@@ -41,7 +43,8 @@ class Options:
     budget: float = 120.0
     """Training seconds of every variant."""
     variants: tuple[str, ...] = ("w256", "w64", "voronoi-16")
-    """wN: one network of width N. voronoi-K or voronoi-KxK: K cells (per level) of width 64."""
+    """wN: one network of width N. voronoi-K or voronoi-KxK: K cells (per level) of width 64. Followed by @LR, with that
+    learning rate."""
     seeds: int = 1
     """Runs of every variant, seeds 0, 1, ..."""
     turn: float = 10.0
@@ -54,8 +57,8 @@ class Options:
     """Rays per step."""
     samples: int = TrainConfig.samples
     """Samples per ray."""
-    lr: float = TrainConfig.lr
-    """Learning rate at the start."""
+    lr: float | None = None
+    """Learning rate at the start; default: that of `voronerf train`, which depends on the width."""
     backend: str = "auto"
     """Backend of the operations."""
     json: Path | None = None
@@ -72,7 +75,10 @@ def configuration(name: str, options: Options, seed: int, out: Path) -> TrainCon
     Raises:
         ConfigError: For a name of another form.
     """
-    common = TrainConfig(
+    match = re.fullmatch(r"(w(?P<width>\d+)|voronoi-(?P<cells>\d+(x\d+)*))(@(?P<lr>[\d.e-]+))?", name)
+    if match is None:
+        raise ConfigError(f"--variants must be wN, voronoi-K or voronoi-KxK, got {name!r}")
+    return TrainConfig(
         data=options.data,
         downscale=options.downscale,
         out=out,
@@ -83,20 +89,18 @@ def configuration(name: str, options: Options, seed: int, out: Path) -> TrainCon
         final_views=options.eval_views,
         rays=options.rays,
         samples=options.samples,
-        lr=options.lr,
+        lr=float(match["lr"]) if match["lr"] else options.lr,
         backend=options.backend,
         checkpoint_every=1e9,
-        cells=(),
+        cells=tuple(int(k) for k in match["cells"].split("x")) if match["cells"] else (),
+        width=int(match["width"] or 64),
     )
-    if match := re.fullmatch(r"w(\d+)", name):
-        return replace(common, width=int(match[1]))
-    if match := re.fullmatch(r"voronoi-(\d+(?:x\d+)*)", name):
-        return replace(common, cells=tuple(int(k) for k in match[1].split("x")))
-    raise ConfigError(f"--variants must be wN, voronoi-K or voronoi-KxK, got {name!r}")
 
 
 def compare(options: Options, folder: Path) -> dict[str, Any]:
     """Trains every variant and seed in turns; returns {metadata, results}."""
+    if not options.turn > 0:
+        raise ConfigError(f"--turn must be positive, got {options.turn}")
     scene = load_scene(options.data, downscale=options.downscale)
     trainers: dict[tuple[str, int], Trainer] = {}
     for name in options.variants:
@@ -111,9 +115,11 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
     results = []
     for (name, seed), trainer in trainers.items():
         summary = trainer.run()
-        results.append({"variant": name, "seed": seed, **summary, "curve": read_metrics(trainer.out)})
+        lr = trainer.config.lr
+        results.append({"variant": name, "seed": seed, "lr": lr, **summary, "curve": read_metrics(trainer.out)})
         if options.panels is not None and seed == 0:
-            write_panels(trainer.router, scene, options.panels / name, samples=options.samples, views=3)
+            pictures, backend = options.panels / name, options.backend
+            write_panels(trainer.router, scene, pictures, samples=options.samples, views=3, backend=backend)
     metadata = {
         "benchmark": "time_to_quality",
         "scene": scene.name,
@@ -122,7 +128,6 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
         "budget_seconds": options.budget,
         "rays": options.rays,
         "samples": options.samples,
-        "lr": options.lr,
         "backend": options.backend,
         "voronerf": __version__,
         "torch": torch.__version__,
@@ -164,4 +169,7 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, config=(tyro.conf.OmitArgPrefixes,)))
+    try:
+        main(tyro.cli(Options, config=(tyro.conf.OmitArgPrefixes,)))
+    except EXPECTED as error:
+        sys.exit(f"time_to_quality: error: {error}")

@@ -1,3 +1,50 @@
 """Many small networks, one per Voronoi cell of space, as cheap to run and to train as one."""
 
 __version__ = "0.1.0"
+
+from voronerf.backends import BackendUnavailable
+from voronerf.balance import Balance, balance, imbalance
+from voronerf.diagram import VoronoiDiagram, uniform_centres
+from voronerf.fields import NeRF
+from voronerf.layers import MLP, Layer
+from voronerf.ops import (
+    Composite,
+    cell_sort,
+    composite,
+    frequency_encode,
+    grouped_linear,
+    grouped_mlp,
+    integrated_encode,
+    locate_cell,
+    nearest_centre,
+    resample,
+)
+from voronerf.router import VoronoiRouter
+from voronerf.subdivision import Split, split_diagram
+from voronerf.training.reservoir import SampleReservoir
+
+__all__ = [
+    "MLP",
+    "BackendUnavailable",
+    "Balance",
+    "Composite",
+    "Layer",
+    "NeRF",
+    "SampleReservoir",
+    "Split",
+    "VoronoiDiagram",
+    "VoronoiRouter",
+    "balance",
+    "cell_sort",
+    "composite",
+    "frequency_encode",
+    "grouped_linear",
+    "grouped_mlp",
+    "imbalance",
+    "integrated_encode",
+    "locate_cell",
+    "nearest_centre",
+    "resample",
+    "split_diagram",
+    "uniform_centres",
+]

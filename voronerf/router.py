@@ -75,7 +75,7 @@ class VoronoiRouter(nn.Module):
             raise ValueError(f"VoronoiRouter: assignment must be 'nearest' or 'stochastic', got {assignment!r}")
         if not temperature > 0:
             raise ValueError(f"VoronoiRouter: temperature must be positive, got {temperature}")
-        self.diagram = diagram if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
+        self.diagram = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
         self.assignment = assignment
         self.temperature = temperature
         self.backend = backend
@@ -195,8 +195,8 @@ class VoronoiRouter(nn.Module):
             diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it.
             parents: int64 [new cells], the present cell that each new cell lies in.
             optimizer: The optimiser that holds this router's parameters.
-            inherit: False draws fresh parameters for every new cell and drops their optimiser state: the ablation
-                that shows ghosting.
+            inherit: False draws fresh parameters for the children of every cell that is split, with moments of zero:
+                the ablation that shows ghosting.
 
         Raises:
             ValueError: When ``parents`` does not fit, or the field cannot draw fresh parameters.
@@ -212,16 +212,20 @@ class VoronoiRouter(nn.Module):
                 f"VoronoiRouter.subdivide: parents must lie in 0..{self.num_cells - 1}, got "
                 f"{int(parents.min())}..{int(parents.max())}"
             )
+        # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
+        new = torch.bincount(parents, minlength=self.num_cells)[parents] > 1
         fresh = None if inherit else self._fresh_parameters(diagram.num_cells)
         replaced: dict[Tensor, nn.Parameter] = {}
         for index, (owner, name, parameter) in enumerate(_owned_parameters(self.module)):
-            values = parameter[parents.to(parameter.device)] if fresh is None else fresh[index]
-            child = nn.Parameter(values.clone(), requires_grad=parameter.requires_grad)
+            values = parameter[parents.to(parameter.device)]
+            if fresh is not None:
+                values[new] = fresh[index][new]
+            child = nn.Parameter(values, requires_grad=parameter.requires_grad)
             owner.register_parameter(name, child)
             replaced[parameter] = child
         if optimizer is not None:
-            _move_state(optimizer, replaced, parents if inherit else None)
-        self.diagram = diagram.to(parents.device if not replaced else next(iter(replaced)).device)
+            _move_state(optimizer, replaced, parents, None if inherit else new)
+        self.diagram = copy.deepcopy(diagram).to(self.diagram.centres.device)
 
     def _fresh_parameters(self, k: int) -> list[Tensor]:
         """Newly drawn parameters [k, ...] of every parameter of the field, in order."""
@@ -266,17 +270,23 @@ def _owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parame
     ]
 
 
-def _move_state(optimizer: torch.optim.Optimizer, replaced: dict[Tensor, nn.Parameter], parents: Tensor | None) -> None:
-    """Puts the new parameters in the place of the old in an optimiser, their state copied from the parent cell."""
+def _move_state(
+    optimizer: torch.optim.Optimizer, replaced: dict[Tensor, nn.Parameter], parents: Tensor, fresh: Tensor | None
+) -> None:
+    """Puts the new parameters in the place of the old in an optimiser, their state copied from the parent cell.
+
+    The state of the cells that the mask ``fresh`` names is zero instead.
+    """
     for group in optimizer.param_groups:
         group["params"] = [replaced.get(parameter, parameter) for parameter in group["params"]]
     for old, new in replaced.items():
         state = optimizer.state.pop(old, None)
-        if state is None or parents is None:
+        if state is None:
             continue
-        optimizer.state[new] = {
-            key: value[parents.to(value.device)].clone()
-            if isinstance(value, Tensor) and value.shape == old.shape
-            else copy.deepcopy(value)
-            for key, value in state.items()
-        }
+        for key, value in state.items():
+            moved = copy.deepcopy(value)
+            if isinstance(value, Tensor) and value.shape == old.shape:
+                moved = value[parents.to(value.device)]
+                if fresh is not None:
+                    moved[fresh] = 0
+            optimizer.state[new][key] = moved

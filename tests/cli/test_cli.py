@@ -73,12 +73,28 @@ def test_info_names_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
         assert word in output
 
 
-def test_resume_continues(run: Path, tmp_path: Path) -> None:
+def test_resume_needs_no_setting_again(run: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
-    longer = ["20" if word == "16" else word for word in TINY]
-    assert main(["train", "--data", "builtin", "--out", str(copy), "--resume", *longer]) == 0
+    assert main(["train", "--resume", "--out", str(copy), "--steps", "20"]) == 0
     assert json.loads((copy / "summary.json").read_text())["steps"] == 20
+    assert json.loads((copy / "config.json").read_text())["width"] == 8
+    assert main(["train", f"--out={copy}", "--resume", "--steps", "22"]) == 0
+    assert json.loads((copy / "summary.json").read_text())["steps"] == 22
+
+
+def test_demo_compares_two_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["demo", "--out", str(tmp_path), "--budget", "1", "--size", "16", "--cells", "3"]
+    assert main(command) == 0
+    assert main(command) == 0  # in the place of the first
+    output = capsys.readouterr().out
+    results = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ("single", "voronoi")}
+    assert (results["single"]["cells"], results["voronoi"]["cells"]) == (1, 3)
+    for result in results.values():
+        assert f"{result['psnr']:.2f}" in output
+    assert (tmp_path / "psnr.png").stat().st_size > 1000
+    assert "--cells must be at least 2" in error_of(capsys, "demo", "--out", str(tmp_path / "x"), "--cells", "1")
+    assert not (tmp_path / "x").exists()
 
 
 def test_help_has_units(capsys: pytest.CaptureFixture[str]) -> None:
@@ -103,10 +119,21 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.Capture
     assert "--resume needs a checkpoint" in error_of(capsys, "train", "--resume", "--out", out)
     assert "--resume needs --out" in error_of(capsys, "train", "--resume")
     assert "there is no checkpoint" in error_of(capsys, "eval", str(tmp_path))
-    assert "--frames and --fps" in error_of(capsys, "render", str(run), "--frames", "0")
-    many = ["--cells", "4000"] + [w for w in TINY if w not in ("--cells", "3")]
-    assert "more cells than samples" in error_of(capsys, "train", "--data", "builtin", "--out", out, *many)
-    assert not Path(out, "summary.json").exists()
+    assert "--frames must be at least 1, got 0" in error_of(capsys, "render", str(run), "--frames", "0")
+    assert "--views must be at least 1, got 0" in error_of(capsys, "eval", str(run), "--views", "0")
+    assert "--samples must be at least 1, got 0" in error_of(capsys, "eval", str(run), "--samples", "0")
+    assert "--panels must not be negative" in error_of(capsys, "eval", str(run), "--panels", "-1")
+    assert not Path(out).exists()
+
+
+def test_a_failed_run_leaves_its_folder_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    many = ["400" if word == "3" else word for word in TINY]
+    few = ["--reservoir", "400", "--reservoir-batches", "10"]
+    assert "more cells than samples" in error_of(capsys, "train", "--data", "builtin", *out, *many, *few)
+    (tmp_path / "out" / "checkpoints" / "last.safetensors").unlink()
+    assert main(["train", "--data", "builtin", *out, *TINY]) == 0
+    assert (tmp_path / "out" / "metrics.jsonl").read_text().count("\n") == 2
 
 
 def test_another_configuration_is_one_line(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -117,12 +144,20 @@ def test_another_configuration_is_one_line(run: Path, capsys: pytest.CaptureFixt
 def test_a_full_disk_is_one_line(
     run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+    whole, calls = os.fsync, []
+
+    def full(descriptor: int) -> None:
+        calls.append(descriptor)
+        if len(calls) > 3:
+            raise OSError(28, "No space left on device")
+        whole(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
     args = ["train", "--data", "builtin", "--out", str(tmp_path / "x"), *TINY]
     assert "No space left on device" in error_of(capsys, *args)
+    assert not list(tmp_path.rglob("*.partial"))
+    monkeypatch.undo()
+    assert main(args) == 0
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGINT") or sys.platform == "win32", reason="needs POSIX signals")

@@ -49,7 +49,9 @@ def test_is_the_published_architecture(inputs: tuple[torch.Tensor, torch.Tensor]
 def test_every_depth_has_gradients_everywhere(
     inputs: tuple[torch.Tensor, torch.Tensor], depth: int, view_directions: bool
 ) -> None:
-    field = NeRF(width=7, depth=depth, skips=(0, 4), view_directions=view_directions)
+    skips = tuple(s for s in (0, 4) if s < depth - 1)
+    field = NeRF(width=7, depth=depth, skips=skips, view_directions=view_directions)
+    assert [layer.in_features for layer in field.trunk[1:]] == [7 + 63 * (i in skips) for i in range(depth - 1)]
     rgb, sigma = field(*inputs) if view_directions else field(inputs[0])
     (rgb.sum() + sigma.sum()).backward()
     for name, parameter in field.named_parameters():
@@ -86,7 +88,8 @@ def test_empty_batch() -> None:
         ({"depth": 0}, "depth must be at least 1, got 0"),
         ({"density_scale": 0.0}, "density_scale must be positive, got 0.0"),
         ({"position_octaves": -1}, "octaves must not be negative"),
-        ({"skips": (-1,)}, "skips must be indices of trunk layers"),
+        ({"skips": (-1,)}, "skips must be trunk layers with another behind"),
+        ({"depth": 4, "skips": (3,)}, r"0\.\.2, got \(3,\)"),
     ],
 )
 def test_bad_settings(settings: dict[str, object], message: str) -> None:

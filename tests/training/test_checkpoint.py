@@ -17,8 +17,8 @@ from voronerf.training.checkpoint import (
     load_optimizer_tensors,
     optimizer_tensors,
     save_checkpoint,
-    write_text,
 )
+from voronerf.training.files import read_json_lines, write_text
 
 
 def example() -> Checkpoint:
@@ -96,3 +96,13 @@ def test_optimizer_state_round_trips() -> None:
     step(first, optimizer)
     step(second, other)
     assert torch.equal(first, second)
+
+
+def test_broken_json_lines_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    assert read_json_lines(path) == []
+    write_text(path, '{"step": 1}\n{"step": 2}\n')
+    assert read_json_lines(path) == [{"step": 1}, {"step": 2}]
+    write_text(path, '{"step": 1}\n{"ste')
+    with pytest.raises(ValueError, match=r"metrics.jsonl: line 2 is no JSON"):
+        read_json_lines(path)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig, differences
+from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig, check_device, differences
 
 
 def test_defaults_are_usable() -> None:
@@ -52,15 +52,29 @@ def test_json_of_something_else(text: str) -> None:
         ({"cells": (4,), "split_at": (0.2, 0.4)}, "--split-at must have one fraction for each of the 1 levels"),
         ({"cells": (4, 4), "split_at": (0.4, 0.2)}, "--split-at must be rising fractions between 0 and 1"),
         ({"split_at": (1.0,)}, "--split-at must be rising fractions between 0 and 1"),
-        ({"device": "gpu7"}, "--device must name a device that is present, got 'gpu7'"),
         ({"backend": "fast"}, "--backend must be auto, .*got 'fast'"),
         ({"eval_views": 0}, "--eval-views must be at least 1, got 0"),
-        ({"temperature": -1.0}, "--temperature must be positive, got -1.0"),
+        ({"temperature": -1.0}, "--temperature must be positive and finite, got -1.0"),
+        ({"temperature": float("inf")}, "--temperature must be positive and finite, got inf"),
+        ({"seed": 10**22}, r"--seed must lie in 0\.\.2\^63 - 1"),
+        ({"cells": (20_000,)}, r"--cells must not exceed --reservoir, the 10000 samples of a split, got \(20000,\)"),
     ],
 )
 def test_bad_settings(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         TrainConfig(**settings)
+
+
+@pytest.mark.parametrize("name", ["gpu7", "meta", "cuda:99"])
+def test_a_device_that_is_not_there(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"--device must name a device that is present, got '{name}'"):
+        check_device(name)
+
+
+def test_wide_networks_learn_slower() -> None:
+    assert TrainConfig(width=256).lr == pytest.approx(0.005)
+    assert TrainConfig(width=16).lr == TrainConfig(width=64).lr == 0.02
+    assert TrainConfig(width=256, lr=0.3).lr == 0.3
 
 
 def test_differences_name_what_cannot_change() -> None:

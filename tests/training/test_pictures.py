@@ -86,5 +86,5 @@ def test_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="fps must be positive, got 0"):
         write_video(path, frames, 0)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(RuntimeError, match="pip install imageio-ffmpeg"):
+    with pytest.raises(ImportError, match="pip install imageio-ffmpeg"):
         write_video(path, frames, 10)

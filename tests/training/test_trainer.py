@@ -10,11 +10,15 @@ from typing import Any
 import pytest
 import torch
 
+import voronerf.training.trainer as trainer_module
+from voronerf.backends import BackendUnavailable
 from voronerf.data import Scene, builtin_scene
+from voronerf.training.batches import Batch
 from voronerf.training.checkpoint import CheckpointError, load_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.evaluation import evaluate, render_view
-from voronerf.training.trainer import Trainer, TrainingError, checkpoint_path, load_run
+from voronerf.training.model import checkpoint_path, load_run, make_router, octaves_for, restore_router
+from voronerf.training.trainer import Trainer, TrainingError
 
 
 @pytest.fixture(scope="module")
@@ -95,27 +99,98 @@ def test_nested_levels_and_cells_too_small(tmp_path: Path, scene: Scene) -> None
     assert summary["stages"][2]["balance_after"] is None
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"centres": "random"},
-        {"centres": "uniform"},
-        {"balance": "transport"},
-        {"init": "random"},
-        {"assignment": "stochastic"},
-        {"cells": (3, 2), "split": "worst"},
-        {"backend": "reference"},
-        {"background": "white"},
-        {"view_directions": False},
-        {"cells": ()},
-    ],
-    ids=str,
-)
-def test_every_variant_of_the_paper_runs(tmp_path: Path, scene: Scene, settings: dict[str, Any]) -> None:
-    summary = Trainer(small(tmp_path, **settings), scene).run()
-    expected = {"(3, 2)": 4, "()": 1}.get(str(settings.get("cells")), 4)
-    assert summary["cells"] == expected
-    assert summary["psnr"] > 3
+def after_the_split(tmp_path: Path, scene: Scene, **settings: Any) -> Trainer:
+    """A trainer of four cells that has made one step since its split."""
+    trainer = Trainer(small(tmp_path, **settings), scene)
+    trainer.on_step = lambda p: trainer.request_stop() if p.step == 13 else None
+    trainer.advance()
+    assert trainer.router.num_cells == 4
+    return trainer
+
+
+@pytest.mark.parametrize("centres", ["random", "uniform"])
+def test_centres_that_are_not_balanced(tmp_path: Path, scene: Scene, centres: str) -> None:
+    stages = {}
+    for name in ("balanced", centres):
+        stages[name] = after_the_split(tmp_path / name, scene, centres=name).stages[-1]
+        assert (stages[name].balance_before == stages[name].balance_after) == (name == centres)
+    if centres == "random":  # the same draw, moved or not
+        assert stages["balanced"].balance_before == stages["random"].balance_before
+
+
+def test_balance_by_transport_has_power_weights(tmp_path: Path, scene: Scene) -> None:
+    assert after_the_split(tmp_path / "a", scene, balance="transport").router.diagram.power is not None
+    assert after_the_split(tmp_path / "b", scene).router.diagram.power is None
+
+
+def test_children_inherit_or_start_afresh(tmp_path: Path, scene: Scene) -> None:
+    spread = {}
+    for init in ("inherit", "random"):
+        weight = after_the_split(tmp_path / init, scene, init=init).router.module.trunk[0].weight
+        spread[init] = float((weight[0] - weight[1]).detach().abs().mean())
+    assert 0 < spread["inherit"] < 0.05 < 0.1 < spread["random"]
+
+
+def test_random_initialisation_leaves_cells_that_are_not_split(tmp_path: Path, scene: Scene) -> None:
+    trainer = Trainer(small(tmp_path, cells=(3, 2), split_at=(0.4, 0.8), split="worst", init="random"), scene)
+    before: dict[str, torch.Tensor] = {}
+
+    def keep(progress: Any) -> None:
+        weight = trainer.router.module.trunk[0].weight.detach().clone()
+        before["now" if progress.cells == 4 else "then"] = weight
+        if progress.cells == 4:
+            trainer.request_stop()
+
+    trainer.on_step = keep
+    trainer.advance()
+    distance = (before["now"][:, None] - before["then"][None]).abs().mean((2, 3)).amin(1)
+    assert (distance < 0.05).sum() == 2 and (distance > 0.1).sum() == 2, distance
+
+
+def test_assignment_reaches_the_router(tmp_path: Path, scene: Scene) -> None:
+    router = Trainer(small(tmp_path / "a", assignment="stochastic", temperature=0.7), scene).router
+    assert (router.assignment, router.temperature) == ("stochastic", 0.7)
+    summary = Trainer(small(tmp_path / "b", assignment="stochastic"), scene).run()
+    assert summary["cells"] == 4
+
+
+@pytest.mark.parametrize("settings", [{"backend": "reference"}, {"view_directions": False}, {"cells": ()}], ids=str)
+def test_further_settings_run(tmp_path: Path, scene: Scene, settings: dict[str, Any]) -> None:
+    trainer = Trainer(small(tmp_path, **settings), scene)
+    assert trainer.run()["complete"]
+    assert trainer.router.field.layers.uses_directions == settings.get("view_directions", True)
+
+
+def test_the_reference_backend_trains_to_the_same_curve(tmp_path: Path, scene: Scene) -> None:
+    psnr = {}
+    for backend in ("auto", "reference"):
+        config = small(tmp_path / backend, backend=backend, steps=60, rays=128, width=16)
+        psnr[backend] = Trainer(config, scene).run()["psnr"]
+    assert psnr["auto"] == pytest.approx(psnr["reference"], abs=0.5)
+
+
+def test_kept_samples_are_weight_times_ray_error(tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Importance w * E(r), E the squared error of the ray's colour summed over its channels."""
+    rendered, targets = [], []
+    whole, target = trainer_module.render_rays, Batch.target
+    monkeypatch.setattr(trainer_module, "render_rays", lambda *a, **k: rendered.append(whole(*a, **k)) or rendered[-1])
+    monkeypatch.setattr(Batch, "target", lambda *a: targets.append(target(*a)) or targets[-1])
+    trainer = Trainer(small(tmp_path, reservoir=40, reservoir_batches=1, cells=(4,), split_at=(0.9,)), scene)
+    trainer.on_step = lambda p: trainer.request_stop()
+    trainer.advance()
+    points, importance = trainer.reservoir.samples()
+    error = (rendered[0].colour - targets[0]).square().sum(1)
+    expected = (rendered[0].weights * error[:, None]).detach().reshape(-1)
+    heaviest = expected.topk(40)
+    torch.testing.assert_close(importance.sort(descending=True).values, heaviest.values)
+    at = rendered[0].positions.detach().reshape(-1, 3)[heaviest.indices]
+    assert {tuple(p) for p in points.tolist()} == {tuple(p) for p in at.tolist()}
+
+
+def test_octaves_follow_the_pixels() -> None:
+    """100 x 100 images of a Blender-like scene: 8 octaves; the paper's 10 at 400 x 400; one more for half the pixel."""
+    octaves = [octaves_for(builtin_scene(size, train_views=2, test_views=1)) for size in (50, 100, 200, 400)]
+    assert octaves == [7, 8, 9, 10]
 
 
 def tensors(run: Path) -> dict[str, torch.Tensor]:
@@ -179,9 +254,7 @@ def test_another_configuration_is_refused(tmp_path: Path, scene: Scene) -> None:
     checkpoint = load_checkpoint(checkpoint_path(tmp_path))
     del checkpoint.tensors["router.module.density.weight"]
     with pytest.raises(CheckpointError, match="another architecture"):
-        from voronerf.training.trainer import make_router, restore_router
-
-        restore_router(make_router(config), checkpoint)
+        restore_router(make_router(small(tmp_path, position_octaves=octaves_for(scene)), "cpu"), checkpoint)
 
 
 def test_a_loss_that_is_not_finite_stops_training(tmp_path: Path, scene: Scene) -> None:
@@ -192,12 +265,45 @@ def test_a_loss_that_is_not_finite_stops_training(tmp_path: Path, scene: Scene) 
     with torch.no_grad():
         next(iter(trainer.router.parameters())).fill_(float("nan"))
     trainer.config = replace(trainer.config, steps=99, split_at=(0.01,))
-    with pytest.raises(TrainingError, match=r"the loss is nan at step 25; the last checkpoint in .* is untouched"):
+    with pytest.raises(TrainingError, match=r"the loss is nan at step 25, .*the checkpoint is as it was"):
         trainer.run()
     after = tensors(tmp_path)
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
 def test_more_cells_than_samples(tmp_path: Path, scene: Scene) -> None:
-    with pytest.raises(ValueError, match="more cells than samples"):
-        Trainer(small(tmp_path, cells=(500,), min_cell_samples=0), scene).run()
+    config = small(tmp_path, cells=(390,), split_at=(0.1,))
+    with pytest.raises(TrainingError, match=r"more cells than samples: --cells asks for 390, .* in 3 steps"):
+        Trainer(config, scene).run()
+    assert load_checkpoint(checkpoint_path(tmp_path)).values["step"] == 3
+
+
+def test_a_level_without_samples_is_skipped(tmp_path: Path, scene: Scene) -> None:
+    lines: list[str] = []
+    config = small(tmp_path, cells=(4, 64), split_at=(0.5, 0.54))
+    summary = Trainer(config, scene, on_event=lines.append).run()
+    assert [s["cells"] for s in summary["stages"]] == [1, 4, 4]
+    assert any(line.startswith("no cell split") and "40 samples kept" in line for line in lines)
+
+
+def test_a_backend_that_cannot_train_says_so_before_writing(tmp_path: Path, scene: Scene) -> None:
+    with pytest.raises(BackendUnavailable):
+        Trainer(small(tmp_path, backend="warp"), scene)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_longer_resumed_runs_are_evaluated(tmp_path: Path, scene: Scene) -> None:
+    config = small(tmp_path, steps=8, cells=(), evaluations=4)
+    Trainer(config, scene).run()
+    summary = Trainer(replace(config, steps=16, resume=True), scene).run()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [2, 4, 6, 8, 12, 16]
+    assert lines[-1]["psnr"] == summary["psnr"]
+
+
+@pytest.mark.cuda
+def test_training_on_a_gpu(tmp_path: Path, scene: Scene) -> None:
+    config = small(tmp_path, device="cuda", assignment="stochastic")
+    assert Trainer(config, scene).run()["cells"] == 4
+    _, router = load_run(tmp_path, device="cpu")
+    assert len(evaluate(router, scene, samples=8, views=1)) == 1

@@ -20,15 +20,20 @@ from voronerf.data import Scene, load_scene
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.volume import render_image
 from voronerf.training.config import ConfigError, TrainConfig, check_device
+from voronerf.training.model import load_run
 from voronerf.training.runs import choose_directory, score_views, write_curve, write_panels
-from voronerf.training.trainer import Trainer, load_run
+from voronerf.training.trainer import Trainer
 from voronerf.training.video import write_video
 
 console = Console(soft_wrap=True)
 
 
 def train(config: TrainConfig) -> int:
-    """Train a scene: coarse network, balanced Voronoi cells, cells trained further."""
+    """Train a scene: coarse network, balanced Voronoi cells, cells trained further.
+
+    With --resume, what is not given is as it was in the run in --out.
+    """
+    check_device(config.device)
     scene = load_scene(config.data, downscale=config.downscale)
     summary = run_training(choose_directory(config, scene), scene)
     return 0 if summary["complete"] else 130
@@ -55,7 +60,7 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
         finally:
             signal.signal(signal.SIGINT, before)
     if not summary["complete"]:
-        console.print(f"stopped; continue with --resume --out {config.out}", highlight=False)
+        console.print(f"stopped; continue with: voronerf train --resume --out {config.out}", highlight=False)
         return summary
     if config.panels:
         write_panels(
@@ -94,8 +99,11 @@ def evaluate_run(
         device: Torch device.
         backend: Backend of the operations.
     """
+    if panels < 0:
+        raise ConfigError(f"--panels must not be negative, got {panels}")
+    check_counts(views=views, samples=samples, downscale=downscale)
     config, router, scene = _load(run, data, downscale, device, backend)
-    samples = samples or config.samples
+    samples = config.samples if samples is None else samples
     result = score_views(router, scene, samples=samples, views=views, backend=backend, path=run / "eval.json")
     table = Table("view", "psnr [dB]", "ssim")
     for view in result["views"]:
@@ -134,8 +142,7 @@ def render(
         device: Torch device.
         backend: Backend of the operations.
     """
-    if frames < 1 or fps < 1:
-        raise ConfigError(f"--frames and --fps must be at least 1, got {frames} and {fps}")
+    check_counts(frames=frames, fps=fps, samples=samples, downscale=downscale)
     config, router, scene = _load(run, data, downscale, device, backend)
     cameras = turntable_cameras(scene.train.cameras, frames).to(device)
     pictures = []
@@ -147,7 +154,7 @@ def render(
             near=scene.near,
             far=scene.far,
             box=None if scene.box is None else scene.box.to(device),
-            samples=samples or config.samples,
+            samples=config.samples if samples is None else samples,
             background=scene.background_colour(device),
             spacing=scene.spacing,
             backend=backend,
@@ -183,10 +190,21 @@ def info() -> int:
     return 0
 
 
+def check_counts(**counts: int | None) -> None:
+    """Raises ConfigError for an option below 1; None stands for its default."""
+    for name, value in counts.items():
+        if value is not None and value < 1:
+            raise ConfigError(f"--{name} must be at least 1, got {value}")
+
+
 def _load(
     run: Path, data: str | None, downscale: int | None, device: str, backend: str
 ) -> tuple[TrainConfig, Any, Scene]:
     check_device(device)
     config, router = load_run(run, device=device, backend=backend)
-    config = replace(config, data=data or config.data, downscale=downscale or config.downscale)
+    config = replace(
+        config,
+        data=config.data if data is None else data,
+        downscale=config.downscale if downscale is None else downscale,
+    )
     return config, router, load_scene(config.data, downscale=config.downscale)

@@ -34,16 +34,18 @@ def demo(
     """
     if not 1 <= size <= 100:
         raise ConfigError(f"--size must lie in 1..100, got {size}")
+    configs = {
+        name: TrainConfig(
+            out=out / name, budget=budget, cells=levels, seed=seed, backend=backend, evaluations=6, eval_views=5
+        )
+        for name, levels in (("single", ()), ("voronoi", (cells,)))
+    }
     scene = builtin_scene(size)
     results: dict[str, dict[str, Any]] = {}
-    for name, levels in (("single", ()), ("voronoi", (cells,))):
-        run = out / name
-        _remove_run(run)
-        networks = f"{cells} Voronoi cells" if levels else "one coarse network"
+    for name, config in configs.items():
+        _remove_run(out / name)
+        networks = f"{cells} Voronoi cells" if config.cells else "one coarse network"
         console.print(f"\n[bold]{name}[/bold]: {networks}, {budget:.0f} s", highlight=False)
-        config = TrainConfig(
-            out=run, budget=budget, cells=levels, seed=seed, backend=backend, evaluations=6, eval_views=5
-        )
         results[name] = run_training(config, scene)
         if not results[name]["complete"]:
             return 130

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 import warnings
+from collections.abc import Callable
+from pathlib import Path
 
+import torch
 import tyro
 from rich.console import Console
 
 from voronerf.backends import BackendUnavailable
 from voronerf.cli import commands, demo
-from voronerf.training.config import ConfigError
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.runs import stored_config
 from voronerf.training.trainer import TrainingError
+
+#: What a user can cause, told in one line. ValueError includes the project's own SceneError and CheckpointError.
+EXPECTED = (ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError, torch.OutOfMemoryError)
 
 
 def main(args: list[str] | None = None) -> int:
@@ -29,7 +37,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         return tyro.extras.subcommand_cli_from_dict(
             {
-                "train": commands.train,
+                "train": _train_command(sys.argv[1:] if args is None else args),
                 "eval": commands.evaluate_run,
                 "render": commands.render,
                 "info": commands.info,
@@ -40,13 +48,32 @@ def main(args: list[str] | None = None) -> int:
             args=args,
             config=(tyro.conf.OmitArgPrefixes,),
         )
-    except (ConfigError, ValueError, OSError, ImportError, BackendUnavailable, TrainingError) as error:
-        # ValueError includes the project's own SceneError and CheckpointError.
+    except KeyboardInterrupt:
+        print("voronerf: interrupted", file=sys.stderr)
+        return 130
+    except EXPECTED as error:
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
         text = " ".join(str(error).split()) or type(error).__name__
         print(f"voronerf: error: {text}", file=sys.stderr)
         return 1
+
+
+def _train_command(args: list[str]) -> Callable[..., int]:
+    """``train``, with the stored settings of the run in --out as defaults where --resume is given."""
+    if "train" not in args[:1] or "--resume" not in args:
+        return commands.train
+    out = next((after for word, after in itertools.pairwise(args) if word == "--out"), None)
+    out = next((word.removeprefix("--out=") for word in args if word.startswith("--out=")), out)
+    stored = None if out is None else stored_config(Path(out))
+    if stored is None:
+        return commands.train
+
+    def train(config: TrainConfig = stored) -> int:
+        return commands.train(config)
+
+    train.__doc__ = commands.train.__doc__
+    return train
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -36,7 +36,8 @@ class NeRF(nn.Module):
     Args:
         width: Channels of the hidden layers, at least 2.
         depth: Hidden layers before the heads, at least 1.
-        skips: Indices of trunk layers whose output is joined with the encoded position again.
+        skips: Indices of trunk layers whose output is joined with the encoded position again; None is 4, as published,
+            where the trunk has more than five layers, else none.
         position_octaves: Frequencies of the position's encoding; 0 takes the position as it is.
         direction_octaves: The same for the view direction.
         view_directions: Whether colour depends on the view direction.
@@ -50,7 +51,7 @@ class NeRF(nn.Module):
         self,
         width: int = 64,
         depth: int = 8,
-        skips: tuple[int, ...] = (4,),
+        skips: tuple[int, ...] | None = None,
         position_octaves: int = 10,
         direction_octaves: int = 4,
         view_directions: bool = True,
@@ -65,9 +66,10 @@ class NeRF(nn.Module):
             raise ValueError(f"NeRF: density_scale must be positive, got {density_scale}")
         if min(position_octaves, direction_octaves) < 0:
             raise ValueError(f"NeRF: octaves must not be negative, got {position_octaves} and {direction_octaves}")
-        skips = tuple(s for s in skips if s < depth - 1)
-        if any(s < 0 for s in skips):
-            raise ValueError(f"NeRF: skips must be indices of trunk layers, got {skips}")
+        if skips is None:
+            skips = (4,) if depth > 5 else ()
+        if any(not 0 <= s < depth - 1 for s in skips):
+            raise ValueError(f"NeRF: skips must be trunk layers with another behind, 0..{depth - 2}, got {skips}")
 
         self.width = width
         self.view_directions = view_directions

@@ -7,7 +7,6 @@ random generators'. What is not a tensor (configuration, counters, stages) is JS
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
+
+from voronerf.training.files import write_bytes
 
 FORMAT = "voronerf-checkpoint-1"
 
@@ -34,29 +35,6 @@ class Checkpoint:
     def group(self, prefix: str) -> dict[str, Tensor]:
         """The tensors below ``prefix.``, without it."""
         return {name[len(prefix) + 1 :]: t for name, t in self.tensors.items() if name.startswith(prefix + ".")}
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Writes a file so that a reader, or a crash at any moment, sees the old content or the new, never a part.
-
-    Raises:
-        OSError: When the disk is full or the folder cannot be written; the old file is then untouched.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def write_text(path: Path, text: str) -> None:
-    """:func:`write_bytes` for text."""
-    write_bytes(path, text.encode())
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:

@@ -52,10 +52,11 @@ class TrainConfig:
     """Channels of the networks' hidden layers."""
     depth: int = 4
     """Hidden layers before the heads."""
-    skips: tuple[int, ...] = (4,)
-    """Trunk layers whose output is joined with the encoded position again."""
-    position_octaves: int = 10
-    """Frequencies of the position's encoding."""
+    skips: tuple[int, ...] | None = None
+    """Trunk layers whose output is joined with the encoded position again; default: 4, as published, where there are
+    more than five layers, else none."""
+    position_octaves: int | None = None
+    """Frequencies of the position's encoding; default: until the finest wave spans two pixels of the training views."""
     direction_octaves: int = 4
     """Frequencies of the view direction's encoding."""
     view_directions: bool = True
@@ -88,8 +89,8 @@ class TrainConfig:
     """Rays per training step."""
     samples: int = 64
     """Samples per ray, one in each of as many strata."""
-    lr: float = 5e-3
-    """Learning rate of Adam at the start."""
+    lr: float | None = None
+    """Learning rate of Adam at the start; default: 0.02 up to width 64, beyond in inverse proportion to the width."""
     lr_final: float = 0.05
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
     warmup: float = 0.02
@@ -111,6 +112,9 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.budget is None and self.steps is None:
             object.__setattr__(self, "budget", 480.0)
+        if self.lr is None:
+            # Hidden layers under Adam want steps in inverse proportion to their width (Yang et al. 2021, table 3).
+            object.__setattr__(self, "lr", 0.02 * 64 / max(self.width, 64))
         check_config(self)
 
     @property
@@ -152,7 +156,7 @@ class TrainConfig:
 
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
-    {"out", "resume", "device", "backend", "budget", "steps", "evaluations", "eval_views", "final_views"}
+    {"data", "out", "resume", "device", "backend", "budget", "steps", "evaluations", "eval_views", "final_views"}
     | {"checkpoint_every", "panels"}
 )
 
@@ -166,7 +170,6 @@ def check_config(config: TrainConfig) -> None:
 
     if config.budget is not None and config.steps is not None:
         raise ConfigError("give --budget SECONDS or --steps N, not both")
-    check_device(config.device)
     need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
     need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
     for name in ("downscale", "rays", "samples", "depth", "reservoir", "reservoir_batches", "evaluations"):
@@ -174,13 +177,16 @@ def check_config(config: TrainConfig) -> None:
     need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
     need(config.width >= 2, "width", "be at least 2")
     for name in ("position_octaves", "direction_octaves", "panels", "min_cell_samples"):
-        need(getattr(config, name) >= 0, name, "not be negative")
+        need((getattr(config, name) or 0) >= 0, name, "not be negative")
     need(config.eval_views >= 1, "eval_views", "be at least 1")
     need(config.final_views is None or config.final_views >= 1, "final_views", "be at least 1")
-    need(0 < config.lr < float("inf"), "lr", "be positive")
+    need(0 < (config.lr or 0.0) < float("inf"), "lr", "be positive")
     need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
     need(0 <= config.warmup < 1, "warmup", "lie in [0, 1)")
-    need(config.temperature > 0, "temperature", "be positive")
+    need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
+    need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
+    largest = max(config.cells, default=0)
+    need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
     need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
     need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
     if config.split_at is not None:
@@ -194,8 +200,8 @@ def check_config(config: TrainConfig) -> None:
 def check_device(name: str) -> None:
     """Raises ConfigError unless ``name`` is a torch device that is present."""
     try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError) as error:
+        float(torch.zeros((), device=name))
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
         raise ConfigError(f"--device must name a device that is present, got {name!r}: {reason}") from None
 

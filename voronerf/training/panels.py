@@ -16,7 +16,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from voronerf.training.checkpoint import write_bytes
+from voronerf.training.files import write_bytes
 
 # steps of hue, saturation and value: sequences that fill their range evenly however many are drawn (Roberts 2018)
 HUE_STEP, SATURATION_STEP, VALUE_STEP = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532

@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from voronerf.training.checkpoint import write_bytes
+from voronerf.training.files import write_bytes
 
 
 def plot_curves(

@@ -7,15 +7,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from voronerf.training.panels import save_panel
-
 from voronerf.data import Scene
 from voronerf.router import VoronoiRouter
-from voronerf.training.checkpoint import write_text
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.evaluation import evaluate, mean_scores, render_view, view_numbers
+from voronerf.training.files import read_json_lines, write_text
+from voronerf.training.model import checkpoint_path
+from voronerf.training.panels import save_panel
 from voronerf.training.plots import plot_curves
-from voronerf.training.trainer import checkpoint_path
 
 
 def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
@@ -31,11 +30,23 @@ def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
         root = Path("runs")
         names = [scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000))]
         out = next(root / name for name in names if not (root / name).exists())
-    elif not config.resume and (out / "config.json").exists():
+    elif not config.resume and checkpoint_path(out).exists():
         raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
     elif config.resume and not checkpoint_path(out).is_file():
         raise ConfigError(f"--resume needs a checkpoint in --out, got {out}")
     return replace(config, out=out)
+
+
+def stored_config(run: Path) -> TrainConfig | None:
+    """The settings of the run in a directory, to be continued there; None when there is none.
+
+    Raises:
+        ConfigError: When the file is of another version.
+    """
+    path = run / "config.json"
+    if not path.is_file():
+        return None
+    return replace(TrainConfig.from_json(path.read_text(), str(path)), out=run)
 
 
 def write_panels(
@@ -63,8 +74,7 @@ def write_panels(
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
     """The evaluations of a run, in order."""
-    path = run / "metrics.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    return read_json_lines(run / "metrics.jsonl")
 
 
 def write_curve(run: Path) -> Path | None:

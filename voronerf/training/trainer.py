@@ -5,22 +5,22 @@ Time means training time: steps and splits count, evaluations and checkpoints do
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from voronerf import backends
 from voronerf.data import Scene
-from voronerf.diagram import VoronoiDiagram
-from voronerf.fields import NeRF
 from voronerf.rendering.volume import render_rays
-from voronerf.router import VoronoiRouter
 from voronerf.subdivision import split_diagram
 from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import (
@@ -30,10 +30,11 @@ from voronerf.training.checkpoint import (
     load_optimizer_tensors,
     optimizer_tensors,
     save_checkpoint,
-    write_text,
 )
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.evaluation import ViewScore, evaluate, mean_scores
+from voronerf.training.files import read_json_lines, write_bytes, write_text
+from voronerf.training.model import checkpoint_path, make_optimizer, make_router, octaves_for, restore_router
 from voronerf.training.reservoir import SampleReservoir
 
 
@@ -70,33 +71,6 @@ class Progress:
     psnr: float | None
 
 
-def make_field(config: TrainConfig) -> NeRF:
-    """The field that a configuration describes, freshly initialised from torch's global generator."""
-    return NeRF(
-        width=config.width,
-        depth=config.depth,
-        skips=config.skips,
-        position_octaves=config.position_octaves,
-        direction_octaves=config.direction_octaves,
-        view_directions=config.view_directions,
-    )
-
-
-def make_router(config: TrainConfig) -> VoronoiRouter:
-    """A router of one cell around the configured field: the coarse stage. Depends on the seed alone."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        field = make_field(config)
-    router = VoronoiRouter(
-        field,
-        VoronoiDiagram(torch.zeros(1, 3)),
-        assignment=config.assignment,
-        temperature=config.temperature,
-        backend=config.backend,
-    )
-    return router.to(config.device)
-
-
 class Trainer:
     """Trains one scene by the whole method and keeps its run directory.
 
@@ -120,24 +94,30 @@ class Trainer:
     ) -> None:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
+        self.out = config.out
+        if config.position_octaves is None:
+            config = replace(config, position_octaves=octaves_for(scene))
         self.config = config
         self.scene = scene
-        self.out = config.out
         self.on_step = on_step
         self.on_event = on_event
         self.device = torch.device(config.device)
+        # Every op of a step is looked up now: a backend that cannot train should say so before anything is written.
+        for op in ("nearest_centre", "locate_cell", "grouped_mlp", "composite"):
+            backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
+        backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.batches = RayBatches(scene, self.device)
         self.background = scene.background_colour(self.device)
-        self.router = make_router(config)
+        self.router = make_router(config, self.device)
         self.router.generator = self.generator
-        self.optimizer = torch.optim.Adam(self.router.parameters(), lr=config.lr, eps=1e-15, fused=True)
+        self.optimizer = make_optimizer(self.router, config)
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches)
         self.step = 0
         self.seconds = 0.0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
         self.evaluated = 0
-        self.last: dict[str, Any] = {}
+        self.metrics: list[dict[str, Any]] = []
         self.stopped = False
         if config.resume:
             self._load()
@@ -160,6 +140,7 @@ class Trainer:
     def learning_rate(self) -> float:
         """Exponential decay from ``lr`` to ``lr * lr_final``, after a linear rise over the warm-up."""
         config, done = self.config, self.fraction
+        assert config.lr is not None
         rise = 1.0 if done >= config.warmup else 0.01 + 0.99 * done / config.warmup
         return config.lr * rise * math.exp(math.log(config.lr_final) * done)
 
@@ -179,7 +160,7 @@ class Trainer:
         self.advance()
         self.save()
         if not self.stopped:
-            self._evaluate(self.config.evaluations, self.config.final_views)
+            self._evaluate(self.config.final_views)
         return self._summarise()
 
     def advance(self, until: float = math.inf) -> None:
@@ -200,17 +181,14 @@ class Trainer:
             self.step += 1
             self.seconds += time.perf_counter() - started
             if not math.isfinite(loss):
-                raise TrainingError(
-                    f"the loss is {loss} at step {self.step}; the last checkpoint in {self.out} is untouched; "
-                    "a smaller --lr helps"
-                )
+                kept = "the checkpoint is as it was" if checkpoint_path(self.out).exists() else "there is no checkpoint"
+                raise TrainingError(f"{self.out}: the loss is {loss} at step {self.step}, try a smaller --lr; {kept}")
             if self.on_step is not None:
                 speed = self.step * self.config.rays / max(self.seconds, 1e-9)
-                psnr = self.last.get("psnr")
+                psnr = self.metrics[-1]["psnr"] if self.metrics else None
                 self.on_step(Progress(self.step, self.seconds, self.fraction, loss, speed, self.router.num_cells, psnr))
-            due = int(self.fraction * self.config.evaluations + 1e-9)
-            if due > self.evaluated and self.fraction < 1:
-                self._evaluate(due, self.config.eval_views)
+            if self._due() > self.evaluated and self.fraction < 1:
+                self._evaluate(self.config.eval_views)
             if self.seconds - saved_at >= self.config.checkpoint_every:
                 self.save()
                 saved_at = self.seconds
@@ -249,40 +227,58 @@ class Trainer:
         return float(loss.detach())
 
     def _split(self) -> None:
-        """Splits the cells by the kept samples; where there are too few of them, the diagram stays as it is."""
-        config = self.config
+        """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
+        config, level, k = self.config, self.level, self.config.cells[self.level]
         points, importance = self.reservoir.samples()
-        split = split_diagram(
-            self.router.diagram,
-            points,
-            importance,
-            config.cells[self.level],
-            cells="all" if self.level == 0 else config.split,
-            centres=config.centres,
-            method=config.balance,
-            min_samples=config.min_cell_samples,
-            generator=self.generator,
-            backend=config.backend,
-        )
-        before = [b.imbalance_before for b in split.balances.values()]
-        after = [b.imbalance_after for b in split.balances.values()]
-        self.router.subdivide(split.diagram, split.parents, optimizer=self.optimizer, inherit=config.init == "inherit")
-        self.stages.append(
-            Stage(self.router.num_cells, self.seconds, self.step, _median(before), _median(after), len(before))
-        )
-        _save_samples(self.out / "samples" / f"level-{self.level}.npz", points, importance)
+        if level == 0 and points.shape[0] < k:
+            self.save()
+            raise TrainingError(
+                f"{self.out}: more cells than samples: --cells asks for {k}, {points.shape[0]} samples were kept in "
+                f"{self.step} steps; split later or keep more a batch (--reservoir, --reservoir-batches)"
+            )
+        _save_samples(self.out / "samples" / f"level-{level + 1}.npz", points, importance)
+        split = None
+        if points.shape[0] >= k:
+            split = split_diagram(
+                self.router.diagram,
+                points,
+                importance,
+                k,
+                cells="all" if level == 0 else config.split,
+                centres=config.centres,
+                method=config.balance,
+                min_samples=0 if level == 0 else config.min_cell_samples,
+                generator=self.generator,
+                backend=config.backend,
+            )
+        balances = list(split.balances.values()) if split is not None else []
+        if split is not None and balances:
+            self.router.subdivide(
+                split.diagram, split.parents, optimizer=self.optimizer, inherit=config.init == "inherit"
+            )
+        before = _median([balance.imbalance_before for balance in balances])
+        after = _median([balance.imbalance_after for balance in balances])
+        self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches)
-        balance = f", std(W / max W) {before_after(self.stages[-1])}" if before else ""
-        self._say(f"split into {self.router.num_cells} cells at {self.seconds:.0f} s, step {self.step}{balance}")
+        when = f"at {self.seconds:.0f} s, step {self.step}"
+        if balances:
+            self._say(f"{self.router.num_cells} cells {when}, std(W / max W) {before:.3f} -> {after:.4f}")
+        else:
+            need = max(k, config.min_cell_samples)
+            self._say(f"no cell split {when}: none holds {need} of the {points.shape[0]} samples kept")
 
     # --- evaluation and files --------------------------------------------------------------------------------------
 
-    def _evaluate(self, number: int, views: int | None) -> list[ViewScore]:
-        self.evaluated = number
+    def _due(self) -> int:
+        """Evaluations that should have been made by now."""
+        return int(self.fraction * self.config.evaluations + 1e-9)
+
+    def _evaluate(self, views: int | None) -> list[ViewScore]:
+        self.evaluated = self._due()
         scores = evaluate(
             self.router, self.scene, samples=self.config.samples, views=views, backend=self.config.backend
         )
-        self.last = {
+        now = {
             "step": self.step,
             "seconds": round(self.seconds, 3),
             "cells": self.router.num_cells,
@@ -290,19 +286,17 @@ class Trainer:
             "views": len(scores),
             **mean_scores(scores),
         }
-        with open(self.out / "metrics.jsonl", "a") as file:
-            file.write(json.dumps(self.last) + "\n")
+        self.metrics = [m for m in self.metrics if m["step"] < self.step] + [now]
+        write_text(self.out / "metrics.jsonl", "".join(json.dumps(m) + "\n" for m in self.metrics))
         self._say(
             f"{self.seconds:7.1f} s  step {self.step:6d}  {self.router.num_cells:4d} cells  "
-            f"psnr {self.last['psnr']:6.2f}  ssim {self.last['ssim']:.4f}  ({len(scores)} views)"
+            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
         )
         return scores
 
     def _summarise(self) -> dict[str, Any]:
         summary = {
-            "psnr": self.last.get("psnr"),
-            "ssim": self.last.get("ssim"),
-            "views": self.last.get("views"),
+            **{key: self.metrics[-1][key] if self.metrics else None for key in ("psnr", "ssim", "views")},
             "complete": self.fraction >= 1,
             "seconds": self.seconds,
             "steps": self.step,
@@ -329,8 +323,6 @@ class Trainer:
             "config": json.loads(self.config.to_json()),
             "step": self.step,
             "seconds": self.seconds,
-            "evaluated": self.evaluated,
-            "last": self.last,
             "stages": [asdict(stage) for stage in self.stages],
         }
         save_checkpoint(checkpoint_path(self.out), Checkpoint(tensors, values))
@@ -343,58 +335,20 @@ class Trainer:
         if different:
             raise CheckpointError(f"{path}: a checkpoint of another configuration: {'; '.join(different)}")
         restore_router(self.router, checkpoint)
-        self.optimizer = torch.optim.Adam(self.router.parameters(), lr=self.config.lr, eps=1e-15, fused=True)
+        self.optimizer = make_optimizer(self.router, self.config)
         load_optimizer_tensors(self.optimizer, checkpoint.group("optimizer"))
         self.reservoir.load_state_dict(checkpoint.group("reservoir"))
         self.generator.set_state(checkpoint.group("generator")["state"])
         self.step = checkpoint.values["step"]
         self.seconds = checkpoint.values["seconds"]
-        self.evaluated = checkpoint.values["evaluated"]
-        self.last = checkpoint.values["last"]
         self.stages = [Stage(**stage) for stage in checkpoint.values["stages"]]
-        _drop_later_lines(self.out / "metrics.jsonl", self.step)
+        self.evaluated = self._due()
+        # Evaluations made after the checkpoint will be made again.
+        self.metrics = [m for m in read_json_lines(self.out / "metrics.jsonl") if m["step"] <= self.step]
 
     def _say(self, line: str) -> None:
         if self.on_event is not None:
             self.on_event(line)
-
-
-def checkpoint_path(run: Path) -> Path:
-    """Where a run directory keeps its last checkpoint."""
-    return run / "checkpoints" / "last.safetensors"
-
-
-def restore_router(router: VoronoiRouter, checkpoint: Checkpoint) -> None:
-    """Fills a router with a checkpoint's cells, whatever the number of them.
-
-    Raises:
-        CheckpointError: When the checkpoint's parameters are of another architecture.
-    """
-    state = checkpoint.group("router")
-    try:
-        router.load_state_dict(state)
-    except RuntimeError as error:
-        raise CheckpointError(f"the checkpoint is of another architecture: {str(error).splitlines()[-1]}") from None
-
-
-def load_run(run: Path, *, device: str = "cpu", backend: str = "auto") -> tuple[TrainConfig, VoronoiRouter]:
-    """The configuration and the trained router of a run directory.
-
-    Raises:
-        CheckpointError: When ``run`` holds no usable checkpoint.
-    """
-    path = checkpoint_path(run)
-    checkpoint = load_checkpoint(path)
-    config = TrainConfig.from_json(json.dumps(checkpoint.values["config"]), str(path))
-    router = make_router(config)
-    restore_router(router, checkpoint)
-    router.backend = backend
-    return config, router.to(device).eval()
-
-
-def before_after(stage: Stage) -> str:
-    """ "0.25 -> 0.002", the balance of a stage's split."""
-    return f"{stage.balance_before:.3f} -> {stage.balance_after:.4f}"
 
 
 def _median(values: list[float]) -> float | None:
@@ -403,19 +357,6 @@ def _median(values: list[float]) -> float | None:
 
 def _save_samples(path: Path, points: Tensor, importance: Tensor) -> None:
     """The samples that a split was made from, for a later look (and ``benchmarks/balance.py``)."""
-    import io
-
-    import numpy as np
-
-    from voronerf.training.checkpoint import write_bytes
-
     buffer = io.BytesIO()
     np.savez(buffer, points=points.cpu().numpy(), importance=importance.cpu().numpy())
     write_bytes(path, buffer.getvalue())
-
-
-def _drop_later_lines(path: Path, step: int) -> None:
-    """Takes out the evaluations made after the checkpoint that a run is continued from."""
-    if path.is_file():
-        lines = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
-        write_text(path, "".join(line + "\n" for line in lines))

@@ -20,7 +20,7 @@ def write_video(path: Path, frames: Tensor, fps: float) -> None:
 
     Raises:
         ValueError: shape or rate.
-        RuntimeError: imageio-ffmpeg is not installed.
+        ImportError: imageio-ffmpeg is not installed.
         OSError: ffmpeg cannot write the file.
     """
     if frames.dim() != 4 or frames.shape[-1] != 3 or 0 in frames.shape:
@@ -30,7 +30,7 @@ def write_video(path: Path, frames: Tensor, fps: float) -> None:
     try:
         import imageio_ffmpeg
     except ImportError:
-        raise RuntimeError("writing a video needs imageio-ffmpeg: pip install imageio-ffmpeg") from None
+        raise ImportError("writing a video needs imageio-ffmpeg: pip install imageio-ffmpeg") from None
     height, width = frames.shape[1:3]
     even = pad(frames.permute(0, 3, 1, 2), (0, width % 2, 0, height % 2), mode="replicate").permute(0, 2, 3, 1)
     path.parent.mkdir(parents=True, exist_ok=True)
