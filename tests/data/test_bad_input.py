@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -174,11 +175,32 @@ def test_one_image_is_too_few(tmp_path: Path) -> None:
         ({"is_fisheye": True}, "camera model fisheye is not supported"),
         ({"k1": -5.0}, "cannot be inverted inside the image"),
         ({"k1": math.inf}, "k1 must be a finite number, got inf"),
+        ({"k1": 10**400}, "k1 must be a finite number, got 1000"),
+        ({"fl_x": -(10**400)}, "fl_x must be a finite number, got -1000"),
+        ({"cy": 1e39}, "cy must be a finite number, got 1e+39"),
     ],
 )
 def test_intrinsics_and_lens(tmp_path: Path, entries: dict[str, Any], reason: str) -> None:
     write_capture(tmp_path, **entries)
     fails(tmp_path, reason)
+
+
+@pytest.mark.parametrize(("value", "reason"), [(10**400, "is no matrix of numbers"), (1e300, "are not finite")])
+def test_poses_of_huge_numbers(tmp_path: Path, value: float, reason: str) -> None:
+    write_capture(tmp_path)
+    for row, column in ((0, 0), (1, 3)):
+        matrix = [list(values) for values in POSE]
+        matrix[row][column] = value
+        rewrite(tmp_path, lambda c, matrix=matrix: c["frames"].__setitem__(1, frame("1.png", matrix)))
+        fails(tmp_path, "frame 1 (1.png)", reason)
+
+
+@pytest.mark.skipif(not hasattr(sys, "get_int_max_str_digits"), reason="this Python reads integers of any length")
+def test_more_digits_than_python_reads(tmp_path: Path) -> None:
+    write_capture(tmp_path, k1=0)
+    path = tmp_path / "transforms.json"
+    path.write_text(path.read_text().replace('"k1": 0', '"k1": 1' + "0" * sys.get_int_max_str_digits()))
+    fails(tmp_path, "transforms.json: is no JSON")
 
 
 def test_blender(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 ORTHONORMAL = 2e-3
+LARGEST = float(np.finfo(np.float32).max)  # what cameras can hold
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
     """
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # ValueError: of the syntax, the encoding, or an integer's digits
         raise SceneError(f"{path}: is no JSON: {error}") from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
@@ -78,13 +78,14 @@ def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = Fa
     """A finite number of a transforms file, None where there is no such entry.
 
     Raises:
-        SceneError: the entry is no finite number, or not positive where it must be.
+        SceneError: the entry is no number, not finite in float32, or not positive where it must be.
     """
     value = entries.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise SceneError(f"{path}: {key} must be a finite number, got {value!r}")
+    # The comparison, unlike math.isfinite, takes integers of any size; NaN fails it.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise SceneError(f"{path}: {key} must be a finite number, got {value!r:.60}")
     if positive and value <= 0:
         raise SceneError(f"{path}: {key} must be positive, got {value!r}")
     return float(value)
@@ -101,11 +102,11 @@ def _pose(matrix: object, where: str) -> Tensor:
     """Checks that rows of numbers are a rigid motion; float64 [4, 4]."""
     try:
         values = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError(f"{where}: transform_matrix is no matrix of numbers") from None
     if values.shape not in ((4, 4), (3, 4)):
         raise SceneError(f"{where}: transform_matrix must be 4 x 4, got shape {list(values.shape)}")
-    if not np.isfinite(values).all():
+    if not (np.abs(values) <= LARGEST).all():
         raise SceneError(f"{where}: transform_matrix has values that are not finite")
     rotation = values[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
