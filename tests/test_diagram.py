@@ -283,6 +283,27 @@ def test_stochastic_assignment_becomes_the_nearest_cell_as_the_temperature_falls
         diagram.sample_cell(points, temperature=-1.0)
 
 
+def test_stochastic_assignment_draws_on_the_generators_device():
+    drawn = (
+        uneven_diagram()
+        .to("meta")
+        .sample_cell(torch.randn(50, 3, device="meta"), temperature=1.0, generator=torch.Generator().manual_seed(2))
+    )
+    assert drawn.device.type == "meta" and drawn.shape == (50,)
+
+
+@pytest.mark.cuda
+def test_stochastic_assignment_on_cuda_with_a_generator_of_the_cpu():
+    diagram, points = uneven_diagram(), torch.randn(500, 3, generator=torch.Generator().manual_seed(2)) * 6
+    expected = diagram.sample_cell(points, temperature=2.0, generator=torch.Generator().manual_seed(4))
+    drawn = diagram.cuda().sample_cell(points.cuda(), temperature=2.0, generator=torch.Generator().manual_seed(4))
+    assert drawn.is_cuda
+    # Roundings of the distances may decide between two cells that are all but equally likely.
+    assert int((drawn.cpu() != expected).sum()) <= 2
+    own = torch.Generator("cuda").manual_seed(4)
+    assert diagram.sample_cell(points.cuda(), temperature=2.0, generator=own).is_cuda
+
+
 def test_stochastic_assignment_with_power_weights():
     centres, points = integer_points(6), torch.randn(300, 3) * 5
     weights = torch.tensor([0.0, 5.0, -3.0, 2.0, 0.0, 9.0])

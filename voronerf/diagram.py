@@ -186,7 +186,7 @@ class VoronoiDiagram(nn.Module):
         Args:
             points: floating [..., 3].
             temperature: >= 0, in scene units.
-            generator: of the device of `points`; None for torch's global one.
+            generator: on any device, what it draws is moved to that of `points`; None for torch's global one.
 
         Returns:
             int32 [...] leaf numbers.
@@ -204,6 +204,7 @@ class VoronoiDiagram(nn.Module):
         return torch.cat(cells).reshape(points.shape[:-1]) if cells else flat.new_empty(0, dtype=torch.int32)
 
     def _sample_piece(self, points: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
+        drawn_on = points.device if generator is None else generator.device
         column = torch.arange(self._widest, device=points.device)
         last = self.centres.shape[0] - 1
         child = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
@@ -217,8 +218,12 @@ class VoronoiDiagram(nn.Module):
                 weights = self.power[rows].masked_fill(absent, -float("inf"))
                 squared = squared + weights.amax(1, keepdim=True) - self.power[rows]
             # Gumbel-max: the argmax of logit - log(e), e exponential, is a draw from the softmax of the logits.
-            noise = torch.empty_like(squared).exponential_(generator=generator).log()
-            score = (-squared.clamp(min=0).sqrt() / temperature - noise).nan_to_num(nan=-1e30, neginf=-1e30)
+            noise = (
+                torch.empty(squared.shape, dtype=squared.dtype, device=drawn_on).exponential_(generator=generator).log()
+            )
+            score = (-squared.clamp(min=0).sqrt() / temperature - noise.to(points.device)).nan_to_num(
+                nan=-1e30, neginf=-1e30
+            )
             choice = score.masked_fill(absent, -float("inf")).argmax(1, keepdim=True)
             child = torch.where(child < 0, child, self.child[rows.gather(1, choice).squeeze(1)])
         return -1 - child

@@ -99,6 +99,14 @@ def test_spacing_against_slow_loop() -> None:
             assert float(depths[0, i]) == pytest.approx(expected, rel=1e-6)
 
 
+def test_disparity_from_distance_0_is_finite() -> None:
+    near, far = torch.zeros(3), torch.tensor([4.0, 1e-6, 0.0])
+    depths, deltas, edges = stratified_depths(near, far, 5, jitter=True, spacing="disparity")
+    for part in (depths, deltas, edges):
+        assert part.isfinite().all() and (part >= 0).all()
+    assert torch.equal(edges[:, -1], far) and torch.equal(edges[:, :-1], torch.zeros(3, 5))
+
+
 def test_jitter_is_uniform_and_reproducible() -> None:
     near, far = torch.zeros(4000), torch.full((4000,), 4.0)
     first = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
@@ -107,6 +115,27 @@ def test_jitter_is_uniform_and_reproducible() -> None:
     inside = first - torch.arange(4.0)
     assert float(inside.mean()) == pytest.approx(0.5, abs=0.01)
     assert float(inside.var()) == pytest.approx(1 / 12, abs=0.003)
+
+
+def test_a_generator_of_another_device_draws_there() -> None:
+    one = torch.ones(4, device="meta")
+    generator = torch.Generator().manual_seed(3)
+    parts = stratified_depths(one, one, 2, jitter=True, generator=generator)
+    assert all(part.device.type == "meta" for part in parts)
+    drawn = generator.get_state()
+    torch.rand(4, 2, generator=generator.manual_seed(3))
+    assert torch.equal(drawn, generator.get_state())
+
+
+@pytest.mark.cuda
+def test_a_generator_of_the_cpu_gives_cuda_rays_the_same_jitter() -> None:
+    near, far = torch.zeros(40), torch.full((40,), 4.0)
+    expected = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
+    depths = stratified_depths(near.cuda(), far.cuda(), 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
+    assert depths.is_cuda
+    torch.testing.assert_close(depths.cpu(), expected)
+    own = torch.Generator("cuda").manual_seed(3)
+    assert stratified_depths(near.cuda(), far.cuda(), 4, jitter=True, generator=own)[0].is_cuda
 
 
 def test_no_rays_and_errors() -> None:

@@ -20,14 +20,15 @@ def stratified_depths(
     """One sample in each of s strata of [near, far] (Mildenhall et al. 2020, NeRF, eq. 2).
 
     Args:
-        near: [r]; positive where spacing is "disparity".
+        near: [r]; positive where spacing is "disparity". That is not checked, which would make the host wait for the
+            device; a ray with near == 0 gets finite depths there, all but the far end at 0.
         far: [r], >= near.
         samples: s, >= 1.
         jitter: uniformly random inside each stratum, else in its middle (the middle in disparity, where that is the
             spacing).
         spacing: "linear": strata of equal length; "disparity": equal steps of 1 / distance, dense near the camera, for
             scenes with a far background.
-        generator: of the jitter; on the rays' device.
+        generator: of the jitter, on any device: what it draws is moved to the rays'.
 
     Returns:
         (depths [r, s] ascending, deltas [r, s], edges [r, s + 1]). A sample stands for its whole stratum: deltas are
@@ -49,7 +50,8 @@ def stratified_depths(
     steps = torch.arange(samples + 1, device=near.device, dtype=near.dtype) / samples
     edges = _spaced(near[:, None], far[:, None], steps[None, :], spacing)
     if jitter:
-        inside = torch.rand(len(near), samples, device=near.device, dtype=near.dtype, generator=generator)
+        device = near.device if generator is None else generator.device
+        inside = torch.rand(len(near), samples, device=device, dtype=near.dtype, generator=generator).to(near.device)
     else:
         inside = torch.full((1, samples), 0.5, device=near.device, dtype=near.dtype)
     fractions = (torch.arange(samples, device=near.device, dtype=near.dtype) + inside) / samples
@@ -63,5 +65,6 @@ def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor
     """Distance at a fraction of the way, exact at both ends."""
     if spacing == "linear":
         return torch.lerp(near, far, fraction)
-    # 1 / lerp(1 / near, 1 / far), without the two roundings of the reciprocals
-    return near * far / (far * (1 - fraction) + near * fraction)
+    # 1 / lerp(1 / near, 1 / far), without the two roundings of the reciprocals, and without 0 / 0 where near is 0
+    disparity = far * (1 - fraction) + near * fraction
+    return torch.where(fraction < 1, near * far / disparity.clamp_min(torch.finfo(near.dtype).tiny), far)
