@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from voronerf.data import Scene, builtin_scene, load_scene
 from voronerf.data.capture import normalise_poses
 from voronerf.rendering.cameras import Cameras, focus_point, orbit_cameras
+from voronerf.rendering.volume import render_rays
 
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 
@@ -127,6 +129,64 @@ def test_capture_without_missing_images_is_silent(tmp_path: Path, caplog: pytest
     write_capture(tmp_path, orbit_cameras(3, radius=2, elevation=5, width=4, height=4, focal=4))
     load_scene(tmp_path)
     assert not caplog.records
+
+
+@pytest.mark.parametrize("rig", ["outward", "parallel", "one place"])
+def test_rays_of_a_capture_without_a_common_focus_are_finite(tmp_path: Path, rig: str) -> None:
+    """Among them one whose camera stands at the origin, from which near is measured."""
+    poses = orbit_cameras(9, radius=2, elevation=0, width=4, height=4, focal=4).poses
+    if rig == "outward":
+        poses[:, :3, [0, 2]] *= -1
+    else:
+        poses[:, :3, :3] = torch.eye(3)
+    poses[8, :3, 3] = poses[:8, :3, 3].mean(0)
+    if rig == "one place":
+        poses[:, :3, 3] = 0
+    write_capture(tmp_path, Cameras(poses, torch.full((9, 4), 4.0), 4, 4, None))
+    scene = load_scene(tmp_path)
+    assert scene.spacing == "disparity" and scene.near == pytest.approx(0.05) and scene.far > 1
+    origins = torch.cat([split.cameras.origins for split in (scene.train, scene.test)])
+    assert float(origins.norm(dim=-1).min()) < 1e-6
+
+    def field(positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        assert positions.isfinite().all()
+        return torch.full_like(positions, 0.5), torch.ones(len(positions))
+
+    rays = scene.test.cameras.image_rays(0)
+    for jitter in (False, True):
+        rendered = render_rays(
+            field, rays, scene.near, scene.far, samples=8, jitter=jitter, spacing=scene.spacing, backend="reference"
+        )
+        assert all(part.isfinite().all() for part in rendered)
+        assert (rendered.depth > scene.near).all() and (rendered.depth < scene.far).all()
+
+
+def test_names_of_a_capture_are_all_different(tmp_path: Path) -> None:
+    write_capture(tmp_path, orbit_cameras(8, radius=2, elevation=5, width=4, height=4, focal=4))
+    path = tmp_path / "transforms.json"
+    contents = json.loads(path.read_text())
+    original = [frame["file_path"] for frame in contents["frames"]]
+    left_right = [f"{side}/{index:02d}.png" for side in ("left", "right") for index in range(4)]
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+    for frame, name, source in zip(contents["frames"], left_right, original):
+        (tmp_path / source).rename(tmp_path / name)
+        frame["file_path"] = name
+    path.write_text(json.dumps(contents))
+
+    def names() -> list[str]:
+        scene = load_scene(tmp_path)
+        return sorted(scene.train.names + scene.test.names)
+
+    assert names() == [name.removesuffix(".png").replace("/", "_") for name in left_right]
+    contents["frames"][1]["file_path"] = "./left/../left/00.png"  # the first one's image again
+    path.write_text(json.dumps(contents))
+    assert len(set(names())) == 8
+    for frame, name in zip(contents["frames"], ("a", "b", "c", "d", "e", "f", "g", "h")):
+        (tmp_path / frame["file_path"]).with_name(f"{name}.png").write_bytes((tmp_path / "left/00.png").read_bytes())
+        frame["file_path"] = str(Path(frame["file_path"]).with_name(f"{name}.png"))
+    path.write_text(json.dumps(contents))
+    assert names() == list("abcdefgh")
 
 
 def test_capture_intrinsics_per_frame_and_from_angles(tmp_path: Path) -> None:

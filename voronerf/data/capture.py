@@ -7,6 +7,7 @@ origin, their mean up direction the z axis, and the farthest camera is at distan
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from voronerf.rendering.cameras import Cameras, distort, focus_point, undistort
 HOLD_OUT = 8
 # share of the distance from the focus to the nearest camera: what is closer than this was not photographed sharply
 NEAR = 0.35
+# share of the distance of the farthest camera from the origin: near is no less, since disparity has no place for 0
+NEAREST = 0.05
 FAR = 4.0
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
 UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
@@ -31,7 +34,9 @@ def load_capture(folder: Path, downscale: int) -> Scene:
     """Loads a capture; every 8th image in the order of their names is held out for testing.
 
     Rays of an opaque capture reach from near the cameras to four times their distance, sampled in disparity: a plain
-    network in such coordinates learns the object and, coarsely, the room. With alpha it is an object on white, in a box
+    network in such coordinates learns the object and, coarsely, the room. "Near the cameras" is a share of the distance
+    to the nearest one and at least 0.05 of that to the farthest: cameras that look outwards or in parallel may stand at
+    the origin. With alpha it is an object on white, in a box
     carved from the masks.
 
     Args:
@@ -66,7 +71,7 @@ def load_capture(folder: Path, downscale: int) -> Scene:
     cameras = cameras.downscaled(downscale)
 
     nearest = float(cameras.origins.norm(dim=-1).min())
-    near, far, box, spacing, background = NEAR * nearest, FAR, None, "disparity", None
+    near, far, box, spacing, background = max(NEAR * nearest, NEAREST), FAR, None, "disparity", None
     if images.shape[-1] == 4 and bool((images[..., 3] < 255).any()):
         spacing, background = "linear", "white"
         near, far = 0.05 * nearest, 2.0
@@ -74,11 +79,12 @@ def load_capture(folder: Path, downscale: int) -> Scene:
     else:
         images = images[..., :3]
 
+    names = _names([frame.path for frame in frames], folder)
     held_out = torch.arange(len(frames)) % HOLD_OUT == 0
     return Scene(
         folder.resolve().name,
-        _split(cameras, images, frames, ~held_out),
-        _split(cameras, images, frames, held_out),
+        _split(cameras, images, names, ~held_out),
+        _split(cameras, images, names, held_out),
         near,
         far,
         box,
@@ -113,9 +119,24 @@ def normalise_poses(poses: Tensor) -> Tensor:
     return result
 
 
-def _split(cameras: Cameras, images: Tensor, frames: list[Frame], chosen: Tensor) -> Split:
-    names = tuple(frame.path.stem for frame, wanted in zip(frames, chosen.tolist()) if wanted)
-    return Split(cameras[chosen], images[chosen].contiguous(), names)
+def _names(paths: list[Path], folder: Path) -> list[str]:
+    """A name for each image that no other has, since pictures are stored under it: the shortest of three that will do.
+
+    The stem; the path inside the scene's folder, a/00.png becoming a_00; or that behind the image's number, for a file
+    that is listed twice.
+    """
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        inside = [Path(os.path.relpath(path, folder)).with_suffix("") for path in paths]
+        names = ["_".join(part for part in path.parts if part != "..") for path in inside]
+    if len(set(names)) < len(names):
+        names = [f"{position:04d}_{name}" for position, name in enumerate(names)]
+    return names
+
+
+def _split(cameras: Cameras, images: Tensor, names: list[str], chosen: Tensor) -> Split:
+    kept = tuple(name for name, wanted in zip(names, chosen.tolist()) if wanted)
+    return Split(cameras[chosen], images[chosen].contiguous(), kept)
 
 
 def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> list[float]:
