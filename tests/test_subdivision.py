@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from voronerf.balance import imbalance
+from voronerf.balance import cell_weights, imbalance
 from voronerf.diagram import VoronoiDiagram
-from voronerf.subdivision import cell_importance, split_diagram
+from voronerf.subdivision import split_diagram
 
 ROOT = VoronoiDiagram(torch.tensor([[-2.0, 0, 0], [0, 0, 0], [2, 0, 0]]))
 
@@ -37,11 +37,11 @@ def test_every_cell_is_balanced_by_its_own_samples_and_small_cells_stay_leaves()
     split = split_diagram(ROOT, points, importance, 8, generator=generator())
     assert sorted(split.balances) == [0, 1]
     assert split.parents.tolist() == [0] * 8 + [1] * 8 + [2]
-    weights = cell_importance(split.diagram, points, importance)
+    weights = cell_weights(split.diagram.locate(points), importance, split.diagram.num_cells)
     for cell, result in split.balances.items():
         assert torch.allclose(weights[split.parents == cell], result.after)
         assert result.imbalance_after < 0.03 < result.imbalance_before
-    assert float(weights[16]) == pytest.approx(float(cell_importance(ROOT, points, importance)[2]))
+    assert float(weights[16]) == pytest.approx(float(importance[ROOT.locate(points) == 2].double().sum()))
 
 
 def test_only_the_worst_cell():

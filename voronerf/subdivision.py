@@ -31,22 +31,6 @@ class Split:
     balances: dict[int, Balance]
 
 
-def cell_importance(diagram: VoronoiDiagram, points: Tensor, importance: Tensor, *, backend: str = "auto") -> Tensor:
-    """float64 [num_cells], on the CPU: the importance of the samples that lie in each cell, its accumulated error.
-
-    Args:
-        diagram: whose cells are meant.
-        points: floating [m, 3], finite.
-        importance: floating [m], finite, >= 0.
-        backend: of the cell query, see `voronerf.backends`.
-
-    Raises:
-        ValueError: wrong shapes, values that are not finite, or negative importance.
-    """
-    check_samples("cell_importance", points, importance)
-    return cell_weights(diagram.locate(points, backend=backend).cpu(), importance.cpu(), diagram.num_cells)
-
-
 def split_diagram(
     diagram: VoronoiDiagram,
     points: Tensor,

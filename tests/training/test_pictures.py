@@ -54,7 +54,7 @@ def test_depth_and_error() -> None:
     assert int(panels.picture_of_error(torch.ones(2, 2, 3), torch.ones(2, 2, 3)).max()) < 10
 
 
-def test_panel_and_sheet_files(tmp_path: Path) -> None:
+def test_panel_file(tmp_path: Path) -> None:
     colour = torch.rand(7, 9, 3)
     path = tmp_path / "new" / "panel.png"
     cells = torch.zeros(7, 9, dtype=torch.int32)
@@ -66,8 +66,6 @@ def test_panel_and_sheet_files(tmp_path: Path) -> None:
     pixels = np.asarray(Image.open(path))
     truth = panels.picture_of_colour(colour)
     assert pixels[6 + 18, 6].tolist() == truth[0, 0].tolist()
-    panels.save_sheet(tmp_path / "sheet.png", [colour, colour, colour], ["a", "b", "c"], columns=2)
-    assert Image.open(tmp_path / "sheet.png").size[1] == 2 * (7 * zoom + 24) + 6
     with pytest.raises(ValueError, match="one size"):
         panels.contact_sheet({"a": truth, "b": truth[1:]})
 

@@ -107,16 +107,6 @@ def test_states_of_other_reservoirs_are_refused():
         SampleReservoir(30, batches=4).load_state_dict({name: state[name] for name in ("points", "importance")})
 
 
-def test_clear_forgets():
-    reservoir = SampleReservoir(8, batches=2)
-    for seed in range(3):
-        reservoir.add(*batch(seed, 8))
-    reservoir.clear()
-    assert len(reservoir) == 0
-    reservoir.add(*batch(3, 8))
-    assert rows(*reservoir.samples()) == heaviest(3, 8, 4)
-
-
 def test_bad_input_gets_one_clear_line():
     with pytest.raises(ValueError, match="at least 1, got 0 and 5"):
         SampleReservoir(0, batches=5)

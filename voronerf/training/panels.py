@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import colorsys
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib
@@ -75,12 +75,11 @@ def picture_of_cells(cells: Tensor, opacity: Tensor, colour: Tensor | None = Non
     return _on_white(picture, opacity)
 
 
-def contact_sheet(pictures: Mapping[str, Tensor], columns: int | None = None) -> Tensor:
-    """Captioned pictures of one size in a grid; small ones are enlarged by a whole number.
+def contact_sheet(pictures: Mapping[str, Tensor]) -> Tensor:
+    """Captioned pictures of one size in a row; small ones are enlarged by a whole number.
 
     Args:
         pictures: by caption.
-        columns: of the grid; None: one row.
 
     Raises:
         ValueError: no pictures, or of different sizes.
@@ -90,14 +89,12 @@ def contact_sheet(pictures: Mapping[str, Tensor], columns: int | None = None) ->
         raise ValueError(f"contact_sheet: pictures must have one size [h, w, 3], got {sorted(sizes)}")
     height, width, _ = sizes.pop()
     zoom = max(1, -(-PICTURE_HEIGHT // height)) if height < PICTURE_HEIGHT else 1
-    columns = len(pictures) if columns is None else columns
-    rows = -(-len(pictures) // columns)
-    cell_width, cell_height = width * zoom + GAP, height * zoom + GAP + CAPTION
-    sheet = Image.new("RGB", (columns * cell_width + GAP, rows * cell_height + GAP), "white")
+    step = width * zoom + GAP
+    sheet = Image.new("RGB", (len(pictures) * step + GAP, GAP + CAPTION + height * zoom + GAP), "white")
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default()
     for index, (caption, picture) in enumerate(pictures.items()):
-        left, top = GAP + index % columns * cell_width, GAP + index // columns * cell_height
+        left, top = GAP + index * step, GAP
         enlarged = Image.fromarray(picture.numpy()).resize((width * zoom, height * zoom), Image.Resampling.NEAREST)
         sheet.paste(enlarged, (left, top + CAPTION))
         draw.text((left, top + 2), caption, fill="black", font=font)
@@ -142,12 +139,6 @@ def save_panel(
         "cells": picture_of_cells(cells, opacity, colour),
     }
     save_picture(path, contact_sheet(pictures))
-
-
-def save_sheet(path: Path, pictures: Sequence[Tensor], captions: Sequence[str], columns: int | None = None) -> None:
-    """Writes colours [h, w, 3] in 0..1 as one captioned sheet, as PNG."""
-    named = {caption: picture_of_colour(picture) for caption, picture in zip(captions, pictures)}
-    save_picture(path, contact_sheet(named, columns))
 
 
 def _mapped(values: Tensor, name: str) -> Tensor:

@@ -80,11 +80,6 @@ class SampleReservoir:
         kept = importance > 0
         return self._points.roll(-start, 0).reshape(-1, 3)[kept], importance[kept]
 
-    def clear(self) -> None:
-        """Forgets all samples."""
-        self._importance.zero_()
-        self._added = 0
-
     def __len__(self) -> int:
         return int((self._importance > 0).sum())
 
