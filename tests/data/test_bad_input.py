@@ -185,7 +185,9 @@ def test_intrinsics_and_lens(tmp_path: Path, entries: dict[str, Any], reason: st
     fails(tmp_path, reason)
 
 
-@pytest.mark.parametrize(("value", "reason"), [(10**400, "is no matrix of numbers"), (1e300, "are not finite")])
+@pytest.mark.parametrize(
+    ("value", "reason"), [(10**400, "is no matrix of numbers"), (1e300, "are not finite")], ids=["int", "float"]
+)
 def test_poses_of_huge_numbers(tmp_path: Path, value: float, reason: str) -> None:
     write_capture(tmp_path)
     for row, column in ((0, 0), (1, 3)):
