@@ -11,8 +11,6 @@ divided, so values near 1 and above limit what any method reaches.
 from __future__ import annotations
 
 import json
-import platform
-import re
 import statistics
 import time
 from dataclasses import dataclass
@@ -22,9 +20,9 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from harness import metadata
 from torch import Tensor
 
-from voronerf import __version__, backends
 from voronerf.balance import balance
 from voronerf.transport import fair_share
 
@@ -110,19 +108,14 @@ def measure(options: Options) -> dict[str, Any]:
             results.append(row)
             print(line(row), flush=True)
     return {
-        "metadata": {
-            "benchmark": "balance",
-            "samples": "separate objects" if options.samples is None else options.samples.name,
-            "count": drawn[0][0].shape[0],
-            "objects": None if kept else options.objects,
-            "tail": None if kept else options.tail,
-            "seeds": options.seeds,
-            "voronerf": __version__,
-            "torch": torch.__version__,
-            "threads": torch.get_num_threads(),
-            "machine": processor(),
-            "native": backends.describe()["native"],
-        },
+        "metadata": metadata(
+            benchmark="balance",
+            samples="separate objects" if options.samples is None else options.samples.name,
+            count=drawn[0][0].shape[0],
+            objects=None if kept else options.objects,
+            tail=None if kept else options.tail,
+            seeds=options.seeds,
+        ),
         "results": results,
     }
 
@@ -133,13 +126,6 @@ def line(row: dict[str, Any]) -> str:
         f"{row['cells']:5d}  {row['method']:20} {row['before']:7.4f} {row['after']:8.4f} {row['after_worst']:8.4f}"
         f" {row['seconds']:8.2f} {row['heaviest']:9.2f}"
     )
-
-
-def processor() -> str:
-    """The processor's name."""
-    path = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.*)", path.read_text()) if path.is_file() else []
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def main(options: Options) -> None:
