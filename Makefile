@@ -22,8 +22,10 @@ demo: $(VENV)/.built
 test: $(VENV)/.built
 	@OMP_NUM_THREADS=$(THREADS) $(BIN)/pytest -q $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
 
+# A few minutes; for figures to keep, run the scripts with --json and the settings they document.
 bench: $(VENV)/.built
-	@$(BIN)/python benchmarks/throughput.py
+	@$(BIN)/python benchmarks/balance.py --cells 4 16 64 --seeds 2
+	@$(BIN)/python benchmarks/time_to_quality.py --data builtin --budget 30 --eval-views 5
 
 check: $(VENV)/.built
 	@$(BIN)/ruff check

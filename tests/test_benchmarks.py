@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 import voronerf
@@ -22,6 +24,13 @@ def test_metadata_says_what_was_measured_where() -> None:
     assert (metadata["voronerf"], metadata["torch"]) == (voronerf.__version__, torch.__version__)
     assert metadata["threads"] == torch.get_num_threads() and metadata["machine"] and metadata["python"]
     assert "available" in metadata["native"]
+
+
+@pytest.mark.parametrize("name", ["Makefile", "README.md", "CONTRIBUTING.md"])
+def test_scripts_that_are_named_are_there(name: str) -> None:
+    path = BENCHMARKS.parent / name
+    for script in re.findall(r"benchmarks/\w+\.py", path.read_text()):
+        assert (BENCHMARKS.parent / script).is_file(), f"{name} names {script}"
 
 
 def test_balance_runs_as_a_script(tmp_path: Path) -> None:
