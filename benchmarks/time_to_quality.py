@@ -11,7 +11,6 @@ every evaluation; the plot shows them.
 from __future__ import annotations
 
 import json
-import platform
 import re
 import sys
 import tempfile
@@ -19,10 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
+from harness import metadata
 
-from voronerf import __version__, backends
+from voronerf import backends
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
 from voronerf.training.config import ConfigError, TrainConfig
@@ -120,29 +119,18 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
         if options.panels is not None and seed == 0:
             pictures, backend = options.panels / name, options.backend
             write_panels(trainer.router, scene, pictures, samples=options.samples, views=3, backend=backend)
-    metadata = {
-        "benchmark": "time_to_quality",
-        "scene": scene.name,
-        "downscale": options.downscale,
-        "train_views": len(scene.train),
-        "budget_seconds": options.budget,
-        "rays": options.rays,
-        "samples": options.samples,
-        "backend": options.backend,
-        "voronerf": __version__,
-        "torch": torch.__version__,
-        "threads": torch.get_num_threads(),
-        "machine": processor(),
-        "native": backends.describe()["native"],
-    }
-    return {"metadata": metadata, "results": results}
-
-
-def processor() -> str:
-    """The processor's name."""
-    path = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.*)", path.read_text()) if path.is_file() else []
-    return names[0] if names else platform.processor() or platform.machine()
+    description = metadata(
+        benchmark="time_to_quality",
+        scene=scene.name,
+        downscale=options.downscale,
+        train_views=len(scene.train),
+        budget_seconds=options.budget,
+        rays=options.rays,
+        samples=options.samples,
+        backend=options.backend,
+        native=backends.describe()["native"],
+    )
+    return {"metadata": description, "results": results}
 
 
 def table(outcome: dict[str, Any]) -> str:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from voronerf.training.metrics import psnr, ssim
 
 from voronerf.data import Scene
 from voronerf.rendering.volume import RenderedImage, render_image
 from voronerf.router import VoronoiRouter
+from voronerf.training.metrics import psnr, ssim
 
 
 @dataclass(frozen=True)
