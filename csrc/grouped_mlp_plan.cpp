@@ -211,6 +211,10 @@ MlpPlanner::MlpPlanner(const MlpTable& table, bool indexed_directions, const Mlp
       layer.packed_depth += wanted.half ? ceil_div(s.width, int64_t{2}) : s.width;
       sources_[l].push_back(s);
     }
+    // The products walk sources and their values with loops that test at the end.
+    const bool sound = layer.width > 0 && !sources_[l].empty();
+    VN_CHECK(sound && std::all_of(sources_[l].begin(), sources_[l].end(), [](const auto& s) { return s.width > 0; }),
+             "grouped_mlp: every layer must have outputs, and inputs from sources that have features");
     layer.sources = sources_[l].data();
     layer.source_count = static_cast<int64_t>(sources_[l].size());
     layer.partial = plan_.partial;

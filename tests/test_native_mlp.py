@@ -417,6 +417,15 @@ def test_errors() -> None:
             grouped_mlp(**{**given, "direction_index": index}, backend="native")
 
 
+def test_a_plan_without_features_is_refused() -> None:
+    native = pytest.importorskip("voronerf._native_mlp")
+    offsets, weight = torch.tensor([0, 5], dtype=torch.int32), torch.zeros(1, 2, 0)
+    with pytest.raises(RuntimeError, match="grouped_mlp: every layer must have outputs, and inputs from sources"):
+        native.grouped_linear(torch.zeros(5, 0), offsets, weight)
+    with pytest.raises(RuntimeError, match="grouped_mlp: every layer must have outputs, and inputs from sources"):
+        native.grouped_mlp(torch.zeros(5, 0), offsets, [weight], [None], layers=chain(2, 0, out=2))
+
+
 def test_float64_is_left_to_the_reference() -> None:
     given = cast(arguments(nerf(6, 2), [5, 8]), torch.float64)
     assert grouped_mlp(**given).dtype == torch.float64

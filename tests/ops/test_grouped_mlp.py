@@ -293,6 +293,30 @@ def test_compiles(device: torch.device, backend: str) -> None:
         torch.testing.assert_close(compiled(*leaves), run(*leaves))
 
 
+def test_inputs_without_features_are_refused(device: torch.device, backend: str) -> None:
+    positions, offsets, index = torch.rand(5, 3, device=device), offsets_of([2, 3], device), torch.zeros(5).int()
+    table = MLP((Layer((POSITIONS, DIRECTIONS), 4, "relu"), Layer((0,), 2)), (1,), 2, 1)
+    message = "grouped_mlp: ... must have at least one feature where a layer reads them, got 0"
+
+    def call(layers: MLP, p: int, q: int, **changed: Tensor) -> Tensor:
+        weights = [torch.rand(2, o, i, device=device) for o, i in layers.weight_shapes(p, q)]
+        biases = [None] * len(weights)
+        return grouped_mlp(positions[:, :p], offsets, weights, biases, layers=layers, backend=backend, **changed)
+
+    for octaves in (2, None):
+        layers = MLP(table.layers, table.outputs, octaves, octaves)
+        assert call(layers, 3, 3, directions=positions).shape == (5, 2)
+        with refused(ValueError, message.replace("...", "positions")):
+            call(layers, 0, 3, directions=positions)
+        with refused(ValueError, message.replace("...", "directions")):
+            call(layers, 3, 0, directions=positions[:, :0])
+        with refused(ValueError, message.replace("...", "directions")):
+            call(layers, 3, 0, directions=positions[:4, :0], direction_index=index.to(device))
+    # What no layer reads may be empty.
+    unread = MLP((Layer((DIRECTIONS,), 4, "relu"),), (0,))
+    assert call(unread, 0, 3, directions=positions).shape == (5, 4)
+
+
 def test_errors() -> None:
     case = Case.make("nerf", [2, 3])
     positions, directions, *parameters = case.inputs

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.checks import FLOATS, INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
-from voronerf.layers import MLP
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 
 _OP = "grouped_mlp"
 
@@ -32,7 +32,8 @@ def grouped_mlp(
     ``torch.autocast`` layers run in its dtype.
 
     Args:
-        positions: [n, p] floating point, sorted by cell, n < 2**31; raw where the table gives octaves, else encoded.
+        positions: [n, p] floating point, sorted by cell, n < 2**31; raw where the table gives octaves, else encoded;
+            p >= 1 where a layer reads them, as q >= 1 for directions.
         offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows of no cell (before
             ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
         weights: one [k, o, i] for each layer, all of one dtype; i as ``layers.input_width`` says.
@@ -102,6 +103,9 @@ def _check_parameters(
             raise ValueError(f"{_OP}: {name} must have one entry for each of {count} layers, got {len(parameters)}")
     if sizes["k"] < 1:
         raise ValueError(f"{_OP}: offsets must have at least two entries, got [{sizes['k'] + 1}]")
+    for source, features in ((POSITIONS, sizes["p"]), (DIRECTIONS, sizes["q"])):
+        if features < 1 and any(source in layer.inputs for layer in layers.layers):
+            raise ValueError(f"{_OP}: {source} must have at least one feature where a layer reads them, got {features}")
     for index, (o, i) in enumerate(layers.weight_shapes(sizes["p"], sizes["q"])):
         check_shape(_OP, f"weights[{index}]", weights[index], ("k", o, i), sizes)
         check_dtype(_OP, f"weights[{index}]", weights[index], FLOATS if index == 0 else (weights[0].dtype,))
