@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Iterator
 
@@ -388,7 +389,14 @@ def test_opcheck() -> None:
     torch.library.opcheck(native._forward, (*shared, *directions))
     gradient = torch.randn(13, 4, requires_grad=True)
     torch.library.opcheck(native._backward, (gradient, *shared, *directions, [True, True, True]))
-    assert native._unflatten(tuple(table)) == given["layers"]
+    assert native._unflatten(table) == given["layers"]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_width_of_the_output(name: str) -> None:
+    native = pytest.importorskip("voronerf._native_mlp")
+    table = [3, 3, -1, -1, 0, *native._flatten(NETWORKS[name])]
+    assert native._out_features(table) == NETWORKS[name].out_features
 
 
 def test_compiles_whole() -> None:
@@ -403,6 +411,37 @@ def test_compiles_whole() -> None:
     eager = torch.autograd.grad(grouped_mlp(**given, backend="native").square().sum(), leaves)
     for got, want in zip(compiled, eager):
         torch.testing.assert_close(got, want)
+
+
+def test_compiles_for_any_size() -> None:
+    given = cast(arguments(nerf(8, 2), [9, 0, 4], rays=3), torch.float32)
+
+    @torch.compile(fullgraph=True, dynamic=True, backend="aot_eager")
+    def loss(positions: Tensor, offsets: Tensor, index: Tensor, weights: list[Tensor]) -> Tensor:
+        changed = {"positions": positions, "offsets": offsets, "direction_index": index, "weights": weights}
+        return grouped_mlp(**{**given, **changed}, backend="native").square().sum()
+
+    leaves = [given["positions"], *given["weights"]]
+    compiled = torch.autograd.grad(
+        loss(given["positions"], given["offsets"], given["direction_index"], given["weights"]), leaves
+    )
+    eager = torch.autograd.grad(grouped_mlp(**given, backend="native").square().sum(), leaves)
+    for got, want in zip(compiled, eager):
+        torch.testing.assert_close(got, want)
+
+
+def test_linear_compiles_for_any_size() -> None:
+    @torch.compile(fullgraph=True, dynamic=True, backend="aot_eager")
+    def run(x: Tensor, offsets: Tensor, weight: Tensor) -> Tensor:
+        return grouped_linear(x, offsets, weight, activation="relu", backend="native")
+
+    for n, k, o, i in ((9, 2, 5, 4), (14, 3, 7, 6)):
+        x, weight = torch.randn(n, i, requires_grad=True), torch.randn(k, o, i, requires_grad=True)
+        offsets = torch.linspace(0, n, k + 1).int()
+        got, want = (each(x, offsets, weight) for each in (run, functools.partial(grouped_linear, activation="relu")))
+        torch.testing.assert_close(got, want)
+        for a, b in zip(*(torch.autograd.grad(y.square().sum(), [x, weight]) for y in (got, want))):
+            torch.testing.assert_close(a, b)
 
 
 def test_errors() -> None:

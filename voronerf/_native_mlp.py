@@ -10,7 +10,6 @@ have been validated by ``voronerf.ops``.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -101,8 +100,17 @@ def _flatten(layers: MLP) -> list[int]:
     return [*flat, *layers.outputs]
 
 
-@functools.lru_cache(maxsize=256)
-def _unflatten(flat: tuple[int, ...]) -> MLP:
+def _out_features(flat: Sequence[int]) -> int:
+    """Width of the output. Under ``torch.compile`` entries may be symbolic, which can be added up but not hashed."""
+    count, outputs = flat[5:7]
+    widths, at = [], 7
+    for _ in range(count):
+        widths.append(flat[at])
+        at += 3 + flat[at + 2]
+    return sum(widths[output] for output in flat[at : at + outputs])
+
+
+def _unflatten(flat: Sequence[int]) -> MLP:
     """The table of a whole flat list."""
     position_octaves, direction_octaves = (None if count < 0 else count for count in flat[2:4])
     numbers = iter(flat[5:])
@@ -193,7 +201,7 @@ def _address(tensor: Tensor | None) -> int:
 
 
 def _allocate(positions: Tensor, table: Sequence[int]) -> Tensor:
-    return positions.new_empty(positions.shape[0], _unflatten(tuple(table)).out_features)
+    return positions.new_empty(positions.shape[0], _out_features(table))
 
 
 def _allocate_gradients(
@@ -287,7 +295,7 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
             offsets,
             [_given(weight) for weight in leaves[:count]],
             [bias if _given(bias).numel() else None for bias in leaves[count : 2 * count]],
-            layers=_unflatten(tuple(ctx.table)),
+            layers=_unflatten(ctx.table),
             directions=leaves[-2],
             direction_index=direction_index,
         )

@@ -46,14 +46,15 @@ def check_shape(
     check_tensor(op, name, tensor)
     known = {} if sizes is None else sizes
     found = dict(known)
-    wanted = [str(entry) for entry in shape]
-    fits = tensor.dim() == len(wanted)
+    fits = tensor.dim() == len(shape)
     if fits:
         for entry, size in zip(shape, tensor.shape):
             letter, extra = (entry[:-2], 1) if isinstance(entry, str) and entry.endswith("+1") else (entry, 0)
             expected = letter if isinstance(letter, int) else found.setdefault(letter, size - extra)
             fits = fits and size == expected + extra and size >= extra
     if not fits:
+        # Here alone: torch.compile cannot turn a symbolic size into text.
+        wanted = [str(entry) for entry in shape]
         letters = dict.fromkeys(entry.removesuffix("+1") for entry in wanted)
         bound = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in known)
         rule = f"[{', '.join(wanted)}]" + (f" with {bound}" if bound else "")
