@@ -8,6 +8,10 @@
 
 #include "hd.h"
 
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
 #ifdef __CUDACC__
 #include <cuda_runtime.h>
 // A CUDA error becomes an exception that names the call. Launches are checked with cudaGetLastError(), which does not
@@ -32,6 +36,15 @@ namespace voronerf {
 template <typename T>
 VN_HD constexpr T ceil_div(T a, T b) {
   return (a + b - 1) / b;
+}
+
+// Number of this thread in its team; 0 in a build without OpenMP.
+inline int thread_number() {
+#ifdef _OPENMP
+  return omp_get_thread_num();
+#else
+  return 0;
+#endif
 }
 
 }  // namespace voronerf

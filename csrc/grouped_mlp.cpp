@@ -3,8 +3,6 @@
 // of threads or on which thread took what.
 #include "grouped_mlp.h"
 
-#include <omp.h>
-
 #include <algorithm>
 #include <cstdlib>
 #include <memory>
@@ -149,7 +147,7 @@ void for_each_task(const Tasks& tasks, const MlpPlan& plan, const MlpData& data,
   threads = static_cast<int>(std::min<int64_t>(threads, count));
 #pragma omp parallel num_threads(threads) if (threads > 1)
   {
-    float* own = memory + omp_get_thread_num() * stride;
+    float* own = memory + thread_number() * stride;
     int64_t packed = -1;
     prepare(isa, plan, own);
 #pragma omp for schedule(dynamic, 1)

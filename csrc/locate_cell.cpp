@@ -9,10 +9,6 @@
 #include "common.h"
 #include "nearest_centre.h"
 
-#ifdef _OPENMP
-#include <omp.h>
-#endif
-
 namespace voronerf {
 
 namespace {
@@ -117,11 +113,7 @@ bool locate_cell_cpu(const T* points, const T* centres, const T* weights, const 
   bool arrived = true;
 #pragma omp parallel for schedule(dynamic) num_threads(threads) reduction(&& : arrived) if (threads > 1 && blocks > 1)
   for (int64_t b = 0; b < blocks; ++b) {
-#ifdef _OPENMP
-    int32_t* place = workspace + omp_get_thread_num() * m;
-#else
-    int32_t* place = workspace;
-#endif
+    int32_t* place = workspace + thread_number() * m;
     const int64_t start = b * kBlock;
     const int32_t rows = static_cast<int32_t>(std::min<int64_t>(kBlock, n - start));
     const bool all = locate_block(tree, points + 3 * start, leaves + start, rows, place);
