@@ -234,7 +234,7 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   }
   if (wanted.parameters) {
     const int64_t items = in.k * plan.layer_count;
-#pragma omp parallel for schedule(dynamic, 1) num_threads(threads) if (threads > 1 && partials > 0)
+#pragma omp parallel for schedule(dynamic, 1) num_threads(threads) if (threads > 1)
     for (int64_t item = 0; item < items; ++item) {
       const int64_t cell = item / plan.layer_count, l = item % plan.layer_count;
       const int64_t first = tasks.first_partial[cell], count = tasks.first_partial[cell + 1] - first;
