@@ -56,7 +56,7 @@ struct Product {
   float* c;
   int64_t c_stride;
   Finish finish;
-  const float* slope;  // relu_slope: C is multiplied by slope > 0, [rows][c_stride]
+  const float* slope;  // relu_slope: C is 0 where slope <= 0, [rows][c_stride]
   // bfloat16 operands, columns a multiple of 32, finish none or relu: C as pairs as well, [rows][pairs_stride], and c
   // may be null.
   float* pairs;
@@ -114,8 +114,8 @@ void block(const Product& p, int64_t row, int64_t column) {
     }
   } while (++source != end);
   // Every way to finish stores by itself: merging them would send the sums through the stack. Comparisons are written
-  // so that NaN passes, as in torch.
-  const F32 zero = splat(0.0f), one = splat(1.0f);
+  // so that NaN passes, as in torch; a slope selects, since 0 times an infinite gradient would be NaN.
+  const F32 zero = splat(0.0f);
   const int64_t c_stride = p.c_stride;
   float* const c = p.c == nullptr ? nullptr : p.c + row * c_stride + column;
 #if VN_HALF
@@ -150,7 +150,7 @@ void block(const Product& p, int64_t row, int64_t column) {
     for (int r = 0; r < R; ++r) {
       for (int v = 0; v < V; ++v) {
         const int64_t at = r * c_stride + v * kLanes;
-        store(c + at, sum[r][v] * (load(slope + at) > zero ? one : zero));
+        store(c + at, load(slope + at) <= zero ? zero : sum[r][v]);
       }
     }
   }

@@ -52,8 +52,11 @@ void times_slope(const MlpPlanLayer& layer, int64_t rows, const float* value, co
   const F32 zero = splat(0.0f), one = splat(1.0f);
   for (int64_t i = 0; i < size; i += kLanes) {
     const F32 y = load(value + i), g = load(gradient + i);
+    if (layer.activation == kRelu) {
+      store(gradient + i, y <= zero ? zero : g);
+      continue;
+    }
     F32 factor = one;
-    if (layer.activation == kRelu) factor = y > zero ? one : zero;
     if (layer.activation == kSoftplus) factor = zero - exponential_minus_one(zero - y);
     if (layer.activation == kSigmoid) factor = y * (one - y);
     if (layer.activation == kSine) factor = load(slope + i);

@@ -189,6 +189,31 @@ def test_relu_gradients_agree_on_most_entries() -> None:
         assert float((got - want).abs().median()) <= 1e-5 * float(want.abs().max())
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("o", [2, 40])
+def test_relu_stops_an_infinite_gradient_and_passes_what_is_not_a_number(o: int, dtype: torch.dtype, isa: str) -> None:
+    weight = torch.ones(1, o, 1)
+    weight[0, 1::2] = -1  # inactive for a positive x
+    x, offsets = torch.tensor([[1.0], [2.0], [torch.nan]]), torch.tensor([0, 3], dtype=torch.int32)
+    slopes = torch.tensor([[torch.inf], [1.0], [1.0]])
+    heads = torch.ones(1, 1, o)
+    active = Layer(("positions",), o, "relu")
+    # ReLU as the last layer, and as one that another reads.
+    for layers, weights in ((MLP((active,), (0,)), [weight]), (MLP((active, Layer((0,), 1)), (1,)), [weight, heads])):
+        results = []
+        for backend in ("native", "reference"):
+            leaves = [tensor.to(dtype).requires_grad_() for tensor in (x, weights[0], torch.zeros(1, o))]
+            rest = [tensor.to(dtype) for tensor in weights[1:]]
+            biases = [leaves[2], *[None] * len(rest)]
+            y = grouped_mlp(leaves[0], offsets, [leaves[1], *rest], biases, layers=layers, backend=backend)
+            results.append([y.detach(), *torch.autograd.grad(y, leaves, slopes.to(dtype).expand_as(y))])
+        for got, want in zip(*results):
+            torch.testing.assert_close(got, want, equal_nan=True)
+        positions, bias = results[0][1], results[0][3][0]
+        assert positions[0] == torch.inf and positions[1] == o // 2 and positions[2].isfinite()
+        assert (bias[::2] == torch.inf).all() and (bias[1::2] == 1).all()
+
+
 def test_same_bits_for_any_number_of_threads(isa: str) -> None:
     given = arguments(nerf(40, 2), [5000, 3, 0, 900], rays=50)
     before, results = torch.get_num_threads(), []
