@@ -139,11 +139,12 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder."""
     import pybind11
 
-    # fp-contract: results are defined by separate roundings (csrc/nearest_centre_math.h); fused ones are named.
-    common = ["-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off", "-Wall", "-Wextra", "-I."]
+    common = ["-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
     openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas"]
     includes = [f"-I{SOURCES}", f"-isystem{pybind11.get_include()}", f"-isystem{sysconfig.get_path('include')}"]
-    extra = shlex.split(os.environ.get("CXXFLAGS", ""))
+    # After CXXFLAGS: results are defined by separate roundings (csrc/nearest_centre_math.h), fused ones are named, and
+    # NaN and infinity are told apart from numbers.
+    extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off"]
     # libgomp is left out of the link: voronerf/_native.py binds the module to the copy that torch has loaded.
     if cuda.nvcc is not None:
         # nvcc knows where its static runtime is. With that, the module loads on a machine without CUDA.

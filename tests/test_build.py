@@ -49,6 +49,15 @@ def test_nvcc_gets_one_program_and_the_arguments(build: dict[str, Any], monkeypa
         assert "ccache" not in rules[rule]
 
 
+@pytest.mark.parametrize("given", ["", "-Ofast -march=native", "-ffast-math -ffp-contract=fast"])
+def test_arithmetic_is_exact_whatever_flags_are_given(
+    build: dict[str, Any], monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    monkeypatch.setenv("CXXFLAGS", given)
+    command = commands(build, build["Cuda"]("built without CUDA"))["cxx"]
+    assert f"{given} -fno-fast-math -ffp-contract=off $flags " in command
+
+
 def test_one_word_and_none(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CXX", "ccache")
     assert build["host_compiler"]() == ["-ccbin", "ccache"]
