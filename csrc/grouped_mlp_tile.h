@@ -275,9 +275,11 @@ struct Tile {
 
   void input_gradient(const MlpPlanInput& input, float* out) const {
     if (!input.gradient_wanted) return;
-    const float* value = input.octaves >= 0 ? at(input.value) : nullptr;
-    encode_backward(value, at(input.gradient), workspace + input.table, rows, input.raw,
-                    input.octaves >= 0 ? input.octaves : 0, input.gradient.stride, out + begin * input.raw);
+    const float* gradient = at(input.gradient);
+    // Without octaves `value` is walked but not read.
+    const float* value = input.octaves >= 0 ? at(input.value) : gradient;
+    encode_backward(value, gradient, workspace + input.table, rows, input.raw, input.octaves >= 0 ? input.octaves : 0,
+                    input.gradient.stride, out + begin * input.raw);
   }
 };
 

@@ -51,7 +51,7 @@ void descend(const Tree<T>& tree, const Level<T>& level, const Group& group, Lev
   for (int32_t i = group.begin; i < group.end; ++i) {
     const int32_t centre = found[i - group.begin], child = tree.child[first + centre];
     if (child < 0) {
-      leaves[level.rows[i]] = -child - 1;
+      leaves[level.rows[i]] = ~child;  // -child - 1, which could overflow
     } else {
       ++place[centre];
     }
