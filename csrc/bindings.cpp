@@ -10,8 +10,8 @@
 #include "build_info.h"
 #include "cell_sort.h"
 #include "common.h"
-#include "cuda.h"
 #include "isa.h"
+#include "launchers.h"
 #include "locate_cell.h"
 #include "nearest_centre.h"
 

@@ -9,7 +9,7 @@
 // that of the CPU, bit for bit. Bucket 0 is for cells below 0 and bucket k + 1 for cells from k on.
 #include "cell_sort.h"
 #include "common.h"
-#include "cuda.h"
+#include "launchers.h"
 
 namespace voronerf {
 

@@ -2,7 +2,7 @@
 // in float32 and decided in float64 where float32 cannot (nearest_centre_math.h). Neighbouring samples of a ray share
 // their diagrams, so that the centres come from the first-level cache.
 #include "common.h"
-#include "cuda.h"
+#include "launchers.h"
 #include "nearest_centre_math.h"
 
 namespace voronerf {

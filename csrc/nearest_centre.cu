@@ -2,7 +2,7 @@
 // at the same address (a broadcast). Float32 input is screened and, rarely, decided again in float64 by
 // nearest_centre_math.h, with the same answer as on the CPU to the last index.
 #include "common.h"
-#include "cuda.h"
+#include "launchers.h"
 #include "nearest_centre_math.h"
 
 namespace voronerf {

@@ -1,5 +1,5 @@
 #include "common.h"
-#include "cuda.h"
+#include "launchers.h"
 
 namespace voronerf {
 
