@@ -21,7 +21,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 1;
+constexpr int INTERFACE = 2;
 
 using Address = std::uintptr_t;
 
@@ -62,11 +62,11 @@ void nearest_centre_cuda(Address points, Address centres, Address weights, Addre
 
 template <typename T>
 void locate_cell_cuda(Address points, Address centres, Address weights, Address child_offsets, Address child,
-                      Address leaves, int64_t n, int depth, int device, Address stream) {
+                      Address leaves, int64_t n, int64_t m, int64_t g, int depth, int device, Address stream) {
   const voronerf::CudaDevice current(device);
   voronerf::locate_cell_cuda(at<const T>(points), at<const T>(centres), at<const T>(weights),
-                             at<const int32_t>(child_offsets), at<const int32_t>(child), at<int32_t>(leaves), n, depth,
-                             at<void>(stream));
+                             at<const int32_t>(child_offsets), at<const int32_t>(child), at<int32_t>(leaves), n, m, g,
+                             depth, at<void>(stream));
 }
 
 void cell_sort_cuda(Address cells, Address order, Address offsets, Address workspace, int64_t n, int64_t k, int device,

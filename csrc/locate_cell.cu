@@ -38,35 +38,37 @@ template <typename T>
 __global__ void __launch_bounds__(kThreads)
     locate_cell_kernel(const T* __restrict__ points, const T* __restrict__ centres, const T* __restrict__ weights,
                        const int32_t* __restrict__ child_offsets, const int32_t* __restrict__ child,
-                       int32_t* __restrict__ leaves, int64_t n, int depth) {
+                       int32_t* __restrict__ leaves, int64_t n, int64_t m, int64_t g, int depth) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= n) return;
   int32_t state = 0;  // the diagram the point is in, or (negative) the leaf it has reached
   for (int d = 0; d < depth && state >= 0; ++d) {
-    const int32_t first = child_offsets[state], size = child_offsets[state + 1] - first;
+    if (state >= g) break;
+    const int32_t first = child_offsets[state], end = child_offsets[state + 1];
+    if (first < 0 || end <= first || end > m) break;
     const T* local_weights = weights == nullptr ? nullptr : weights + first;
     const int32_t found =
-        nearest_in_diagram(points + 3 * i, centres + 3 * static_cast<int64_t>(first), local_weights, size);
+        nearest_in_diagram(points + 3 * i, centres + 3 * static_cast<int64_t>(first), local_weights, end - first);
     state = child[first + found];
   }
-  leaves[i] = -state - 1;
+  leaves[i] = ~state;  // -state - 1, which could overflow; negative where the walk has reached no leaf
 }
 
 }  // namespace
 
 template <typename T>
 void locate_cell_cuda(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
-                      const int32_t* child, int32_t* leaves, int64_t n, int depth, void* stream) {
+                      const int32_t* child, int32_t* leaves, int64_t n, int64_t m, int64_t g, int depth, void* stream) {
   if (n == 0) return;
   const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
   locate_cell_kernel<T><<<blocks, kThreads, 0, static_cast<cudaStream_t>(stream)>>>(
-      points, centres, weights, child_offsets, child, leaves, n, depth);
+      points, centres, weights, child_offsets, child, leaves, n, m, g, depth);
   VN_CUDA_CHECK(cudaGetLastError());
 }
 
 template void locate_cell_cuda(const float*, const float*, const float*, const int32_t*, const int32_t*, int32_t*,
-                               int64_t, int, void*);
+                               int64_t, int64_t, int64_t, int, void*);
 template void locate_cell_cuda(const double*, const double*, const double*, const int32_t*, const int32_t*, int32_t*,
-                               int64_t, int, void*);
+                               int64_t, int64_t, int64_t, int, void*);
 
 }  // namespace voronerf

@@ -241,6 +241,19 @@ def test_locate_refuses_unsound_tables(change: dict[str, object], message: str) 
         _native.locate_cell(torch.rand(10, 3), **{**tree, **tables})
 
 
+@pytest.mark.cuda
+def test_locate_on_cuda_stays_inside_unsound_tables() -> None:
+    points = torch.rand(100, 3)
+    tree = random_tree((2, 2), uneven=False)
+    sound = _native.locate_cell(points, **tree)
+    second = reference_nearest(points, tree["centres"][:2]) == 1
+    for change in ({"child": [1, 7, -1, -2, -3, -4]}, {"child_offsets": [0, 2, 4, 9]}, {"child_offsets": [0, 2, 4, 4]}):
+        tables = {**tree, **{name: torch.tensor(value).int() for name, value in change.items()}}
+        on_device = {name: value.cuda() if isinstance(value, Tensor) else value for name, value in tables.items()}
+        leaves = _native.locate_cell(points.cuda(), **on_device).cpu()
+        assert (leaves[second] < 0).all() and torch.equal(leaves[~second], sound[~second])
+
+
 def test_ops_pass_opcheck_and_compile_whole() -> None:
     points, centres, weights = torch.rand(50, 3), torch.rand(7, 3), torch.rand(7)
     cells, tree = torch.randint(0, 7, (50,), dtype=torch.int32), random_tree((3, 2))

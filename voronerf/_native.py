@@ -27,7 +27,7 @@ from voronerf.backends import BackendUnavailable
 
 ISAS = ("portable", "avx2", "avx512")
 # Number of csrc/bindings.cpp that this file and its companions are written for.
-INTERFACE = 1
+INTERFACE = 2
 
 _REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
 
@@ -144,7 +144,7 @@ def _locate_cell(
     n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
     addresses = _addresses(points, centres, weights, child_offsets, child, leaves)
     if points.is_cuda:
-        _entry("locate_cell_cuda", points.dtype)(*addresses, n, depth, *_stream(points))
+        _entry("locate_cell_cuda", points.dtype)(*addresses, n, m, g, depth, *_stream(points))
         return leaves
     fault = _C.locate_cell_fault(child_offsets.data_ptr(), child.data_ptr(), g, m)
     if fault is not None:

@@ -28,6 +28,10 @@ def locate_cell(
     with ties to the lowest index, as ``nearest_centre``; a point that is not finite takes the first centre at every
     level. Trees may be uneven. Not differentiable.
 
+    On the CPU "native" refuses tables that are no tree of this depth: a diagram without centres, a child that is no
+    diagram, a walk longer than ``depth``. On CUDA, where telling would need a host read, it reads nothing outside the
+    tables, and a point whose walk leads out of them or ends at no leaf gets a negative number.
+
     Args:
         points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are compared in float32.
         centres: [m, 3] floating point, finite, m >= 1; every diagram has at least one.
@@ -42,7 +46,8 @@ def locate_cell(
         leaf int32 [n].
 
     Raises:
-        ValueError: shapes, devices, depth or an unknown backend.
+        ValueError: shapes, devices, depth or an unknown backend; tables that are no tree, where
+            they are refused.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
     """
