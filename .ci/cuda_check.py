@@ -1,8 +1,9 @@
 """Compile every .cu for every architecture, warnings as errors, without a GPU: ``cuda_check.py 80 90a ...``.
 
 Registers, spills and shared memory of every kernel are printed and kept in build/cuda-check/resources.json, so that a
-regression shows in a diff of two runs. The last architecture is compiled to PTX as well. The last line says in one
-sentence what was compiled and whether it held.
+regression shows in a diff of two runs. The last architecture is compiled to PTX as well. A kernel whose resources are
+not reported for every architecture is a failure, and so is no kernel at all: nothing was checked then. The last line
+says in one sentence what was compiled and whether it held.
 """
 
 from __future__ import annotations
@@ -62,9 +63,24 @@ def main(architectures: list[str]) -> int:
     (OUT / "resources.json").write_text(json.dumps(kernels, indent=1, sort_keys=True) + "\n")
     spilling = sum(row["spilled_bytes"] > 0 for rows in kernels.values() for row in rows.values())
     targets = f"{', '.join(f'sm_{arch}' for arch in architectures)} and PTX of {architectures[-1]}"
-    outcome = f"failed in {', '.join(failed)}" if failed else f"held without a warning, {spilling} spilling"
+    # What did not compile lacks architectures for that reason.
+    compiled = {kernel: found for kernel, found in kernels.items() if kernel.split(":")[0] not in failed}
+    lacking = [
+        f"{kernel} (sm_{arch})"
+        for kernel, found in sorted(compiled.items())
+        for arch in architectures
+        if f"sm_{arch}" not in found
+    ]
+    if failed:
+        outcome = f"failed in {', '.join(failed)}"
+    elif lacking:
+        outcome = f"failed: no resources were reported of {', '.join(lacking)}"
+    elif not kernels:
+        outcome = "failed: no kernel was reported"
+    else:
+        outcome = f"held without a warning, {spilling} spilling"
     print(f"cuda-check: {len(sources)} files, {len(kernels)} kernels compiled for {targets} {outcome}.")
-    return 1 if failed else 0
+    return 1 if failed or lacking or not kernels else 0
 
 
 def demangled(name: str) -> str:

@@ -1,7 +1,9 @@
-"""The build script: commands of build.ninja, from compilers of more than one word."""
+"""The build scripts: commands of build.ninja, from compilers of more than one word, and the check of the CUDA files."""
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import runpy
 from pathlib import Path
 from typing import Any
@@ -66,3 +68,45 @@ def test_one_word_and_none(build: dict[str, Any], monkeypatch: pytest.MonkeyPatc
         assert len(build["compiler"]()) == 1
     monkeypatch.delenv("CXX")
     assert len(build["compiler"]()) == 1
+
+
+REPORT = """\
+ptxas info    : Compiling entry function '_Z6kernelv' for 'sm_{0}'
+ptxas info    : Function properties for _Z6kernelv
+    0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
+ptxas info    : Used 8 registers, used 0 barriers
+"""
+
+
+@pytest.mark.parametrize(
+    ("reported", "status", "outcome"),
+    [
+        (["80", "90a"], 0, "held without a warning, 0 spilling."),
+        (["80"], 1, "(sm_90a)."),
+        ([], 1, "failed: no kernel was reported."),
+    ],
+)
+def test_cuda_check_fails_where_nothing_was_checked(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    reported: list[str],
+    status: int,
+    outcome: str,
+) -> None:
+    path = ROOT / ".ci" / "cuda_check.py"
+    if not path.is_file():
+        pytest.skip(".ci/cuda_check.py is not there: the tests are not in the source tree")
+    spec = importlib.util.spec_from_file_location("cuda_check", path)
+    assert spec is not None and spec.loader is not None
+    check = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(check)
+    # An nvcc that compiles nothing and reports what it is told to.
+    (tmp_path / "report").write_text("".join(REPORT.format(arch) for arch in reported))
+    nvcc = tmp_path / "nvcc"
+    nvcc.write_text(f"#!/bin/sh\ncat '{tmp_path}/report' >&2\n")
+    nvcc.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(check, "OUT", tmp_path / "out")
+    assert check.main(["80", "90a"]) == status
+    assert capsys.readouterr().out.rstrip().endswith(outcome)
