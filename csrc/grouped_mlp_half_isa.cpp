@@ -1,10 +1,10 @@
 // The kernels of grouped_mlp with bfloat16 products: AVX-512 with its bfloat16 dot product, which multiplies pairs and
 // adds to float32 at twice the rate of float32's multiply-add. Values, slopes, sums and gradients stay float32 in the
 // tile; what enters a product is rounded to bfloat16 on the way (bfloat16_tile.h).
-#if VN_ISA == 2 && defined(__GNUC__) && !defined(__clang__)
-#pragma GCC target("avx512bf16")
-
 #include "grouped_mlp_isa.h"
+
+#if VN_ISA == 2 && VN_HAS_HALF
+#pragma GCC target("avx512bf16")
 
 #define VN_HALF 1
 #include "grouped_mlp_tile.h"

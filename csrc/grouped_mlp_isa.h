@@ -4,8 +4,8 @@
 #include "grouped_mlp_plan.h"
 #include "isa.h"
 
-// Whether the build has bfloat16 products: gcc's target pragma gives them to one file.
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+// Whether the build has bfloat16 products: gcc's target pragma gives them to one file, from version 10 on.
+#if defined(__x86_64__) && defined(__GNUC__) && __GNUC__ >= 10 && !defined(__clang__)
 #define VN_HAS_HALF 1
 #else
 #define VN_HAS_HALF 0
