@@ -270,6 +270,15 @@ def test_every_output_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (got[0][-6:] == 0).all() and (got[1][-6:] == 0).all()
 
 
+def test_memory_only_for_the_gradients_asked_for() -> None:
+    native = pytest.importorskip("voronerf._native_mlp")
+    x, tensor, empty = torch.zeros(9, 3), torch.zeros(2, 4, 3), torch.Size([0])
+    sizes = [result.shape for result in native._allocate_gradients(x, [tensor] * 2, [tensor] * 2, x, [False] * 3)]
+    assert sizes == [empty] * 6
+    sizes = [result.shape for result in native._allocate_gradients(x, [tensor], [tensor], None, [True, False, True])]
+    assert sizes == [tensor.shape] * 2 + [empty] * 2
+
+
 def test_only_the_gradients_asked_for() -> None:
     given = cast(arguments(nerf(16, 2), [20, 30], rays=7), torch.float32)
     everything = tensors(given)

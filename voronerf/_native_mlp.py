@@ -21,7 +21,6 @@ from voronerf.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_mlp import grouped_mlp as _reference
 
-_HALF = (torch.float16, torch.bfloat16)
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
 
 
@@ -212,14 +211,12 @@ def _allocate_gradients(
     wanted: Sequence[bool],
 ) -> list[Tensor]:
     """Gradients of weights, biases, positions, directions; empty unless wanted: (parameters, positions, directions)."""
-    parameters = [torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in (*weights, *biases)]
-    nothing = positions.new_empty
+    chosen = [wanted[0]] * (len(weights) + len(biases)) + [wanted[1], wanted[2]]
     return [
-        *(parameters if wanted[0] else [nothing(0) for _ in parameters]),
-        torch.empty_like(positions, memory_format=torch.contiguous_format) if wanted[1] else nothing(0),
-        torch.empty_like(directions, memory_format=torch.contiguous_format)
-        if directions is not None and wanted[2]
-        else nothing(0),
+        torch.empty_like(tensor, memory_format=torch.contiguous_format)
+        if tensor is not None and want
+        else positions.new_empty(0)
+        for tensor, want in zip((*weights, *biases, positions, directions), chosen)
     ]
 
 
