@@ -28,8 +28,8 @@ std::vector<T*> pointers(const std::vector<Address>& addresses) {
   return result;
 }
 
-// [p, q, position octaves, direction octaves, half, layers, outputs, then for each layer: width, activation, sources,
-// the sources; then the outputs], as voronerf/_native_mlp.py writes it.
+// [p, q, position octaves, direction octaves, half, linear, layers, outputs, then for each layer: width, activation,
+// sources, the sources; then the outputs], as voronerf/_native_mlp.py writes it.
 voronerf::MlpTable read_table(const std::vector<int64_t>& flat) {
   size_t next = 0;
   const auto take = [&] {
@@ -42,6 +42,7 @@ voronerf::MlpTable read_table(const std::vector<int64_t>& flat) {
   table.position_octaves = static_cast<int>(take());
   table.direction_octaves = static_cast<int>(take());
   table.half = take() != 0;
+  table.linear = take() != 0;
   const int64_t layers = take(), outputs = take();
   for (int64_t l = 0; l < layers; ++l) {
     voronerf::MlpTable::Layer layer;

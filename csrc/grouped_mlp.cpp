@@ -60,11 +60,12 @@ class Workspace {
 
 thread_local Workspace workspace;
 
-void check(const MlpInputs& in) {
+void check(const MlpTable& table, const MlpInputs& in) {
+  const std::string op = table.linear ? "grouped_linear: " : "grouped_mlp: ";
   int64_t before = 0;
   for (int64_t c = 0; c <= in.k; ++c) {
     if (in.offsets[c] < before || in.offsets[c] > in.n) {
-      throw std::invalid_argument("offsets must rise from 0 or more to at most the number of rows, " +
+      throw std::invalid_argument(op + "offsets must rise from 0 or more to at most the number of rows, " +
                                   std::to_string(in.n) + ", got " + std::to_string(in.offsets[c]) + " for cell " +
                                   std::to_string(c));
     }
@@ -77,7 +78,7 @@ void check(const MlpInputs& in) {
     high = std::max(high, in.direction_index[i]);
   }
   if (low < 0 || high >= in.r) {
-    throw std::invalid_argument("direction_index must be 0 to " + std::to_string(in.r - 1) + ", got " +
+    throw std::invalid_argument(op + "direction_index must be 0 to " + std::to_string(in.r - 1) + ", got " +
                                 std::to_string(low < 0 ? low : high));
   }
 }
@@ -178,7 +179,7 @@ float* take(const MlpPlan& plan, int threads, int64_t extra) {
 }  // namespace
 
 void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa isa, int threads) {
-  check(in);
+  check(table, in);
   const MlpPlanner planner(table, in.direction_index != nullptr, {false, false, false, use_half(table, isa)});
   const MlpPlan& plan = planner.plan();
   zero_strays(in, plan.out_features, out);
@@ -192,7 +193,7 @@ void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa
 
 void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const MlpGradients& gradients, Isa isa,
                               int threads) {
-  check(in);
+  check(table, in);
   const bool indexed = in.direction_index != nullptr;
   const MlpWanted wanted{gradients.weights != nullptr, gradients.positions != nullptr, gradients.directions != nullptr,
                          use_half(table, isa)};

@@ -30,7 +30,8 @@ struct MlpTable {
   std::vector<int> outputs;
   int64_t positions = 0, directions = 0;  // p and q
   int position_octaves = -1, direction_octaves = -1;
-  bool half = false;  // round what enters a product to bfloat16, where the processor multiplies that faster
+  bool half = false;    // round what enters a product to bfloat16, where the processor multiplies that faster
+  bool linear = false;  // called as grouped_linear, the name that errors begin with
 };
 
 struct MlpInputs {

@@ -417,7 +417,7 @@ def test_second_derivatives() -> None:
 def test_opcheck() -> None:
     native = pytest.importorskip("voronerf._native_mlp")
     given = cast(arguments(nerf(6, 2), [5, 0, 8], rays=4), torch.float32)
-    table = [3, 3, 4, 2, 0, *native._flatten(given["layers"])]
+    table = [3, 3, 4, 2, 0, 0, *native._flatten(given["layers"])]
     shared = (given["positions"], given["offsets"], given["weights"], given["biases"], table)
     directions = (given["directions"], given["direction_index"])
     torch.library.opcheck(native._forward, (*shared, *directions))
@@ -429,7 +429,7 @@ def test_opcheck() -> None:
 @pytest.mark.parametrize("name", NETWORKS)
 def test_width_of_the_output(name: str) -> None:
     native = pytest.importorskip("voronerf._native_mlp")
-    table = [3, 3, -1, -1, 0, *native._flatten(NETWORKS[name])]
+    table = [3, 3, -1, -1, 0, 0, *native._flatten(NETWORKS[name])]
     assert native._out_features(table) == NETWORKS[name].out_features
 
 
@@ -481,12 +481,12 @@ def test_linear_compiles_for_any_size() -> None:
 def test_errors() -> None:
     given = cast(arguments(nerf(6, 2), [5, 8], rays=4), torch.float32)
     for bad in ([0, 9, 5], [0, 5, 14], [-1, 5, 13]):
-        with pytest.raises(ValueError, match="offsets must rise"):
+        with pytest.raises(ValueError, match=r"^grouped_mlp: offsets must rise"):
             grouped_mlp(**{**given, "offsets": torch.tensor(bad, dtype=torch.int32)}, backend="native")
     for bad_index in (4, -1):
         index = given["direction_index"].clone()
         index[3] = bad_index
-        with pytest.raises(ValueError, match=r"direction_index must be 0 to 3, got"):
+        with pytest.raises(ValueError, match=r"^grouped_mlp: direction_index must be 0 to 3, got"):
             grouped_mlp(**{**given, "direction_index": index}, backend="native")
 
 

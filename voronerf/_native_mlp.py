@@ -47,6 +47,7 @@ def grouped_mlp(
         positions.shape[1],
         0 if directions is None else directions.shape[1],
         *[-1 if count is None else count for count in octaves],
+        0,
         *_flatten(layers),
     ]
     return _run(positions, offsets, weights, biases, table, directions, direction_index)
@@ -56,7 +57,7 @@ def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer."""
-    table = [x.shape[1], 0, -1, -1, 1, 1, weight.shape[1], ACTIVATIONS.index(activation), 1, _OUTSIDE[POSITIONS], 0]
+    table = [x.shape[1], 0, -1, -1, 1, 1, 1, weight.shape[1], ACTIVATIONS.index(activation), 1, _OUTSIDE[POSITIONS], 0]
     return _run(x, offsets, [weight], [bias], table, None, None)
 
 
@@ -71,7 +72,8 @@ def _run(
 ) -> Tensor:
     """The op on float32 tensors, its result in the storage type (of autocast, where it is on).
 
-    ``table`` begins with p, q and the octaves of both; what follows them here is whether to multiply in bfloat16.
+    ``table`` begins with p, q and the octaves of both; what follows them here is whether to multiply in bfloat16. Next
+    is whether errors are those of ``grouped_linear``.
     """
     dtype, kind = weights[0].dtype, positions.device.type
     if torch.is_autocast_enabled(kind):
@@ -91,7 +93,7 @@ def _run(
 
 
 def _flatten(layers: MLP) -> list[int]:
-    """Layers and outputs of a table as csrc/bindings_mlp.cpp reads them, after the five numbers of the inputs."""
+    """Layers and outputs of a table as csrc/bindings_mlp.cpp reads them, after the six numbers before them."""
     flat = [len(layers.layers), len(layers.outputs)]
     for layer in layers.layers:
         sources = [_OUTSIDE[source] if isinstance(source, str) else source for source in layer.inputs]
@@ -101,8 +103,8 @@ def _flatten(layers: MLP) -> list[int]:
 
 def _out_features(flat: Sequence[int]) -> int:
     """Width of the output. Under ``torch.compile`` entries may be symbolic, which can be added up but not hashed."""
-    count, outputs = flat[5:7]
-    widths, at = [], 7
+    count, outputs = flat[6:8]
+    widths, at = [], 8
     for _ in range(count):
         widths.append(flat[at])
         at += 3 + flat[at + 2]
@@ -112,7 +114,7 @@ def _out_features(flat: Sequence[int]) -> int:
 def _unflatten(flat: Sequence[int]) -> MLP:
     """The table of a whole flat list."""
     position_octaves, direction_octaves = (None if count < 0 else count for count in flat[2:4])
-    numbers = iter(flat[5:])
+    numbers = iter(flat[6:])
     count, outputs = next(numbers), next(numbers)
     names = {number: name for name, number in _OUTSIDE.items()}
     layers = []

@@ -317,6 +317,15 @@ def test_inputs_without_features_are_refused(device: torch.device, backend: str)
     assert call(unread, 0, 3, directions=positions).shape == (5, 4)
 
 
+@pytest.mark.parametrize("bad", [[0, 2, 6], [0, 4, 3], [-1, 2, 5]])
+def test_offsets_that_are_no_offsets_are_refused(backend: str, bad: list[int]) -> None:
+    need("grouped_mlp", backend, CPU, torch.float32)
+    case = Case.make("nerf", [2, 3])
+    case.offsets = torch.tensor(bad, dtype=torch.int32)
+    with pytest.raises(ValueError, match=r"^grouped_mlp: offsets must rise from 0 or more to at most .* 5, got"):
+        case.run(grouped_mlp, case.inputs, backend=backend)
+
+
 def test_errors() -> None:
     case = Case.make("nerf", [2, 3])
     positions, directions, *parameters = case.inputs

@@ -48,7 +48,7 @@ def _linear(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None, act
     y = x.new_empty(x.shape[0], weight.shape[1])
     transposed = weight.to(dtype).transpose(1, 2).unbind()
     biases = None if bias is None else bias.to(dtype).unbind()
-    for cell, rows in pieces(offsets, x.shape[0]):
+    for cell, rows in pieces("grouped_linear", offsets, x.shape[0]):
         out = y[rows] if dtype == x.dtype else torch.empty_like(y[rows], dtype=dtype)
         if biases is None:
             torch.mm(x[rows].to(dtype), transposed[cell], out=out)
@@ -76,7 +76,7 @@ def _linear_backward_op(
     to_x = torch.empty_like(x, memory_format=torch.contiguous_format) if needs_x else None
     to_weight = weight.new_zeros(weight.shape, dtype=wide) if needs_weight else None
     to_bias = weight.new_zeros(weight.shape[:2], dtype=wide) if needs_bias else None
-    for cell, rows in pieces(offsets, x.shape[0]):
+    for cell, rows in pieces("grouped_linear", offsets, x.shape[0]):
         gradient = g[rows].to(dtype)
         if output is not None:
             gradient = times_derivative_(activation, gradient.clone(), output[rows].to(dtype))
@@ -105,7 +105,7 @@ def _(
 def _outer(g: Tensor, x: Tensor, offsets: Tensor) -> Tensor:
     dtype, wide = compute_dtype(x), wide_dtype(x)
     total = x.new_zeros(offsets.shape[0] - 1, g.shape[1], x.shape[1], dtype=wide)
-    for cell, rows in pieces(offsets, x.shape[0]):
+    for cell, rows in pieces("grouped_linear", offsets, x.shape[0]):
         add_product(total[cell], g[rows].to(dtype).t(), x[rows].to(dtype))
     return total.to(x.dtype)
 
@@ -119,7 +119,7 @@ def _(g: Tensor, x: Tensor, offsets: Tensor) -> Tensor:
 def _sum(g: Tensor, offsets: Tensor) -> Tensor:
     wide = wide_dtype(g)
     total = g.new_zeros(offsets.shape[0] - 1, g.shape[1], dtype=wide)
-    for cell, rows in pieces(offsets, g.shape[0]):
+    for cell, rows in pieces("grouped_linear", offsets, g.shape[0]):
         total[cell] += g[rows].sum(dim=0, dtype=wide)
     return total.to(g.dtype)
 

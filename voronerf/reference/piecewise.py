@@ -23,11 +23,11 @@ PIECE = 4096
 """Most rows of a piece. Fewer pay for the calls (a tenth more time at 1,024 rows), more gain nothing."""
 
 
-def pieces(offsets: Tensor, rows: int) -> Iterator[tuple[int, slice]]:
+def pieces(op: str, offsets: Tensor, rows: int) -> Iterator[tuple[int, slice]]:
     """Cells that have samples, in slices of at most ``PIECE`` rows. Reads ``offsets`` on the host."""
     bounds = offsets.tolist()
     if bounds[0] < 0 or bounds[-1] > rows or any(low > high for low, high in itertools.pairwise(bounds)):
-        raise ValueError(f"offsets must rise from at least 0 to at most the number of rows, {rows}, got {bounds}")
+        raise ValueError(f"{op}: offsets must rise from 0 or more to at most the number of rows, {rows}, got {bounds}")
     for cell, (low, high) in enumerate(itertools.pairwise(bounds)):
         for start in range(low, high, PIECE):
             yield cell, slice(start, min(start + PIECE, high))
@@ -143,7 +143,7 @@ def forward(network: Network, keep: bool) -> tuple[Tensor, list[Tensor]]:
     widths = kept_widths(table, positions.shape[1])
     hidden = [positions.new_empty(held, width, dtype=network.dtype) for width in widths]
     kept = Kept(table, hidden)
-    for cell, rows in pieces(network.offsets, n):
+    for cell, rows in pieces("grouped_mlp", network.offsets, n):
         at = rows if keep else slice(0, rows.stop - rows.start)
         encoded = None
         if kept.encoded is not None:
@@ -182,7 +182,7 @@ def backward(network: Network, g: Tensor, hidden: Sequence[Tensor], needs: list[
         direction_total = torch.zeros_like(network.encoded_directions, dtype=wide_dtype(network.encoded_directions))
     flow = _Flow(network)
 
-    for cell, rows in pieces(network.offsets, positions.shape[0]):
+    for cell, rows in pieces("grouped_mlp", network.offsets, positions.shape[0]):
         sources = network.sources(rows, None if kept.encoded is None else kept.encoded[rows])
         sources.update((index, values[rows]) for index, values in enumerate(kept.values))
         flow.begin(rows.stop - rows.start)
