@@ -39,18 +39,23 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32
   if (!valid) return false;
 
   // In place, a count becomes the first place of that cell's rows of that chunk: walk the chunks once for the cells'
-  // totals (in `offsets`), once to hand out the places, both along the rows of the workspace.
+  // totals, once to hand out the places, both along the rows of the workspace. offsets[c + 1] is cell c's total, then
+  // the next place to hand out, which begins at the cell's start and ends at its end.
   std::fill(offsets, offsets + k + 1, 0);
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     for (int64_t c = 0; c < k; ++c) offsets[c + 1] += workspace[chunk * k + c];
   }
-  for (int64_t c = 0; c < k; ++c) offsets[c + 1] += offsets[c];
+  int32_t start = 0;
   for (int64_t c = 0; c < k; ++c) {
-    int32_t place = offsets[c];
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+    const int32_t total = offsets[c + 1];
+    offsets[c + 1] = start;
+    start += total;
+  }
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+    for (int64_t c = 0; c < k; ++c) {
       const int32_t count = workspace[chunk * k + c];
-      workspace[chunk * k + c] = place;
-      place += count;
+      workspace[chunk * k + c] = offsets[c + 1];
+      offsets[c + 1] += count;
     }
   }
 
