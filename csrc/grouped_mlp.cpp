@@ -25,6 +25,8 @@ constexpr int64_t kTasks = 64;
 constexpr int64_t kTaskUnit = 48;
 // Partial weight gradients of one call, in floats: wide networks get longer tasks instead of more memory.
 constexpr int64_t kPartialFloats = int64_t{1} << 24;
+// What a thread keeps from one call to the next, in floats: the partials of a wide network, and as much again.
+constexpr int64_t kKeptFloats = 2 * kPartialFloats;
 constexpr int64_t kAlign = 64;
 
 struct Task {
@@ -37,28 +39,36 @@ struct Tasks {
   std::vector<int64_t> first_partial;  // [k+1] for each cell
 };
 
-// Memory that a calling thread keeps: a fresh page costs a microsecond at its first touch.
-class Workspace {
- public:
-  float* take(int64_t floats) {
-    if (floats > size_) {
-      memory_.reset();
-      memory_.reset(static_cast<float*>(std::aligned_alloc(kAlign, ceil_div(floats * 4, kAlign) * kAlign)));
-      size_ = memory_ == nullptr ? 0 : floats;
-      if (memory_ == nullptr) throw std::bad_alloc();
-    }
-    return memory_.get();
-  }
-
- private:
-  struct Free {
-    void operator()(float* memory) const { std::free(memory); }
-  };
-  std::unique_ptr<float, Free> memory_;
-  int64_t size_ = 0;
+struct Free {
+  void operator()(float* memory) const { std::free(memory); }
 };
 
-thread_local Workspace workspace;
+struct Block {
+  std::unique_ptr<float, Free> memory;
+  int64_t size = 0;
+};
+
+// Kept by a thread that has made a call until it ends: a fresh page costs a microsecond at its first touch.
+thread_local Block kept;
+
+// Memory for one call. It is the thread's block, and where that is too small replaces it; a block of more than
+// kKeptFloats goes back at the end of the call.
+class Workspace {
+ public:
+  explicit Workspace(int64_t floats) {
+    if (floats <= kept.size) return;
+    kept = Block{};
+    kept.memory.reset(static_cast<float*>(std::aligned_alloc(kAlign, ceil_div(floats * 4, kAlign) * kAlign)));
+    if (kept.memory == nullptr) throw std::bad_alloc();
+    kept.size = floats;
+  }
+  ~Workspace() {
+    if (kept.size > kKeptFloats) kept = Block{};
+  }
+  Workspace(const Workspace&) = delete;
+  Workspace& operator=(const Workspace&) = delete;
+  float* data() const { return kept.memory.get(); }
+};
 
 void check(const MlpTable& table, const MlpInputs& in) {
   const std::string op = table.linear ? "grouped_linear: " : "grouped_mlp: ";
@@ -171,9 +181,9 @@ MlpData pointers(const MlpInputs& in) {
   return data;
 }
 
-// Workspaces of the threads, then `extra` floats.
-float* take(const MlpPlan& plan, int threads, int64_t extra) {
-  return workspace.take(ceil_div(plan.workspace, kGranule) * kGranule * threads + extra);
+// Floats of the workspaces of all threads.
+int64_t workspaces(const MlpPlan& plan, int threads) {
+  return ceil_div(plan.workspace, kGranule) * kGranule * threads;
 }
 
 }  // namespace
@@ -187,7 +197,8 @@ void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa
   if (tasks.tasks.empty()) return;
   MlpData data = pointers(in);
   data.out = out;
-  for_each_task(tasks, plan, data, take(plan, threads, 0), isa, threads,
+  const Workspace workspace(workspaces(plan, threads));
+  for_each_task(tasks, plan, data, workspace.data(), isa, threads,
                 [&](const Task& task, float* own) { forward(isa, plan, data, task, own); });
 }
 
@@ -205,8 +216,10 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   const int64_t partials = wanted.parameters ? tasks.first_partial[in.k] : 0;
   // Gradients of the samples' directions, before they are summed over each ray's samples.
   const int64_t samples = wanted.directions && indexed ? in.n * table.directions : 0;
-  float* memory = take(plan, threads, partials * plan.partial + ceil_div(samples, kGranule) * kGranule);
-  float* partial = memory + ceil_div(plan.workspace, kGranule) * kGranule * threads;
+  const Workspace workspace(workspaces(plan, threads) + partials * plan.partial +
+                            ceil_div(samples, kGranule) * kGranule);
+  float* memory = workspace.data();
+  float* partial = memory + workspaces(plan, threads);
   float* sample_directions = partial + partials * plan.partial;
 
   MlpData data = pointers(in);
