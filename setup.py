@@ -140,7 +140,8 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     import pybind11
 
     common = ["-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
-    openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas"]
+    # Without OpenMP its pragmas mean nothing, nor do the numbers of threads that stand in them.
+    openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
     includes = [f"-I{SOURCES}", f"-isystem{pybind11.get_include()}", f"-isystem{sysconfig.get_path('include')}"]
     # After CXXFLAGS: results are defined by separate roundings (csrc/nearest_centre_math.h), fused ones are named, and
     # NaN and infinity are told apart from numbers.
