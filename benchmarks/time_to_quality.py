@@ -21,7 +21,6 @@ from typing import Any
 import tyro
 from harness import metadata
 
-from voronerf import backends
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
 from voronerf.training.config import ConfigError, TrainConfig
@@ -128,7 +127,6 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
         rays=options.rays,
         samples=options.samples,
         backend=options.backend,
-        native=backends.describe()["native"],
     )
     return {"metadata": description, "results": results}
 

@@ -112,7 +112,7 @@ class Trainer:
         self.router = make_router(config, self.device)
         self.router.generator = self.generator
         self.optimizer = make_optimizer(self.router, config)
-        self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches)
+        self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
         self.step = 0
         self.seconds = 0.0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
@@ -259,7 +259,7 @@ class Trainer:
         before = _median([balance.imbalance_before for balance in balances])
         after = _median([balance.imbalance_after for balance in balances])
         self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
-        self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches)
+        self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
         when = f"at {self.seconds:.0f} s, step {self.step}"
         if balances:
             self._say(f"{self.router.num_cells} cells {when}, std(W / max W) {before:.3f} -> {after:.4f}")
