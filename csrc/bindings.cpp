@@ -13,6 +13,7 @@
 #include "isa.h"
 #include "launchers.h"
 #include "locate_cell.h"
+#include "measure_peak.h"
 #include "nearest_centre.h"
 
 namespace py = pybind11;
@@ -21,7 +22,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 2;
+constexpr int INTERFACE = 3;
 
 using Address = std::uintptr_t;
 
@@ -48,6 +49,10 @@ bool locate_cell(Address points, Address centres, Address weights, Address child
 bool cell_sort(Address cells, Address order, Address offsets, Address workspace, int64_t n, int64_t k, int threads) {
   return voronerf::cell_sort_cpu(at<const int32_t>(cells), at<int32_t>(order), at<int32_t>(offsets),
                                  at<int32_t>(workspace), n, k, threads);
+}
+
+double measure_peak(int kind, int isa, int threads) {
+  return voronerf::measure_peak(static_cast<voronerf::Peak>(kind), static_cast<voronerf::Isa>(isa), threads);
 }
 
 #ifdef VN_WITH_CUDA
@@ -90,6 +95,7 @@ PYBIND11_MODULE(_C, module) {
   module.attr("cuda_outcome") = VN_CUDA_OUTCOME;
   module.attr("cuda_architectures") = VN_CUDA_ARCHITECTURES;
   module.def("isa_supported", [](int isa) { return voronerf::isa_supported(static_cast<voronerf::Isa>(isa)); });
+  module.def("measure_peak", &measure_peak, no_gil);
 
   module.def("nearest_centre_float32", &nearest_centre<float>, no_gil);
   module.def("nearest_centre_float64", &nearest_centre<double>, no_gil);

@@ -4,13 +4,6 @@
 #include "grouped_mlp_plan.h"
 #include "isa.h"
 
-// Whether the build has bfloat16 products: gcc's target pragma gives them to one file, from version 10 on.
-#if defined(__x86_64__) && defined(__GNUC__) && __GNUC__ >= 10 && !defined(__clang__)
-#define VN_HAS_HALF 1
-#else
-#define VN_HAS_HALF 0
-#endif
-
 namespace voronerf {
 
 // Fills the encoding tables of a workspace; once for each thread and call.

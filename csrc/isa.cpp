@@ -19,4 +19,12 @@ bool isa_supported(Isa isa) {
 #endif
 }
 
+bool isa_multiplies_bfloat16(Isa isa) {
+#if VN_HAS_HALF
+  return isa == Isa::avx512 && isa_supported(isa) && __builtin_cpu_supports("avx512bf16");
+#else
+  return static_cast<void>(isa), false;
+#endif
+}
+
 }  // namespace voronerf

@@ -9,7 +9,18 @@ enum class Isa : int { portable = 0, avx2 = 1, avx512 = 2 };
 // Whether this processor and its operating system can run it.
 bool isa_supported(Isa isa);
 
+// Whether it multiplies pairs of bfloat16, and the build has the code for it.
+bool isa_multiplies_bfloat16(Isa isa);
+
 }  // namespace voronerf
+
+// Whether the build has bfloat16 products: gcc's target pragma and attribute give them to one file or function, from
+// version 10 on.
+#if defined(__x86_64__) && defined(__GNUC__) && __GNUC__ >= 10 && !defined(__clang__)
+#define VN_HAS_HALF 1
+#else
+#define VN_HAS_HALF 0
+#endif
 
 // The paths that exist in a build. x86-64 has all three, anything else the portable one.
 #if defined(__x86_64__)

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -323,3 +324,20 @@ else:
 def test_devices_of_a_cuda_build(architectures: list[str], runs: list[int], fails: list[int]) -> None:
     assert all(_native._runs_on(architectures, capability) for capability in runs)
     assert not any(_native._runs_on(architectures, capability) for capability in fails)
+
+
+def test_peak_of_each_kind(isa: str) -> None:
+    fp32 = _native.measure_peak("float32", threads=1)
+    assert fp32 > 1e9 and _native.measure_peak("copy", isa=isa, threads=2) > 1e8
+    if isa != "avx512":
+        with pytest.raises(ValueError, match=r"^measure_peak: kind must be one that the instruction set has, got bfl"):
+            _native.measure_peak("bfloat16", isa=isa)
+    elif "avx512_bf16" in Path("/proc/cpuinfo").read_text():
+        assert _native.measure_peak("bfloat16", threads=1) > 1.2 * fp32
+
+
+def test_peak_errors() -> None:
+    with pytest.raises(ValueError, match=r"^measure_peak: kind must be one of float32, bfloat16, copy, got 'fp32'"):
+        _native.measure_peak("fp32")
+    with pytest.raises(ValueError, match=r"^measure_peak: isa must be one of portable, avx2, avx512, got 'sse'"):
+        _native.measure_peak("copy", isa="sse")

@@ -27,7 +27,10 @@ from voronerf.backends import BackendUnavailable
 
 ISAS = ("portable", "avx2", "avx512")
 # Number of csrc/bindings.cpp that this file and its companions are written for.
-INTERFACE = 2
+INTERFACE = 3
+
+# In the order of csrc/measure_peak.h.
+_PEAKS = ("float32", "bfloat16", "copy")
 
 _REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
 
@@ -97,6 +100,27 @@ def describe() -> dict[str, Any]:
         "cuda": _C.cuda_outcome,
         "cuda architectures": _C.cuda_architectures.split(";") if _C.cuda else [],
     }
+
+
+def measure_peak(kind: str, *, isa: str | None = None, threads: int | None = None) -> float:
+    """What the machine can do at best, as the yardstick of benchmarks; takes 0.1 to 0.2 s.
+
+    Args:
+        kind: "float32" (multiply-adds) or "bfloat16" (dot products), in floating-point operations a second, operands
+            in registers; or "copy", in bytes a second, read and written, of memory that fits no cache.
+        isa: one of ``ISAS``; by default the one in use.
+        threads: by default torch's number.
+
+    Raises:
+        ValueError: an unknown kind or instruction set, or one that this processor or build does not have.
+    """
+    if kind not in _PEAKS:
+        raise ValueError(f"measure_peak: kind must be one of {', '.join(_PEAKS)}, got {kind!r}")
+    if isa is not None and isa not in ISAS:
+        raise ValueError(f"measure_peak: isa must be one of {', '.join(ISAS)}, got {isa!r}")
+    number = _ISA if isa is None else ISAS.index(isa)
+    peak: float = _C.measure_peak(_PEAKS.index(kind), number, threads or torch.get_num_threads())
+    return peak
 
 
 def nearest_centre(points: Tensor, centres: Tensor, *, weights: Tensor | None = None) -> Tensor:

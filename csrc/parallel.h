@@ -1,0 +1,70 @@
+// Teams of threads. The kernels share their work out through `parallel` and `Items` rather than through loops of
+// OpenMP, so that one macro, VN_STD_THREADS, runs all of it on std::thread: ThreadSanitizer knows nothing of libgomp's
+// barriers and would report every result of a region as a race (tests/cpp/sanitize.sh). What a region does with its
+// data is the same in both builds.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+
+#ifdef VN_STD_THREADS
+#include <thread>
+#include <vector>
+#elif defined(_OPENMP)
+#include <omp.h>
+#endif
+
+namespace voronerf {
+
+// body(thread) once for each thread of a team of at most `threads`, numbered from 0; returns when all have. One thread
+// is the caller's own, with no team, which is what a forked child can run. Nothing may be thrown out of body.
+template <typename Body>
+void parallel(int threads, const Body& body) {
+  if (threads <= 1) {
+    body(0);
+    return;
+  }
+#ifdef VN_STD_THREADS
+  std::vector<std::thread> others;
+  for (int thread = 1; thread < threads; ++thread) others.emplace_back([&body, thread] { body(thread); });
+  body(0);
+  for (std::thread& other : others) other.join();
+#elif defined(_OPENMP)
+#pragma omp parallel num_threads(threads)
+  body(omp_get_thread_num());
+#else
+  body(0);
+#endif
+}
+
+// Items 0 to count - 1 in runs of `run`, for whichever thread of a team asks next.
+class Items {
+ public:
+  explicit Items(int64_t count, int64_t run = 1) : count_(count), run_(run) {}
+
+  // Whether there was a run left: items [begin, end).
+  bool take(int64_t& begin, int64_t& end) {
+    begin = next_.fetch_add(run_, std::memory_order_relaxed);
+    end = std::min(begin + run_, count_);
+    return begin < count_;
+  }
+
+ private:
+  std::atomic<int64_t> next_{0};
+  const int64_t count_, run_;
+};
+
+// body(item) for every item, on at most `threads` threads, no more than there are runs.
+template <typename Body>
+void parallel_for(int64_t count, int64_t run, int threads, const Body& body) {
+  const int64_t runs = (count + run - 1) / run;
+  Items items(count, run);
+  parallel(static_cast<int>(std::min<int64_t>(threads, runs)), [&](int) {
+    for (int64_t begin, end; items.take(begin, end);) {
+      for (int64_t item = begin; item < end; ++item) body(item);
+    }
+  });
+}
+
+}  // namespace voronerf
