@@ -13,6 +13,7 @@
 #include "common.h"
 #include "grouped_mlp_isa.h"
 #include "grouped_mlp_planner.h"
+#include "parallel.h"
 
 namespace voronerf {
 
@@ -116,11 +117,7 @@ void zero_strays(const MlpInputs& in, int64_t width, float* out) {
 }
 
 bool use_half(const MlpTable& table, Isa isa) {
-#if VN_HAS_HALF
-  return table.half && isa == Isa::avx512 && __builtin_cpu_supports("avx512bf16");
-#else
-  return false && table.half && isa == Isa::avx512;
-#endif
+  return table.half && isa_multiplies_bfloat16(isa);
 }
 
 void prepare(Isa isa, const MlpPlan& plan, float* own) {
@@ -155,20 +152,18 @@ void for_each_task(const Tasks& tasks, const MlpPlan& plan, const MlpData& data,
                    const Run& run) {
   const int64_t count = static_cast<int64_t>(tasks.tasks.size());
   const int64_t stride = ceil_div(plan.workspace, kGranule) * kGranule;
-  threads = static_cast<int>(std::min<int64_t>(threads, count));
-#pragma omp parallel num_threads(threads) if (threads > 1)
-  {
-    float* own = memory + thread_number() * stride;
+  Items items(count);
+  parallel(static_cast<int>(std::min<int64_t>(threads, count)), [&](int thread) {
+    float* own = memory + thread * stride;
     int64_t packed = -1;
     prepare(isa, plan, own);
-#pragma omp for schedule(dynamic, 1)
-    for (int64_t i = 0; i < count; ++i) {
+    for (int64_t i, end; items.take(i, end);) {
       const Task& task = tasks.tasks[i];
       if (task.cell != packed) pack(isa, plan, data, task.cell, own);
       packed = task.cell;
       run(task, own);
     }
-  }
+  });
 }
 
 MlpData pointers(const MlpInputs& in) {
@@ -247,14 +242,12 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
     });
   }
   if (wanted.parameters) {
-    const int64_t items = in.k * plan.layer_count;
-#pragma omp parallel for schedule(dynamic, 1) num_threads(threads) if (threads > 1)
-    for (int64_t item = 0; item < items; ++item) {
+    parallel_for(in.k * plan.layer_count, 1, threads, [&](int64_t item) {
       const int64_t cell = item / plan.layer_count, l = item % plan.layer_count;
       const int64_t first = tasks.first_partial[cell], count = tasks.first_partial[cell + 1] - first;
       const bool empty = in.offsets[cell + 1] == in.offsets[cell];
       if (count > 0 || empty) reduce(isa, plan, data, cell, l, partial + first * plan.partial, count);
-    }
+    });
   }
   if (wanted.directions && indexed) {
     const int64_t q = table.directions;
