@@ -28,8 +28,8 @@ std::vector<T*> pointers(const std::vector<Address>& addresses) {
   return result;
 }
 
-// [p, q, position octaves, direction octaves, half, linear, layers, outputs, then for each layer: width, activation,
-// sources, the sources; then the outputs], as voronerf/_native_mlp.py writes it.
+// [p, q, position octaves, direction octaves, half, caller, integrated, layers, outputs, then for each layer: width,
+// activation, sources, the sources; then the outputs], as voronerf/_native_mlp.py writes it.
 voronerf::MlpTable read_table(const std::vector<int64_t>& flat) {
   size_t next = 0;
   const auto take = [&] {
@@ -42,7 +42,8 @@ voronerf::MlpTable read_table(const std::vector<int64_t>& flat) {
   table.position_octaves = static_cast<int>(take());
   table.direction_octaves = static_cast<int>(take());
   table.half = take() != 0;
-  table.linear = take() != 0;
+  table.caller = static_cast<voronerf::MlpCaller>(take());
+  table.integrated = take() != 0;
   const int64_t layers = take(), outputs = take();
   for (int64_t l = 0; l < layers; ++l) {
     voronerf::MlpTable::Layer layer;
@@ -61,18 +62,19 @@ voronerf::MlpTable read_table(const std::vector<int64_t>& flat) {
   return table;
 }
 
-// Inputs of a call, in the order of `arguments`: positions, directions, direction_index, offsets, then n, r, k.
+// Inputs of a call, in the order of `arguments`: positions, directions, direction_index, offsets, order, then n, r, k.
 voronerf::MlpInputs read_inputs(const std::vector<Address>& arguments, const std::vector<const float*>& weights,
                                 const std::vector<const float*>& biases) {
-  VN_CHECK(arguments.size() == 7, "grouped_mlp: seven arguments expected");
+  VN_CHECK(arguments.size() == 8, "grouped_mlp: eight arguments expected");
   voronerf::MlpInputs in{};
   in.positions = at<const float>(arguments[0]);
   in.directions = at<const float>(arguments[1]);
   in.direction_index = at<const int32_t>(arguments[2]);
   in.offsets = at<const int32_t>(arguments[3]);
-  in.n = static_cast<int64_t>(arguments[4]);
-  in.r = static_cast<int64_t>(arguments[5]);
-  in.k = static_cast<int64_t>(arguments[6]);
+  in.order = at<const int32_t>(arguments[4]);
+  in.n = static_cast<int64_t>(arguments[5]);
+  in.r = static_cast<int64_t>(arguments[6]);
+  in.k = static_cast<int64_t>(arguments[7]);
   in.weights = weights.data();
   in.biases = biases.data();
   return in;

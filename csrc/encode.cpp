@@ -14,9 +14,9 @@ int64_t stride_of(int64_t d, int64_t octaves) {
   return ceil_div(d * (1 + 2 * octaves), kEncodeLanes) * kEncodeLanes;
 }
 
-// Table, staged rows with a vector to spare, staged variances, encoded rows, blurs.
+// Table, encoded rows, staged rows with a vector to spare, staged variances.
 int64_t workspace_of_thread(int64_t d, int64_t octaves) {
-  return (3 + 2 * kEncodeRows) * stride_of(d, octaves) + 2 * (kEncodeRows * d + kEncodeLanes);
+  return (3 + kEncodeRows) * stride_of(d, octaves) + 2 * (kEncodeRows * d + kEncodeLanes);
 }
 
 template <typename Run>

@@ -1,11 +1,9 @@
-// The frequency encoding of the rows of a tile, and its gradient: [x, sin x,
-// cos x, sin 2x, cos 2x, sin 4x, ...], each a block of d features, as in
-// voronerf/reference/frequency_encode.py.
+// The encodings of the rows of a tile, and their gradients: [x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...], each a
+// block of d features, with or without x, as in voronerf/reference/frequency_encode.py; and for a Gaussian of mean x
+// each value times exp(-4^l variance / 2), as in integrated_encode.py beside it.
 //
-// A lane is a column of the encoding: a permutation brings it its feature, a
-// table its octave and phase, and one sine with one range reduction does the
-// rest. So rows come out in the layout the products read, with no
-// transposition.
+// A lane is a column of the encoding: a permutation brings it its feature, a table its octave and phase, and one sine
+// with one range reduction does the rest. So rows come out in the layout the products read, with no transposition.
 #pragma once
 
 #include "elementwise_math.h"
@@ -27,18 +25,27 @@ VN_INLINE F32 permute(F32 x, Bits index) {
 #endif
 }
 
-// table [3][stride]: source feature (as an integer), scale and phase of each
-// column.
-VN_INLINE void encode_table(float* table, int64_t stride, int64_t d, int64_t octaves) {
+// The columns of an encoded row: d features of x themselves, where they are included, then 2d for each octave.
+struct Columns {
+  int64_t d, octaves;
+  bool input;
+
+  int64_t first() const { return input ? d : 0; }  // sine
+  int64_t width() const { return first() + 2 * d * octaves; }
+};
+
+// table [3][stride]: source feature (as an integer), scale and phase of each column.
+VN_INLINE void encode_table(float* table, int64_t stride, const Columns& columns) {
+  const int64_t d = columns.d, first = columns.first();
   for (int64_t column = 0; column < stride; ++column) {
     int32_t feature = static_cast<int32_t>(column);
     float scale = 1.0f, phase = 0.0f;
-    if (column >= d) {
-      const int64_t octave = (column - d) / (2 * d), within = (column - d) % (2 * d);
+    if (column >= first) {
+      const int64_t octave = (column - first) / (2 * d), within = (column - first) % (2 * d);
       feature = static_cast<int32_t>(within % d);
       phase = within < d ? 0.0f : 0.5f;
       for (int64_t o = 0; o < octave; ++o) scale *= 2.0f;
-      if (octave >= octaves) scale = 0.0f;
+      if (octave >= columns.octaves) scale = 0.0f;
     }
     __builtin_memcpy(table + column, &feature, sizeof feature);
     table[stride + column] = scale;
@@ -46,10 +53,9 @@ VN_INLINE void encode_table(float* table, int64_t stride, int64_t d, int64_t oct
   }
 }
 
-// Angles too large for the vector sine, and what is not finite: the C library's
-// functions.
-void encode_row_exactly(const float* x, const float* table, int64_t stride, int64_t d, int64_t width, float* out) {
-  for (int64_t column = d; column < width; ++column) {
+// Angles too large for the vector sine, and what is not finite: the C library's functions.
+void encode_row_exactly(const float* x, const float* table, int64_t stride, const Columns& columns, float* out) {
+  for (int64_t column = columns.first(); column < columns.width(); ++column) {
     int32_t feature;
     __builtin_memcpy(&feature, table + column, sizeof feature);
     const float angle = x[feature] * table[stride + column];
@@ -57,7 +63,7 @@ void encode_row_exactly(const float* x, const float* table, int64_t stride, int6
   }
 }
 
-// A row by lanes: d <= kLanes, all angles small.
+// A row by lanes: d <= kLanes, all angles small. `raw`: the lanes of the first vector that hold x itself.
 VN_INLINE void encode_row(const float* x, const float* table, Bits raw, int64_t stride, float* out) {
   const F32 features = load(x);
   for (int64_t column = 0; column < stride; column += kLanes) {
@@ -89,39 +95,74 @@ VN_INLINE bool all_small(const float* x, int64_t count, float largest) {
   return small;
 }
 
-// x [rows][d], with kLanes readable floats from every row's start -> out
-// [rows][stride].
-void encode(const float* x, const float* table, int64_t rows, int64_t d, int64_t octaves, float* out, int64_t stride) {
-  const int64_t width = d * (1 + 2 * octaves);
-  const float largest = octaves > 0 ? kLargestAngle / table[stride + width - 1] : 0.0f;
-  if (octaves > 0 && d <= kLanes && all_small(x, rows * d, largest)) {
+// Rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride].
+void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
+            int64_t stride) {
+  const int64_t d = columns.d;
+  const bool waves = columns.octaves > 0;
+  const float largest = waves ? kLargestAngle / table[stride + columns.width() - 1] : 0.0f;
+  bool lanes = waves && d <= kLanes;
+  if (lanes && x_stride == d) {
+    lanes = all_small(x, rows * d, largest);
+  } else {
+    for (int64_t row = 0; lanes && row < rows; ++row) lanes = all_small(x + row * x_stride, d, largest);
+  }
+  if (lanes) {
     Bits raw;
-    for (int lane = 0; lane < kLanes; ++lane) raw[lane] = lane < d ? -1 : 0;
-    for (int64_t row = 0; row < rows; ++row) encode_row(x + row * d, table, raw, stride, out + row * stride);
+    for (int lane = 0; lane < kLanes; ++lane) raw[lane] = lane < columns.first() ? -1 : 0;
+    for (int64_t row = 0; row < rows; ++row) encode_row(x + row * x_stride, table, raw, stride, out + row * stride);
     return;
   }
-  for (int64_t row = 0; row < rows; ++row, x += d, out += stride) {
-    if (octaves > 0 && all_small(x, d, largest)) {
+  for (int64_t row = 0; row < rows; ++row, x += x_stride, out += stride) {
+    if (waves && all_small(x, d, largest)) {
       encode_row_slowly(x, table, stride, d, out);
-    } else if (octaves > 0) {
-      encode_row_exactly(x, table, stride, d, width, out);
+    } else if (waves) {
+      encode_row_exactly(x, table, stride, columns, out);
     }
-    for (int64_t f = 0; f < d; ++f) out[f] = x[f];
+    for (int64_t f = 0; f < columns.first(); ++f) out[f] = x[f];
   }
 }
 
-// Gradient to the raw features, from that of the encoding and the encoding
-// itself, whose sines and cosines are each other's derivatives.
-void encode_backward(const float* value, const float* gradient, const float* table, int64_t rows, int64_t d,
-                     int64_t octaves, int64_t stride, float* out) {
-  for (int64_t row = 0; row < rows; ++row, value += stride, gradient += stride, out += d) {
-    for (int64_t f = 0; f < d; ++f) out[f] = gradient[f];
-    for (int64_t octave = 0; octave < octaves; ++octave) {
-      const int64_t sine_at = d * (1 + 2 * octave), cosine_at = sine_at + d;
-      const float scale = table[stride + sine_at];
-      for (int64_t f = 0; f < d; ++f) {
-        out[f] += scale * (gradient[sine_at + f] * value[cosine_at + f] - gradient[cosine_at + f] * value[sine_at + f]);
-      }
+// What the variances leave of encoded rows: d <= kLanes, no input among the columns, rows as in `encode`.
+void blur(const float* variances, int64_t x_stride, const float* table, int64_t rows, float* out, int64_t stride) {
+  for (int64_t row = 0; row < rows; ++row, variances += x_stride, out += stride) {
+    const F32 features = load(variances);
+    for (int64_t column = 0; column < stride; column += kLanes) {
+      Bits index;
+      __builtin_memcpy(&index, table + column, sizeof index);
+      const F32 scale = load(table + stride + column);
+      const F32 exponent = permute(features, index) * (splat(-0.5f) * scale * scale);
+      const F32 left = exponent < splat(-87.0f) ? splat(0.0f) : exponential(exponent);
+      store(out + column, load(out + column) * left);
+    }
+  }
+}
+
+// Gradient to the features of a row, from that of its encoding and the encoding itself, whose sines and cosines are
+// each other's derivatives; what variances have left of them is a factor of both.
+VN_INLINE void encode_row_backward(const float* value, const float* gradient, const float* table, int64_t stride,
+                                   const Columns& columns, float* out) {
+  const int64_t d = columns.d;
+  for (int64_t f = 0; f < d; ++f) out[f] = columns.input ? gradient[f] : 0.0f;
+  for (int64_t octave = 0; octave < columns.octaves; ++octave) {
+    const int64_t sine_at = columns.first() + 2 * d * octave, cosine_at = sine_at + d;
+    const float scale = table[stride + sine_at];
+    for (int64_t f = 0; f < d; ++f) {
+      out[f] += scale * (gradient[sine_at + f] * value[cosine_at + f] - gradient[cosine_at + f] * value[sine_at + f]);
+    }
+  }
+}
+
+// ... and to its variances: the derivative of exp(-4^l variance / 2) is -4^l / 2 times itself.
+VN_INLINE void blur_row_backward(const float* value, const float* gradient, const float* table, int64_t stride,
+                                 const Columns& columns, float* out) {
+  const int64_t d = columns.d;
+  for (int64_t f = 0; f < d; ++f) out[f] = 0.0f;
+  for (int64_t octave = 0; octave < columns.octaves; ++octave) {
+    const int64_t sine_at = columns.first() + 2 * d * octave, cosine_at = sine_at + d;
+    const float scale = table[stride + sine_at], slope = -0.5f * scale * scale;
+    for (int64_t f = 0; f < d; ++f) {
+      out[f] += slope * (gradient[sine_at + f] * value[sine_at + f] + gradient[cosine_at + f] * value[cosine_at + f]);
     }
   }
 }

@@ -72,7 +72,8 @@ class Workspace {
 };
 
 void check(const MlpTable& table, const MlpInputs& in) {
-  const std::string op = table.linear ? "grouped_linear: " : "grouped_mlp: ";
+  constexpr const char* kNames[] = {"grouped_mlp: ", "grouped_linear: ", "routed_mlp: "};
+  const std::string op = kNames[static_cast<int>(table.caller)];
   int64_t before = 0;
   for (int64_t c = 0; c <= in.k; ++c) {
     if (in.offsets[c] < before || in.offsets[c] > in.n) {
@@ -112,8 +113,15 @@ Tasks split(const MlpInputs& in, int64_t target) {
 
 // Rows of no cell.
 void zero_strays(const MlpInputs& in, int64_t width, float* out) {
-  std::fill(out, out + in.offsets[0] * width, 0.0f);
-  std::fill(out + in.offsets[in.k] * width, out + in.n * width, 0.0f);
+  const auto clear = [&](int64_t begin, int64_t end) {
+    if (in.order == nullptr) {
+      std::fill(out + begin * width, out + end * width, 0.0f);
+    } else {
+      for (int64_t i = begin; i < end; ++i) std::fill_n(out + in.order[i] * width, width, 0.0f);
+    }
+  };
+  clear(0, in.offsets[0]);
+  clear(in.offsets[in.k], in.n);
 }
 
 bool use_half(const MlpTable& table, Isa isa) {
@@ -171,9 +179,23 @@ MlpData pointers(const MlpInputs& in) {
   data.positions = in.positions;
   data.directions = in.directions;
   data.direction_index = in.direction_index;
+  data.order = in.order;
   data.weights = in.weights;
   data.biases = in.biases;
   return data;
+}
+
+MlpGathered gathered(const MlpInputs& in) {
+  return {in.order != nullptr, in.order != nullptr || in.direction_index != nullptr};
+}
+
+// Gradients of the samples' directions, rows as sorted, summed over each ray's samples in that order.
+void sum_by_ray(const MlpInputs& in, int64_t q, const float* samples, float* out) {
+  std::fill(out, out + in.r * q, 0.0f);
+  for (int64_t i = in.offsets[0]; i < in.offsets[in.k]; ++i) {
+    float* to = out + in.direction_index[in.order == nullptr ? i : in.order[i]] * q;
+    for (int64_t f = 0; f < q; ++f) to[f] += samples[i * q + f];
+  }
 }
 
 // Floats of the workspaces of all threads.
@@ -185,7 +207,7 @@ int64_t workspaces(const MlpPlan& plan, int threads) {
 
 void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa isa, int threads) {
   check(table, in);
-  const MlpPlanner planner(table, in.direction_index != nullptr, {false, false, false, use_half(table, isa)});
+  const MlpPlanner planner(table, gathered(in), {false, false, false, use_half(table, isa)});
   const MlpPlan& plan = planner.plan();
   zero_strays(in, plan.out_features, out);
   const Tasks tasks = split(in, std::clamp(in.n / kTasks, kFewestRows, kMostRows));
@@ -203,14 +225,15 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   const bool indexed = in.direction_index != nullptr;
   const MlpWanted wanted{gradients.weights != nullptr, gradients.positions != nullptr, gradients.directions != nullptr,
                          use_half(table, isa)};
-  const MlpPlanner planner(table, indexed, wanted);
+  const MlpPlanner planner(table, gathered(in), wanted);
   const MlpPlan& plan = planner.plan();
   const int64_t room = std::max<int64_t>(kPartialFloats / std::max<int64_t>(plan.partial, 1), 1);
   const int64_t target = std::max(std::clamp(in.n / kTasks, kFewestGradientRows, kMostGradientRows), in.n / room);
   const Tasks tasks = split(in, target);
   const int64_t partials = wanted.parameters ? tasks.first_partial[in.k] : 0;
   // Gradients of the samples' directions, before they are summed over each ray's samples.
-  const int64_t samples = wanted.directions && indexed ? in.n * table.directions : 0;
+  const bool by_ray = wanted.directions && indexed && plan.directions.used;
+  const int64_t samples = by_ray ? in.n * table.directions : 0;
   const Workspace workspace(workspaces(plan, threads) + partials * plan.partial +
                             ceil_div(samples, kGranule) * kGranule);
   float* memory = workspace.data();
@@ -231,7 +254,7 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
     }
   };
   if (wanted.positions) clear(data.grad_positions, table.positions, plan.positions.used);
-  if (wanted.directions) clear(data.grad_directions, table.directions, plan.directions.used);
+  if (wanted.directions && !indexed) clear(data.grad_directions, table.directions, plan.directions.used);
 
   if (!tasks.tasks.empty()) {
     for_each_task(tasks, plan, data, memory, isa, threads, [&](const Task& task, float* own) {
@@ -249,13 +272,10 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
       if (count > 0 || empty) reduce(isa, plan, data, cell, l, partial + first * plan.partial, count);
     });
   }
-  if (wanted.directions && indexed) {
-    const int64_t q = table.directions;
-    std::fill(gradients.directions, gradients.directions + in.r * q, 0.0f);
-    for (int64_t i = 0; i < in.n; ++i) {
-      float* to = gradients.directions + in.direction_index[i] * q;
-      for (int64_t f = 0; f < q; ++f) to[f] += sample_directions[i * q + f];
-    }
+  if (by_ray) {
+    sum_by_ray(in, table.directions, sample_directions, gradients.directions);
+  } else if (wanted.directions && indexed) {
+    std::fill(gradients.directions, gradients.directions + in.r * table.directions, 0.0f);
   }
 }
 

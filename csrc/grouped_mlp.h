@@ -5,6 +5,10 @@
 //   positions [n,p], directions [n,q] or [r,q] with direction_index [n], offsets [k+1], weights[l] [k,o,i], biases[l]
 //   [k,o] or null
 // Rows of no cell (before offsets[0], from offsets[k] on) give 0. Results do not depend on the number of threads.
+//
+// With `order` [n] the samples lie anywhere: the row i that the offsets speak of is row order[i] of positions,
+// directions, direction_index, output and gradients. Rows are gathered and scattered by the tiles, so that nothing is
+// permuted in memory.
 #pragma once
 
 #include <cstdint>
@@ -15,6 +19,9 @@
 namespace voronerf {
 
 enum class Activation : int { none = 0, relu, softplus, sigmoid, sine };
+
+// The operation that errors name.
+enum class MlpCaller : int { grouped_mlp = 0, grouped_linear, routed_mlp };
 
 constexpr int kFromPositions = -1;
 constexpr int kFromDirections = -2;
@@ -30,8 +37,9 @@ struct MlpTable {
   std::vector<int> outputs;
   int64_t positions = 0, directions = 0;  // p and q
   int position_octaves = -1, direction_octaves = -1;
-  bool half = false;    // round what enters a product to bfloat16, where the processor multiplies that faster
-  bool linear = false;  // called as grouped_linear, the name that errors begin with
+  bool integrated = false;  // positions are means and variances, each half of them, encoded as mip-NeRF does
+  bool half = false;        // round what enters a product to bfloat16, where the processor multiplies that faster
+  MlpCaller caller = MlpCaller::grouped_mlp;
 };
 
 struct MlpInputs {
@@ -42,6 +50,7 @@ struct MlpInputs {
   const float* const* weights;
   const float* const* biases;
   int64_t n, r, k;
+  const int32_t* order = nullptr;  // null: rows are sorted
 };
 
 // Where gradients go; every element is written. Null: not wanted (weights: all or none; a layer without bias has null).

@@ -17,7 +17,7 @@ void mlp_prepare(const MlpPlan& plan, float* workspace) {
   const MlpPlanInput* inputs[] = {&plan.positions, &plan.directions};
   for (const MlpPlanInput* input : inputs) {
     if (input->used && input->octaves >= 0) {
-      encode_table(workspace + input->table, input->value.stride, input->raw, input->octaves);
+      encode_table(workspace + input->table, input->value.stride, columns_of(*input));
     }
   }
 }

@@ -173,24 +173,28 @@ void MlpPlanner::mark_live(const MlpTable& table) {
   }
 }
 
-MlpPlanner::MlpPlanner(const MlpTable& table, bool indexed_directions, const MlpWanted& wanted) {
+MlpPlanner::MlpPlanner(const MlpTable& table, const MlpGathered& gathered, const MlpWanted& wanted) {
   plan_.layer_count = static_cast<int64_t>(table.layers.size());
   plan_.gradients = wanted.parameters || wanted.positions || wanted.directions;
   plan_.parameter_gradients = wanted.parameters;
   plan_.half = wanted.half;
   layers_.resize(table.layers.size());
   sources_.resize(table.layers.size());
-  const auto input = [&wanted](int64_t raw, int octaves, bool gather, bool gradient) {
+  const auto input = [&wanted](int64_t raw, int octaves, bool integrated, bool gather, bool gradient) {
     MlpPlanInput it{};
     it.raw = raw;
     it.octaves = octaves;
-    it.width = octaves < 0 ? raw : raw * (1 + 2 * octaves);
+    it.integrated = integrated;
+    it.width = octaves < 0 ? raw : integrated ? raw * octaves : raw * (1 + 2 * octaves);
     it.copied = octaves >= 0 || gather || wanted.half;
     it.gradient_wanted = gradient;
     return it;
   };
-  plan_.positions = input(table.positions, table.position_octaves, false, wanted.positions);
-  plan_.directions = input(table.directions, table.direction_octaves, indexed_directions, wanted.directions);
+  VN_CHECK(!table.integrated || (table.position_octaves > 0 && table.positions % 2 == 0),
+           "grouped_mlp: the integrated encoding must have octaves and as many means as variances");
+  plan_.positions =
+      input(table.positions, table.position_octaves, table.integrated, gathered.positions, wanted.positions);
+  plan_.directions = input(table.directions, table.direction_octaves, false, gathered.directions, wanted.directions);
 
   for (size_t l = 0; l < layers_.size(); ++l) {
     MlpPlanLayer& layer = layers_[l];

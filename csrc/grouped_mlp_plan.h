@@ -51,6 +51,7 @@ struct MlpPlanOutput {
 // Raw features and their encoding.
 struct MlpPlanInput {
   int64_t raw, octaves, width;  // octaves -1: none
+  bool integrated;              // raw features are means, then variances
   bool used, copied;            // copied: values lie in `value`, otherwise they are read where they are
   MlpBuffer staged, value, narrow, gradient;
   int64_t table;  // lanes of the encoding, in the workspace: [3][value.stride] source feature, scale, phase
@@ -78,6 +79,7 @@ struct MlpData {
   const float* positions = nullptr;
   const float* directions = nullptr;
   const int32_t* direction_index = nullptr;
+  const int32_t* order = nullptr;  // the caller's row of each sorted one, or null
   const float* const* weights = nullptr;
   const float* const* biases = nullptr;
   float* out = nullptr;
@@ -85,7 +87,7 @@ struct MlpData {
   float* const* grad_weights = nullptr;
   float* const* grad_biases = nullptr;
   float* grad_positions = nullptr;
-  float* grad_directions = nullptr;  // one row a sample
+  float* grad_directions = nullptr;  // one row a sample; with direction_index in sorted order, to be summed by ray
 };
 
 }  // namespace voronerf

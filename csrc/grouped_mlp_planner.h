@@ -13,9 +13,14 @@ struct MlpWanted {
   bool half;                               // bfloat16 operands
 };
 
+// Inputs whose rows are not where the tile's are.
+struct MlpGathered {
+  bool positions, directions;
+};
+
 class MlpPlanner {
  public:
-  MlpPlanner(const MlpTable& table, bool indexed_directions, const MlpWanted& wanted);
+  MlpPlanner(const MlpTable& table, const MlpGathered& gathered, const MlpWanted& wanted);
   MlpPlanner(const MlpPlanner&) = delete;
   MlpPlanner& operator=(const MlpPlanner&) = delete;
   const MlpPlan& plan() const { return plan_; }

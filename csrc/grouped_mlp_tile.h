@@ -24,6 +24,11 @@ VN_INLINE void copy_row(const float* from, int64_t width, float* to) {
   for (; c < width; ++c) to[c] = from[c];
 }
 
+// How an input is encoded; one that is not has no octaves.
+VN_INLINE Columns columns_of(const MlpPlanInput& input) {
+  return {input.integrated ? input.raw / 2 : input.raw, input.octaves < 0 ? 0 : input.octaves, !input.integrated};
+}
+
 // In place; sine leaves its cosine in `slope` where that is kept.
 void activate(const MlpPlanLayer& layer, int64_t rows, float* value, float* slope) {
   const int64_t size = rows * layer.padded;
@@ -73,6 +78,9 @@ struct Tile {
 
   float* at(const MlpBuffer& buffer) const { return workspace + buffer.offset; }
 
+  // Where a row of the tile lies in the caller's arrays.
+  int64_t place(int64_t row) const { return data.order == nullptr ? begin + row : data.order[begin + row]; }
+
   // A row of k for every sample: floats, or pairs.
   Source source(int from, int64_t width) const {
 #if VN_HALF
@@ -88,22 +96,25 @@ struct Tile {
 #endif
   }
 
-  // Raw features, gathered by `index` where there is one, to what the layers read.
+  // Raw features, gathered by order and `index` where there are any, to what the layers read.
   void read_input(const MlpPlanInput& input, const float* raw, const int32_t* index) const {
     if (!input.used || !input.copied) return;
     const bool encoded = input.octaves >= 0;
     float* staged = encoded ? at(input.staged) : at(input.value);
     const int64_t stride = encoded ? input.raw : input.value.stride;
-    if (index == nullptr && stride == input.raw) {
+    if (index == nullptr && data.order == nullptr && stride == input.raw) {
       __builtin_memcpy(staged, raw + begin * input.raw, sizeof(float) * rows * input.raw);
     } else {
       for (int64_t row = 0; row < rows; ++row) {
-        const int64_t from = index == nullptr ? begin + row : index[begin + row];
+        const int64_t from = index == nullptr ? place(row) : index[place(row)];
         for (int64_t f = 0; f < input.raw; ++f) staged[row * stride + f] = raw[from * input.raw + f];
       }
     }
     if (encoded) {
-      encode(staged, workspace + input.table, rows, input.raw, input.octaves, at(input.value), input.value.stride);
+      const Columns columns = columns_of(input);
+      const float* table = workspace + input.table;
+      encode(staged, stride, table, rows, columns, at(input.value), input.value.stride);
+      if (input.integrated) blur(staged + columns.d, stride, table, rows, at(input.value), input.value.stride);
     }
 #if VN_HALF
     narrow(at(input.value), input.value.stride, input.width, rows, at(input.narrow));
@@ -161,9 +172,9 @@ struct Tile {
     for (int64_t i = 0; i < plan.output_count; ++i) {
       const MlpPlanLayer& layer = plan.layers[plan.outputs[i].layer];
       const float* value = at(layer.value);
-      float* out = data.out + begin * plan.out_features + plan.outputs[i].column;
-      for (int64_t row = 0; row < rows; ++row, value += layer.padded, out += plan.out_features) {
-        copy_row(value, layer.width, out);
+      float* out = data.out + plan.outputs[i].column;
+      for (int64_t row = 0; row < rows; ++row, value += layer.padded) {
+        copy_row(value, layer.width, out + place(row) * plan.out_features);
       }
     }
   }
@@ -176,10 +187,9 @@ struct Tile {
       for (int64_t i = 0; i < rows * layer.padded; ++i) gradient[i] = 0.0f;
       for (int64_t i = 0; i < plan.output_count; ++i) {
         if (plan.outputs[i].layer != l) continue;
-        const float* from = data.grad_out + begin * plan.out_features + plan.outputs[i].column;
         for (int64_t row = 0; row < rows; ++row) {
-          for (int64_t c = 0; c < layer.width; ++c)
-            gradient[row * layer.padded + c] += from[row * plan.out_features + c];
+          const float* from = data.grad_out + place(row) * plan.out_features + plan.outputs[i].column;
+          for (int64_t c = 0; c < layer.width; ++c) gradient[row * layer.padded + c] += from[c];
         }
       }
     }
@@ -269,17 +279,22 @@ struct Tile {
         if (layer.sources[s].gradient) source_gradient(layer, layer.sources[s], a);
       }
     }
-    input_gradient(plan.positions, data.grad_positions);
-    input_gradient(plan.directions, data.grad_directions);
+    input_gradient(plan.positions, data.grad_positions, false);
+    input_gradient(plan.directions, data.grad_directions, data.direction_index != nullptr);
   }
 
-  void input_gradient(const MlpPlanInput& input, float* out) const {
+  void input_gradient(const MlpPlanInput& input, float* out, bool sorted) const {
     if (!input.gradient_wanted) return;
-    const float* gradient = at(input.gradient);
+    const Columns columns = columns_of(input);
+    const int64_t stride = input.gradient.stride;
+    const float *gradient = at(input.gradient), *table = workspace + input.table;
     // Without octaves `value` is walked but not read.
     const float* value = input.octaves >= 0 ? at(input.value) : gradient;
-    encode_backward(value, gradient, workspace + input.table, rows, input.raw, input.octaves >= 0 ? input.octaves : 0,
-                    input.gradient.stride, out + begin * input.raw);
+    for (int64_t row = 0; row < rows; ++row, value += stride, gradient += stride) {
+      float* to = out + (sorted ? begin + row : place(row)) * input.raw;
+      encode_row_backward(value, gradient, table, stride, columns, to);
+      if (input.integrated) blur_row_backward(value, gradient, table, stride, columns, to + columns.d);
+    }
   }
 };
 

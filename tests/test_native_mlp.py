@@ -48,6 +48,7 @@ NETWORKS = {
     "width 200": chain(200, 1, out=48),
     "nerf 64": nerf(64, 3),
     "nerf 18": nerf(18, 2),
+    "integrated": MLP(nerf(33, 2).layers, nerf(33, 2).outputs, 16, 2, "integrated"),
     "sigmoid": chain(20, 2, activation="sigmoid"),
     "sine": chain(20, 2, activation="sine"),
     # Sources repeated, more than fit one product, outputs that other layers read, and a layer that nothing reads.
@@ -69,6 +70,7 @@ NETWORKS = {
 def arguments(layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, p: int = 3, q: int = 3) -> dict:
     """Float64 arguments of grouped_mlp for cells of the given sizes; rays 0: a direction for each sample."""
     n, k = sum(counts), len(counts)
+    p = 6 if layers.integrated else p
     uniform = torch.distributions.Uniform(torch.tensor(-1.0, dtype=torch.float64), 1.0)
     shapes = layers.weight_shapes(p, q)
     given = {
@@ -78,6 +80,8 @@ def arguments(layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, 
         "biases": [uniform.sample((k, o)) if bias else None for o, _ in shapes],
         "layers": layers,
     }
+    if layers.integrated:
+        given["positions"][:, 3:].square_()
     if layers.uses_directions:
         given["directions"] = uniform.sample((rays or n, q))
         given["direction_index"] = torch.randint(rays, (n,), dtype=torch.int32) if rays else None
@@ -417,19 +421,20 @@ def test_second_derivatives() -> None:
 def test_opcheck() -> None:
     native = pytest.importorskip("voronerf._native_mlp")
     given = cast(arguments(nerf(6, 2), [5, 0, 8], rays=4), torch.float32)
-    table = [3, 3, 4, 2, 0, 0, *native._flatten(given["layers"])]
+    table = [3, 3, 4, 2, 0, 0, 0, *native._flatten(given["layers"])]
     shared = (given["positions"], given["offsets"], given["weights"], given["biases"], table)
     directions = (given["directions"], given["direction_index"])
     torch.library.opcheck(native._forward, (*shared, *directions))
     gradient = torch.randn(13, 4, requires_grad=True)
-    torch.library.opcheck(native._backward, (gradient, *shared, *directions, [True, True, True]))
+    order = torch.randperm(13, dtype=torch.int32)
+    torch.library.opcheck(native._backward, (gradient, *shared, *directions, order, [True, True, True]))
     assert native._unflatten(table) == given["layers"]
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_width_of_the_output(name: str) -> None:
     native = pytest.importorskip("voronerf._native_mlp")
-    table = [3, 3, -1, -1, 0, 0, *native._flatten(NETWORKS[name])]
+    table = [3, 3, -1, -1, 0, 0, 0, *native._flatten(NETWORKS[name])]
     assert native._out_features(table) == NETWORKS[name].out_features
 
 

@@ -18,6 +18,7 @@ from voronerf.ops import (
     locate_cell,
     nearest_centre,
     resample,
+    routed_mlp,
 )
 from voronerf.router import VoronoiRouter
 from voronerf.subdivision import Split, split_diagram
@@ -45,6 +46,7 @@ __all__ = [
     "locate_cell",
     "nearest_centre",
     "resample",
+    "routed_mlp",
     "split_diagram",
     "uniform_centres",
 ]

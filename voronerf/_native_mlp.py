@@ -11,17 +11,20 @@ have been validated by ``voronerf.ops``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from voronerf import _native
-from voronerf.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.layers import ACTIVATIONS, DIRECTIONS, ENCODINGS, MLP, POSITIONS, Layer
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_mlp import grouped_mlp as _reference
+from voronerf.reference.specification import encode_positions
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
+# Operations by the numbers of MlpCaller in csrc/grouped_mlp.h.
+CALLERS = ("grouped_mlp", "grouped_linear", "routed_mlp")
 
 
 def grouped_mlp(
@@ -38,62 +41,79 @@ def grouped_mlp(
 
     Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
     """
-    octaves = [layers.position_octaves, layers.direction_octaves]
-    if positions.dtype == torch.float64 and octaves[0] is not None:
-        positions, octaves[0] = frequency_encode(positions, octaves[0]), None
-    if directions is not None and directions.dtype == torch.float64 and octaves[1] is not None:
-        directions, octaves[1] = frequency_encode(directions, octaves[1]), None
-    table = [
-        positions.shape[1],
-        0 if directions is None else directions.shape[1],
-        *[-1 if count is None else count for count in octaves],
-        0,
-        *_flatten(layers),
-    ]
-    return _run(positions, offsets, weights, biases, table, directions, direction_index)
+    given = network(positions, weights, biases, layers, directions)
+    out: Tensor = _forward(
+        given.positions, offsets, given.weights, given.biases, given.table, given.directions, direction_index
+    )
+    return out.to(given.dtype)
 
 
 def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer."""
-    table = [x.shape[1], 0, -1, -1, 1, 1, 1, weight.shape[1], ACTIVATIONS.index(activation), 1, _OUTSIDE[POSITIONS], 0]
-    return _run(x, offsets, [weight], [bias], table, None, None)
+    layers = [1, 1, weight.shape[1], ACTIVATIONS.index(activation), 1, _OUTSIDE[POSITIONS], 0]
+    given = _cast(x, [weight], [bias], [x.shape[1], 0, -1, -1], [CALLERS.index("grouped_linear"), 0, *layers], None)
+    out: Tensor = _forward(given.positions, offsets, given.weights, given.biases, given.table, None, None)
+    return out.to(given.dtype)
 
 
-def _run(
+class Network(NamedTuple):
+    """Arguments of the ops, in float32, and the storage type of their result (autocast's, where it is on)."""
+
+    positions: Tensor
+    weights: list[Tensor]
+    biases: list[Tensor]
+    table: list[int]
+    directions: Tensor | None
+    dtype: torch.dtype
+
+
+def network(
     positions: Tensor,
-    offsets: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor | None],
-    table: list[int],
+    layers: MLP,
     directions: Tensor | None,
-    direction_index: Tensor | None,
-) -> Tensor:
-    """The op on float32 tensors, its result in the storage type (of autocast, where it is on).
+    caller: str = "grouped_mlp",
+) -> Network:
+    """What the ops take for a layer table. Positions and directions in float64 are encoded in float64, beforehand."""
+    octaves, integrated = [layers.position_octaves, layers.direction_octaves], layers.integrated
+    if positions.dtype == torch.float64 and octaves[0] is not None:
+        positions, octaves[0], integrated = encode_positions(positions, layers), None, False
+    if directions is not None and directions.dtype == torch.float64 and octaves[1] is not None:
+        directions, octaves[1] = frequency_encode(directions, octaves[1]), None
+    widths = positions.shape[1], 0 if directions is None else directions.shape[1]
+    encodings = [-1 if count is None else count for count in octaves]
+    rest = [CALLERS.index(caller), int(integrated), *_flatten(layers)]
+    return _cast(positions, weights, biases, [*widths, *encodings], rest, directions)
 
-    ``table`` begins with p, q and the octaves of both; what follows them here is whether to multiply in bfloat16. Next
-    is whether errors are those of ``grouped_linear``.
-    """
+
+def _cast(
+    positions: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    begin: list[int],
+    rest: list[int],
+    directions: Tensor | None,
+) -> Network:
+    """Everything in float32. Between the parts of the table belongs whether to multiply in bfloat16."""
     dtype, kind = weights[0].dtype, positions.device.type
     if torch.is_autocast_enabled(kind):
         dtype = torch.get_autocast_dtype(kind)
-    table = [*table[:4], int(dtype == torch.bfloat16), *table[4:]]
-    out: Tensor = _forward(
+    return Network(
         positions.float(),
-        offsets,
         [weight.float() for weight in weights],
         # Autograd takes no list of optional tensors; an empty one stands for no bias.
         [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in biases],
-        table,
+        [*begin, int(dtype == torch.bfloat16), *rest],
         None if directions is None else directions.float(),
-        direction_index,
+        dtype,
     )
-    return out.to(dtype)
 
 
 def _flatten(layers: MLP) -> list[int]:
-    """Layers and outputs of a table as csrc/bindings_mlp.cpp reads them, after the six numbers before them."""
+    """Layers and outputs of a table as csrc/bindings_mlp.cpp reads them, after the seven numbers before them."""
     flat = [len(layers.layers), len(layers.outputs)]
     for layer in layers.layers:
         sources = [_OUTSIDE[source] if isinstance(source, str) else source for source in layer.inputs]
@@ -103,8 +123,8 @@ def _flatten(layers: MLP) -> list[int]:
 
 def _out_features(flat: Sequence[int]) -> int:
     """Width of the output. Under ``torch.compile`` entries may be symbolic, which can be added up but not hashed."""
-    count, outputs = flat[6:8]
-    widths, at = [], 8
+    count, outputs = flat[7:9]
+    widths, at = [], 9
     for _ in range(count):
         widths.append(flat[at])
         at += 3 + flat[at + 2]
@@ -114,7 +134,7 @@ def _out_features(flat: Sequence[int]) -> int:
 def _unflatten(flat: Sequence[int]) -> MLP:
     """The table of a whole flat list."""
     position_octaves, direction_octaves = (None if count < 0 else count for count in flat[2:4])
-    numbers = iter(flat[6:])
+    numbers = iter(flat[7:])
     count, outputs = next(numbers), next(numbers)
     names = {number: name for name, number in _OUTSIDE.items()}
     layers = []
@@ -122,7 +142,8 @@ def _unflatten(flat: Sequence[int]) -> MLP:
         width, activation, sources = next(numbers), next(numbers), next(numbers)
         inputs = [next(numbers) for _ in range(sources)]
         layers.append(Layer(tuple(names.get(source, source) for source in inputs), width, ACTIVATIONS[activation]))
-    return MLP(tuple(layers), tuple(next(numbers) for _ in range(outputs)), position_octaves, direction_octaves)
+    ends = tuple(next(numbers) for _ in range(outputs))
+    return MLP(tuple(layers), ends, position_octaves, direction_octaves, ENCODINGS[flat[6]])
 
 
 @torch.library.custom_op("voronerf::grouped_mlp_native", mutates_args=(), device_types="cpu")
@@ -135,7 +156,21 @@ def _forward(
     directions: Tensor | None,
     direction_index: Tensor | None,
 ) -> Tensor:
-    kept = _Arguments(positions, offsets, weights, biases, directions, direction_index)
+    return run(positions, offsets, weights, biases, table, directions, direction_index, None)
+
+
+def run(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: Sequence[int],
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    order: Tensor | None,
+) -> Tensor:
+    """The forward pass on sorted rows, or on those that ``order`` int32 [n] sorts."""
+    kept = _Arguments(positions, offsets, weights, biases, directions, direction_index, order)
     out = _allocate(positions, table)
     _native._C.grouped_mlp(
         list(table), kept.inputs, kept.weights, kept.biases, out.data_ptr(), _native._ISA, torch.get_num_threads()
@@ -153,9 +188,10 @@ def _backward(
     table: Sequence[int],
     directions: Tensor | None,
     direction_index: Tensor | None,
+    order: Tensor | None,
     wanted: Sequence[bool],
 ) -> list[Tensor]:
-    kept = _Arguments(positions, offsets, weights, biases, directions, direction_index)
+    kept = _Arguments(positions, offsets, weights, biases, directions, direction_index, order)
     results = _allocate_gradients(positions, weights, biases, directions, wanted)
     count, gradient = len(weights), gradient.contiguous()
     addresses = [_address(result) for result in results]
@@ -186,15 +222,16 @@ class _Arguments:
         biases: Sequence[Tensor],
         directions: Tensor | None,
         direction_index: Tensor | None,
+        order: Tensor | None,
     ) -> None:
-        given = (positions, directions, direction_index, offsets, *weights, *biases)
+        given = (positions, directions, direction_index, offsets, order, *weights, *biases)
         self.tensors = [None if tensor is None else tensor.contiguous() for tensor in given]
         addresses = [_address(tensor) for tensor in self.tensors]
         if direction_index is not None and not addresses[2]:
             addresses[2] = addresses[3]  # an index of no samples has no address, but it is there
         rays = 0 if directions is None else directions.shape[0]
-        self.inputs = [*addresses[:4], positions.shape[0], rays, offsets.shape[0] - 1]
-        self.weights, self.biases = addresses[4 : 4 + len(weights)], addresses[4 + len(weights) :]
+        self.inputs = [*addresses[:5], positions.shape[0], rays, offsets.shape[0] - 1]
+        self.weights, self.biases = addresses[5 : 5 + len(weights)], addresses[5 + len(weights) :]
 
 
 def _address(tensor: Tensor | None) -> int:
@@ -245,6 +282,7 @@ def _(
     table: Sequence[int],
     directions: Tensor | None,
     direction_index: Tensor | None,
+    order: Tensor | None,
     wanted: Sequence[bool],
 ) -> list[Tensor]:
     return _allocate_gradients(positions, weights, biases, directions, wanted)
@@ -261,7 +299,9 @@ def _forward_backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
     weights, biases = parameters[: ctx.count], parameters[ctx.count :]
     needs = ctx.needs_input_grad
     wanted = [any(needs[2]) or any(needs[3]), needs[0], needs[5]]
-    results = _backward(gradient, positions, offsets, weights, biases, ctx.table, directions, direction_index, wanted)
+    results = _backward(
+        gradient, positions, offsets, weights, biases, ctx.table, directions, direction_index, None, wanted
+    )
     return (
         results[-2] if needs[0] else None,
         None,
@@ -274,14 +314,14 @@ def _forward_backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
 
 
 def _backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
-    gradient, positions, offsets, weights, biases, ctx.table, directions, direction_index, ctx.wanted = inputs
+    gradient, positions, offsets, weights, biases, ctx.table, directions, direction_index, order, ctx.wanted = inputs
     ctx.count = len(weights)
-    ctx.save_for_backward(gradient, positions, offsets, directions, direction_index, *weights, *biases)
+    ctx.save_for_backward(gradient, positions, offsets, directions, direction_index, order, *weights, *biases)
 
 
 def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
     """Derivative of the gradients, through the reference formula."""
-    gradient, positions, offsets, directions, direction_index, *parameters = ctx.saved_tensors
+    gradient, positions, offsets, directions, direction_index, order, *parameters = ctx.saved_tensors
     count = ctx.count
     with torch.enable_grad():
         leaves = [
@@ -289,13 +329,20 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
             for tensor in (*parameters, positions, directions, gradient)
         ]
         *inputs, gradient = leaves
+        rows, seen = _given(leaves[-3]), leaves[-2]
+        if order is not None:
+            rows, gradient = rows[order], _given(gradient)[order]
+            if direction_index is not None:
+                direction_index = direction_index[order]
+            elif seen is not None:
+                seen = seen[order]
         out = _reference(
-            _given(leaves[-3]),
+            rows,
             offsets,
             [_given(weight) for weight in leaves[:count]],
             [bias if _given(bias).numel() else None for bias in leaves[count : 2 * count]],
             layers=_unflatten(ctx.table),
-            directions=leaves[-2],
+            directions=seen,
             direction_index=direction_index,
         )
         chosen = [ctx.wanted[0]] * (2 * count) + [ctx.wanted[1], ctx.wanted[2]]
@@ -321,6 +368,7 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
         results[count : 2 * count],
         None,
         results[-2],
+        None,
         None,
         None,
     )

@@ -15,6 +15,7 @@ import json
 from dataclasses import dataclass, field
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
+ENCODINGS = ("frequency", "integrated")
 POSITIONS = "positions"
 DIRECTIONS = "directions"
 
@@ -41,20 +42,22 @@ class MLP:
     Attributes:
         layers: in order of evaluation.
         outputs: indices of the layers whose results are concatenated into the network's output.
-        position_octaves: octaves of the frequency encoding of the positions (the input itself is included: d -> d +
-            2dL); None takes the positions as they come.
-        direction_octaves: the same for the view directions.
+        position_octaves: octaves of the encoding of the positions; None takes the positions as they come.
+        direction_octaves: octaves of the frequency encoding of the view directions, or None.
+        position_encoding: "frequency", ``frequency_encode`` with the input included (d -> d + 2dL); or "integrated",
+            ``integrated_encode`` of Gaussians: positions are [n, 6], the mean and then the diagonal variance (6 -> 6L).
         text: the whole table as JSON, the form in which it passes through a ``torch.library`` operator; see ``parse``.
 
     Raises:
         ValueError: a table that cannot be evaluated: no layers or outputs, a source that is not an earlier layer, a
-            width below 1, an unknown activation, negative octaves.
+            width below 1, an unknown activation or encoding, negative octaves, the integrated encoding without octaves.
     """
 
     layers: tuple[Layer, ...]
     outputs: tuple[int, ...]
     position_octaves: int | None = None
     direction_octaves: int | None = None
+    position_encoding: str = "frequency"
     text: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -73,17 +76,33 @@ class MLP:
         ):
             if octaves is not None and octaves < 0:
                 raise ValueError(f"MLP: {name} must be None or at least 0, got {octaves}")
+        if self.position_encoding not in ENCODINGS:
+            raise ValueError(
+                f"MLP: position_encoding must be one of {', '.join(ENCODINGS)}, got {self.position_encoding!r}"
+            )
+        if self.integrated and not self.position_octaves:
+            raise ValueError(
+                f"MLP: position_octaves must be at least 1 with the integrated encoding, got {self.position_octaves}"
+            )
         rows = [[list(layer.inputs), layer.width, layer.activation] for layer in self.layers]
         table = [rows, list(self.outputs), self.position_octaves, self.direction_octaves]
+        # Tables from before there was a choice have four entries.
+        if self.integrated:
+            table.append(self.position_encoding)
         object.__setattr__(self, "text", json.dumps(table))
 
     @staticmethod
     @functools.lru_cache(maxsize=256)
     def parse(text: str) -> MLP:
         """The table whose ``text`` this is."""
-        rows, outputs, position_octaves, direction_octaves = json.loads(text)
+        rows, outputs, *encodings = json.loads(text)
         layers = tuple(Layer(tuple(inputs), width, activation) for inputs, width, activation in rows)
-        return MLP(layers, tuple(outputs), position_octaves, direction_octaves)
+        return MLP(layers, tuple(outputs), *encodings)
+
+    @property
+    def integrated(self) -> bool:
+        """Whether positions are Gaussians, [n, 6], for the integrated encoding."""
+        return self.position_encoding == "integrated"
 
     @property
     def out_features(self) -> int:
@@ -98,6 +117,9 @@ class MLP:
     def source_width(self, source: int | str, positions_d: int, directions_d: int = 0) -> int:
         """Features that a source contributes to a layer's input, after encoding."""
         if source == POSITIONS:
+            if self.integrated:
+                assert self.position_octaves is not None
+                return positions_d * self.position_octaves
             return encoded_width(positions_d, self.position_octaves)
         if source == DIRECTIONS:
             return encoded_width(directions_d, self.direction_octaves)

@@ -4,6 +4,7 @@
 //
 // Numbers are compared in Python (tests/test_native_mlp.py); here every array has exactly its size, outputs start
 // poisoned and must come out finite, and one and three threads must agree bit for bit.
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -39,8 +40,8 @@ Array poisoned(int64_t size) {
   return values;
 }
 
-int64_t encoded(int64_t d, int octaves) {
-  return octaves < 0 ? d : d * (1 + 2 * octaves);
+int64_t encoded(int64_t d, int octaves, bool integrated) {
+  return octaves < 0 ? d : integrated ? d * octaves : d * (1 + 2 * octaves);
 }
 
 MlpTable random_table() {
@@ -51,6 +52,8 @@ MlpTable random_table() {
   table.position_octaves = static_cast<int>(below(6)) - 1;
   table.direction_octaves = static_cast<int>(below(4)) - 1;
   table.half = below(2) == 0;
+  table.integrated = table.position_octaves > 0 && below(3) == 0;
+  if (table.integrated) table.positions = 6;
   const int64_t layers = 1 + below(5);
   for (int64_t l = 0; l < layers; ++l) {
     MlpTable::Layer layer;
@@ -99,7 +102,7 @@ struct Result {
 
 struct Case {
   MlpTable table = random_table();
-  std::vector<int32_t> offsets, index;
+  std::vector<int32_t> offsets, index, order;
   Array positions, directions, gradient;
   std::vector<Array> weights, biases;
   int64_t n, rays, k, width = 0;
@@ -117,6 +120,9 @@ struct Case {
     const bool indexed = below(2) == 0;
     rays = indexed ? 1 + below(20) : n;
     for (int64_t i = 0; indexed && i < n; ++i) index.push_back(static_cast<int32_t>(below(rays)));
+    const bool ordered = below(2) == 0;
+    for (int64_t i = 0; ordered && i < n; ++i) order.push_back(static_cast<int32_t>(i));
+    std::shuffle(order.begin(), order.end(), generator);
     positions = uniform(n * table.positions);
     directions = uniform(rays * table.directions);
     std::vector<int64_t> depths;
@@ -124,8 +130,8 @@ struct Case {
       int64_t depth = 0;
       for (const int from : layer.inputs) {
         depth += from >= 0                          ? table.layers[from].width
-                 : from == voronerf::kFromPositions ? encoded(table.positions, table.position_octaves)
-                                                    : encoded(table.directions, table.direction_octaves);
+                 : from == voronerf::kFromPositions ? encoded(table.positions, table.position_octaves, table.integrated)
+                                                    : encoded(table.directions, table.direction_octaves, false);
       }
       weights.push_back(uniform(k * layer.width * depth));
       for (float& weight : weights.back()) weight /= static_cast<float>(depth);
@@ -158,7 +164,8 @@ struct Case {
                                  b.data(),
                                  n,
                                  rays,
-                                 k};
+                                 k,
+                                 order.empty() ? nullptr : order.data()};
     voronerf::grouped_mlp_cpu(table, in, result.out.data(), isa, threads);
     const voronerf::MlpGradients gradients{gradient.data(), parameters ? grad_w.data() : nullptr, grad_b.data(),
                                            inputs ? result.positions.data() : nullptr,

@@ -10,7 +10,7 @@ from tolerances import assert_as_exact, error
 from torch import Tensor
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.ops import frequency_encode, grouped_mlp
+from voronerf.ops import frequency_encode, grouped_mlp, integrated_encode
 from voronerf.reference import specification
 
 pytestmark = pytest.mark.op("grouped_mlp")
@@ -33,6 +33,13 @@ TABLES = {
         outputs=(6, 3),
         position_octaves=3,
         direction_octaves=2,
+    ),
+    # Gaussians, mip-NeRF's positions.
+    "integrated": MLP(
+        (Layer((POSITIONS,), 9, "softplus"), Layer((0, POSITIONS), 6, "sine"), Layer((DIRECTIONS, 1), 4)),
+        outputs=(2, 0),
+        position_octaves=5,
+        position_encoding="integrated",
     ),
     # A layer read three times, one that is an output and an input, one that nothing reads, one output twice.
     "tangled": MLP(
@@ -63,9 +70,11 @@ class Case:
     def make(cls, name: str, counts: list[int], dtype: torch.dtype = torch.float32, rays: int | None = 5) -> Case:
         table, n, k = TABLES[name], sum(counts), len(counts)
         positions = 2 * torch.rand(n, 3) - 1
+        if table.integrated:
+            positions = torch.cat([positions, 0.1 * torch.rand(n, 3)], dim=1)
         directions = torch.nn.functional.normalize(torch.randn(n if rays is None else rays, 3), dim=1)
         index = None if rays is None else torch.randint(0, rays, (n,), dtype=torch.int32)
-        weights = [torch.randn(k, o, i) / i**0.5 for o, i in table.weight_shapes(3, 3)]
+        weights = [torch.randn(k, o, i) / i**0.5 for o, i in table.weight_shapes(positions.shape[1], 3)]
         bias = [index != 1 for index in range(len(weights))]
         biases = [torch.randn(k, weight.shape[1]) for weight, has in zip(weights, bias) if has]
         inputs = [tensor.to(dtype) for tensor in (positions, directions, *weights, *biases)]
@@ -143,6 +152,19 @@ def test_encoded_and_raw_positions_agree(device: torch.device, backend: str) -> 
     case.table = MLP(case.table.layers, case.table.outputs)
     encoded = case.run(grouped_mlp, [frequency_encode(leaves[0], 4), *leaves[1:]], backend=backend)
     torch.testing.assert_close(raw, encoded, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e6])
+def test_integrated_inside_and_before(device: torch.device, backend: str, scale: float) -> None:
+    case = Case.make("integrated", COUNTS["odd"])
+    leaves = [tensor.to(device) for tensor in case.inputs]
+    leaves[0] *= scale  # beyond the angles of the vector sine
+    leaves[0][:3, 3:] = torch.tensor([[0.0], [1e5], [torch.inf]], device=device)
+    inside = case.run(grouped_mlp, leaves, backend=backend)
+    encoded = integrated_encode(*leaves[0].chunk(2, dim=1), 5, backend=backend)
+    case.table = MLP(case.table.layers, case.table.outputs)
+    before = case.run(grouped_mlp, [encoded, *leaves[1:]], backend=backend)
+    torch.testing.assert_close(inside, before, rtol=1e-5, atol=1e-5)
 
 
 def test_identical_cells_are_one_chain_of_layers(device: torch.device, backend: str) -> None:

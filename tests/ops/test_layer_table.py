@@ -39,6 +39,22 @@ def test_text_round_trip() -> None:
     assert MLP.parse(encoded.text) == encoded
 
 
+def test_text_of_integrated_positions() -> None:
+    layers = (Layer((POSITIONS,), 4, "relu"), Layer((0, POSITIONS), 2))
+    gaussians = MLP(layers, (1,), 16, position_encoding="integrated")
+    assert gaussians.weight_shapes(6) == [(4, 96), (2, 100)]
+    assert MLP.parse(gaussians.text) == gaussians
+    points = MLP(layers, (1,), 16)
+    assert points != gaussians and points.text != gaussians.text
+    # As it was written before there was a choice.
+    assert points.text == '[[[["positions"], 4, "relu"], [[0, "positions"], 2, "none"]], [1], 16, null]'
+    for octaves in (None, 0):
+        with pytest.raises(ValueError, match=r"^MLP: position_octaves must be at least 1 with the integrated encoding"):
+            MLP(layers, (1,), octaves, position_encoding="integrated")
+    with pytest.raises(ValueError, match=r"^MLP: position_encoding must be one of frequency, integrated, got 'hash'"):
+        MLP(layers, (1,), 4, position_encoding="hash")
+
+
 @pytest.mark.parametrize(
     ("layers", "outputs", "octaves", "message"),
     [

@@ -15,6 +15,7 @@ from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.nearest_centre import nearest_centre
 from voronerf.ops.resample import resample
+from voronerf.ops.routed_mlp import routed_mlp
 
 __all__ = [
     "MLP",
@@ -29,4 +30,5 @@ __all__ = [
     "locate_cell",
     "nearest_centre",
     "resample",
+    "routed_mlp",
 ]

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.checks import FLOATS, INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
+from voronerf.layers import MLP
+from voronerf.ops.network import check_network
 
 _OP = "grouped_mlp"
 
@@ -26,14 +27,15 @@ def grouped_mlp(
 ) -> Tensor:
     """Every sample through the network of its cell, encodings included.
 
-    The same as ``frequency_encode`` where ``layers`` gives octaves, then one ``grouped_linear`` for each layer, with
-    the sources that the table names concatenated. Gradients of every order to positions, directions, weights and
-    biases. Encodings are computed in float32 at least, and rounded to the dtype of the weights; under
-    ``torch.autocast`` layers run in its dtype.
+    The same as ``frequency_encode`` (or ``integrated_encode``) where ``layers`` gives octaves, then one
+    ``grouped_linear`` for each layer, with the sources that the table names concatenated. Gradients of every order to
+    positions, directions, weights and biases. Encodings are computed in float32 at least, and rounded to the dtype of
+    the weights; under ``torch.autocast`` layers run in its dtype.
 
     Args:
         positions: [n, p] floating point, sorted by cell, n < 2**31; raw where the table gives octaves, else encoded;
-            p >= 1 where a layer reads them, as q >= 1 for directions.
+            p >= 1 where a layer reads them, as q >= 1 for directions; p = 6, mean and diagonal variance, for the
+            integrated encoding.
         offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows of no cell (before
             ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
         weights: one [k, o, i] for each layer, all of one dtype; i as ``layers.input_width`` says.
@@ -58,8 +60,9 @@ def grouped_mlp(
     check_dtype(_OP, "positions", positions)
     check_shape(_OP, "offsets", offsets, ("k+1",), sizes)
     check_dtype(_OP, "offsets", offsets, INDEX)
-    _check_directions(directions, direction_index, layers, sizes)
-    _check_parameters(weights, biases, layers, sizes)
+    if sizes["k"] < 1:
+        raise ValueError(f"{_OP}: offsets must have at least two entries, got [{sizes['k'] + 1}]")
+    check_network(_OP, weights, biases, layers, directions, direction_index, sizes)
     check_same_device(
         _OP,
         positions=positions,
@@ -75,41 +78,3 @@ def grouped_mlp(
         positions, offsets, weights, biases, layers=layers, directions=directions, direction_index=direction_index
     )
     return out
-
-
-def _check_directions(
-    directions: Tensor | None, direction_index: Tensor | None, layers: MLP, sizes: dict[str, int]
-) -> None:
-    if directions is None:
-        if layers.uses_directions:
-            raise ValueError(f"{_OP}: directions must be given for layers that read them, got None")
-        if direction_index is not None:
-            raise ValueError(f"{_OP}: direction_index must come with directions, got no directions")
-        sizes["q"] = 0
-        return
-    check_shape(_OP, "directions", directions, ("n", "q") if direction_index is None else ("r", "q"), sizes)
-    check_dtype(_OP, "directions", directions)
-    if direction_index is not None:
-        check_shape(_OP, "direction_index", direction_index, ("n",), sizes)
-        check_dtype(_OP, "direction_index", direction_index, INDEX)
-
-
-def _check_parameters(
-    weights: Sequence[Tensor], biases: Sequence[Tensor | None], layers: MLP, sizes: dict[str, int]
-) -> None:
-    count = len(layers.layers)
-    for name, parameters in (("weights", weights), ("biases", biases)):
-        if len(parameters) != count:
-            raise ValueError(f"{_OP}: {name} must have one entry for each of {count} layers, got {len(parameters)}")
-    if sizes["k"] < 1:
-        raise ValueError(f"{_OP}: offsets must have at least two entries, got [{sizes['k'] + 1}]")
-    for source, features in ((POSITIONS, sizes["p"]), (DIRECTIONS, sizes["q"])):
-        if features < 1 and any(source in layer.inputs for layer in layers.layers):
-            raise ValueError(f"{_OP}: {source} must have at least one feature where a layer reads them, got {features}")
-    for index, (o, i) in enumerate(layers.weight_shapes(sizes["p"], sizes["q"])):
-        check_shape(_OP, f"weights[{index}]", weights[index], ("k", o, i), sizes)
-        check_dtype(_OP, f"weights[{index}]", weights[index], FLOATS if index == 0 else (weights[0].dtype,))
-        bias = biases[index]
-        if bias is not None:
-            check_shape(_OP, f"biases[{index}]", bias, ("k", o), sizes)
-            check_same_dtype(_OP, **{"weights[0]": weights[0], f"biases[{index}]": bias})

@@ -15,9 +15,9 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, encoded_width
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.reference.activation import activate_, times_derivative_
-from voronerf.reference.specification import encode
+from voronerf.reference.specification import encode, encode_positions
 
 PIECE = 4096
 """Most rows of a piece. Fewer pay for the calls (a tenth more time at 1,024 rows), more gain nothing."""
@@ -129,7 +129,7 @@ class Kept:
 
 def kept_widths(table: MLP, positions_d: int) -> list[int]:
     """Columns of each array in ``Kept``, in order. One large array would be fresh memory every time."""
-    encoded = [] if table.position_octaves is None else [encoded_width(positions_d, table.position_octaves)]
+    encoded = [] if table.position_octaves is None else [table.source_width(POSITIONS, positions_d)]
     slopes = [layer.width for layer in table.layers if layer.activation == "sine"]
     return encoded + [layer.width for layer in table.layers] + slopes
 
@@ -147,7 +147,7 @@ def forward(network: Network, keep: bool) -> tuple[Tensor, list[Tensor]]:
         at = rows if keep else slice(0, rows.stop - rows.start)
         encoded = None
         if kept.encoded is not None:
-            encoded = kept.encoded[at].copy_(encode(positions[rows], table.position_octaves))
+            encoded = kept.encoded[at].copy_(encode_positions(positions[rows], table))
         sources = network.sources(rows, encoded)
         for index, layer in enumerate(table.layers):
             y = kept.values[index][at]
@@ -206,7 +206,7 @@ def backward(network: Network, g: Tensor, hidden: Sequence[Tensor], needs: list[
             flow.done(index)
         if position_total is not None and POSITIONS in flow.gradients:
             position_total[rows] = encode_backward(
-                flow.gradients[POSITIONS], sources[POSITIONS], table.position_octaves
+                flow.gradients[POSITIONS], sources[POSITIONS], table.position_octaves, integrated=table.integrated
             )
         if direction_total is not None and DIRECTIONS in flow.gradients:
             gradient = flow.gradients[DIRECTIONS].to(direction_total.dtype)
@@ -268,16 +268,24 @@ class _Flow:
         return self.gradients[source]
 
 
-def encode_backward(gradient: Tensor, encoded: Tensor, octaves: int | None) -> Tensor:
-    """Gradient of the raw features [m, d] from that of their encoding [m, e], whose sines and cosines are at hand."""
+def encode_backward(gradient: Tensor, encoded: Tensor, octaves: int | None, *, integrated: bool = False) -> Tensor:
+    """Gradient of the raw features [m, d] from that of their encoding [m, e], whose sines and cosines are at hand.
+
+    Of the integrated encoding the raw features are means and variances, and e^(-4^l variance / 2) is a factor of both
+    sine and cosine: its derivative is -4^l / 2 times itself.
+    """
     if octaves is None:
         return gradient
     gradient, encoded = gradient.to(wide_dtype(gradient)), encoded.to(wide_dtype(encoded))
-    d = gradient.shape[1] // (1 + 2 * octaves)
-    waves, slopes = (part[:, d:].unflatten(1, (octaves, 2, d)) for part in (gradient, encoded))
+    d = gradient.shape[1] // (2 * octaves if integrated else 1 + 2 * octaves)
+    first = 0 if integrated else d
+    waves, slopes = (part[:, first:].unflatten(1, (octaves, 2, d)) for part in (gradient, encoded))
     frequency = 2.0 ** torch.arange(octaves, dtype=gradient.dtype, device=gradient.device)[:, None]
     through = waves[:, :, 0] * slopes[:, :, 1] - waves[:, :, 1] * slopes[:, :, 0]
-    return gradient[:, :d] + (through * frequency).sum(dim=1)
+    means = (through * frequency).sum(dim=1)
+    if not integrated:
+        return gradient[:, :d] + means
+    return torch.cat([means, ((waves * slopes).sum(dim=2) * frequency.square()).sum(dim=1) * -0.5], dim=1)
 
 
 def split_parameters(parameters: Sequence[Tensor | None], has_bias: Sequence[bool]) -> tuple[list, list]:

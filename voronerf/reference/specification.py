@@ -15,6 +15,7 @@ from torch import Tensor
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.reference.activation import activate
 from voronerf.reference.frequency_encode import frequency_encode
+from voronerf.reference.integrated_encode import integrated_encode
 
 Linear = Callable[..., Tensor]
 
@@ -43,7 +44,7 @@ def grouped_mlp(
 ) -> Tensor:
     """Encode, then every layer of the table on the concatenation of its sources, by whichever ``linear``."""
     dtype = weights[0].dtype
-    sources: dict[int | str, Tensor] = {POSITIONS: encode(positions, layers.position_octaves).to(dtype)}
+    sources: dict[int | str, Tensor] = {POSITIONS: encode_positions(positions, layers).to(dtype)}
     if directions is not None:
         encoded = encode(directions, layers.direction_octaves).to(dtype)
         sources[DIRECTIONS] = encoded if direction_index is None else encoded[direction_index]
@@ -51,6 +52,15 @@ def grouped_mlp(
         x = torch.cat([sources[source] for source in layer.inputs], dim=1)
         sources[index] = linear(x, offsets, weight, bias, activation=layer.activation)
     return torch.cat([sources[index] for index in layers.outputs], dim=1)
+
+
+def encode_positions(positions: Tensor, layers: MLP) -> Tensor:
+    """Positions as the layers of a table read them."""
+    if not layers.integrated:
+        return encode(positions, layers.position_octaves)
+    assert layers.position_octaves is not None
+    means, variances = positions.to(torch.promote_types(positions.dtype, torch.float32)).chunk(2, dim=1)
+    return integrated_encode(means, variances, layers.position_octaves)
 
 
 def encode(x: Tensor, octaves: int | None) -> Tensor:

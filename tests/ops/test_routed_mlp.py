@@ -1,0 +1,443 @@
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pytest
+import torch
+from op_cases import need, refused, strided
+from tolerances import assert_as_exact
+from torch import Tensor
+
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops import cell_sort, frequency_encode, grouped_mlp, locate_cell, nearest_centre, routed_mlp
+from voronerf.reference import specification
+
+pytestmark = pytest.mark.op("routed_mlp")
+
+CPU = torch.device("cpu")
+PLAIN = MLP((Layer((POSITIONS,), 9, "softplus"), Layer((0,), 4)), (1,), position_octaves=4)
+# Skip connection, density head, branch that sees the direction.
+NERF = MLP(
+    (
+        Layer((POSITIONS,), 16, "sine"),
+        Layer((POSITIONS, 0), 16, "softplus"),
+        Layer((1,), 1, "softplus"),
+        Layer((1, DIRECTIONS), 7, "softplus"),
+        Layer((3,), 3, "sigmoid"),
+    ),
+    outputs=(4, 2),
+    position_octaves=3,
+    direction_octaves=2,
+)
+TABLES = {
+    "plain": PLAIN,
+    "raw": replace(PLAIN, position_octaves=None),
+    "nerf": NERF,
+    "integrated": replace(NERF, position_encoding="integrated"),
+}
+# A tree of two levels, the second uneven: leaf 0, leaves 1 to 3 in diagram 1, leaves 4 and 5 in diagram 2.
+TREE = {
+    "child_offsets": torch.tensor([0, 3, 6, 8], dtype=torch.int32),
+    "child": torch.tensor([-1, 1, 2, -2, -3, -4, -5, -6], dtype=torch.int32),
+}
+
+
+@dataclass
+class Case:
+    """A network, its samples, where the cells come from."""
+
+    table: MLP
+    leaves: list[Tensor]
+    """Positions, directions, then weights, then biases."""
+    options: dict[str, Any]
+    bias: list[bool]
+    expected_cells: Tensor
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def make(
+        cls,
+        name: str = "nerf",
+        source: str = "flat",
+        n: int = 61,
+        rays: int | None = 5,
+        dtype: torch.dtype = torch.float32,
+    ) -> Case:
+        table = TABLES[name]
+        k = {"flat": 6, "tree": 6, "cells": 6, "one": 1}[source]
+        positions = 2 * torch.rand(n, 3) - 1
+        centres = torch.rand(8 if source == "tree" else k, 3) - 0.5
+        options: dict[str, Any] = {"centres": centres}
+        if source == "tree":
+            options |= {**TREE, "depth": 2}
+            cells = locate_cell(positions, centres, **TREE, depth=2, backend="reference")
+        elif source == "cells":
+            # Some cells stay empty.
+            cells = torch.randint(1, 4, (n,), dtype=torch.int32)
+            options = {"cells": cells}
+        else:
+            cells = nearest_centre(positions, centres, backend="reference")
+        if table.integrated:
+            positions = torch.cat([positions, 0.05 * torch.rand(n, 3)], dim=1)
+        directions = torch.nn.functional.normalize(torch.randn(n if rays is None else rays, 3), dim=1)
+        if table.uses_directions and rays is not None:
+            options["direction_index"] = torch.randint(0, rays, (n,), dtype=torch.int32)
+        weights = [torch.randn(k, o, i) / i**0.5 for o, i in table.weight_shapes(positions.shape[1], 3)]
+        bias = [index != 1 for index in range(len(weights))]
+        biases = [torch.randn(k, weight.shape[1]) for weight, has in zip(weights, bias) if has]
+        leaves = [tensor.to(dtype) for tensor in (positions, directions, *weights, *biases)]
+        return cls(table, leaves, options, bias, cells)
+
+    def run(self, leaves: list[Tensor], **changed: Any) -> tuple[Tensor, Tensor]:
+        positions, directions, *parameters = leaves
+        biases = iter(parameters[len(self.bias) :])
+        device = positions.device
+        options = {key: value.to(device) if isinstance(value, Tensor) else value for key, value in self.options.items()}
+        arguments = {
+            "positions": positions,
+            "weights": parameters[: len(self.bias)],
+            "biases": [next(biases) if has else None for has in self.bias],
+            "layers": self.table,
+            "directions": directions if self.table.uses_directions else None,
+            **options,
+            **changed,
+        }
+        return routed_mlp(**arguments)
+
+    def given(self, dtype: torch.dtype = torch.float32, device: torch.device = CPU) -> list[Tensor]:
+        return [tensor.detach().to(device, dtype).requires_grad_() for tensor in self.leaves]
+
+    def specified(self, leaves: list[Tensor]) -> Tensor:
+        """One cell after another, by its definition."""
+        positions, directions, *parameters = leaves
+        index = self.options.get("direction_index")
+        seen = directions if index is None else directions[index]
+        order = self.expected_cells.argsort(stable=True)
+        k = parameters[0].shape[0]
+        biases = iter(parameters[len(self.bias) :])
+        out = specification.grouped_mlp(
+            positions[order],
+            torch.tensor([0, *self.expected_cells.bincount(minlength=k)]).cumsum(0).int(),
+            parameters[: len(self.bias)],
+            [next(biases) if has else None for has in self.bias],
+            layers=self.table,
+            directions=seen[order] if self.table.uses_directions else None,
+        )
+        return out[order.argsort()]
+
+    def results(
+        self, run: Callable[[list[Tensor]], Tensor], dtype: torch.dtype, device: torch.device = CPU
+    ) -> list[Tensor]:
+        leaves = self.given(dtype, device)
+        y = run(leaves)
+        g = torch.randn(y.shape, generator=torch.Generator().manual_seed(1)).to(device, dtype)
+        return [y, *torch.autograd.grad(y, leaves, g, allow_unused=True, materialize_grads=True)]
+
+    def check(self, device: torch.device, backend: str, dtype: torch.dtype = torch.float32) -> None:
+        exact = self.results(self.specified, torch.float64)
+        plain = self.results(self.specified, dtype)
+        found = self.results(lambda leaves: self.run(leaves, backend=backend)[0], dtype, device)
+        for part, same, right in zip(found, plain, exact):
+            assert_as_exact(part, same, right)
+
+
+@pytest.mark.parametrize("source", ["flat", "tree", "cells", "one"])
+@pytest.mark.parametrize("name", TABLES)
+def test_output_cells_and_gradients(device: torch.device, backend: str, name: str, source: str) -> None:
+    case = Case.make(name, source)
+    case.check(device, backend)
+    out, cells = case.run([tensor.to(device) for tensor in case.leaves], backend=backend)
+    assert cells.dtype == torch.int32 and torch.equal(cells.cpu(), case.expected_cells)
+    assert out.shape == (61, case.table.out_features)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 95, 97, 2500])
+def test_any_number_of_samples(device: torch.device, backend: str, n: int) -> None:
+    Case.make(n=n).check(device, backend)
+
+
+def test_directions_of_each_sample(device: torch.device, backend: str) -> None:
+    Case.make(rays=None).check(device, backend)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("name", ["nerf", "integrated"])
+def test_half_types(device: torch.device, backend: str, name: str, dtype: torch.dtype) -> None:
+    need("routed_mlp", backend, device, dtype)
+    case = Case.make(name, "cells", dtype=dtype)
+    case.check(device, backend, dtype)
+
+
+def test_float64_positions_and_half_coordinates(device: torch.device, backend: str) -> None:
+    case = Case.make()
+    leaves = [tensor.to(device) for tensor in case.leaves]
+    expected, _ = case.run(leaves, backend=backend)
+    found, cells = case.run([leaves[0].double(), *leaves[1:]], backend=backend)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    assert torch.equal(cells.cpu(), case.expected_cells)
+    halves = leaves[0].half()
+    _, cells = case.run(leaves, coords=halves, backend=backend)
+    assert torch.equal(cells, nearest_centre(halves, case.options["centres"].to(device)))
+
+
+def test_coordinates_beside_encoded_positions(device: torch.device, backend: str) -> None:
+    case = Case.make("plain", "tree")
+    leaves = [tensor.to(device) for tensor in case.leaves]
+    raw, _ = case.run(leaves, backend=backend)
+    encoded = frequency_encode(leaves[0], 4)
+    case.table = replace(case.table, position_octaves=None)
+    for given in ({}, {"coords": leaves[0]}):
+        found, cells = case.run([encoded, *leaves[1:]], **given, backend=backend)
+        torch.testing.assert_close(found, raw, rtol=1e-5, atol=1e-5)
+        assert torch.equal(cells.cpu(), case.expected_cells)
+    _, elsewhere = case.run([encoded, *leaves[1:]], coords=leaves[0] + 9, backend=backend)
+    assert not torch.equal(elsewhere.cpu(), case.expected_cells)
+
+
+@pytest.mark.parametrize("name", ["raw", "integrated"])
+def test_layouts(device: torch.device, backend: str, name: str) -> None:
+    case = Case.make(name, "tree")
+    leaves = [tensor.to(device) for tensor in case.leaves]
+    expected, _ = case.run(leaves, backend=backend)
+    case.options = {key: strided(value) if isinstance(value, Tensor) else value for key, value in case.options.items()}
+    given = [strided(tensor).requires_grad_() for tensor in leaves]
+    found, _ = case.run(given, backend=backend)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+    found.sum().backward()
+    used = [leaf for leaf in given if leaf is not given[1] or case.table.uses_directions]
+    assert all(leaf.grad is not None for leaf in used)
+
+
+def test_power_diagram(device: torch.device, backend: str) -> None:
+    case = Case.make()
+    weights = torch.tensor([5.0, 0, 0, 0, 0, 0])
+    _, cells = case.run(
+        [tensor.to(device) for tensor in case.leaves], centre_weights=weights.to(device), backend=backend
+    )
+    assert (cells == 0).all()
+
+
+def test_samples_nowhere_go_to_the_first_cell(device: torch.device, backend: str) -> None:
+    for source in ("flat", "tree"):
+        case = Case.make("nerf", source)
+        plain, cells = case.run([tensor.to(device) for tensor in case.leaves], backend=backend)
+        rows = [3, 17, 40]
+        for row, value in zip(rows, (torch.nan, torch.inf, -torch.inf)):
+            case.leaves[0][row] = value
+        leaves = case.given(torch.float32, device)
+        out, found = case.run(leaves, backend=backend)
+        others = [row for row in range(61) if row not in rows]
+        assert (found[rows] == 0).all() and torch.equal(found[others], cells[others])
+        torch.testing.assert_close(out[others], plain[others], rtol=1e-5, atol=1e-6)
+        out[others].sum().backward()
+        assert leaves[0].grad[others].isfinite().all() and leaves[2].grad[1:].isfinite().all()
+
+
+def test_autocast(device: torch.device, backend: str) -> None:
+    case = Case.make()
+    leaves = case.given(torch.float32, device)
+    with torch.autocast(device.type, torch.bfloat16):
+        out, _ = case.run(leaves, backend=backend)
+    assert out.dtype == torch.bfloat16
+    torch.testing.assert_close(out.float(), case.run(leaves, backend=backend)[0], rtol=0.1, atol=0.1)
+    out.sum().backward()
+    assert all(leaf.grad.dtype == torch.float32 for leaf in leaves)
+
+
+def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> None:
+    case = Case.make()
+    full = case.given(torch.float32, device)
+    case.run(full, backend=backend)[0].sum().backward()
+    for wanted in range(len(full)):
+        leaves = [tensor.clone().to(device).requires_grad_(i == wanted) for i, tensor in enumerate(case.leaves)]
+        case.run(leaves, backend=backend)[0].sum().backward()
+        assert [leaf.grad is not None for leaf in leaves] == [index == wanted for index in range(len(leaves))]
+        torch.testing.assert_close(leaves[wanted].grad, full[wanted].grad)
+    with torch.no_grad():
+        assert not case.run(leaves, backend=backend)[0].requires_grad
+
+
+@pytest.mark.parametrize("rays", [3, None])
+def test_second_derivatives(device: torch.device, backend: str, rays: int | None) -> None:
+    case = Case.make("integrated", "flat", n=9, rays=rays)
+
+    def penalty(run: Callable[[list[Tensor]], Tensor], dtype: torch.dtype, device: torch.device) -> list[Tensor]:
+        leaves = case.given(dtype, device)
+        (slope,) = torch.autograd.grad(run(leaves).square().sum(), leaves[0], create_graph=True)
+        return list(torch.autograd.grad(slope.square().sum(), leaves, allow_unused=True, materialize_grads=True))
+
+    exact = penalty(case.specified, torch.float64, CPU)
+    plain = penalty(case.specified, torch.float32, CPU)
+    found = penalty(lambda leaves: case.run(leaves, backend=backend)[0], torch.float32, device)
+    for part, same, right in zip(found, plain, exact):
+        assert_as_exact(part, same, right)
+
+
+@pytest.mark.parametrize("source", ["tree", "cells", "one"])
+def test_compiles(device: torch.device, backend: str, source: str) -> None:
+    case = Case.make("nerf", source)
+    leaves = case.given(torch.float32, device)
+
+    def run(*leaves: Tensor) -> tuple[Tensor, Tensor]:
+        out, cells = case.run(list(leaves), backend=backend)
+        return out.square(), cells
+
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    (found, cells), (expected, _) = compiled(*leaves), run(*leaves)
+    assert torch.equal(cells.cpu(), case.expected_cells)
+    found, expected = ([y, *torch.autograd.grad(y.sum(), leaves)] for y in (found, expected))
+    for part, other in zip(found, expected):
+        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
+
+
+def test_auto_composes_where_nothing_is_fused() -> None:
+    case = Case.make("nerf", "tree", dtype=torch.float64)
+    assert case.run(case.leaves)[0].dtype == torch.float64
+    case.check(CPU, "auto", torch.float64)
+
+
+def test_cells_outside_are_refused(backend: str) -> None:
+    case = Case.make("nerf", "cells")
+    for value in (-1, 6):
+        case.options["cells"][5] = value
+        with pytest.raises(ValueError, match=r"cells must lie in 0 to 5, got values from"):
+            case.run(case.leaves, backend=backend)
+
+
+def test_errors() -> None:
+    case, op = Case.make("nerf", "flat"), "routed_mlp"
+    centres, cells = case.options["centres"], case.expected_cells
+    call = functools.partial(case.run, case.leaves)
+    assert call()[0].shape == (61, 4)
+    with refused(ValueError, f"{op}: positions must have shape [n, p], got [3]"):
+        call(positions=case.leaves[0][0])
+    with refused(ValueError, f"{op}: centres must be None where cells are given, got both"):
+        call(cells=cells)
+    with refused(ValueError, f"{op}: centres or cells must be given for 6 cells, got neither"):
+        call(centres=None)
+    with refused(ValueError, f"{op}: child must come with centres, got no centres"):
+        call(centres=None, cells=cells, child=TREE["child"])
+    with refused(ValueError, f"{op}: child_offsets and child must come together, got no child_offsets"):
+        call(child=TREE["child"])
+    with refused(ValueError, f"{op}: depth must be 1 for a flat diagram, got 2"):
+        call(depth=2)
+    with refused(ValueError, f"{op}: centres must have shape [k, 3] with k = 6, got [5, 3]"):
+        call(centres=centres[1:])
+    with refused(TypeError, f"{op}: centres must have dtype ..., got int32"):
+        call(centres=centres.int())
+    with refused(ValueError, f"{op}: cells must have shape [n] with n = 61, got [60]"):
+        call(centres=None, cells=cells[1:])
+    with refused(TypeError, f"{op}: cells must have dtype int32, got int64"):
+        call(centres=None, cells=cells.long())
+    with refused(ValueError, f"{op}: coords must come with centres, got none to compare them with"):
+        call(centres=None, cells=cells, coords=case.leaves[0])
+    with refused(ValueError, f"{op}: coords must have shape [n, 3] with n = 61, got [61, 2]"):
+        call(coords=case.leaves[0][:, :2])
+    with refused(ValueError, f"{op}: directions must be given for layers that read them, got None"):
+        call(directions=None, direction_index=None)
+    with refused(ValueError, f"{op}: weights must have one entry for each of 5 layers, got 0"):
+        call(weights=[])
+    with refused(ValueError, f"{op}: weights[0] must hold at least one cell, got [0, 16, 21]"):
+        call(weights=[tensor[:0] for tensor in case.leaves[2:7]], biases=[None] * 5)
+    with refused(ValueError, f"{op}: centres must be on the device of positions, cpu, got meta"):
+        call(centres=centres.to("meta"))
+    narrow = Case.make("raw")
+    narrow.leaves[0], narrow.leaves[2] = narrow.leaves[0][:, :2], narrow.leaves[2][:, :, :2]
+    with refused(ValueError, f"{op}: coords must be given for positions of less than 3 features, got 2"):
+        narrow.run(narrow.leaves)
+    integrated = Case.make("integrated")
+    message = "positions must have 6 features, mean and variance, where they are integrated, got 3"
+    with refused(ValueError, f"{op}: {message}"):
+        integrated.run(integrated.leaves, positions=integrated.leaves[0][:, :3])
+    with refused(ValueError, f"grouped_mlp: {message}"):
+        grouped_mlp(
+            integrated.leaves[0][:, :3],
+            torch.zeros(7).int(),
+            [],
+            [],
+            layers=integrated.table,
+            directions=integrated.leaves[0][:, :3],
+        )
+
+
+@pytest.mark.native
+def test_errors_of_the_kernel() -> None:
+    tree, op = Case.make("nerf", "tree"), "routed_mlp"
+    call = functools.partial(tree.run, tree.leaves, backend="native")
+    with refused(ValueError, f"{op}: child must name a diagram (below the number of diagrams) or a leaf (negative)"):
+        call(child=TREE["child"] + 9)
+    with refused(ValueError, f"{op}: depth must be the number of levels of the tree, got 1, which is too few"):
+        call(depth=1)
+    # A leaf that no network has.
+    with refused(ValueError, f"{op}: cells must lie in 0 to 5, got values from ..."):
+        call(child=torch.where(TREE["child"] == -6, -7, TREE["child"]))
+    with refused(ValueError, f"{op}: direction_index must be 0 to 4, got 5"):
+        call(direction_index=tree.options["direction_index"] + 1 + (tree.options["direction_index"] == 3).int())
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("name", ["wide", "nerf", "integrated", "raw"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name: str, dtype: torch.dtype) -> None:
+    wide = MLP((Layer((POSITIONS,), 64, "relu"), Layer((0,), 64, "relu"), Layer((1,), 4)), (2,), position_octaves=10)
+    case = Case.make("nerf" if name == "wide" else name, n=3001)
+    if name == "wide":
+        case.table, case.bias = wide, [False] * 3
+        case.leaves[2:] = [torch.randn(6, o, i) / i**0.5 for o, i in wide.weight_shapes(3)]
+        case.options.pop("direction_index")
+    case.leaves[2:] = [tensor.to(dtype) for tensor in case.leaves[2:]]
+    uses = case.table.uses_directions
+    index = case.options.get("direction_index")
+
+    def separate(leaves: list[Tensor]) -> Tensor:
+        positions, directions, *parameters = leaves
+        order, offsets = cell_sort(nearest_centre(positions[:, :3], case.options["centres"]), 6)
+        biases = iter(parameters[len(case.bias) :])
+        out = grouped_mlp(
+            positions[order],
+            offsets,
+            parameters[: len(case.bias)],
+            [next(biases) if has else None for has in case.bias],
+            layers=case.table,
+            directions=directions if uses else None,
+            direction_index=index[order] if uses else None,
+        )
+        return torch.zeros_like(out).index_copy(0, order.long(), out)
+
+    def results(run: Callable[[list[Tensor]], Tensor]) -> list[Tensor]:
+        leaves = [tensor.detach().requires_grad_() for tensor in case.leaves]
+        y = run(leaves)
+        g = torch.linspace(-1, 2, y.numel()).view_as(y).to(y.dtype)
+        return [y, *torch.autograd.grad(y, leaves, g, allow_unused=True, materialize_grads=True)]
+
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(results(lambda leaves: case.run(leaves, backend="native")[0]))
+        found.append(results(separate))
+    finally:
+        torch.set_num_threads(before)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other))
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("source", ["flat", "tree", "cells", "one"])
+def test_opcheck(source: str) -> None:
+    native = pytest.importorskip("voronerf._native_route")
+    case = Case.make("integrated", source, n=7)
+    given = case.given()
+    count = len(case.bias)
+    parameters = iter(given[2 + count :])
+    biases = [next(parameters) if has else torch.empty(0) for has in case.bias]
+    network = native._native_mlp.network(given[0], given[2 : 2 + count], biases, case.table, given[1], "routed_mlp")
+    options = {} if source == "one" else case.options
+    names = ("direction_index", "cells", "coords", "centres", "child_offsets", "child", "centre_weights")
+    options = {"coords": given[0][:, :3].detach() if "centres" in options else None, **options}
+    values = [case.options["direction_index"], *(options.get(name) for name in names[1:])]
+    arguments = (network.positions, network.weights, network.biases, network.table, network.directions)
+    torch.library.opcheck(native._forward, (*arguments, *values, options.get("depth", 1)))
