@@ -37,6 +37,24 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
   }
 }
 
+// Weights [o][depth] -> [dots][depth], in pairs with bfloat16 operands, filled up with 0.
+void pack_dots(const float* weights, const MlpPlanLayer& layer, float* packed) {
+  for (int64_t o = 0; o < layer.dots; ++o, packed += layer.packed_depth) {
+    for (int64_t i = 0; i < layer.packed_depth; i += kLanes) {
+      if (o >= layer.width) {
+        store(packed + i, splat(0.0f));
+        continue;
+      }
+#if VN_HALF
+      const float* from = weights + o * layer.depth + 2 * i;
+      store(packed + i, joined(load(from), load(from + kLanes)));
+#else
+      store(packed + i, load(weights + o * layer.depth + i));
+#endif
+    }
+  }
+}
+
 #if VN_HALF
 
 // Weights [o][depth] -> panels [pairs of inputs][<= 64 of o, padded to 16 with 0]; each source starts a pair. Rows are

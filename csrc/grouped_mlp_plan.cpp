@@ -13,6 +13,9 @@ constexpr int64_t kTile = 96;
 // Outputs that a row of 16 lanes wastes most of: at most a block's rows, and [outputs][inputs] then fits [inputs][16].
 constexpr int64_t kFewOutputs = 6;
 
+// A layer of few outputs as dot products (few_outputs_tile.h): where each source is a tile's buffer of whole vectors.
+constexpr int64_t kMostDots = 4, kMostDotSources = 8;
+
 int64_t pad(int64_t width) {
   return ceil_div(width, kGranule) * kGranule;
 }
@@ -219,6 +222,11 @@ MlpPlanner::MlpPlanner(const MlpTable& table, const MlpGathered& gathered, const
     const bool sound = layer.width > 0 && !sources_[l].empty();
     VN_CHECK(sound && std::all_of(sources_[l].begin(), sources_[l].end(), [](const auto& s) { return s.width > 0; }),
              "grouped_mlp: every layer must have outputs, and inputs from sources that have features");
+    const int64_t unit = wanted.half ? 2 * kGranule : kGranule;
+    const bool dots = layer.width <= kMostDots && sources_[l].size() <= kMostDotSources &&
+                      std::all_of(sources_[l].begin(), sources_[l].end(),
+                                  [unit](const auto& s) { return s.from >= 0 && s.width % unit == 0; });
+    layer.dots = !dots ? 0 : layer.width == 1 ? 1 : kMostDots;
     layer.sources = sources_[l].data();
     layer.source_count = static_cast<int64_t>(sources_[l].size());
     layer.partial = plan_.partial;

@@ -33,6 +33,7 @@ struct MlpPlanLayer {
   int64_t source_count;
   int64_t packed_depth, packed_width;  // depth and width, in pairs with bfloat16 operands
   int64_t packed, bias;                // weights [depth][padded] in panels, bias [padded], in the workspace
+  int64_t dots;  // 1 or 4: outputs are computed as that many dot products, weights packed as [dots][depth]; else 0
   MlpBuffer value, slope, gradient;
   MlpBuffer narrow;               // the value as pairs of bfloat16, stride in pairs
   bool read;                      // by another layer

@@ -1,6 +1,7 @@
 // A tile of samples through the network of a cell, forward and backward; see grouped_mlp_isa.cpp.
 #pragma once
 
+#include "few_outputs_tile.h"
 #include "frequency_encode_tile.h"
 #include "grouped_mlp_pack.h"
 
@@ -144,6 +145,12 @@ struct Tile {
       for (int64_t s = 0; s < count; ++s) {
         sources[s] = source(layer.sources[group + s].from, layer.sources[group + s].width);
         depth += sources[s].depth;
+      }
+      if (layer.dots > 0) {
+        const auto run = layer.dots == 1 ? few_outputs<1> : few_outputs<4>;
+        run(sources, count, workspace + layer.packed, layer.packed_depth, workspace + layer.bias,
+            layer.activation == kRelu, rows, value);
+        break;
       }
       const bool last = group + count == layer.source_count;
       const bool pairs = narrowed && last;
@@ -304,7 +311,11 @@ void pack_cell(const MlpPlan& plan, const MlpData& data, int64_t cell, float* wo
     if (!layer.live) continue;
     const float* weights = data.weights[l] + cell * layer.width * layer.depth;
     const float* bias = data.biases[l] == nullptr ? nullptr : data.biases[l] + cell * layer.width;
-    pack_forward(weights, layer, workspace + layer.packed, workspace + plan.scratch_input);
+    if (layer.dots > 0) {
+      pack_dots(weights, layer, workspace + layer.packed);
+    } else {
+      pack_forward(weights, layer, workspace + layer.packed, workspace + plan.scratch_input);
+    }
     float* packed_bias = workspace + layer.bias;
     for (int64_t o = 0; o < layer.padded; ++o) packed_bias[o] = bias != nullptr && o < layer.width ? bias[o] : 0.0f;
     if (!plan.gradients) continue;

@@ -93,6 +93,23 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
   z = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, z_ab, b), z_c, c);
 }
 
+// Lane i: the sum of v[i]'s lanes, every one added up in the same order.
+VN_INLINE F32 lane_sums(const F32* v) {
+  F32 four[4];  // lane 4 j + i of the g-th: what v[4 g + i] has in its j-th quarter
+  for (int g = 0; g < 4; ++g) {
+    const F32 *a = v + 4 * g,
+              ab = add(_mm512_maskz_unpacklo_ps(0xffff, a[0], a[1]), _mm512_maskz_unpackhi_ps(0xffff, a[0], a[1]));
+    const F32 cd = add(_mm512_maskz_unpacklo_ps(0xffff, a[2], a[3]), _mm512_maskz_unpackhi_ps(0xffff, a[2], a[3]));
+    const __m512d low = _mm512_maskz_unpacklo_pd(0xff, _mm512_castps_pd(ab), _mm512_castps_pd(cd));
+    const __m512d high = _mm512_maskz_unpackhi_pd(0xff, _mm512_castps_pd(ab), _mm512_castps_pd(cd));
+    four[g] = add(_mm512_castpd_ps(low), _mm512_castpd_ps(high));
+  }
+  const auto halves = [](F32 a, F32 b) {
+    return add(_mm512_maskz_shuffle_f32x4(0xffff, a, b, 0x88), _mm512_maskz_shuffle_f32x4(0xffff, a, b, 0xdd));
+  };
+  return halves(halves(four[0], four[1]), halves(four[2], four[3]));
+}
+
 #elif VN_ISA == 1
 
 constexpr int kLanes = 8;
@@ -138,6 +155,19 @@ VN_INLINE unsigned bits(Mask m) {
 }
 VN_INLINE void store(int32_t* to, I32 a) {
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(to), a);
+}
+
+VN_INLINE F32 lane_sums(const F32* v) {
+  F32 two[2];
+  for (int g = 0; g < 2; ++g) {
+    const F32* a = v + 4 * g;
+    const F32 ab = add(_mm256_unpacklo_ps(a[0], a[1]), _mm256_unpackhi_ps(a[0], a[1]));
+    const F32 cd = add(_mm256_unpacklo_ps(a[2], a[3]), _mm256_unpackhi_ps(a[2], a[3]));
+    const __m256d low = _mm256_unpacklo_pd(_mm256_castps_pd(ab), _mm256_castps_pd(cd));
+    const __m256d high = _mm256_unpackhi_pd(_mm256_castps_pd(ab), _mm256_castps_pd(cd));
+    two[g] = add(_mm256_castpd_ps(low), _mm256_castpd_ps(high));
+  }
+  return add(_mm256_permute2f128_ps(two[0], two[1], 0x20), _mm256_permute2f128_ps(two[0], two[1], 0x31));
 }
 
 VN_INLINE __m256 load_halves(const float* low, const float* high) {
@@ -202,6 +232,12 @@ VN_INLINE unsigned bits(Mask m) {
 }
 VN_INLINE void store(int32_t* to, I32 a) {
   __builtin_memcpy(to, &a, sizeof a);
+}
+
+VN_INLINE F32 lane_sums(const F32* v) {
+  F32 sums;
+  for (int i = 0; i < 4; ++i) sums[i] = (v[i][0] + v[i][2]) + (v[i][1] + v[i][3]);
+  return sums;
 }
 
 VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {

@@ -51,6 +51,20 @@ NETWORKS = {
     "integrated": MLP(nerf(33, 2).layers, nerf(33, 2).outputs, 16, 2, "integrated"),
     "sigmoid": chain(20, 2, activation="sigmoid"),
     "sine": chain(20, 2, activation="sine"),
+    # Few outputs of whole vectors of inputs: in one piece and concatenated, read by other layers, with activations.
+    "heads": MLP(
+        (
+            Layer(("positions",), 64, "softplus"),
+            Layer((0,), 32, "sine"),
+            Layer((0, 1, 0), 2, "sigmoid"),
+            Layer((1, 2), 32, "softplus"),
+            Layer((3, 1), 1, "softplus"),
+            Layer((3, 4), 4),
+            Layer((3, 0), 3),
+        ),
+        (6, 2, 5, 4),
+        3,
+    ),
     # Sources repeated, more than fit one product, outputs that other layers read, and a layer that nothing reads.
     "graph": MLP(
         (
@@ -144,6 +158,26 @@ def test_matches_float64(name: str, isa: str) -> None:
 @pytest.mark.parametrize("rows", [0, 1, 2, 5, 6, 7, 11, 12, 13, 47, 48, 49, 95, 96, 97, 500, 2500])
 def test_any_number_of_rows(rows: int) -> None:
     assert_close(arguments(nerf(16, 2), [rows], rays=5))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("name", ["heads", "nerf 64", "graph", "width 63"])
+def test_a_row_does_not_depend_on_its_place(name: str, dtype: torch.dtype, isa: str) -> None:
+    given = cast(arguments(NETWORKS[name], [41]), dtype)
+    together = grouped_mlp(**given, backend="native").detach()
+    for row in (0, 3, 4, 17, 40):
+        one = {**given, "positions": given["positions"][row : row + 1], "offsets": torch.tensor([0, 1]).int()}
+        if "directions" in given:
+            one["directions"] = given["directions"][row : row + 1]
+        assert torch.equal(grouped_mlp(**one, backend="native")[0], together[row])
+
+
+def test_relu_on_few_outputs(isa: str) -> None:
+    layers = MLP((Layer(("positions",), 32, "softplus"), Layer((0,), 4, "relu"), Layer((0,), 1, "relu")), (1, 2), 2)
+    given = arguments(layers, [50], bias=False)
+    got, want = (grouped_mlp(**cast(given, torch.float32), backend=backend) for backend in ("native", "reference"))
+    assert 0.2 < float((want > 0).float().mean()) < 0.8
+    torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("counts", [[0, 0, 0], [3000, 1, 0, 2], [1] * 300, [0] * 150 + [2000] + [0, 3] * 70])
