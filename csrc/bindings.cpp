@@ -5,6 +5,7 @@
 
 #include <cstdint>
 
+#include "bindings_march.h"
 #include "bindings_mlp.h"
 #include "bindings_sampling.h"
 #include "build_info.h"
@@ -22,7 +23,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 4;
+constexpr int INTERFACE = 5;
 
 using Address = std::uintptr_t;
 
@@ -113,6 +114,7 @@ PYBIND11_MODULE(_C, module) {
   bind_mlp(module);
   bind_composite(module);
   bind_sampling(module);
+  bind_march(module);
 
 #ifdef VN_WITH_CUDA
   module.def("nearest_centre_cuda_float32", &nearest_centre_cuda<float>, no_gil);

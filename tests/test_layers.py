@@ -13,7 +13,17 @@ ROOT = Path(__file__).resolve().parent.parent
 # From the bottom up; a module may import its own layer and those below.
 LAYERS = (
     {"backends", "checks", "layers"},
-    {"_native", "_native_composite", "_native_mlp", "_native_route", "_native_sampling", "_C", "kernels", "reference"},
+    {
+        "_native",
+        "_native_composite",
+        "_native_march",
+        "_native_mlp",
+        "_native_route",
+        "_native_sampling",
+        "_C",
+        "kernels",
+        "reference",
+    },
     {"ops"},
     {"router", "diagram", "balance", "transport", "subdivision"},
     {"data", "rendering", "fields"},

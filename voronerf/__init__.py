@@ -16,10 +16,13 @@ from voronerf.ops import (
     grouped_mlp,
     integrated_encode,
     locate_cell,
+    march_rays,
     nearest_centre,
     resample,
     routed_mlp,
+    update_occupancy,
 )
+from voronerf.rendering import OccupancyGrid
 from voronerf.router import VoronoiRouter
 from voronerf.subdivision import Split, split_diagram
 from voronerf.training.reservoir import SampleReservoir
@@ -31,6 +34,7 @@ __all__ = [
     "Composite",
     "Layer",
     "NeRF",
+    "OccupancyGrid",
     "SampleReservoir",
     "Split",
     "VoronoiDiagram",
@@ -44,9 +48,11 @@ __all__ = [
     "imbalance",
     "integrated_encode",
     "locate_cell",
+    "march_rays",
     "nearest_centre",
     "resample",
     "routed_mlp",
     "split_diagram",
     "uniform_centres",
+    "update_occupancy",
 ]

@@ -36,6 +36,8 @@ OPS = (
     "integrated_encode",
     "composite",
     "resample",
+    "march_rays",
+    "update_occupancy",
 )
 
 
@@ -97,6 +99,10 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("frequency_encode", "native"): Implementation("voronerf._native_sampling:frequency_encode", ("cpu",), _FLOATS),
     ("integrated_encode", "native"): Implementation("voronerf._native_sampling:integrated_encode", ("cpu",), _FLOATS),
     ("resample", "native"): Implementation("voronerf._native_sampling:resample", ("cpu",), _FLOATS),
+    ("march_rays", "native"): Implementation("voronerf._native_march:march_rays", ("cpu",), (torch.float32,)),
+    ("update_occupancy", "native"): Implementation(
+        "voronerf._native_march:update_occupancy", ("cpu",), (torch.float32,)
+    ),
     ("nearest_centre", "warp"): Implementation(
         "voronerf.kernels.nearest_centre:nearest_centre", ("cpu", "cuda"), _COORDINATES
     ),

@@ -66,6 +66,13 @@ def test_render_makes_a_video(run: Path, tmp_path: Path) -> None:
     assert len(list(frames)) == 3
 
 
+def test_pictures_through_an_occupancy_grid(run: Path, tmp_path: Path) -> None:
+    assert main(["eval", str(run), "--views", "1", "--panels", "0", "--occupancy"]) == 0
+    path = tmp_path / "turn.mp4"
+    assert main(["render", str(run), "--frames", "2", "--out", str(path), "--occupancy"]) == 0
+    assert path.stat().st_size > 0
+
+
 def test_info_names_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info"]) == 0
     output = capsys.readouterr().out

@@ -7,17 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 import voronerf.training.trainer as trainer_module
 from voronerf.backends import BackendUnavailable
 from voronerf.data import Scene, builtin_scene
+from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.training.batches import Batch
 from voronerf.training.checkpoint import CheckpointError, load_checkpoint
-from voronerf.training.config import TrainConfig
+from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.evaluation import evaluate, render_view
-from voronerf.training.model import checkpoint_path, load_run, make_router, octaves_for, restore_router
+from voronerf.training.model import checkpoint_path, load_grid, load_run, make_router, octaves_for, restore_router
 from voronerf.training.trainer import Trainer, TrainingError
 
 
@@ -299,6 +301,51 @@ def test_longer_resumed_runs_are_evaluated(tmp_path: Path, scene: Scene) -> None
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [2, 4, 6, 8, 12, 16]
     assert lines[-1]["psnr"] == summary["psnr"]
+
+
+def test_training_through_an_occupancy_grid(tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, steps in (("WARMUP", 6), ("EVERY", 2)):
+        monkeypatch.setattr(trainer_module, f"OCCUPANCY_{name}", steps)
+    config = small(tmp_path / "a", split_at=(0.9,), reservoir_batches=5, occupancy=True, occupancy_resolution=8)
+    trainer = Trainer(config, scene)
+    assert trainer.looked_at is None
+    # What is empty: the upper half of the box, which the field is then never asked about.
+    monkeypatch.setattr(trainer_module.OccupancyGrid, "update", _only_below)
+    summary = trainer.run()
+    assert trainer.looked_at is not None and trainer.looked_at.share == 0.5
+    middle = float(trainer.looked_at.box[:, 2].mean())
+    points = np.load(tmp_path / "a" / "samples" / "level-1.npz")["points"]
+    assert summary["cells"] == 4 and len(points) > 0 and points[:, 2].max() < middle
+    _, router = load_run(tmp_path / "a")
+    grid = load_grid(tmp_path / "a", config, router, scene, wanted=False)
+    assert grid is not None and torch.equal(grid.occupied, trainer.looked_at.occupied)
+    expected = evaluate(trainer.router, scene, samples=12, views=1, occupancy=trainer.looked_at)
+    assert evaluate(router, scene, samples=12, views=1, occupancy=grid) == expected
+
+
+def _only_below(self: OccupancyGrid, *_: Any, **__: Any) -> None:
+    self.occupied[:, :, self.occupied.shape[2] // 2 :] = False
+
+
+def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, steps in (("WARMUP", 4), ("EVERY", 2)):
+        monkeypatch.setattr(trainer_module, f"OCCUPANCY_{name}", steps)
+    whole = small(tmp_path / "whole", occupancy=True, occupancy_resolution=8)
+    Trainer(whole, scene).run()
+    parts = replace(whole, out=tmp_path / "parts")
+    first = Trainer(parts, scene, on_step=lambda p: first.request_stop() if p.step == 15 else None)
+    first.run()
+    Trainer(replace(parts, resume=True), scene).run()
+    a, b = tensors(tmp_path / "whole"), tensors(tmp_path / "parts")
+    assert a.keys() == b.keys() and "occupancy.density" in a
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert not bool((a["occupancy.density"] == a["occupancy.density"].flatten()[0]).all())
+
+
+def test_a_grid_needs_a_box(tmp_path: Path, scene: Scene) -> None:
+    with pytest.raises(ConfigError, match="--occupancy needs a scene with a box around everything, builtin has none"):
+        Trainer(small(tmp_path, occupancy=True), replace(scene, box=None))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.cuda

@@ -20,7 +20,7 @@ from voronerf.data import Scene, load_scene
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.volume import render_image
 from voronerf.training.config import ConfigError, TrainConfig, check_device
-from voronerf.training.model import load_run
+from voronerf.training.model import load_grid, load_run
 from voronerf.training.runs import choose_directory, score_views, write_curve, write_panels
 from voronerf.training.trainer import Trainer
 from voronerf.training.video import write_video
@@ -70,6 +70,7 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
             samples=config.samples,
             views=config.panels,
             backend=config.backend,
+            occupancy=trainer.looked_at,
         )
     write_curve(config.out)
     console.print(f"wrote {config.out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/", highlight=False)
@@ -84,6 +85,7 @@ def evaluate_run(
     views: int | None = None,
     panels: int = 4,
     samples: int | None = None,
+    occupancy: bool = False,
     device: str = "cpu",
     backend: str = "auto",
 ) -> int:
@@ -96,6 +98,8 @@ def evaluate_run(
         views: Number of test views, evenly spread; default all.
         panels: Number of views drawn.
         samples: Samples per ray; default as in training.
+        occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
+            grid.
         device: Torch device.
         backend: Backend of the operations.
     """
@@ -104,7 +108,9 @@ def evaluate_run(
     check_counts(views=views, samples=samples, downscale=downscale)
     config, router, scene = _load(run, data, downscale, device, backend)
     samples = config.samples if samples is None else samples
-    result = score_views(router, scene, samples=samples, views=views, backend=backend, path=run / "eval.json")
+    grid = load_grid(run, config, router, scene, wanted=occupancy, backend=backend)
+    options: dict[str, Any] = {"samples": samples, "backend": backend, "occupancy": grid}
+    result = score_views(router, scene, views=views, path=run / "eval.json", **options)
     table = Table("view", "psnr [dB]", "ssim")
     for view in result["views"]:
         table.add_row(view["name"], f"{view['psnr']:.2f}", f"{view['ssim']:.4f}")
@@ -112,7 +118,7 @@ def evaluate_run(
     table.add_row("mean", f"{result['psnr']:.2f}", f"{result['ssim']:.4f}")
     console.print(table)
     if panels:
-        write_panels(router, scene, run / "images", samples=samples, views=panels, backend=backend)
+        write_panels(router, scene, run / "images", views=panels, **options)
     console.print(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""), highlight=False)
     return 0
 
@@ -126,6 +132,7 @@ def render(
     data: str | None = None,
     downscale: int | None = None,
     samples: int | None = None,
+    occupancy: bool = False,
     device: str = "cpu",
     backend: str = "auto",
 ) -> int:
@@ -139,11 +146,14 @@ def render(
         data: Scene folder, where it has moved since training.
         downscale: Factor on the images, which decides the video's size; default as in training.
         samples: Samples per ray; default as in training.
+        occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
+            grid.
         device: Torch device.
         backend: Backend of the operations.
     """
     check_counts(frames=frames, fps=fps, samples=samples, downscale=downscale)
     config, router, scene = _load(run, data, downscale, device, backend)
+    grid = load_grid(run, config, router, scene, wanted=occupancy, backend=backend)
     cameras = turntable_cameras(scene.train.cameras, frames).to(device)
     pictures = []
     for frame in track(range(frames), description="rendering", console=console, disable=not console.is_terminal):
@@ -157,6 +167,7 @@ def render(
             samples=config.samples if samples is None else samples,
             background=scene.background_colour(device),
             spacing=scene.spacing,
+            occupancy=grid,
             backend=backend,
         )
         pictures.append((image.colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu())

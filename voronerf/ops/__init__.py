@@ -13,14 +13,17 @@ from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
 from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.locate_cell import locate_cell
+from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.update_occupancy import update_occupancy
 
 __all__ = [
     "MLP",
     "Composite",
     "Layer",
+    "March",
     "cell_sort",
     "composite",
     "frequency_encode",
@@ -28,7 +31,9 @@ __all__ = [
     "grouped_mlp",
     "integrated_encode",
     "locate_cell",
+    "march_rays",
     "nearest_centre",
     "resample",
     "routed_mlp",
+    "update_occupancy",
 ]

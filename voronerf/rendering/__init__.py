@@ -1,12 +1,18 @@
 """From cameras to rays, from rays to colours. Knows nothing of files."""
 
 from voronerf.rendering.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
+from voronerf.rendering.field import Field
+from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
+from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.sampling import stratified_depths
 from voronerf.rendering.volume import Rendered, RenderedImage, render_image, render_rays
 
 __all__ = [
     "Cameras",
+    "Field",
+    "Marched",
+    "OccupancyGrid",
     "Rays",
     "Rendered",
     "RenderedImage",
@@ -14,7 +20,9 @@ __all__ = [
     "intersect_box",
     "orbit_cameras",
     "render_image",
+    "render_marched",
     "render_rays",
+    "render_until_opaque",
     "stratified_depths",
     "turntable_cameras",
 ]

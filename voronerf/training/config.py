@@ -89,6 +89,10 @@ class TrainConfig:
     """Rays per training step."""
     samples: int = 64
     """Samples per ray, one in each of as many strata."""
+    occupancy: bool = False
+    """Skip the samples in cells of space found empty, in training and in its pictures; needs a scene with a box."""
+    occupancy_resolution: int = 64
+    """Cells of that grid along each axis."""
     lr: float | None = None
     """Learning rate of Adam at the start; default: 0.02 up to width 64, beyond in inverse proportion to the width."""
     lr_final: float = 0.05
@@ -172,8 +176,18 @@ def check_config(config: TrainConfig) -> None:
         raise ConfigError("give --budget SECONDS or --steps N, not both")
     need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
     need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
-    for name in ("downscale", "rays", "samples", "depth", "reservoir", "reservoir_batches", "evaluations"):
+    for name in (
+        "downscale",
+        "rays",
+        "samples",
+        "depth",
+        "reservoir",
+        "reservoir_batches",
+        "evaluations",
+        "occupancy_resolution",
+    ):
         need(getattr(config, name) >= 1, name, "be at least 1")
+    need(config.occupancy_resolution <= 512, "occupancy_resolution", "be at most 512")
     need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
     need(config.width >= 2, "width", "be at least 2")
     for name in ("position_octaves", "direction_octaves", "panels", "min_cell_samples"):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from voronerf.data import Scene
+from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.volume import RenderedImage, render_image
 from voronerf.router import VoronoiRouter
 from voronerf.training.metrics import psnr, ssim
@@ -29,8 +30,16 @@ def view_numbers(count: int, views: int | None) -> list[int]:
 
 
 @torch.no_grad()
-def render_view(router: VoronoiRouter, scene: Scene, view: int, *, samples: int, backend: str) -> RenderedImage:
-    """One test view as the router sees it, samples at the middle of their strata."""
+def render_view(
+    router: VoronoiRouter,
+    scene: Scene,
+    view: int,
+    *,
+    samples: int,
+    backend: str,
+    occupancy: OccupancyGrid | None = None,
+) -> RenderedImage:
+    """One test view as the router sees it, samples at the middle of their strata, those in empty cells left out."""
     device = next(router.parameters()).device
     router.eval()
     return render_image(
@@ -43,18 +52,25 @@ def render_view(router: VoronoiRouter, scene: Scene, view: int, *, samples: int,
         samples=samples,
         background=scene.background_colour(device),
         spacing=scene.spacing,
+        occupancy=occupancy,
         backend=backend,
     )
 
 
 def evaluate(
-    router: VoronoiRouter, scene: Scene, *, samples: int, views: int | None = None, backend: str = "auto"
+    router: VoronoiRouter,
+    scene: Scene,
+    *,
+    samples: int,
+    views: int | None = None,
+    backend: str = "auto",
+    occupancy: OccupancyGrid | None = None,
 ) -> list[ViewScore]:
     """PSNR and SSIM of ``views`` evenly spread test views (None: all)."""
     device = next(router.parameters()).device
     scores = []
     for view in view_numbers(len(scene.test.names), views):
-        image = render_view(router, scene, view, samples=samples, backend=backend)
+        image = render_view(router, scene, view, samples=samples, backend=backend, occupancy=occupancy)
         target = scene.test.truth(view, scene.background_colour()).to(device)
         colour = image.colour.clamp(0, 1)
         scores.append(ViewScore(scene.test.names[view], float(psnr(colour, target)), float(ssim(colour, target))))

@@ -11,9 +11,15 @@ import torch
 from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import NeRF
+from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint
-from voronerf.training.config import TrainConfig
+from voronerf.training.config import ConfigError, TrainConfig
+
+#: A sample that takes less of the light than this, were its cell that dense throughout, is not worth asking for.
+LEAST_OPACITY = 0.01
+#: Of a grid made for pictures alone: cells along each axis, and points asked for in each.
+PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 
 
 def octaves_for(scene: Scene) -> int:
@@ -59,6 +65,24 @@ def make_router(config: TrainConfig, device: torch.device | str) -> VoronoiRoute
     return router.to(device)
 
 
+def make_grid(
+    config: TrainConfig, scene: Scene, device: torch.device | str, resolution: int | None = None
+) -> OccupancyGrid:
+    """A grid over the scene's box that is occupied everywhere.
+
+    A cell is empty below the density with which an average stratum, the box's diagonal divided by the samples of a ray,
+    takes `LEAST_OPACITY` of the light.
+
+    Raises:
+        ConfigError: When the scene has no box.
+    """
+    if scene.box is None:
+        raise ConfigError(f"--occupancy needs a scene with a box around everything, {scene.name} has none")
+    diagonal = float((scene.box[1] - scene.box[0]).norm())
+    threshold = -math.log1p(-LEAST_OPACITY) * config.samples / diagonal
+    return OccupancyGrid(scene.box, resolution or config.occupancy_resolution, threshold=threshold, device=device)
+
+
 def make_optimizer(router: VoronoiRouter, config: TrainConfig) -> torch.optim.Adam:
     """Adam with a shorter memory of squared gradients than its default (0.99 for 0.999).
 
@@ -100,3 +124,27 @@ def load_run(run: Path, *, device: str = "cpu", backend: str = "auto") -> tuple[
     restore_router(router, checkpoint)
     router.backend = backend
     return config, router.eval()
+
+
+def load_grid(
+    run: Path, config: TrainConfig, router: VoronoiRouter, scene: Scene, *, wanted: bool, backend: str = "auto"
+) -> OccupancyGrid | None:
+    """The occupancy grid to make pictures with: the run's own, else one made from its field where ``wanted``.
+
+    A field that was trained with a grid has learnt nothing about the cells that were empty, so it always gets its own.
+
+    Raises:
+        CheckpointError: When ``run`` holds no usable checkpoint.
+        ConfigError: When a grid is to be made and the scene has no box.
+    """
+    device = next(router.parameters()).device
+    state = load_checkpoint(checkpoint_path(run)).group("occupancy")
+    if state:
+        return OccupancyGrid.from_state(state, device=device)
+    if not wanted:
+        return None
+    grid = make_grid(config, scene, device, PICTURE_RESOLUTION)
+    generator = torch.Generator().manual_seed(0)
+    for points in range(PICTURE_POINTS):
+        grid.update(router, decay=float(points > 0), generator=generator, backend=backend)
+    return grid

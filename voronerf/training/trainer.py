@@ -20,9 +20,11 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.data import Scene
-from voronerf.rendering.volume import render_rays
+from voronerf.rendering.marching import Marched, render_marched
+from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.volume import Rendered, render_rays
 from voronerf.subdivision import split_diagram
-from voronerf.training.batches import RayBatches
+from voronerf.training.batches import Batch, RayBatches
 from voronerf.training.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -34,8 +36,22 @@ from voronerf.training.checkpoint import (
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.evaluation import ViewScore, evaluate, mean_scores
 from voronerf.training.files import read_json_lines, write_bytes, write_text
-from voronerf.training.model import checkpoint_path, make_optimizer, make_router, octaves_for, restore_router
+from voronerf.training.model import (
+    checkpoint_path,
+    make_grid,
+    make_optimizer,
+    make_router,
+    octaves_for,
+    restore_router,
+)
 from voronerf.training.reservoir import SampleReservoir
+
+#: Steps before the first look at which cells are empty: until then the field has said nothing about most of them.
+OCCUPANCY_WARMUP = 256
+#: Steps between looks, and looks over which all cells are spread.
+OCCUPANCY_EVERY, OCCUPANCY_PARTS = 16, 4
+#: What a cell remembers at each look at it: a density of 100 is forgotten after some twelve.
+OCCUPANCY_DECAY = 0.6
 
 
 class TrainingError(RuntimeError):
@@ -103,7 +119,8 @@ class Trainer:
         self.on_event = on_event
         self.device = torch.device(config.device)
         # Every op of a step is looked up now: a backend that cannot train should say so before anything is written.
-        for op in ("nearest_centre", "locate_cell", "grouped_mlp", "composite"):
+        marching = ("march_rays", "update_occupancy") if config.occupancy else ()
+        for op in ("nearest_centre", "locate_cell", "grouped_mlp", "composite", *marching):
             backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
         backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -113,6 +130,7 @@ class Trainer:
         self.router.generator = self.generator
         self.optimizer = make_optimizer(self.router, config)
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
+        self.occupancy = make_grid(config, scene, self.device) if config.occupancy else None
         self.step = 0
         self.seconds = 0.0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
@@ -143,6 +161,11 @@ class Trainer:
         assert config.lr is not None
         rise = 1.0 if done >= config.warmup else 0.01 + 0.99 * done / config.warmup
         return config.lr * rise * math.exp(math.log(config.lr_final) * done)
+
+    @property
+    def looked_at(self) -> OccupancyGrid | None:
+        """The grid, once it knows what is empty."""
+        return self.occupancy if self.step > OCCUPANCY_WARMUP else None
 
     def request_stop(self) -> None:
         """Ends training after the step in hand, with a checkpoint; what Ctrl-C does."""
@@ -203,18 +226,7 @@ class Trainer:
         if batch.alpha is not None and config.background == "random":
             background = torch.rand(config.rays, 3, generator=self.generator).to(self.device)
         self.router.train()
-        rendered = render_rays(
-            self.router,
-            batch.rays,
-            batch.near,
-            batch.far,
-            samples=config.samples,
-            background=background,
-            jitter=True,
-            generator=self.generator,
-            spacing=self.scene.spacing,
-            backend=config.backend,
-        )
+        rendered = self._render(batch, background)
         error = (rendered.colour - batch.target(background)).square()
         loss = error.mean()
         self.optimizer.zero_grad(set_to_none=True)
@@ -222,9 +234,37 @@ class Trainer:
         self.optimizer.step()
         if self.level < len(config.cells):
             # Importance of a sample: its weight in the image times its ray's error (section 3.1 of the paper).
-            importance = rendered.weights.detach() * error.detach().sum(-1, keepdim=True)
+            wrong = error.detach().sum(-1)
+            wrong = wrong[:, None] if isinstance(rendered, Rendered) else wrong[rendered.ray_index]
+            importance = rendered.weights.detach() * wrong
             self.reservoir.add(rendered.positions.detach().reshape(-1, 3), importance.reshape(-1))
         return float(loss.detach())
+
+    def _render(self, batch: Batch, background: Tensor | None) -> Rendered | Marched:
+        options: dict[str, Any] = {
+            "samples": self.config.samples,
+            "background": background,
+            "jitter": True,
+            "generator": self.generator,
+            "spacing": self.scene.spacing,
+            "backend": self.config.backend,
+        }
+        if self.occupancy is None or self.step < OCCUPANCY_WARMUP:
+            return render_rays(self.router, batch.rays, batch.near, batch.far, **options)
+        if self.step % OCCUPANCY_EVERY == 0:
+            self._look(self.occupancy)
+        return render_marched(self.router, batch.rays, batch.near, batch.far, self.occupancy, **options)
+
+    def _look(self, grid: OccupancyGrid) -> None:
+        """Looks which cells are empty: all at first, then a part at a time."""
+        cells = None
+        if self.step > OCCUPANCY_WARMUP:
+            part = self.step // OCCUPANCY_EVERY % OCCUPANCY_PARTS
+            cells = torch.arange(part, grid.occupied.numel(), OCCUPANCY_PARTS, device=self.device)
+        decay = 0.0 if cells is None else OCCUPANCY_DECAY
+        self.router.eval()
+        grid.update(self.router, cells, decay=decay, generator=self.generator, backend=self.config.backend)
+        self.router.train()
 
     def _split(self) -> None:
         """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
@@ -276,7 +316,12 @@ class Trainer:
     def _evaluate(self, views: int | None) -> list[ViewScore]:
         self.evaluated = self._due()
         scores = evaluate(
-            self.router, self.scene, samples=self.config.samples, views=views, backend=self.config.backend
+            self.router,
+            self.scene,
+            samples=self.config.samples,
+            views=views,
+            backend=self.config.backend,
+            occupancy=self.looked_at,
         )
         now = {
             "step": self.step,
@@ -317,6 +362,8 @@ class Trainer:
             "reservoir": self.reservoir.state_dict(),
             "generator": {"state": self.generator.get_state()},
         }
+        if self.looked_at is not None:
+            parts["occupancy"] = self.looked_at.state_dict()
         for prefix, group in parts.items():
             tensors |= {f"{prefix}.{name}": torch.as_tensor(value) for name, value in group.items()}
         values = {
@@ -338,6 +385,9 @@ class Trainer:
         self.optimizer = make_optimizer(self.router, self.config)
         load_optimizer_tensors(self.optimizer, checkpoint.group("optimizer"))
         self.reservoir.load_state_dict(checkpoint.group("reservoir"))
+        occupancy = checkpoint.group("occupancy")
+        if occupancy:
+            self.occupancy = OccupancyGrid.from_state(occupancy, device=self.device)
         self.generator.set_state(checkpoint.group("generator")["state"])
         self.step = checkpoint.values["step"]
         self.seconds = checkpoint.values["seconds"]

@@ -1,0 +1,209 @@
+"""Marching through a grid: against stratified depths and a slow loop, and every backend bit for bit the reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from op_cases import need, refused, strided
+from torch import Tensor
+
+from voronerf.ops import march_rays
+from voronerf.rendering.sampling import stratified_depths
+
+pytestmark = pytest.mark.op("march_rays")
+
+
+def case(r: int, shape: tuple[int, ...] = (5, 4, 7), share: float = 0.4) -> dict[str, Tensor]:
+    """Rays from outside through a box, some of which begin in it, end in it, or miss it."""
+    directions = torch.nn.functional.normalize(0.4 * torch.randn(r, 3) + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
+    near = 0.2 + torch.rand(r)
+    return {
+        "origins": 0.6 * torch.rand(r, 3) - torch.tensor([0.3, 0.3, 1.6]),
+        "directions": directions,
+        "near": near,
+        "far": near + 2.5 * torch.rand(r),
+        "occupied": torch.rand(shape) < share,
+        "box": torch.tensor([[-1.0, -0.8, -1.0], [1.0, 1.1, 0.9]]),
+    }
+
+
+def march(given: dict[str, Tensor], samples: int, device: torch.device, backend: str, **options: Any) -> Any:
+    moved = {name: value.to(device) if isinstance(value, Tensor) else value for name, value in options.items()}
+    result = march_rays(*(tensor.to(device) for tensor in given.values()), samples, **moved, backend=backend)
+    assert all(part.device.type == device.type for part in result)
+    return type(result)(*(part.cpu() for part in result))
+
+
+def same(found: Any, expected: Any) -> None:
+    for name, a, b in zip(found._fields, found, expected):
+        assert a.dtype == b.dtype and torch.equal(a, b), name
+
+
+def test_a_full_grid_gives_stratified_samples(device: torch.device, backend: str) -> None:
+    given = case(9) | {"occupied": torch.ones(3, 2, 4, dtype=torch.bool), "box": torch.tensor([[-9.0] * 3, [9.0] * 3])}
+    for spacing in ("linear", "disparity"):
+        found = march(given, 33, device, backend, spacing=spacing)
+        depths, deltas, _ = stratified_depths(given["near"], given["far"], 33, jitter=False, spacing=spacing)
+        torch.testing.assert_close(found.depths.reshape(9, 33), depths)
+        torch.testing.assert_close(found.deltas.reshape(9, 33), deltas)
+        assert found.ray_offsets.tolist() == [33 * i for i in range(10)]
+        assert found.ray_index.tolist() == [i // 33 for i in range(9 * 33)]
+        assert found.stop.tolist() == [33] * 9
+
+
+def test_samples_are_those_in_occupied_cells(device: torch.device, backend: str) -> None:
+    given = case(40)
+    found = march(given, 50, device, backend)
+    everywhere = march(given | {"occupied": torch.ones(1, 1, 1, dtype=torch.bool)}, 50, device, backend)
+    assert 0 < len(found.depths) < len(everywhere.depths) < 40 * 50
+    low, high = given["box"].double()
+    expected = []
+    for ray, depth in zip(everywhere.ray_index.tolist(), everywhere.depths):
+        place = given["origins"][ray].double() + depth.double() * given["directions"][ray].double()
+        cell = ((place - low) / (high - low) * torch.tensor([5, 4, 7])).long()
+        if given["occupied"][tuple(cell)]:
+            expected.append((ray, float(depth)))
+    assert list(zip(found.ray_index.tolist(), found.depths.tolist())) == expected
+
+
+@pytest.mark.parametrize(("r", "samples"), [(0, 4), (1, 1), (65, 31), (130, 32), (63, 65)])
+@pytest.mark.parametrize("spacing", ["linear", "disparity"])
+def test_equals_the_reference_to_the_last_bit(
+    device: torch.device, backend: str, spacing: str, r: int, samples: int
+) -> None:
+    need("march_rays", backend, device, torch.float32)
+    for shape in ((1, 1, 1), (16, 3, 33)):
+        given = case(r, shape)
+        rest: dict[str, Any] = {"spacing": spacing}
+        for more in (
+            {},
+            {"uniforms": torch.rand(r, samples)},
+            {"start": torch.randint(0, samples + 2, (r,), dtype=torch.int32)},
+            {"most": 3, "uniforms": torch.rand(r, samples)},
+            {"capacity": 41},
+            {"capacity": 5000, "most": 2, "start": torch.randint(0, samples, (r,), dtype=torch.int32)},
+        ):
+            expected = march(given, samples, torch.device("cpu"), "reference", **rest, **more)
+            same(march(given, samples, device, backend, **rest, **more), expected)
+
+
+def test_waves_give_together_what_one_call_gives(device: torch.device, backend: str) -> None:
+    given, uniforms = case(30), torch.rand(30, 40)
+    whole = march(given, 40, device, backend, uniforms=uniforms)
+    for options in ({"most": 1}, {"most": 7}, {"capacity": 100}, {"capacity": 60, "most": 4}):
+        found: list[list[float]] = [[] for _ in range(30)]
+        start = torch.zeros(30, dtype=torch.int32)
+        for _ in range(41):
+            wave = march(given, 40, device, backend, uniforms=uniforms, start=start, **options)
+            count = int(wave.ray_offsets[-1])
+            assert not wave.depths[count:].any() and not wave.deltas[count:].any() and not wave.ray_index[count:].any()
+            for ray, depth in zip(wave.ray_index[:count].tolist(), wave.depths[:count].tolist()):
+                found[ray].append(depth)
+            start = wave.stop
+        assert start.tolist() == [40] * 30
+        assert [depth for own in found for depth in own] == whole.depths.tolist()
+
+
+def test_rays_of_no_length_and_of_no_numbers_have_no_samples(device: torch.device, backend: str) -> None:
+    given = case(6) | {"occupied": torch.ones(2, 2, 2, dtype=torch.bool)}
+    given["origins"][:] = 0
+    given["near"][:], given["far"][:] = 0.1, 0.5
+    given["far"][0] = given["near"][0]
+    given["far"][1] = -1
+    given["origins"][2, 1] = torch.nan
+    given["directions"][3, 0] = torch.inf
+    given["near"][4] = torch.nan
+    found = march(given, 8, device, backend)
+    assert found.ray_offsets[:6].tolist() == [0] * 6 and found.ray_offsets[6] > 0
+    assert found.stop.tolist() == [8] * 6
+
+
+def test_strided_inputs(device: torch.device, backend: str) -> None:
+    given = case(20)
+    expected = march(given, 12, device, backend, uniforms=torch.full((20, 12), 0.25))
+    scattered = {
+        name: strided(tensor.float()) > 0 if name == "occupied" else strided(tensor) for name, tensor in given.items()
+    }
+    same(march(scattered, 12, device, backend, uniforms=strided(torch.full((20, 12), 0.25))), expected)
+
+
+def test_compiles_whole_with_a_capacity(device: torch.device, backend: str) -> None:
+    given = case(5)
+    compiled = torch.compile(
+        lambda *tensors: march_rays(*tensors, 9, capacity=50, backend=backend), fullgraph=True, backend="aot_eager"
+    )
+    arguments = [tensor.to(device) for tensor in given.values()]
+    same(
+        type(march(given, 9, device, backend))(*(part.cpu() for part in compiled(*arguments))),
+        march(given, 9, device, backend, capacity=50),
+    )
+
+
+@pytest.mark.native
+def test_native_ops_pass_opcheck() -> None:
+    from voronerf import _native_march
+
+    given = [*case(5).values(), None, None]
+    rest = (9, False, 9)
+    for options in ((given, 40), ([*given[:6], torch.rand(5, 9), torch.zeros(5, dtype=torch.int32)], 3)):
+        inputs, capacity = options
+        torch.library.opcheck(torch.ops.voronerf.march_rays_native_count.default, (*inputs, *rest, capacity))
+        tables = _native_march._count(*inputs, *rest, capacity)
+        torch.library.opcheck(torch.ops.voronerf.march_rays_native_fill.default, (*inputs, *tables, *rest, capacity))
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("threads", [1, 3])
+def test_instruction_sets_and_threads_agree(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    from voronerf import _native
+
+    given, uniforms = case(300, (9, 8, 7)), torch.rand(300, 70)
+    expected = march(given, 70, torch.device("cpu"), "reference", uniforms=uniforms, most=9)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        for isa in range(len(_native.ISAS)):
+            if _native._C.isa_supported(isa):
+                monkeypatch.setattr(_native, "_ISA", isa)
+                same(march(given, 70, torch.device("cpu"), "native", uniforms=uniforms, most=9), expected)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_refuses_what_makes_no_sense() -> None:
+    given = case(4)
+
+    def run(samples: Any = 8, **changes: Any) -> None:
+        options = {name: changes.pop(name) for name in list(changes) if name not in given}
+        march_rays(*(given | changes).values(), samples, **options)
+
+    with refused(ValueError, "march_rays: directions must have shape [r, 3] with r = 4, got [5, 3]"):
+        run(directions=torch.zeros(5, 3))
+    with refused(ValueError, "march_rays: near must have shape [r] with r = 4, got [3]"):
+        run(near=torch.zeros(3))
+    with refused(TypeError, "march_rays: occupied must have dtype bool, got uint8"):
+        run(occupied=torch.ones(2, 2, 2, dtype=torch.uint8))
+    with refused(ValueError, "march_rays: occupied must have at least one cell, got [2, 0, 2]"):
+        run(occupied=torch.ones(2, 0, 2, dtype=torch.bool))
+    with refused(TypeError, "march_rays: origins must have dtype float32 or float64, got float16"):
+        run(origins=torch.zeros(4, 3).half())
+    with refused(TypeError, "march_rays: far must have the dtype of origins, float32, got float64"):
+        run(far=torch.zeros(4).double())
+    with refused(ValueError, "march_rays: box must have shape [2, 3], got [3, 2]"):
+        run(box=torch.zeros(3, 2))
+    with refused(ValueError, "march_rays: samples must be at least 1, got 0"):
+        run(0)
+    with refused(ValueError, "march_rays: samples must be at most 65535, got 65536"):
+        run(65_536)
+    with refused(ValueError, "march_rays: uniforms must have shape [r, s] with r = 4, s = 8, got [4, 7]"):
+        run(uniforms=torch.zeros(4, 7))
+    with refused(TypeError, "march_rays: start must have dtype int32, got int64"):
+        run(start=torch.zeros(4, dtype=torch.int64))
+    with refused(ValueError, "march_rays: most must be at least 1, got 0"):
+        run(most=0)
+    with refused(ValueError, "march_rays: capacity must be at least 1, got 0"):
+        run(capacity=0)
+    with refused(ValueError, "march_rays: spacing must be one of linear, disparity, got 'log'"):
+        run(spacing="log")

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import refused, strided
+
+from voronerf.ops import update_occupancy
+
+pytestmark = pytest.mark.op("update_occupancy")
+
+
+def slow(density, cells, values, decay, threshold):
+    """One cell at a time."""
+    flat = density.reshape(-1)
+    result = flat.clone()
+    for cell in set(cells.tolist()):
+        found = [float(value) for row, value in zip(cells.tolist(), values) if row == cell]
+        result[cell] = max(float(flat[cell] * decay), *found)
+    return result.reshape(density.shape), result.reshape(density.shape) >= threshold
+
+
+@pytest.mark.parametrize(("shape", "q"), [((3, 4, 5), 37), ((1, 1, 1), 5), ((2, 1, 3), 0), ((40, 40, 50), 9000)])
+@pytest.mark.parametrize("decay", [0.0, 0.75, 1.0])
+def test_equals_a_slow_loop(device: torch.device, backend: str, decay: float, shape, q: int) -> None:
+    density, values = 2 * torch.rand(shape), torch.rand(q)
+    cells = torch.randint(0, density.numel(), (q,), dtype=torch.int32)
+    if q > 1000:
+        cells = torch.randperm(density.numel())[:q].to(torch.int32)
+    given = density.clone()
+    found = update_occupancy(
+        density.to(device), cells.to(device), values.to(device), decay=decay, threshold=0.5, backend=backend
+    )
+    assert torch.equal(density, given)
+    if q <= 1000:
+        expected = slow(density, cells, values, decay, 0.5)
+    else:
+        expected = update_occupancy(density, cells, values, decay=decay, threshold=0.5, backend="reference")
+    for a, b in zip(found, expected):
+        assert a.dtype == b.dtype and torch.equal(a.cpu(), b)
+
+
+def test_infinite_values_strides_and_compile(device: torch.device, backend: str) -> None:
+    density = torch.tensor([[[1.0, torch.inf, 3.0]]], device=device)
+    cells, values = (
+        torch.tensor([0, 2], dtype=torch.int32, device=device),
+        torch.tensor([torch.inf, 0.0], device=device),
+    )
+
+    def run(density, cells, values):
+        return update_occupancy(density, cells, values, decay=0.5, threshold=1.5, backend=backend)
+
+    expected = run(density, cells, values)
+    assert expected[0].tolist() == [[[torch.inf, torch.inf, 1.5]]] and bool(expected[1].all())
+    for found in (
+        run(strided(density), strided(cells), strided(values)),
+        torch.compile(run, fullgraph=True, backend="aot_eager")(density, cells, values),
+    ):
+        assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1])
+
+
+@pytest.mark.native
+def test_native_op_passes_opcheck() -> None:
+    from voronerf import _native_march
+
+    assert _native_march.update_occupancy
+    cells = torch.tensor([3, 0], dtype=torch.int32)
+    arguments = (torch.rand(2, 2, 2), cells, torch.rand(2), 0.5, 0.1)
+    torch.library.opcheck(torch.ops.voronerf.update_occupancy_native.default, arguments)
+
+
+def test_refuses_what_makes_no_sense(device: torch.device) -> None:
+    density, cells, values = torch.rand(2, 2, 2), torch.zeros(3, dtype=torch.int32), torch.rand(3)
+    for backend in ("reference", "native") if device.type == "cpu" else ():
+        with refused(ValueError, "update_occupancy: cells must lie in 0 to 7, got values from 0 to 8"):
+            update_occupancy(
+                density, cells + torch.tensor([0, 8, 1]).int(), values, decay=0.5, threshold=1, backend=backend
+            )
+    with refused(ValueError, "update_occupancy: decay must lie in 0 to 1, got 1.5"):
+        update_occupancy(density, cells, values, decay=1.5, threshold=1)
+    with refused(ValueError, "update_occupancy: values must have shape [q] with q = 3, got [2]"):
+        update_occupancy(density, cells, values[:2], decay=0.5, threshold=1)
+    with refused(TypeError, "update_occupancy: cells must have dtype int32, got int64"):
+        update_occupancy(density, cells.long(), values, decay=0.5, threshold=1)
+    with refused(TypeError, "update_occupancy: density must have dtype float32, got float64"):
+        update_occupancy(density.double(), cells, values, decay=0.5, threshold=1)

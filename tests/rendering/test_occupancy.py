@@ -1,0 +1,190 @@
+"""The grid, and rendering through it: what is left out must not be seen."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from voronerf.rendering import (
+    Cameras,
+    OccupancyGrid,
+    Rays,
+    intersect_box,
+    orbit_cameras,
+    render_image,
+    render_marched,
+    render_rays,
+    render_until_opaque,
+)
+
+BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+WHITE = torch.ones(3)
+
+
+class Ball:
+    """A coloured ball of radius 0.5 in empty space; counts what it is asked."""
+
+    def __init__(self, density: float = 60.0) -> None:
+        self.density, self.asked = density, 0
+
+    def __call__(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        assert len(ray_index) == len(positions) and (not len(ray_index) or int(ray_index.max()) < len(directions))
+        self.asked += len(positions)
+        return (positions + 1) / 2, self.density * (positions.norm(dim=-1) < 0.5)
+
+
+def cameras(size: int = 24) -> Cameras:
+    return orbit_cameras(2, radius=3.0, elevation=20.0, width=size, height=size, focal=size * 1.1)
+
+
+def grid_of(field, resolution=8, looks: int = 3) -> OccupancyGrid:
+    grid = OccupancyGrid(BOX, resolution, threshold=0.1)
+    generator = torch.Generator().manual_seed(0)
+    for look in range(looks):
+        grid.update(field, decay=float(look > 0), generator=generator)
+    return grid
+
+
+def tight_grid(resolution: int = 24) -> OccupancyGrid:
+    """All cells that the ball reaches into, however little, and few others."""
+    grid = OccupancyGrid(BOX, resolution, threshold=0.1)
+    middles = grid.points(torch.arange(resolution**3)).norm(dim=-1)
+    grid.occupied = (middles < 0.5 + 3**0.5 / resolution).reshape(grid.occupied.shape)
+    return grid
+
+
+def test_a_grid_finds_what_is_empty() -> None:
+    grid = OccupancyGrid(BOX, (8, 10, 12), threshold=0.1)
+    assert grid.share == 1 and grid.occupied.shape == (8, 10, 12)
+    for look in range(20):
+        grid.update(Ball(), decay=float(look > 0), generator=torch.Generator().manual_seed(look))
+    middles = grid.points(torch.arange(960)).norm(dim=-1).reshape(8, 10, 12)
+    half = (torch.tensor([2 / 8, 2 / 10, 2 / 12]) / 2).norm()
+    assert bool(grid.occupied[middles < 0.5 - half].all())
+    assert not bool(grid.occupied[middles > 0.5 + half].any())
+
+
+def test_points_lie_in_their_cells() -> None:
+    grid = OccupancyGrid(torch.tensor([[0.0, 10.0, -4.0], [2.0, 13.0, 0.0]]), (2, 3, 4), threshold=1)
+    cells = torch.arange(24)
+    assert grid.points(cells)[0].tolist() == [0.5, 10.5, -3.5]
+    found = []
+    for _ in range(4):
+        place = (grid.points(cells, torch.rand(24, 3)) - grid.box[0]).long()
+        found.append((place[:, 0] * 3 + place[:, 1]) * 4 + place[:, 2])
+    assert all(torch.equal(cell, cells) for cell in found)
+
+
+def test_cells_that_are_looked_at_fade_and_the_others_stay() -> None:
+    grid = OccupancyGrid(BOX, 4, threshold=0.1)
+    grid.update(lambda p, d, i: (p, torch.full((len(p),), 8.0)))
+    seen = torch.arange(0, 64, 2)
+    grid.update(lambda p, d, i: (p, torch.full((len(p),), torch.nan)), seen[:3])
+    grid.update(lambda p, d, i: (p, torch.zeros(len(p))), seen[3:], decay=0.01)
+    density = grid.density.reshape(-1)
+    assert density[seen[:3]].tolist() == [torch.inf] * 3
+    assert bool((density[seen[3:]] == torch.tensor(8.0) * 0.01).all()) and not bool(
+        grid.occupied.reshape(-1)[seen[3:]].any()
+    )
+    assert bool((density[1::2] == 8).all())
+
+
+def test_images_are_the_same_with_a_fraction_of_the_samples() -> None:
+    dense, sparse = Ball(), Ball()
+    options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 96, "background": WHITE}
+    plain = render_image(dense, cameras(), 0, **options)
+    grid = tight_grid()
+    quick = render_image(sparse, cameras(), 0, occupancy=grid, **options)
+    assert sparse.asked * 8 < dense.asked
+    torch.testing.assert_close(quick.colour, plain.colour, atol=2e-3, rtol=0)
+    torch.testing.assert_close(quick.opacity, plain.opacity, atol=2e-3, rtol=0)
+    solid = plain.opacity > 0.5
+    assert solid.any() and not solid.all()
+    torch.testing.assert_close(quick.depth[solid], plain.depth[solid], atol=5e-3, rtol=0)
+    torch.testing.assert_close(quick.heaviest[solid], plain.heaviest[solid], atol=1e-5, rtol=0)
+    chunked = render_image(Ball(), cameras(), 0, occupancy=grid, chunk=50, **options)
+    torch.testing.assert_close(chunked.colour, quick.colour)
+    with pytest.raises(ValueError, match="chunk must be >= 1, got 0"):
+        render_image(Ball(), cameras(), 0, occupancy=grid, chunk=0, **options)
+
+
+def test_a_translucent_field_is_walked_to_its_end() -> None:
+    """Rays that never become opaque need every wave."""
+    options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 128, "background": WHITE}
+    plain = render_image(Ball(0.7), cameras(), 1, **options)
+    quick = render_image(Ball(0.7), cameras(), 1, occupancy=tight_grid(), **options)
+    torch.testing.assert_close(quick.colour, plain.colour, atol=1e-5, rtol=0)
+    torch.testing.assert_close(quick.opacity, plain.opacity, atol=1e-5, rtol=0)
+    assert 0.2 < float(plain.opacity.max()) < 0.9
+
+
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_training_samples_and_gradients_are_those_of_the_dense_form(backend: str) -> None:
+    rays = cameras(9).image_rays(0)
+    near, far, hit = intersect_box(rays.origins, rays.directions, BOX, 1.0, 5.0)
+    rays, near, far = rays[hit], near[hit], far[hit]
+    background = torch.rand(len(rays), 3)
+    grid = OccupancyGrid(BOX * 1.01, 6, threshold=0.1)
+    found = []
+    for render, more in ((render_rays, ()), (render_marched, (grid,))):
+        scale = torch.tensor(2.0, requires_grad=True)
+        result = render(
+            lambda p, d, i, scale=scale: ((p * scale).sigmoid(), (p.square().sum(-1) * scale)),
+            rays,
+            near,
+            far,
+            *more,
+            samples=20,
+            background=background,
+            jitter=True,
+            generator=torch.Generator().manual_seed(3),
+            backend=backend,
+        )
+        result.colour.square().sum().backward()
+        found.append((result.colour, result.opacity, result.depth, result.weights.reshape(-1), scale.grad))
+        assert result.positions.reshape(-1, 3).shape == (20 * len(rays), 3)
+    for a, b in zip(*found):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
+
+
+def test_rays_that_meet_nothing_show_the_background() -> None:
+    grid = grid_of(lambda p, d, i: (p, torch.zeros(len(p))))
+    assert grid.share == 0
+    rays = Rays(torch.zeros(3, 3), torch.eye(3))
+    ends = torch.full((3,), 0.1), torch.full((3,), 0.9)
+    asked = Ball()
+    seen = render_until_opaque(asked, rays, *ends, grid, samples=8, background=WHITE)
+    assert asked.asked == 0
+    assert torch.equal(seen.colour, torch.ones(3, 3)) and torch.equal(seen.depth, ends[1])
+    assert torch.equal(seen.heaviest, 0.9 * torch.eye(3))
+    parameter = torch.ones((), requires_grad=True)
+    marched = render_marched(lambda p, d, i: (p * parameter, p[:, 0] * parameter), rays, *ends, grid, samples=8)
+    marched.colour.sum().backward()
+    assert torch.equal(marched.colour.detach(), torch.zeros(3, 3)) and parameter.grad == 0
+
+
+def test_state_goes_round() -> None:
+    grid = grid_of(Ball(), resolution=(3, 4, 5))
+    other = OccupancyGrid.from_state(grid.state_dict())
+    for name, value in grid.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name])
+    state = grid.state_dict()
+    del state["density"]
+    with pytest.raises(ValueError, match="OccupancyGrid: state must hold density, got box, occupied, threshold"):
+        OccupancyGrid.from_state(state)
+    with pytest.raises(ValueError, match=r"density and occupied of one shape \[x, y, z\], got \[3\] and \[3, 4, 5\]"):
+        OccupancyGrid.from_state(grid.state_dict() | {"density": torch.zeros(3)})
+
+
+def test_refuses_what_is_no_grid() -> None:
+    with pytest.raises(ValueError, match="box must be finite corners"):
+        OccupancyGrid(BOX.flip(0), threshold=1)
+    with pytest.raises(ValueError, match="box must be finite corners"):
+        OccupancyGrid(BOX * torch.inf, threshold=1)
+    with pytest.raises(ValueError, match=r"resolution must be one or three numbers >= 1, got \(3, 0, 3\)"):
+        OccupancyGrid(BOX, (3, 0, 3), threshold=1)
+    with pytest.raises(ValueError, match="threshold must be positive and finite, got 0"):
+        OccupancyGrid(BOX, threshold=0)
+    with pytest.raises(ValueError, match=r"decay must lie in 0..1, got 2"):
+        OccupancyGrid(BOX, 4, threshold=1).update(Ball(), decay=2)

@@ -1,0 +1,128 @@
+"""Ray marching through an occupancy grid. r rays, s strata of a ray, m samples of all rays (packed)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import (
+    INDEX,
+    check_choice,
+    check_count,
+    check_dtype,
+    check_integer,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+)
+from voronerf.reference.march_rays import March
+
+_OP = "march_rays"
+_SPACINGS = ("linear", "disparity")
+
+
+def march_rays(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    samples: int,
+    *,
+    uniforms: Tensor | None = None,
+    spacing: str = "linear",
+    start: Tensor | None = None,
+    most: int | None = None,
+    capacity: int | None = None,
+    backend: str = "auto",
+) -> March:
+    """Stratified samples of rays, those in empty cells of a grid left out, packed for ``composite``.
+
+    Each ray is cut into ``samples`` strata between its near and its far end, with one sample in each, as
+    ``rendering.stratified_depths`` does; a sample is kept where its cell of the grid is occupied. Outside the box all
+    is empty. With every cell occupied the result is the stratified one, so what the grid changes is the cost alone.
+
+    Rays can be walked piece by piece, so that those that have become opaque can be left: ``most`` samples at a time,
+    the ``stop`` of one call being the ``start`` of the next.
+
+    The number of samples depends on the values. Without ``capacity`` it is read on the host; with it the result has
+    that many rows, those beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays for which there is no room are
+    cut, as ``stop`` tells: this form can be captured in a CUDA graph and compiled. Not differentiable.
+
+    Args:
+        origins: float32 or float64 [r, 3].
+        directions: [r, 3], unit vectors.
+        near: [r], the beginning of the first stratum.
+        far: [r], the end of the last; a ray with far <= near has no samples.
+        occupied: bool [x, y, z], which cells of the box are not empty; x, y, z >= 1.
+        box: [2, 3], lowest and highest corner, the second above the first.
+        samples: strata of a ray, s, 1 to 65,535.
+        uniforms: [r, s] in 0 to 1, the place of each sample in its stratum; None for the middles.
+        spacing: of the strata, "linear" or "disparity" (equal steps of 1 / distance).
+        start: int32 [r], first stratum to be looked at, >= 0; None for 0.
+        most: samples of a ray, at least 1; None for all.
+        capacity: rows of the result, at least 1; None for as many as there are samples.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        March(ray_offsets, ray_index, depths, deltas, stop). Floating-point arguments share one dtype, which is that of
+        depths and deltas.
+
+    Raises:
+        ValueError: shapes, devices, counts, an unknown spacing or backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "origins", origins, ("r", 3), sizes)
+    check_shape(_OP, "directions", directions, ("r", 3), sizes)
+    check_shape(_OP, "near", near, ("r",), sizes)
+    check_shape(_OP, "far", far, ("r",), sizes)
+    check_shape(_OP, "occupied", occupied, ("x", "y", "z"), sizes)
+    check_shape(_OP, "box", box, (2, 3))
+    check_integer(_OP, "samples", samples, 1)
+    check_dtype(_OP, "origins", origins, (torch.float32, torch.float64))
+    check_dtype(_OP, "occupied", occupied, (torch.bool,))
+    if uniforms is not None:
+        check_shape(_OP, "uniforms", uniforms, ("r", "s"), {**sizes, "s": samples})
+    if start is not None:
+        check_shape(_OP, "start", start, ("r",), sizes)
+        check_dtype(_OP, "start", start, INDEX)
+    check_same_dtype(_OP, origins=origins, directions=directions, near=near, far=far, box=box, uniforms=uniforms)
+    check_same_device(
+        _OP,
+        origins=origins,
+        directions=directions,
+        near=near,
+        far=far,
+        occupied=occupied,
+        box=box,
+        uniforms=uniforms,
+        start=start,
+    )
+    check_choice(_OP, "spacing", spacing, _SPACINGS)
+    for name, value in (("most", most), ("capacity", capacity)):
+        if value is not None:
+            check_integer(_OP, name, value, 1)
+            check_count(_OP, name, value)
+    check_count(_OP, "occupied", occupied.numel())
+    check_count(_OP, "samples of all rays", sizes["r"] * samples)
+    if occupied.numel() < 1:
+        raise ValueError(f"{_OP}: occupied must have at least one cell, got {list(occupied.shape)}")
+    if samples > 65_535:
+        raise ValueError(f"{_OP}: samples must be at most 65535, got {samples}")
+    run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
+    tensors = (tensor.detach() for tensor in (origins, directions, near, far, occupied, box))
+    return March(
+        *run(
+            *tensors,
+            samples,
+            uniforms=None if uniforms is None else uniforms.detach(),
+            disparity=spacing == "disparity",
+            start=start,
+            most=most,
+            capacity=capacity,
+        )
+    )

@@ -1,0 +1,53 @@
+"""The memory of an occupancy grid. x, y, z cells along each axis, q cells looked at."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
+
+_OP = "update_occupancy"
+
+
+def update_occupancy(
+    density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float, backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
+    """Densities that a grid remembers after some of its cells have been looked at, and which cells are occupied.
+
+    A cell that was looked at gets the largest of the values found in it and ``decay`` times what it remembered (Mueller
+    et al. 2022, appendix C); the others keep what they have. Not differentiable.
+
+    Args:
+        density: float32 [x, y, z], >= 0.
+        cells: int32 [q], flat numbers of the cells that were looked at, each in 0 to x * y * z - 1; one may be named
+            more than once. What is no cell is an error on the CPU, and undefined on CUDA, where it is not read.
+        values: float32 [q], the densities found, none NaN.
+        decay: 0 to 1.
+        threshold: density from which a cell counts as occupied.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        (density float32 [x, y, z], occupied bool [x, y, z]).
+
+    Raises:
+        ValueError: shapes, devices, a decay out of range, cells out of range where they are read, an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "density", density, ("x", "y", "z"), sizes)
+    check_shape(_OP, "cells", cells, ("q",), sizes)
+    check_shape(_OP, "values", values, ("q",), sizes)
+    check_dtype(_OP, "density", density, (torch.float32,))
+    check_dtype(_OP, "cells", cells, INDEX)
+    check_dtype(_OP, "values", values, (torch.float32,))
+    check_same_device(_OP, density=density, cells=cells, values=values)
+    check_count(_OP, "density", density.numel())
+    check_count(_OP, "cells", cells.numel())
+    if not 0 <= decay <= 1:
+        raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
+    run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)
+    remembered, occupied = run(density.detach(), cells, values.detach(), decay=decay, threshold=threshold)
+    return remembered, occupied

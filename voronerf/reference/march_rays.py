@@ -1,0 +1,101 @@
+"""Ray marching through an occupancy grid. r rays, s strata of a ray, m samples of all rays (packed).
+
+Every operation is rounded on its own, and the other backends do the same operations in the same order: which cell a
+sample falls in is then the same everywhere.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class March(NamedTuple):
+    """Samples of rays in occupied cells, packed.
+
+    Attributes:
+        ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
+        ray_index: int32 [m], the ray of each sample.
+        depths: [m], distance along the ray, rising along each ray.
+        deltas: [m], length of the sample's stratum.
+        stop: int32 [r], the stratum with which each ray would go on: s where the whole ray has been walked.
+    """
+
+    ray_offsets: Tensor
+    ray_index: Tensor
+    depths: Tensor
+    deltas: Tensor
+    stop: Tensor
+
+
+@torch.no_grad()
+def march_rays(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    samples: int,
+    *,
+    uniforms: Tensor | None = None,
+    disparity: bool = False,
+    start: Tensor | None = None,
+    most: int | None = None,
+    capacity: int | None = None,
+) -> March:
+    """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
+    r, device = len(near), near.device
+    stratum = torch.arange(samples + 1, device=device)
+    # Divisions are by tensors: one by a number may be done as a product with its reciprocal, and round otherwise.
+    count = near.new_full((), samples)
+    edges = _depth(near[:, None], far[:, None], stratum.to(near.dtype) / count, disparity)
+    edges = torch.where(stratum < samples, edges, far[:, None])
+    inside = near.new_full((), 0.5) if uniforms is None else uniforms
+    at = _depth(near[:, None], far[:, None], (stratum[:-1].to(near.dtype) + inside) / count, disparity)
+    at = torch.minimum(torch.maximum(at, edges[:, :-1]), edges[:, 1:])
+
+    taken = far[:, None] > near[:, None]
+    cell = torch.zeros_like(at, dtype=torch.int64)
+    for axis, size in enumerate(occupied.shape):
+        scale = box.new_full((), size) / (box[1, axis] - box[0, axis])
+        place = origins[:, axis, None] + at * directions[:, axis, None]
+        place = (place - box[0, axis]) * scale
+        taken = taken & (place >= 0) & (place <= size)
+        # What is not a number has been left out; it may become any integer.
+        cell = cell * size + place.nan_to_num(0).clamp(0, size).long().clamp(max=size - 1)
+    taken = taken & (occupied.reshape(-1)[cell] != 0)
+    if start is not None:
+        taken = taken & (stratum[:-1] >= start[:, None])
+    rank = taken.cumsum(dim=1)
+    # Of what a ray could have, what it gets: at most `most`, and no more than fits in all.
+    wanted = rank[:, -1].clamp(max=samples if most is None else most)
+    offsets = torch.nn.functional.pad(wanted.cumsum(dim=0), (1, 0))
+    if capacity is not None:
+        offsets = offsets.clamp(max=capacity)
+    got = offsets.diff()
+    rows = int(offsets[-1]) if capacity is None else capacity
+    taken_now = taken & (rank <= got[:, None])
+    # One row more than there are, for the strata that are left out.
+    row = torch.where(taken_now, offsets[:-1, None] + rank - 1, rows).reshape(-1)
+    ray = torch.arange(r, dtype=torch.int32, device=device)[:, None].expand(r, samples)
+    ray_index, depths, deltas = (
+        torch.zeros(rows + 1, dtype=values.dtype, device=device).scatter(0, row, values.reshape(-1))[:rows]
+        for values in (ray, at, edges.diff(dim=1))
+    )
+    last = torch.where(taken_now, stratum[:-1], -1).amax(dim=1)
+    waiting = torch.where(taken & ~taken_now, stratum[:-1], samples).amin(dim=1)
+    # A ray that has got all it may goes on behind its last sample, one that was cut with the sample it did not get.
+    full = (got == wanted) & (wanted == (samples if most is None else most))
+    stop = torch.where(got < wanted, waiting, torch.where(full, last + 1, samples))
+    return March(offsets.to(torch.int32), ray_index, depths, deltas, stop.to(torch.int32))
+
+
+def _depth(near: Tensor, far: Tensor, fraction: Tensor, disparity: bool) -> Tensor:
+    """Distance at a fraction of the way, in equal steps of distance or of 1 / distance."""
+    if not disparity:
+        return near + (far - near) * fraction
+    inverse = far * (1 - fraction) + near * fraction
+    return near * far / inverse.clamp_min(torch.finfo(near.dtype).tiny)

@@ -1,0 +1,199 @@
+"""Volume rendering through an occupancy grid: only samples in occupied cells reach the field.
+
+r rays, s strata of a ray, m samples of all rays (packed). Units as in `voronerf.rendering.volume`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.ops.composite import composite
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.field import Field
+from voronerf.rendering.occupancy import OccupancyGrid
+
+OPAQUE = 1e-3  # a ray that lets less than this through has ended: half a level of an 8-bit image is 2e-3
+FIRST_WAVE, LARGEST_WAVE = 4, 16  # samples of a ray
+
+
+class Marched(NamedTuple):
+    """What `render_marched` returns.
+
+    Attributes:
+        colour: [r, 3], the background included.
+        opacity: [r], 0..1: the sum of the weights.
+        depth: [r], expected distance, normalised by the opacity; `far` for a ray with none.
+        weights: [m], each sample's contribution.
+        positions: [m, 3].
+        rgb: [m, 3], each sample's colour.
+        ray_index: int32 [m], the ray of each sample.
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    weights: Tensor
+    positions: Tensor
+    rgb: Tensor
+    ray_index: Tensor
+
+
+class Seen(NamedTuple):
+    """What `render_until_opaque` returns: as `Marched`, and `heaviest` [r, 3], the position of each ray's heaviest
+    sample, the point at its far end for a ray without samples."""
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    heaviest: Tensor
+
+
+def render_marched(
+    field: Field,
+    rays: Rays,
+    near: Tensor,
+    far: Tensor,
+    grid: OccupancyGrid,
+    *,
+    samples: int,
+    background: Tensor | None = None,
+    jitter: bool = False,
+    generator: torch.Generator | None = None,
+    spacing: str = "linear",
+    backend: str = "auto",
+) -> Marched:
+    """`render_rays` without the samples that lie in empty cells; differentiable, for training.
+
+    Args:
+        field: called once, on the samples that are left; they may be none.
+        rays: r rays.
+        near: [r], start of the integral.
+        far: [r], end.
+        grid: what is empty; outside its box is nothing.
+        samples: s, strata of a ray.
+        background: [3] or [r, 3]; None is black.
+        jitter: stratified random samples, the same that `render_rays` would draw, else the strata's middles.
+        generator: of the jitter.
+        spacing: of the strata, "linear" or "disparity".
+        backend: of the ops.
+    """
+    uniforms = None
+    if jitter:
+        device = near.device if generator is None else generator.device
+        uniforms = torch.rand(len(rays), samples, device=device, dtype=near.dtype, generator=generator).to(near.device)
+    march = grid.march(rays, near, far, samples, uniforms=uniforms, spacing=spacing, backend=backend)
+    index = march.ray_index
+    positions = rays.origins[index] + march.depths[:, None] * rays.directions[index]
+    rgb, sigma = field(positions, rays.directions, index)
+    # a field under autocast answers in a half type: the sums along a ray are float32's
+    rgb, sigma = rgb.to(near.dtype), sigma.to(near.dtype)
+    result = composite(
+        sigma,
+        rgb,
+        march.depths,
+        march.deltas,
+        ray_offsets=march.ray_offsets,
+        background=background,
+        backend=backend,
+    )
+    return Marched(
+        result.colour,
+        result.opacity,
+        _normalised(result.depth, result.opacity, far),
+        result.weights,
+        positions,
+        rgb,
+        index,
+    )
+
+
+@torch.no_grad()
+def render_until_opaque(
+    field: Field,
+    rays: Rays,
+    near: Tensor,
+    far: Tensor,
+    grid: OccupancyGrid,
+    *,
+    samples: int,
+    background: Tensor | None = None,
+    spacing: str = "linear",
+    backend: str = "auto",
+) -> Seen:
+    """The same for images, without gradients: rays are walked in waves, and those that have become opaque are left.
+
+    A wave is a few samples of every ray that still sees something, so a ray costs the field little more than the
+    samples in front of its first surface.
+
+    Args:
+        field: called once a wave.
+        rays: r rays.
+        near: [r].
+        far: [r].
+        grid: what is empty.
+        samples: s, strata of a ray; the samples are their middles.
+        background: [3] or [r, 3]; None is black.
+        spacing: of the strata.
+        backend: of the ops.
+    """
+    r = len(rays)
+    colour, opacity, depth = torch.zeros_like(rays.origins), torch.zeros_like(near), torch.zeros_like(near)
+    through, top = torch.ones_like(near), torch.zeros_like(near)
+    at = far.clone()
+    live, start, most = torch.arange(r, device=near.device), None, FIRST_WAVE
+    while live.numel() > 0:
+        whole = live.numel() == r
+        now = rays if whole else rays[live]
+        march = grid.march(
+            now, near[live], far[live], samples, spacing=spacing, start=start, most=most, backend=backend
+        )
+        index = march.ray_index
+        positions = now.origins[index] + march.depths[:, None] * now.directions[index]
+        rgb, sigma = field(positions, now.directions, index)
+        rgb, sigma = rgb.to(near.dtype), sigma.to(near.dtype)
+        part = composite(sigma, rgb, march.depths, march.deltas, ray_offsets=march.ray_offsets, backend=backend)
+        light = through[live]
+        colour[live] += light[:, None] * part.colour
+        opacity[live] += light * part.opacity
+        depth[live] += light * part.depth
+        _keep_heaviest(top, at, live, light, part.weights, march.depths, march.ray_offsets, index, most)
+        light = light * (1 - part.opacity)
+        through[live] = light
+        more = ((march.stop < samples) & (light > OPAQUE)).nonzero()[:, 0]
+        live, start, most = live[more], march.stop[more], min(2 * most, LARGEST_WAVE)
+    if background is not None:
+        colour += (1 - opacity)[:, None] * background.to(colour)
+    heaviest = rays.origins + at[:, None] * rays.directions
+    return Seen(colour, opacity, _normalised(depth, opacity, far), heaviest)
+
+
+def _keep_heaviest(
+    top: Tensor,
+    at: Tensor,
+    live: Tensor,
+    light: Tensor,
+    weights: Tensor,
+    depths: Tensor,
+    ray_offsets: Tensor,
+    index: Tensor,
+    most: int,
+) -> None:
+    """Depth `at` [r] and weight `top` [r] of each ray's heaviest sample so far."""
+    row = torch.arange(len(index), device=index.device) - ray_offsets[index]
+    place = index.long() * most + row
+    table = weights.new_full((2, len(live) * most), -1.0)
+    table[0, place], table[1, place] = weights, depths
+    weight, column = table[0].reshape(-1, most).max(dim=1)
+    weight = weight * light
+    better = weight > top[live]
+    rays = live[better]
+    top[rays] = weight[better]
+    at[rays] = table[1].reshape(-1, most).gather(1, column[:, None])[:, 0][better]
+
+
+def _normalised(depth: Tensor, opacity: Tensor, far: Tensor) -> Tensor:
+    seen = opacity > 0
+    return torch.where(seen, depth / torch.where(seen, opacity, 1), far)

@@ -1,0 +1,190 @@
+"""Which cells of a scene's box hold anything: a grid that lets rays skip the empty ones.
+
+x, y, z cells of the grid along each axis, q cells asked about, r rays, s strata of a ray. Densities are per world unit.
+Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (cells that remember the largest recent
+density, decaying); which cells are visited when is this project's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from voronerf.ops.march_rays import March, march_rays
+from voronerf.ops.update_occupancy import update_occupancy
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.field import Field
+
+CHUNK = 1 << 17  # points a field is asked about at a time
+
+
+class OccupancyGrid:
+    """The largest recent density of every cell of a box, and which cells count as occupied.
+
+    A new grid is occupied everywhere; cells become empty as `update` finds them so.
+
+    Attributes:
+        box: float32 [2, 3], lowest and highest corner.
+        density: float32 [x, y, z], what each cell remembers.
+        occupied: bool [x, y, z], density >= threshold.
+        threshold: per world unit.
+    """
+
+    def __init__(
+        self,
+        box: Tensor,
+        resolution: int | Sequence[int] = 64,
+        *,
+        threshold: float,
+        device: torch.device | str | None = None,
+    ) -> None:
+        """Makes a grid that is occupied everywhere.
+
+        Args:
+            box: [2, 3], the second corner above the first.
+            resolution: cells along each axis, one number for all or three.
+            threshold: density from which a cell is occupied, per world unit, > 0 and finite.
+            device: of the grid; default that of the box.
+
+        Raises:
+            ValueError: a box, resolution or threshold that is none.
+        """
+        shape = (resolution,) * 3 if isinstance(resolution, int) else tuple(resolution)
+        if tuple(box.shape) != (2, 3) or not bool((box[1] > box[0]).all()) or not bool(box.isfinite().all()):
+            raise ValueError(f"OccupancyGrid: box must be finite corners [2, 3], low and high, got {box.tolist()}")
+        if len(shape) != 3 or min(shape) < 1:
+            raise ValueError(f"OccupancyGrid: resolution must be one or three numbers >= 1, got {resolution}")
+        if not 0 < threshold < float("inf"):
+            raise ValueError(f"OccupancyGrid: threshold must be positive and finite, got {threshold}")
+        self.box = box.detach().to(device=device, dtype=torch.float32).clone()
+        self.threshold = float(threshold)
+        # Twice the threshold: a cell that is met for the first time has to be found empty, not to fade away.
+        self.density = torch.full(shape, 2 * self.threshold, device=self.box.device)
+        self.occupied = torch.ones(shape, dtype=torch.bool, device=self.box.device)
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that are occupied, 0..1. Waits for the device."""
+        return float(self.occupied.float().mean())
+
+    def points(self, cells: Tensor, uniforms: Tensor | None = None) -> Tensor:
+        """Points in cells.
+
+        Args:
+            cells: int [q], flat numbers of cells.
+            uniforms: [q, 3] in 0..1, where in the cell; None for the middle.
+
+        Returns:
+            float32 [q, 3], world.
+        """
+        shape = torch.tensor(self.occupied.shape, device=self.box.device)
+        _, y, z = self.occupied.shape
+        place = torch.stack((cells // (y * z), cells // z % y, cells % z), dim=-1).float()
+        place = place + (0.5 if uniforms is None else uniforms)
+        return torch.lerp(self.box[0], self.box[1], place / shape)
+
+    @torch.no_grad()
+    def update(
+        self,
+        field: Field,
+        cells: Tensor | None = None,
+        *,
+        decay: float = 0.0,
+        generator: torch.Generator | None = None,
+        backend: str = "auto",
+    ) -> None:
+        """Asks a field for the density at a random point of each cell, and keeps it or what the cell remembers.
+
+        Args:
+            field: called without gradients.
+            cells: int32 or int64 [q], flat numbers of the cells to look at; None for all.
+            decay: factor on what these cells remember, 0..1; 0 forgets it.
+            generator: of the points, on any device.
+            backend: of the op.
+
+        Raises:
+            ValueError: a decay out of range.
+        """
+        if not 0 <= decay <= 1:
+            raise ValueError(f"OccupancyGrid.update: decay must lie in 0..1, got {decay}")
+        device = self.box.device
+        if cells is None:
+            cells = torch.arange(self.occupied.numel(), device=device)
+        drawn_on = device if generator is None else generator.device
+        found = []
+        for part in cells.split(CHUNK):
+            uniforms = torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device)
+            found.append(density_of(field, self.points(part, uniforms)))
+        values = torch.cat(found) if found else self.density.new_empty(0)
+        self.density, self.occupied = update_occupancy(
+            self.density, cells.to(torch.int32), values, decay=decay, threshold=self.threshold, backend=backend
+        )
+
+    def march(
+        self,
+        rays: Rays,
+        near: Tensor,
+        far: Tensor,
+        samples: int,
+        *,
+        uniforms: Tensor | None = None,
+        spacing: str = "linear",
+        start: Tensor | None = None,
+        most: int | None = None,
+        backend: str = "auto",
+    ) -> March:
+        """The samples of rays that lie in occupied cells; see `voronerf.ops.march_rays`."""
+        return march_rays(
+            rays.origins,
+            rays.directions,
+            near,
+            far,
+            self.occupied,
+            self.box,
+            samples,
+            uniforms=uniforms,
+            spacing=spacing,
+            start=start,
+            most=most,
+            backend=backend,
+        )
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Tensors from which `from_state` makes the same grid, bit for bit."""
+        return {
+            "box": self.box.clone(),
+            "density": self.density.clone(),
+            "occupied": self.occupied.clone(),
+            "threshold": torch.tensor(self.threshold, dtype=torch.float64),
+        }
+
+    @staticmethod
+    def from_state(state: Mapping[str, Tensor], *, device: torch.device | str = "cpu") -> OccupancyGrid:
+        """The grid whose `state_dict` this is.
+
+        Raises:
+            ValueError: an entry is missing or has another shape than it should.
+        """
+        missing = [name for name in ("box", "density", "occupied", "threshold") if name not in state]
+        if missing:
+            raise ValueError(
+                f"OccupancyGrid: state must hold {', '.join(missing)}, got {', '.join(state) or 'nothing'}"
+            )
+        density, occupied = state["density"], state["occupied"]
+        if density.dim() != 3 or density.shape != occupied.shape:
+            raise ValueError(
+                "OccupancyGrid: state must hold density and occupied of one shape [x, y, z], got "
+                f"{list(density.shape)} and {list(occupied.shape)}"
+            )
+        grid = OccupancyGrid(state["box"], density.shape, threshold=float(state["threshold"]), device=device)
+        grid.density, grid.occupied = density.to(device, torch.float32), occupied.to(device, torch.bool)
+        return grid
+
+
+def density_of(field: Field, points: Tensor) -> Tensor:
+    """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN counts as endless."""
+    direction = points.new_tensor(((0.0, 0.0, 1.0),))
+    _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
+    return sigma.detach().float().nan_to_num(nan=float("inf"), posinf=float("inf"))
