@@ -1,0 +1,153 @@
+"""Samples sorted by cell: the order, its inverse, and what a pass over the sorted rows needs to know.
+
+n samples, k cells. A sorted tensor may have m entries a sample: its first dimension is then n * m, sample after sample.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf import ops
+
+
+class PerCell(torch.Tensor):
+    """k tensors, one for each cell, that look like one of them: what a routed module finds in the place of a parameter.
+
+    It has the shape of a single cell's tensor and no storage: the operations that it takes part in are carried out by
+    :class:`voronerf.router.rows.RowMode`, on ``stacked``, and any other use fails.
+
+    Attributes:
+        stacked: [k, ...], one entry for each cell.
+    """
+
+    stacked: Tensor
+    # Shape and dtype are answered by the wrapper itself.
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    @staticmethod
+    def __new__(cls, stacked: Tensor, is_parameter: bool = False) -> PerCell:
+        """Wraps [k, ...]; ``is_parameter`` makes it an instance of ``nn.Parameter``."""
+        wrapper: PerCell = torch.Tensor._make_wrapper_subclass(
+            cls,
+            stacked.shape[1:],
+            dtype=stacked.dtype,
+            device=stacked.device,
+            requires_grad=stacked.requires_grad and stacked.is_floating_point(),
+        )
+        wrapper.stacked = stacked
+        wrapper._is_param = is_parameter
+        return wrapper
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
+        """Refuses what did not pass through the mode."""
+        raise TypeError(
+            f"VoronoiRouter: {func} met the parameters of all cells outside of a routed call; call the router, or take "
+            "one cell's module with cell(i)"
+        )
+
+
+class Grouping:
+    """An assignment of n samples to k cells, sorted.
+
+    Attributes:
+        n: samples.
+        k: cells.
+        cells: int32 [n], the cell of each sample in the original order; None where there is one cell.
+        order: int32 [n], the original row of each sorted row; None where there is one cell.
+        offsets: int32 [k + 1]; cell c owns sorted rows ``offsets[c]`` to ``offsets[c + 1]``.
+        backend: of the operations on the sorted rows.
+    """
+
+    def __init__(self, cells: Tensor | None, n: int, k: int, device: torch.device, backend: str) -> None:
+        self.n, self.k, self.backend, self.cells = n, k, backend, cells
+        self.order: Tensor | None = None
+        if cells is None:
+            self.offsets = torch.tensor([0, n], dtype=torch.int32, device=device)
+        else:
+            self.order, self.offsets = ops.cell_sort(cells, k, backend=backend)
+        self._inverse: Tensor | None = None
+        self._sorted_cells: Tensor | None = None
+        self._offsets = {1: self.offsets}
+        self._bounds: list[int] | None = None
+
+    @property
+    def inverse(self) -> Tensor | None:
+        """int32 [n], the sorted row of each original row."""
+        if self._inverse is None and self.order is not None:
+            rows = torch.arange(self.n, dtype=torch.int32, device=self.order.device)
+            self._inverse = torch.empty_like(self.order).scatter_(0, self.order.long(), rows)
+        return self._inverse
+
+    @property
+    def sorted_cells(self) -> Tensor:
+        """int64 [n], the cell of each sorted row."""
+        if self._sorted_cells is None:
+            if self.cells is None or self.order is None:
+                self._sorted_cells = torch.zeros(self.n, dtype=torch.int64, device=self.offsets.device)
+            else:
+                self._sorted_cells = self.cells.index_select(0, self.order).long()
+        return self._sorted_cells
+
+    def scaled_offsets(self, m: int) -> Tensor:
+        """``offsets`` of tensors with m entries a sample."""
+        if m not in self._offsets:
+            self._offsets[m] = self.offsets * m
+        return self._offsets[m]
+
+    def occupied(self) -> list[tuple[int, int, int]]:
+        """(cell, first row, row behind the last) of every cell that has samples; reads them on the host."""
+        if self._bounds is None:
+            self._bounds = self.offsets.tolist()
+        pairs = zip(self._bounds, self._bounds[1:], strict=False)
+        return [(cell, first, last) for cell, (first, last) in enumerate(pairs) if last > first]
+
+    def sort(self, x: Tensor) -> Tensor:
+        """[n, ...] in the original order -> sorted by cell."""
+        return x if self.order is None else permute(x, self.order, self.inverse)
+
+    def unsort(self, x: Tensor) -> Tensor:
+        """[n, ...] sorted by cell -> the original order."""
+        return x if self.order is None else permute(x, self.inverse, self.order)
+
+    def expand(self, parameter: PerCell, m: int = 1) -> Tensor:
+        """[n * m, ...]: each row with its cell's tensor."""
+        stacked = parameter.stacked
+        if not stacked.is_floating_point() or stacked[0].numel() == 0:
+            rows = self.sorted_cells if m == 1 else self.sorted_cells.repeat_interleave(m)
+            return stacked.index_select(0, rows)
+        # A grouped layer without inputs: its backward sums over each cell's rows, where that of indexing would scatter.
+        ones = stacked.new_ones(self.n * m, 1)
+        weight = stacked.reshape(self.k, -1, 1)
+        with torch.autocast(stacked.device.type, enabled=False):
+            rows = ops.grouped_linear(ones, self.scaled_offsets(m), weight, backend=self.backend)
+        return rows.reshape(self.n * m, *stacked.shape[1:])
+
+
+class _Permute(torch.autograd.Function):
+    """Rows in another order. The backward is a gather as well, where that of indexing would be a scatter-add."""
+
+    @staticmethod
+    def forward(x: Tensor, index: Tensor, inverse: Tensor) -> Tensor:
+        return x.index_select(0, index)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[1], inputs[2])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        index, inverse = ctx.saved_tensors
+        return permute(gradient, inverse, index), None, None
+
+
+def permute(x: Tensor, index: Tensor | None, inverse: Tensor | None) -> Tensor:
+    """``x[index]`` for a permutation whose inverse is known."""
+    if x.requires_grad and torch.is_grad_enabled():
+        permuted: Tensor = _Permute.apply(x, index, inverse)
+        return permuted
+    assert index is not None
+    return x.index_select(0, index)

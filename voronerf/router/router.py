@@ -1,0 +1,449 @@
+"""VoronoiRouter: one network per Voronoi cell, evaluated for all cells in one pass.
+
+Letters: n samples, k cells, r rays. Positions are in scene units; index tensors are int32.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, Protocol, cast, runtime_checkable
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.diagram import VoronoiDiagram
+from voronerf.layers import MLP
+from voronerf.ops import cell_sort, grouped_mlp
+from voronerf.router.arguments import accepted_names
+from voronerf.router.calls import Call, Memory, run_grouped
+from voronerf.router.grouping import Grouping
+from voronerf.router.parameters import (
+    check_module,
+    check_optimizer,
+    clone_module,
+    draw_parameters,
+    fill_cell,
+    inherit_parameters,
+    move_state,
+    stack_parameters,
+    take_cell,
+    warn_fresh_state,
+)
+from voronerf.subdivision import split_diagram
+
+Assignment = Literal["nearest", "stochastic"]
+Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
+
+
+@runtime_checkable
+class LayeredField(Protocol):
+    """A field that describes itself by a layer table, as :class:`voronerf.fields.NeRF` does."""
+
+    layers: MLP
+
+    def linears(self) -> list[nn.Linear]:
+        """The linear layers in the table's order."""
+        ...
+
+    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Turns the table's outputs [n, out] into what the field returns."""
+        ...
+
+
+class VoronoiRouter(nn.Module):
+    """k copies of a module, one per cell of a Voronoi diagram, each sample evaluated by the copy of its cell.
+
+    ``router(...)`` takes the arguments of the module's own ``forward`` and returns what it returns, in the same order
+    and with the same leading dimensions. Every cell starts as a copy of the module (inheritance, Adaptive Voronoi
+    NeRFs): positions stay global, so identical copies give exactly what the module gives, and no seam appears at the
+    split. The parameters of all copies are stacked, ``[k, ...]`` under the module's own names below ``module.``, so
+    that an optimiser sees as many tensors as for one module. Buffers are shared by all cells.
+
+    How a call is carried out depends on the module:
+
+    - A field with a layer table (:class:`LayeredField`) runs as one fused operation.
+    - Any other module runs its own ``forward`` once, on the samples of all cells sorted by cell. Linear layers (also
+      ``F.linear``, ``@``, ``einsum`` on a parameter), embeddings, normalisation layers, learned scales and PReLU have
+      forms for all cells at once; other functions of parameters run cell by cell on contiguous rows, which is said
+      once. Every step is followed to see that it treats samples one by one.
+    - Where that is not so, or a parameter's value is read, the module runs once for each cell that has samples, which
+      is said once. A module that mixes samples (BatchNorm, attention across samples) is refused.
+
+    Arguments are per sample ``[..., f]``; per ray ``[rays, f]`` beside ``[rays, samples, f]``; numbers, flags, None and
+    tensors of one element, which are passed on; and objects that hold tensors: dataclasses, and classes with ``shape``,
+    ``flatten()``, ``reshape(shape)`` and indexing, as nerfstudio's ``RaySamples``. A module called with [rays, samples,
+    f] sees [n, 1, f].
+
+    Args:
+        module: Any ``nn.Module`` that treats samples one by one; copied, never changed.
+        diagram: A VoronoiDiagram, or centres [k, 3].
+        coords: Where the positions are: ``"first3"``, the first three features of the first tensor; a slice of its
+            features; or a function of the call's arguments that returns positions [..., 3]. They may be given at the
+            call instead, ``router(x, coords=positions)``. A field with a layer table has them as its first argument.
+        per_ray: Names or numbers of the arguments that have one row for each ray. None tells by shapes, and refuses
+            those that can be read in two ways.
+        shared: Names or numbers of tensor arguments that are the same for all samples.
+        methods: Names of further methods to route, ``router.density(x)``. Assignments are reused between methods that
+            are called with the same positions.
+        assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell from the
+            distances while training (:meth:`VoronoiDiagram.sample_cell`), and is "nearest" in eval mode.
+        temperature: Of the stochastic assignment, in scene units.
+        backend: Of every operation, see ``voronerf info``.
+
+    Raises:
+        TypeError: For a module that mixes samples, or that cannot be one network for each cell.
+        ValueError: For bad centres, coords, methods, an unknown assignment or a temperature that is not positive.
+    """
+
+    def __init__(
+        self,
+        module: nn.Module,
+        diagram: VoronoiDiagram | Tensor,
+        *,
+        coords: Coordinates | None = None,
+        per_ray: Sequence[str | int] | None = None,
+        shared: Sequence[str | int] = (),
+        methods: Sequence[str] = (),
+        assignment: Assignment = "nearest",
+        temperature: float = 0.05,
+        backend: str = "auto",
+    ) -> None:
+        super().__init__()
+        module = getattr(module, "_orig_mod", module)  # of torch.compile, which would not see the parameters of cells
+        check_module(module)
+        if assignment not in ("nearest", "stochastic"):
+            raise ValueError(f"VoronoiRouter: assignment must be 'nearest' or 'stochastic', got {assignment!r}")
+        if not temperature > 0:
+            raise ValueError(f"VoronoiRouter: temperature must be positive, got {temperature}")
+        if not (coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords)):
+            raise ValueError(f"VoronoiRouter: coords must be 'first3', a slice or a function, got {coords!r}")
+        for name, value in (("per_ray", per_ray), ("shared", shared), ("methods", methods)):
+            if isinstance(value, (str, int)):
+                raise TypeError(f"VoronoiRouter: {name} must be a list, got {value!r}")
+        for name in methods:
+            if not callable(getattr(module, name, None)):
+                raise ValueError(f"VoronoiRouter: methods must name methods of {type(module).__name__}, got {name!r}")
+            if hasattr(VoronoiRouter, name) or name in ("module", "diagram"):
+                raise ValueError(f"VoronoiRouter: methods must not name what a router has itself, got {name!r}")
+        known = accepted_names([module.forward, *(getattr(module, name) for name in methods)])
+        for item in (*(per_ray or ()), *shared):
+            if isinstance(item, str) and known is not None and item.split(".")[0] not in known:
+                raise ValueError(
+                    f"VoronoiRouter: per_ray and shared must name arguments of {type(module).__name__}, one of "
+                    f"{', '.join(known)}, got {item!r}"
+                )
+        self.diagram = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
+        self.assignment = assignment
+        self.temperature = temperature
+        self.backend = backend
+        self.generator: torch.Generator | None = None
+        self.coords = coords
+        self.per_ray = None if per_ray is None else tuple(per_ray)
+        self.shared = tuple(shared)
+        self.methods = tuple(methods)
+        self._layered = isinstance(module, LayeredField)
+        self._memory = Memory()
+
+        self.module: nn.Module = clone_module(module)
+        stack_parameters(self.module, self.diagram.num_cells)
+
+    @classmethod
+    def from_modules(
+        cls, modules: Sequence[nn.Module], diagram: VoronoiDiagram | Tensor, **options: Any
+    ) -> VoronoiRouter:
+        """One module for each cell, in the order of the centres, as Mega-NeRF trains them.
+
+        Args:
+            modules: k modules of one architecture.
+            diagram: A VoronoiDiagram of k cells, or centres [k, 3].
+            **options: Those of the constructor.
+
+        Raises:
+            ValueError: Other than k modules, or modules that differ in parameters' names or shapes or in buffers.
+        """
+        modules = list(modules)
+        if not modules:
+            raise ValueError("VoronoiRouter.from_modules: modules must hold a module for each cell, got none")
+        router = cls(modules[0], diagram, **options)
+        if len(modules) != router.num_cells:
+            raise ValueError(
+                f"VoronoiRouter.from_modules: modules must hold a module for each of {router.num_cells} cells, got "
+                f"{len(modules)}"
+            )
+        for index, module in enumerate(modules):
+            fill_cell(router.module, index, module, f"VoronoiRouter.from_modules: modules[{index}]")
+        return router
+
+    @property
+    def field(self) -> LayeredField:
+        """The field whose parameters are stacked; its own ``forward`` is not usable any more."""
+        return cast(LayeredField, self.module)
+
+    @property
+    def num_cells(self) -> int:
+        """Cells of the diagram, networks of the router."""
+        return self.diagram.num_cells
+
+    def assign(self, positions: Tensor) -> Tensor:
+        """The cell that evaluates each position: positions [n, 3] -> int32 [n]."""
+        if self.assignment == "stochastic" and self.training and self.num_cells > 1:
+            return self.diagram.sample_cell(positions, temperature=self.temperature, generator=self.generator)
+        return self.diagram.locate(positions, backend=self.backend)
+
+    def forward(self, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
+        """Evaluates each sample in its cell; the order of the results is the order of the samples.
+
+        Args:
+            *args: Those of the module's ``forward``. For a field with a layer table: positions [n, 3] in scene units,
+                directions, unit vectors [n, 3] or [r, 3] together with ray_index, int32 [n], the row of ``directions``
+                that belongs to each sample.
+            coords: Positions [..., 3] in scene units that decide the cells, in the place of the router's own rule.
+            **kwargs: Those of the module's ``forward``.
+
+        Returns:
+            What the module returns. For a field with a layer table, what its ``activate`` gives: (colour [n, 3],
+            density [n]).
+
+        Raises:
+            ValueError: For shapes that disagree, positions that are not said, arguments that fit no reading or two, or
+                directions that the field needs and did not get.
+            TypeError: When the module turns out to mix samples.
+        """
+        if self._layered:
+            return self._evaluate_table(*args, coords=coords, **kwargs)
+        return self._route("forward", args, kwargs, coords)
+
+    def __getattr__(self, name: str) -> Any:
+        """The routed methods, beside what a module has."""
+        if name in self.__dict__.get("methods", ()):
+            return functools.partial(self._call_method, name)
+        return super().__getattr__(name)
+
+    def _call_method(self, name: str, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
+        return self._route(name, args, kwargs, coords)
+
+    @torch.compiler.disable
+    def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
+        """One call of a method of the module. ``torch.compile`` leaves it as it is and goes on behind it."""
+        call = Call(method, getattr(self.module, method), args, kwargs)
+        rule = coords if coords is not None else self.coords
+        layout, positions, source = call.locate(rule, self.per_ray, self.shared)
+        grouping = self._memory.assignments.find(method, source, positions, self._assignment_key())
+        if grouping is None:
+            grouping = self._group(positions, layout.n)
+            self._memory.assignments.keep(method, source, positions, self._assignment_key(), grouping)
+        return run_grouped(self.module, call, layout, grouping, self._memory)
+
+    def _group(self, positions: Tensor, n: int) -> Grouping:
+        flat = positions.detach().reshape(-1, 3)
+        cells = self.assign(flat) if n and self.num_cells > 1 else None
+        if self.num_cells > 1 and n < 2:
+            # The module runs on two rows, since sizes of 0 and 1 leave open what is a row.
+            cells = torch.zeros(2, dtype=torch.int32, device=flat.device) if cells is None else cells.expand(2).clone()
+        return Grouping(cells, max(n, 2), self.num_cells, positions.device, self.backend)
+
+    def _assignment_key(self) -> tuple[Any, ...]:
+        drawn = self.assignment == "stochastic" and self.training
+        return (id(self.diagram), self.diagram.centres._version, drawn, self.temperature, self.backend)
+
+    def _evaluate_table(
+        self,
+        positions: Tensor,
+        directions: Tensor | None = None,
+        ray_index: Tensor | None = None,
+        *,
+        coords: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise ValueError(f"VoronoiRouter: positions must have shape [n, 3], got {list(positions.shape)}")
+        if coords is not None and coords.shape != positions.shape:
+            raise ValueError(
+                f"VoronoiRouter: coords must have the shape of positions, {list(positions.shape)}, got "
+                f"{list(coords.shape)}"
+            )
+        table = self.field.layers
+        needs_directions = table.uses_directions
+        if needs_directions and directions is None:
+            raise ValueError("VoronoiRouter: directions must be given, since the field's colour depends on them")
+        if not needs_directions:
+            directions = ray_index = None
+        if directions is not None and ray_index is None and directions.shape[0] != positions.shape[0]:
+            raise ValueError(
+                "VoronoiRouter: directions must have a row for each position, or come with ray_index, got "
+                f"{directions.shape[0]} rows for {positions.shape[0]} positions"
+            )
+
+        linears = self.field.linears()
+        weights = [layer.weight for layer in linears]
+        biases = [layer.bias for layer in linears]
+        if self.num_cells == 1:
+            offsets = torch.tensor([0, positions.shape[0]], dtype=torch.int32, device=positions.device)
+            order = None
+        else:
+            where = positions if coords is None else coords
+            order, offsets = cell_sort(self.assign(where.detach()), self.num_cells, backend=self.backend)
+            # Positions are three floats a sample, their encoding sixty-three: permute before encoding.
+            positions = positions[order]
+            if ray_index is not None:
+                ray_index = ray_index[order]
+            elif directions is not None:
+                directions = directions[order]
+        raw = grouped_mlp(
+            positions,
+            offsets,
+            weights,
+            biases,
+            layers=table,
+            directions=directions,
+            direction_index=ray_index,
+            backend=self.backend,
+        )
+        if order is not None:
+            # index_copy rather than indexing by the inverse order: its backward is a gather, not a scatter-add.
+            raw = torch.zeros_like(raw).index_copy(0, order.long(), raw)
+        return self.field.activate(raw)
+
+    def cell(self, index: int) -> nn.Module:
+        """A plain copy of one cell's module, with parameters of its own.
+
+        Raises:
+            IndexError: When there is no such cell.
+        """
+        return take_cell(self.module, self._check_index("cell", index))
+
+    def load_cell(self, index: int, module: nn.Module) -> None:
+        """Puts the parameters of a plain module into one cell; parameter objects stay, as do optimisers.
+
+        Raises:
+            IndexError: When there is no such cell.
+            ValueError: For parameters of other names or shapes, or buffers that are not those shared by the cells.
+        """
+        fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
+
+    def _check_index(self, method: str, index: int) -> int:
+        if not -self.num_cells <= index < self.num_cells:
+            raise IndexError(f"VoronoiRouter.{method}: index must be below {self.num_cells}, got {index}")
+        return index
+
+    @torch.no_grad()
+    def subdivide(
+        self,
+        diagram: VoronoiDiagram | int,
+        parents: Tensor | None = None,
+        *,
+        optimizer: torch.optim.Optimizer | None = None,
+        inherit: bool = True,
+        points: Tensor | None = None,
+        weights: Tensor | None = None,
+        **split: Any,
+    ) -> Tensor:
+        """Replaces the diagram by a finer one; every new cell starts where its parent stands.
+
+        Parameters and, with ``optimizer``, the state of Adam, AdamW, RAdam, SGD and their like are copied from the
+        parent; other optimisers begin anew, which is said. The parameter objects are new; those in the optimiser's
+        groups are replaced in place, so groups, learning rates and schedules go on. A wrapper that holds parameters of
+        its own, such as ``DistributedDataParallel``, has to be made again.
+
+        Args:
+            diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children that
+                :func:`voronerf.split_diagram` gives each cell that has enough samples.
+            parents: int64 [new cells], the present cell that each new cell lies in. None takes for a diagram the cell
+                that holds the new centre.
+            optimizer: The optimiser that holds this router's parameters.
+            inherit: False draws fresh parameters for the children of every cell that is split, with moments of zero:
+                the ablation that shows ghosting.
+            points: [m, 3], for a number of children: samples, in scene units.
+            weights: [m], their importance, by which the new cells are balanced.
+            **split: Further options of ``split_diagram``, such as cells, centres, min_samples.
+
+        Returns:
+            int64 [new cells], the parents.
+
+        Raises:
+            ValueError: When ``parents`` does not fit, ``points`` or ``weights`` are missing, or the module cannot draw
+                fresh parameters.
+        """
+        if not isinstance(diagram, VoronoiDiagram):
+            if isinstance(diagram, bool) or not isinstance(diagram, int):
+                raise TypeError(
+                    "VoronoiRouter.subdivide: diagram must be a VoronoiDiagram or a number of children, got "
+                    f"{type(diagram).__name__}"
+                )
+            if points is None or weights is None or parents is not None:
+                raise ValueError(
+                    "VoronoiRouter.subdivide: a number of children needs points and weights, the samples and their "
+                    "importance, and no parents"
+                )
+            result = split_diagram(
+                self.diagram,
+                points,
+                weights,
+                diagram,
+                **{"generator": self.generator, "backend": self.backend, **split},
+            )
+            diagram, parents = result.diagram, result.parents
+        elif points is not None or weights is not None or split:
+            given = [n for n, v in (("points", points), ("weights", weights)) if v is not None] + list(split)
+            raise ValueError(
+                f"VoronoiRouter.subdivide: {given[0]} must come with a number of children, got a VoronoiDiagram"
+            )
+        if parents is None:
+            parents = self.diagram.locate(diagram.leaf_centres.to(self.diagram.centres.device)).long()
+        if parents.ndim != 1 or parents.shape[0] != diagram.num_cells:
+            raise ValueError(
+                f"VoronoiRouter.subdivide: parents must have shape [{diagram.num_cells}], got {list(parents.shape)}"
+            )
+        if parents.dtype != torch.int64:
+            raise TypeError(f"VoronoiRouter.subdivide: parents must be int64, got {parents.dtype}")
+        if int(parents.min()) < 0 or int(parents.max()) >= self.num_cells:
+            raise ValueError(
+                f"VoronoiRouter.subdivide: parents must lie in 0..{self.num_cells - 1}, got "
+                f"{int(parents.min())}..{int(parents.max())}"
+            )
+        # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
+        new = torch.bincount(parents, minlength=self.num_cells)[parents] > 1
+        fresh = None if inherit else draw_parameters(self.cell(0), diagram.num_cells, self.generator)
+        if optimizer is not None:
+            check_optimizer(optimizer, self.module)
+        replaced = inherit_parameters(self.module, parents, fresh, new)
+        if optimizer is not None:
+            lost = move_state(optimizer, replaced, parents, None if inherit else new)
+            if lost:
+                warn_fresh_state(lost)
+        self.diagram = copy.deepcopy(diagram).to(self.diagram.centres.device)
+        self._memory.forget()
+        return parents
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Takes over the stored diagram first, so that parameters of any number of cells fit.
+
+        Where the number of cells changes, the parameter objects are new: make the optimiser afterwards.
+        """
+        self._memory.forget()
+        if f"{prefix}diagram.centres" in state_dict:
+            diagram = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram.")
+            if diagram.num_cells == self.num_cells:
+                self.diagram = diagram.to(self.diagram.centres.device)
+            else:
+                self.subdivide(diagram, torch.zeros(diagram.num_cells, dtype=torch.int64))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
+        self._memory.forget()
+        return super()._apply(fn, recurse)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
+        for part in self.modules():
+            for value in vars(part).values():
+                if isinstance(value, Tensor) and not value.is_leaf:
+                    memo[id(value)] = value.detach().clone()
+        copied = type(self).__new__(type(self))
+        memo[id(self)] = copied
+        copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in vars(self).items()})
+        return copied
+
+    def extra_repr(self) -> str:
+        """What ``print(router)`` shows beside the field's modules."""
+        return f"num_cells={self.num_cells}, depth={self.diagram.depth}, assignment={self.assignment!r}"
