@@ -24,6 +24,7 @@ test: $(VENV)/.built
 
 # A few minutes; for figures to keep, run the scripts with --json and the settings they document.
 bench: $(VENV)/.built
+	@$(BIN)/python benchmarks/throughput.py --quick --targets
 	@$(BIN)/python benchmarks/balance.py --cells 4 16 64 --seeds 2
 	@$(BIN)/python benchmarks/time_to_quality.py --data builtin --budget 30 --eval-views 5
 

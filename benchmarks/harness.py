@@ -1,15 +1,37 @@
-"""What the benchmarks share: the metadata of a result, so that every file under results/ says where it was measured."""
+"""What the benchmarks share: the metadata of a result, and timings that can be compared.
+
+Every file under results/ says where it was measured. Timings of one table row come from one call of :func:`measure`:
+contenders take turns in one process, each call reads other inputs than the one before, and medians are reported.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import platform
 import re
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from voronerf import __version__, backends
+
+Run = Callable[[int], Any]
+"""A contender: given the number of the call, runs on the inputs that number stands for. Call 0 is the warm-up."""
+
+FEWEST = 3
+"""Timings below which a row says that it was capped."""
+MOST = 200
+TOO_SLOW = 3
+"""Limits that a warm-up may take for its contender to be timed at all apart from it."""
+BATCH_SECONDS = 5e-3
+"""Calls shorter than this are timed several at a time, after one that is not: what ran before has left its own code and
+data in the caches, and its threads spinning."""
 
 
 def processor() -> str:
@@ -30,3 +52,175 @@ def metadata(**extra: Any) -> dict[str, Any]:
         "machine": processor(),
         "native": backends.describe()["native"],
     }
+
+
+@dataclass
+class Timing:
+    """Timings of one contender.
+
+    Attributes:
+        seconds: of single calls, or the mean of a batch of short ones.
+        capped: the time limit left fewer than ``FEWEST`` of them.
+    """
+
+    seconds: list[float] = field(default_factory=list)
+    capped: bool = False
+
+    @property
+    def median_ms(self) -> float:
+        """Milliseconds of a call."""
+        return statistics.median(self.seconds) * 1e3
+
+    @property
+    def iqr_ms(self) -> float | None:
+        """Distance between the quartiles; None of fewer than two timings."""
+        if len(self.seconds) < 2:
+            return None
+        low, _, high = statistics.quantiles(self.seconds, n=4, method="inclusive")
+        return (high - low) * 1e3
+
+
+class Stopwatch:
+    """Seconds that calls take: by the clock on the CPU, between events of the stream on CUDA."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.cuda = device.type == "cuda"
+
+    def __call__(self, run: Run, first: int, count: int) -> float:
+        """Seconds of calls ``first`` to ``first + count``, together."""
+        if not self.cuda:
+            start = time.perf_counter()
+            for call in range(first, first + count):
+                run(call)
+            return time.perf_counter() - start
+        begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        torch.cuda.synchronize()
+        begin.record()
+        for call in range(first, first + count):
+            run(call)
+        end.record()
+        end.synchronize()
+        return float(begin.elapsed_time(end)) * 1e-3
+
+
+def measure(
+    contenders: dict[str, Run],
+    limits: dict[str, float],
+    stopwatch: Callable[[Run, int, int], float],
+    warm: dict[str, float] | None = None,
+) -> dict[str, Timing]:
+    """Times contenders in turns; each has been called once (call 0) before.
+
+    A contender is out of the game when its timings add up to its limit, but not before ``FEWEST`` timings. Where a
+    single call exceeds the limit, that one is all there is, and the timing is capped.
+
+    Args:
+        contenders: what to run, by name, in the order of their turns.
+        limits: seconds for each of them.
+        stopwatch: seconds of calls ``first`` to ``first + count`` of a contender; a :class:`Stopwatch`.
+        warm: seconds of call 0, where known. A contender that took a multiple of its limit then is not called again.
+
+    Returns:
+        A timing for each contender.
+    """
+    timings: dict[str, Timing] = {}
+    batch: dict[str, int] = {}
+    following = dict.fromkeys(contenders, 2)
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        for name, run in contenders.items():
+            seconds = (warm or {}).get(name, 0.0)
+            if seconds <= TOO_SLOW * limits[name]:
+                seconds = stopwatch(run, 1, 1)
+            slow = seconds > limits[name]
+            timings[name] = Timing([seconds] if slow else [], slow)
+            batch[name] = max(1, round(BATCH_SECONDS / max(seconds, 1e-7)))
+        active = [name for name, timing in timings.items() if not timing.capped]
+        while active:
+            for name in active:
+                run, count = contenders[name], batch[name]
+                if count > 1:
+                    run(following[name])
+                seconds = stopwatch(run, following[name] + 1, count)
+                following[name] += count + 1
+                timings[name].seconds.append(seconds / count)
+            active = [name for name in active if not _done(timings[name].seconds, batch[name], limits[name])]
+    finally:
+        if collecting:
+            gc.enable()
+    return timings
+
+
+def _done(seconds: list[float], batch: int, limit: float) -> bool:
+    return len(seconds) >= MOST or (len(seconds) >= FEWEST and sum(seconds) * batch >= limit)
+
+
+class Peaks:
+    """The machine's limits, measured when asked for; the best of all measurements with one instruction set is kept.
+
+    On the CPU by ``voronerf._native.measure_peak``; on CUDA by torch's product of large matrices and a large copy,
+    which are what a user can reach rather than the limit itself.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.found: dict[str, float] = {}
+
+    def __call__(self, kind: str) -> tuple[str, float] | None:
+        """(what it is, operations or bytes a second) of "float32", "bfloat16" or "copy"; None where it is unknown.
+
+        A processor without bfloat16 products computes with float32 ones, whose limit then stands for both.
+        """
+        if self.device.type == "cuda":
+            return self._keep(f"{kind}, torch", _cuda_peak(kind, self.device))
+        if backends.missing("native", self.device) is not None:
+            return None
+        from voronerf import _native
+
+        isa = _native.ISAS[_native._ISA]
+        try:
+            return self._keep(f"{kind}, {isa}" if kind != "copy" else "copy", _native.measure_peak(kind))
+        except ValueError:
+            return None if kind != "bfloat16" else self("float32")
+
+    def _keep(self, name: str, value: float) -> tuple[str, float]:
+        self.found[name] = max(value, self.found.get(name, 0.0))
+        return name, value
+
+
+def _cuda_peak(kind: str, device: torch.device) -> float:
+    stopwatch = Stopwatch(device)
+    if kind == "copy":
+        source = torch.zeros(1 << 28, device=device)
+        target, work = torch.empty_like(source), 2.0 * source.numel() * source.element_size()
+        seconds = [stopwatch(lambda _: target.copy_(source), 0, 1) for _ in range(8)]
+    else:
+        a = torch.randn(8192, 8192, device=device, dtype=getattr(torch, kind))
+        work = 2.0 * 8192**3
+        seconds = [stopwatch(lambda _: a @ a, 0, 1) for _ in range(8)]
+    return work / min(seconds[1:])
+
+
+@contextlib.contextmanager
+def instruction_set(name: str | None) -> Iterator[None]:
+    """Native CPU kernels with this instruction set inside the block; None leaves it as it is.
+
+    What VORONERF_ISA does for a whole process.
+
+    Raises:
+        ValueError: this processor has none of that name.
+    """
+    if name is None:
+        yield
+        return
+    from voronerf import _native
+
+    if name not in _native.ISAS or not _native._C.isa_supported(_native.ISAS.index(name)):
+        raise ValueError(f"this processor has no {name}")
+    before = _native._ISA
+    _native._ISA = _native.ISAS.index(name)
+    try:
+        yield
+    finally:
+        _native._ISA = before

@@ -1,0 +1,154 @@
+"""A result of throughput.py as Markdown, so that tables in documents can be made again from the committed JSON.
+
+python benchmarks/table.py benchmarks/results/throughput.json                    the rows that the README shows
+python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   any others
+python benchmarks/table.py benchmarks/results/throughput.json --targets          what was to be shown, and is
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+from targets import ELSEWHERE, Row, comparisons, reached, verdict
+
+README = (
+    r"^nearest_centre/n=262144 k=(16|512|4096 frozen)/float32",
+    r"^locate_cell/16x16 n=262144/",
+    r"^cell_sort/n=262144 k=256/",
+    r"^grouped_linear/64-64 .*/float32/",
+    r"^grouped_mlp/(w64d4|nerf64) n=262144 k=16/",
+    r"^grouped_mlp/mlp32 n=262144 k=(256|4096)/",
+    r"^grouped_mlp/nerf256 n=262144 k=1/",
+    r"^(frequency|integrated)_encode/L=10 n=262144/float32/",
+    r"^composite/dense n=262144/",
+    r"^resample/.* n=262144/",
+    r"^routed_mlp/(w64d4|mlp32) n=262144 k=(16|256)/",
+)
+"""Rows of the README's table, by op/case/dtype/direction."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Errors in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        fail(message)
+
+
+def fail(message: str) -> NoReturn:
+    sys.exit(f"table: error: {message}")
+
+
+def load(path: Path) -> dict[str, Any]:
+    """{metadata, results} of a file."""
+    try:
+        outcome = json.loads(path.read_text())
+        if outcome["metadata"]["benchmark"] != "throughput":
+            fail(f"{path} must be a result of throughput.py, got {outcome['metadata']['benchmark']}")
+        return dict(outcome)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        fail(f"{path} must be a result of throughput.py: {error!r}")
+
+
+def key(row: Row) -> str:
+    return "/".join(str(row[column]) for column in ("op", "case", "dtype", "direction"))
+
+
+def best(row: Row) -> tuple[str, float] | None:
+    """Name and milliseconds of the fastest alternative."""
+    times = [(value, name) for name, value in row["alternatives"].items() if value is not None]
+    return (min(times)[1], min(times)[0]) if times else None
+
+
+def milliseconds(value: float) -> str:
+    return (
+        f"{value:.3f}"
+        if value < 1
+        else f"{value:.2f}"
+        if value < 10
+        else f"{value:.1f}"
+        if value < 100
+        else f"{value:.0f}"
+    )
+
+
+def markdown(rows: list[Row]) -> list[str]:
+    """The table of some rows, native backend."""
+    found = [
+        "| | dtype | | ms | of the limit | best alternative | ms | x |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        other = best(row)
+        percent = row["percent_of_peak"]
+        cells = [
+            f"`{row['op']}` {row['case']}",
+            row["dtype"],
+            row["direction"].replace("+", " + "),
+            milliseconds(row["median_ms"]),
+            "-" if percent is None else f"{percent:.0f} % {row['bound'].split(',')[0]}",
+            "-" if other is None else other[0],
+            "-" if other is None else milliseconds(other[1]),
+            "-" if row["speedup_over_best"] is None else f"**{row['speedup_over_best']:.1f}**",
+        ]
+        found.append(f"| {' | '.join(cells)} |")
+    return found
+
+
+def target_markdown(rows: list[Row]) -> list[str]:
+    """What was to be shown and what the rows reach, then what kernels and architecture save."""
+    found = ["| | wanted | reached | |", "|---|---|---|---|"]
+    for target, value in reached(rows):
+        figure = "-" if value is None else f"{value:.2f}" if value < 10 else f"{value:.1f}"
+        sign = "at most" if target.most else "at least"
+        found.append(
+            f"| {target.what} | {sign} {target.wanted:g} {target.unit} | {figure} | {verdict(target, value)} |"
+        )
+    found += [f"| {what} | {wanted} | see `{script}` | |" for what, wanted, script in ELSEWHERE]
+    compared = comparisons(rows)
+    if compared:
+        columns = ("best alternative", "kernels here", "x by kernels", "16 cells of width 64", "x by architecture")
+        found += ["", f"| forward, n = 262,144 | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
+    for one in compared:
+        found.append(
+            f"| one network of width 256, {one.dtype} | {one.wide_torch_ms:.0f} ms | {one.wide_ms:.0f} ms "
+            f"| {one.kernel:.2f} | {one.cells_ms:.1f} ms | {one.architecture:.1f} |"
+        )
+    return found
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Prints what was asked for."""
+    parser = Parser(description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
+    parser.add_argument("file", type=Path)
+    parser.add_argument(
+        "--rows", action="append", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in"
+    )
+    parser.add_argument("--targets", action="store_true", help="the table of what was to be shown")
+    options = parser.parse_args(arguments)
+    try:
+        patterns = [re.compile(text) for text in options.rows or README]
+    except re.error as error:
+        fail(f"--rows must be a regular expression, got {options.rows!r}: {error}")
+    outcome = load(options.file)
+    native = [row for row in outcome["results"] if row["backend"] == "native"]
+    if options.targets:
+        print("\n".join(target_markdown(native)))
+        return
+    rows = [row for row in native if any(pattern.search(key(row)) for pattern in patterns)]
+    if not rows:
+        fail(f"{options.file} has no such row of the native backend")
+    described = outcome["metadata"]
+    limits = ", ".join(f"{name} {value:g}" for name, value in described["peaks"].items())
+    print(
+        f"{described['machine']}, {described['threads']} threads, torch {described['torch']}; limits (G/s): {limits}\n"
+    )
+    print("\n".join(markdown(rows)))
+
+
+if __name__ == "__main__":
+    main()

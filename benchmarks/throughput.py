@@ -1,0 +1,301 @@
+"""What every operation and the whole route cost, beside what one would otherwise run and beside the machine's limit.
+
+    python benchmarks/throughput.py                                   everything, about twelve minutes on two cores
+    python benchmarks/throughput.py --quick                           every operation once, under a minute
+    python benchmarks/throughput.py --filter '^grouped_mlp/w64d4.*bfloat16' --targets
+    python benchmarks/throughput.py --json benchmarks/results/throughput.json
+    python benchmarks/table.py benchmarks/results/throughput.json     the JSON as Markdown
+
+docs/performance.md says how to read the table. Rows appear as they are measured; progress goes to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import importlib.metadata
+import json
+import os
+import re
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+# The private op caches compiled products by their shapes; its default of 1,024 is too few for a loop over many cells.
+os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
+
+import cases_lookup
+import cases_network
+import cases_sampling
+import torch
+from case import Case, Contender, NotApplicable, Work, dtype_name
+from harness import Peaks, Stopwatch, Timing, instruction_set, measure, metadata
+from targets import architecture_lines, target_lines
+
+from voronerf import backends
+from voronerf.training.files import write_text
+
+OPTIONAL = {"scipy": "scipy", "faiss": "faiss-cpu", "jax": "jax", "pykeops": "pykeops", "warp": "warp-lang"}
+"""Packages that are used where they are installed, and what to install."""
+LIMITS = {"ours": 1.0, "alternative": 0.8}
+QUICK_LIMITS = {"ours": 0.3, "alternative": 0.25}
+"""Seconds of timings of one contender, at three timings or more: see ``harness.measure``."""
+SLOW = ("compile", "jax", "F.grouped_mm")
+"""Parts of the names of alternatives that take seconds to compile or to run, which --quick leaves out."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Errors in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        fail(message)
+
+
+def fail(message: str) -> NoReturn:
+    sys.exit(f"throughput: error: {message}")
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The options, checked."""
+    parser = Parser(description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
+    parser.add_argument("--quick", action="store_true", help="every operation once, under a minute")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go as well")
+    parser.add_argument("--filter", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda; timings on cuda have not been run yet")
+    parser.add_argument("--backends", nargs="+", default=list(backends.BACKENDS), metavar="NAME", help="rows of these")
+    parser.add_argument(
+        "--targets", action="store_true", help="what the rows reach of what the project set out to show"
+    )
+    parser.add_argument("--list", action="store_true", help="print op/case/dtype/direction of the rows and stop")
+    options = parser.parse_args(arguments)
+    for name in options.backends:
+        if name not in backends.BACKENDS:
+            fail(f"--backends must be of {', '.join(backends.BACKENDS)}, got {name!r}")
+    if options.device not in ("cpu", "cuda"):
+        fail(f"--device must be cpu or cuda, got {options.device!r}")
+    if options.device == "cuda" and not torch.cuda.is_available():
+        fail("--device cuda: torch sees no CUDA device")
+    if options.json is not None and options.json.is_dir():
+        fail(f"--json must name a file, got the folder {options.json}")
+    return options
+
+
+def chosen_cases(options: argparse.Namespace) -> list[Case]:
+    """The cases that the options leave."""
+    every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases()]
+    if options.filter is not None:
+        try:
+            pattern = re.compile(options.filter)
+        except re.error as error:
+            fail(f"--filter must be a regular expression, got {options.filter!r}: {error}")
+        every = [case for case in every if pattern.search(case.key)]
+    if options.quick:
+        every = [case for case in every if case.quick]
+    if not every:
+        fail(f"--filter must leave a row, got {options.filter!r}; --list shows what there is")
+    return every
+
+
+def installed() -> tuple[dict[str, str], list[str]]:
+    """Versions of the optional packages that are there, and what to install for the others."""
+    found, missing = {}, []
+    for module, package in OPTIONAL.items():
+        try:
+            found[module] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            missing.append(f"{module} (pip install {package})")
+    return found, missing
+
+
+class Bench:
+    """Measures cases and keeps their rows.
+
+    Args:
+        device: where everything runs.
+        quick: short limits, and no alternative that has to be compiled.
+        wanted: backends whose rows there are.
+    """
+
+    def __init__(self, device: torch.device, *, quick: bool, wanted: list[str]) -> None:
+        self.device, self.quick, self.wanted = device, quick, wanted
+        self.limits = QUICK_LIMITS if quick else LIMITS
+        self.stopwatch, self.peaks = Stopwatch(device), Peaks(device)
+        self.rows: list[dict[str, Any]] = []
+
+    def run(self, case: Case) -> list[dict[str, Any]]:
+        """The rows of a case, one for each backend that can run it; none where none can."""
+        names = [
+            name
+            for name in case.backends
+            if name in self.wanted and backends.why_not(case.op, name, self.device, case.dtype) is None
+        ]
+        if not names:
+            return []
+        with instruction_set(case.isa):
+            rows = self._measure(case, names, case.build(self.device))
+        self.rows += rows
+        return rows
+
+    def _measure(self, case: Case, names: list[str], work: Work) -> list[dict[str, Any]]:
+        notes: dict[str, str] = {}
+        errors: dict[str, float] = {}
+        warm: dict[str, float] = {}
+        contenders: dict[str, Contender] = {}
+        for name in names:
+            contenders[name] = work.ours(name)
+            errors[name], _ = self._check(contenders[name], work)
+        for name, set_up in work.alternatives.items():
+            if self.quick and any(part in name for part in SLOW):
+                continue
+            try:
+                contenders[name] = self._set_up(set_up, work, warm, name)
+            except NotApplicable as reason:
+                notes[name] = f"n/a: {reason}"
+        before = self.peaks(work.bound) if work.bound else None
+        limits = {name: self.limits["ours" if name in names else "alternative"] for name in contenders}
+        runs = {name: contender.run for name, contender in contenders.items()}
+        timings = measure(runs, limits, self.stopwatch, warm)
+        after = before if self.quick or not work.bound else self.peaks(work.bound)
+        peak = max((found for found in (before, after) if found), key=lambda found: found[1], default=None)
+        alternatives = {
+            name: _milliseconds(timings.get(name)) for name in work.alternatives if name in (*timings, *notes)
+        }
+        notes.update({name: "capped" for name, timing in timings.items() if timing.capped})
+        return [self._row(case, work, name, timings[name], alternatives, errors[name], peak, notes) for name in names]
+
+    def _check(self, contender: Contender, work: Work) -> tuple[float, float]:
+        """Calls a contender for the first time: error, seconds."""
+        start = time.perf_counter()
+        result = contender.run(0)
+        seconds = time.perf_counter() - start
+        return work.error(contender.adapt(result)), seconds
+
+    def _set_up(self, set_up: Callable[[], Contender], work: Work, warm: dict[str, float], name: str) -> Contender:
+        """An alternative that has been seen to do the work, its first call's seconds in ``warm``; or NotApplicable."""
+        try:
+            contender = set_up()
+            error, warm[name] = self._check(contender, work)
+        except NotApplicable:
+            raise
+        except Exception as error:  # an alternative may fail in its own ways, which is a result too
+            first = (str(error).strip().splitlines() or [""])[0]
+            raise NotApplicable(f"{type(error).__name__}: {first}"[:300]) from error
+        if not error <= work.tolerance:
+            raise NotApplicable(f"its error of {error:.2g} is above {work.tolerance:.2g}")
+        return contender
+
+    def _row(
+        self,
+        case: Case,
+        work: Work,
+        backend: str,
+        timing: Timing,
+        alternatives: dict[str, float | None],
+        error: float,
+        peak: tuple[str, float] | None,
+        notes: dict[str, str],
+    ) -> dict[str, Any]:
+        rate = work.amount / timing.median_ms * 1e3
+        best = min((value for value in alternatives.values() if value is not None), default=None)
+        executed = None if work.executed is None or peak is None else work.executed / timing.median_ms * 1e5 / peak[1]
+        return {
+            "op": case.op,
+            "case": case.case,
+            "backend": backend,
+            "device": str(self.device),
+            "dtype": dtype_name(case.dtype),
+            "direction": case.direction,
+            "n": case.n,
+            "k": case.k,
+            "median_ms": timing.median_ms,
+            "iqr_ms": timing.iqr_ms,
+            "throughput": rate * 1e-9,
+            "unit": "GB/s" if work.bound == "copy" else "GFLOP/s",
+            "percent_of_peak": None if peak is None else 100 * rate / peak[1],
+            "alternatives": alternatives,
+            "speedup_over_best": None if best is None else best / timing.median_ms,
+            "max_error": error,
+            "bound": None if peak is None else peak[0],
+            "executed_percent_of_peak": executed if backend == "native" else None,
+            "notes": {name: note for name, note in notes.items() if name in alternatives or name == backend},
+        }
+
+
+def _milliseconds(timing: Timing | None) -> float | None:
+    return None if timing is None else timing.median_ms
+
+
+HEADER = (
+    f"{'op':17} {'case':28} {'dtype':8} {'direction':16} {'backend':9} {'median':>10} {'iqr':>8} {'ns/sample':>10}"
+    f" {'throughput':>15} {'of peak':>8} {'x best':>7} {'error':>8}"
+)
+
+
+def lines(row: dict[str, Any], *, last: bool) -> list[str]:
+    """A row as printed, and below the last backend's the alternatives of all."""
+    percent = "-" if row["percent_of_peak"] is None else f"{row['percent_of_peak']:.1f} %"
+    ahead = "-" if row["speedup_over_best"] is None else f"{row['speedup_over_best']:.2f}"
+    spread = "-" if row["iqr_ms"] is None else f"{row['iqr_ms']:.3f}"
+    found = [
+        f"{row['op']:17} {row['case']:28} {row['dtype']:8} {row['direction']:16} {row['backend']:9}"
+        f" {row['median_ms']:7.3f} ms {spread:>8} {row['median_ms'] * 1e6 / row['n']:10.2f}"
+        f" {row['throughput']:7.1f} {row['unit']:7} {percent:>8} {ahead:>7} {row['max_error']:8.1e}"
+    ]
+    if last:
+        found += [
+            f"    {name:42} {'' if value is None else f'{value:10.3f} ms'} {row['notes'].get(name, '')}".rstrip()
+            for name, value in row["alternatives"].items()
+        ]
+    return found
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measures, prints and stores."""
+    options = parse(arguments)
+    cases = chosen_cases(options)
+    if options.list:
+        print("\n".join(case.key for case in cases))
+        return
+    if options.json is not None:
+        try:
+            options.json.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            fail(f"--json: {error}")
+    start, load = time.perf_counter(), os.getloadavg()
+    torch.manual_seed(0)
+    bench = Bench(torch.device(options.device), quick=options.quick, wanted=options.backends)
+    found, missing = installed()
+    print(f"threads {torch.get_num_threads()}; missing: {', '.join(missing) or 'nothing'}", file=sys.stderr)
+    print(HEADER, flush=True)
+    for number, case in enumerate(cases, 1):
+        progress = functools.partial(print, file=sys.stderr, flush=True)
+        progress(f"[{number}/{len(cases)}, {time.perf_counter() - start:.0f} s] {case.key}")
+        rows = bench.run(case)
+        if not rows:
+            progress(f"    left out: none of {', '.join(case.backends)} runs {case.op} here")
+        for row in rows:
+            print("\n".join(lines(row, last=row is rows[-1])), flush=True)
+    if options.targets:
+        print("\n".join(["", *target_lines(bench.rows), "", *architecture_lines(bench.rows)]))
+    if options.json is not None:
+        description = metadata(
+            benchmark="throughput",
+            quick=options.quick,
+            filter=options.filter,
+            device=str(bench.device),
+            seconds=round(time.perf_counter() - start),
+            load=[round(value, 2) for value in load],
+            peaks={name: round(value * 1e-9, 1) for name, value in bench.peaks.found.items()},
+            installed=found,
+            missing=missing,
+        )
+        write_text(options.json, json.dumps({"metadata": description, "results": bench.rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit("throughput: interrupted")
