@@ -1,0 +1,186 @@
+"""Where the milliseconds of a training step go.
+
+    python benchmarks/step_profile.py --data DIR --downscale 4
+    python benchmarks/step_profile.py --data builtin --json profile.json
+
+Trains a scene until its cells are there, then times whole steps, and profiles as many: the profiler's own time of every
+operator is added up by what the operator is for. What the operators do not account for is Python and the dispatcher.
+The profiler makes small operators look dearer than they are, so the two times of a step stand side by side.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from harness import metadata
+from torch.profiler import ProfilerActivity, profile
+
+from voronerf.cli.main import EXPECTED
+from voronerf.data import load_scene
+from voronerf.training.config import TrainConfig
+from voronerf.training.files import write_text
+from voronerf.training.trainer import Trainer
+
+# What operators are for, by what their names hold; the first that fits. The time of a forward pass that is recorded for
+# autograd stands under a name such as GeneratedBackwardFor_voronerf_routed_mlp_native_default.
+PARTS = {
+    "route": ("routed_mlp", "grouped_mlp", "grouped_linear"),
+    "cells": ("nearest_centre", "locate_cell", "cell_sort"),
+    "composite": ("composite",),
+    "optimiser": ("_fused_adam", "_foreach"),
+    "other operators": ("",),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which step to profile."""
+
+    data: str = "builtin"
+    """Scene folder or "builtin"."""
+    downscale: int = 1
+    """Factor by which the images are made smaller on load."""
+    cells: int = 16
+    """Cells; 1 is one network."""
+    width: int = TrainConfig.width
+    """Channels of the networks' hidden layers."""
+    rays: int = TrainConfig.rays
+    """Rays per step."""
+    samples: int = TrainConfig.samples
+    """Samples per ray."""
+    bfloat16: bool = False
+    """Networks under autocast to bfloat16."""
+    steps: int = 60
+    """Steps to time, and as many to profile."""
+    backend: str = "auto"
+    """Backend of the operations."""
+    top: int = 12
+    """Operators listed one by one."""
+    json: Path | None = None
+    """File for the result, {metadata, results}."""
+
+
+def main() -> None:
+    """Profiles and prints."""
+    options = tyro.cli(Options, description=__doc__)
+    try:
+        result = measure(options)
+    except EXPECTED as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    show(result, options.top)
+    if options.json is not None:
+        write_text(options.json, json.dumps(result, indent=2) + "\n")
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Metadata, and rows {part, ms, share} and {operator, ms, calls} of a step."""
+    warm, every = 20, 2 * options.steps
+    with tempfile.TemporaryDirectory() as folder:
+        config = TrainConfig(
+            data=options.data,
+            downscale=options.downscale,
+            out=Path(folder),
+            # The split comes after the first tenth of the warm-up; nothing is evaluated or saved on the way.
+            steps=warm + every + 1,
+            cells=(options.cells,) if options.cells > 1 else (),
+            split_at=(warm / 2 / (warm + every + 1),) if options.cells > 1 else None,
+            evaluations=1,
+            width=options.width,
+            rays=options.rays,
+            samples=options.samples,
+            backend=options.backend,
+            checkpoint_every=float("inf"),
+        )
+        trainer = Trainer(config, load_scene(options.data, downscale=options.downscale))
+
+        def step() -> None:
+            stop = trainer.step + 1
+            trainer.on_step = lambda progress: trainer.request_stop() if progress.step >= stop else None
+            trainer.stopped = False
+            trainer.advance()
+
+        with torch.autocast("cpu", torch.bfloat16, enabled=options.bfloat16):
+            for _ in range(warm):
+                step()
+            times = []
+            for _ in range(options.steps):
+                start = time.perf_counter()
+                step()
+                times.append(1e3 * (time.perf_counter() - start))
+            with profile(activities=[ProfilerActivity.CPU]) as profiled:
+                start = time.perf_counter()
+                for _ in range(options.steps):
+                    step()
+                profiled_ms = 1e3 * (time.perf_counter() - start) / options.steps
+    operators = [
+        {
+            "operator": event.key,
+            "ms": event.self_cpu_time_total / 1e3 / options.steps,
+            "calls": event.count / options.steps,
+        }
+        for event in profiled.key_averages()
+    ]
+    operators.sort(key=lambda row: -row["ms"])
+    sums = dict.fromkeys(PARTS, 0.0)
+    for row in operators:
+        name = row["operator"]
+        sums[next(part for part, names in PARTS.items() if any(each in name for each in names))] += row["ms"]
+    median = statistics.median(times)
+    # Of the step as it is without the profiler: what is neither of the parts before it.
+    accounted = sum(sums.values())
+    sums["Python and dispatch"] = max(median - accounted, 0.0)
+    return {
+        "metadata": metadata(
+            benchmark="step_profile",
+            data=Path(options.data).name,
+            downscale=options.downscale,
+            cells=trainer.router.num_cells,
+            width=options.width,
+            rays=options.rays,
+            samples=options.samples,
+            bfloat16=options.bfloat16,
+            steps=options.steps,
+            step_ms=median,
+            step_iqr_ms=_spread(times),
+            profiled_step_ms=profiled_ms,
+        ),
+        "results": [
+            *({"part": part, "ms": ms, "share": ms / median} for part, ms in sums.items()),
+            *operators,
+        ],
+    }
+
+
+def show(result: dict[str, Any], top: int) -> None:
+    """Prints the parts of a step and its dearest operators."""
+    about = result["metadata"]
+    print(
+        f"{about['data']}, {about['cells']} cells of width {about['width']}, {about['rays']} rays x "
+        f"{about['samples']} samples, {about['threads']} threads: {about['step_ms']:.2f} ms a step "
+        f"(spread {about['step_iqr_ms']:.2f}; profiled {about['profiled_step_ms']:.2f})"
+    )
+    rows = result["results"]
+    for row in rows:
+        if "part" in row:
+            print(f"  {row['part']:22s} {row['ms']:8.3f} ms  {100 * row['share']:5.1f} %")
+    for row in [row for row in rows if "operator" in row][:top]:
+        print(f"    {row['operator']:44s} {row['ms']:8.3f} ms  {row['calls']:6.1f} calls")
+
+
+def _spread(times: list[float]) -> float:
+    quarters = statistics.quantiles(times, n=4)
+    return quarters[2] - quarters[0]
+
+
+if __name__ == "__main__":
+    main()
