@@ -86,8 +86,9 @@ def render_rays(
     """
     near, far = _per_ray(near, rays), _per_ray(far, rays)
     depths, deltas, _ = stratified_depths(near, far, samples, jitter=jitter, spacing=spacing, generator=generator)
-    positions = rays.origins[:, None, :] + depths[:, :, None] * rays.directions[:, None, :]
-    index = torch.arange(len(rays), device=positions.device, dtype=torch.int32).repeat_interleave(samples)
+    positions = torch.addcmul(rays.origins[:, None, :], depths[:, :, None], rays.directions[:, None, :])
+    # A copy of an expanded view: repeat_interleave would gather.
+    index = torch.arange(len(rays), device=positions.device, dtype=torch.int32)[:, None].expand(-1, samples).reshape(-1)
     rgb, sigma = field(positions.reshape(-1, 3), rays.directions, index)
     # a field under autocast answers in a half type: the sums along a ray are float32's
     rgb = rgb.reshape(len(rays), samples, 3).to(depths.dtype)
