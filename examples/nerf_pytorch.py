@@ -1,0 +1,86 @@
+"""yenchenlin/nerf-pytorch: `NeRF.forward(x)`, encoded outside: [m, 63 + 27] -> [m, 4], raw colour and density.
+
+The encoding keeps the raw position in front, so `coords="first3"` says where it is.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from voronerf import VoronoiRouter
+
+
+def encode(x: Tensor, octaves: int) -> Tensor:
+    """[..., d] -> [..., d (1 + 2 octaves)], x itself first."""
+    waves = [wave(2**i * x) for i in range(octaves) for wave in (torch.sin, torch.cos)]
+    return torch.cat([x, *waves], dim=-1)
+
+
+class NeRF(nn.Module):
+    """Stands for `run_nerf_helpers.NeRF`."""
+
+    def __init__(self, D=8, W=256, input_ch=3, input_ch_views=3, output_ch=4, skips=(4,), use_viewdirs=False):
+        super().__init__()
+        self.input_ch, self.input_ch_views = input_ch, input_ch_views
+        self.skips, self.use_viewdirs = skips, use_viewdirs
+        widths = [input_ch] + [W + input_ch if i in skips else W for i in range(D - 1)]
+        self.pts_linears = nn.ModuleList(nn.Linear(width, W) for width in widths)
+        self.views_linears = nn.ModuleList([nn.Linear(input_ch_views + W, W // 2)])
+        if use_viewdirs:
+            self.feature_linear = nn.Linear(W, W)
+            self.alpha_linear = nn.Linear(W, 1)
+            self.rgb_linear = nn.Linear(W // 2, 3)
+        else:
+            self.output_linear = nn.Linear(W, output_ch)
+
+    def forward(self, x: Tensor) -> Tensor:
+        points, views = torch.split(x, [self.input_ch, self.input_ch_views], dim=-1)
+        h = points
+        for i, layer in enumerate(self.pts_linears):
+            h = F.relu(layer(h))
+            if i in self.skips:
+                h = torch.cat([points, h], -1)
+        if not self.use_viewdirs:
+            return self.output_linear(h)
+        alpha = self.alpha_linear(h)
+        h = torch.cat([self.feature_linear(h), views], -1)
+        for layer in self.views_linears:
+            h = F.relu(layer(h))
+        return torch.cat([self.rgb_linear(h), alpha], -1)
+
+
+def run_network(inputs: Tensor, viewdirs: Tensor, fn: nn.Module, netchunk: int = 1024) -> Tensor:
+    """Stands for `run_nerf.run_network`: encodes [rays, samples, 3], calls the network in chunks; not changed."""
+    flat = inputs.reshape(-1, 3)
+    views = viewdirs[:, None].expand(inputs.shape).reshape(-1, 3)
+    embedded = torch.cat([encode(flat, 10), encode(views, 4)], -1)
+    raw = torch.cat([fn(part) for part in embedded.split(netchunk)])
+    return raw.reshape(*inputs.shape[:-1], -1)
+
+
+def main() -> None:
+    torch.manual_seed(0)
+    points = torch.rand(50, 64, 3) * 2 - 1
+    viewdirs = F.normalize(torch.randn(50, 3), dim=-1)
+    centres = torch.rand(16, 3) * 2 - 1
+
+    # before
+    model = NeRF(D=8, W=64, input_ch=63, input_ch_views=27, use_viewdirs=True)
+    raw = run_network(points, viewdirs, model)
+
+    # after: 16 copies of the model, one a cell; all that calls `model` stays as it is
+    router = VoronoiRouter(model, centres, coords="first3")
+    routed = run_network(points, viewdirs, router)
+    torch.testing.assert_close(routed, raw)
+
+    optimizer = torch.optim.Adam(router.parameters(), lr=5e-4)
+    for _ in range(3):
+        loss = (torch.sigmoid(run_network(points, viewdirs, router)[..., :3]) - 0.5).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    print(f"nerf-pytorch: {router.num_cells} cells, loss {loss.item():.4f} after three steps")
+
+
+if __name__ == "__main__":
+    main()

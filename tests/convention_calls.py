@@ -1,0 +1,252 @@
+"""Fields that nobody listed, by how they are called and by what they do with samples."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from convention_harness import Case
+from convention_listed import RAYS, first, one, uniform
+from torch import Tensor, nn
+
+
+class Heads(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.trunk = nn.Linear(7, 8)
+        self.heads = nn.ModuleDict({"rgb": nn.Linear(8, 3), "sigma": nn.Linear(8, 1), "semantics": nn.Linear(8, 5)})
+
+    def forward(self, x: Tensor) -> dict[str, Any]:
+        h = F.elu(self.trunk(x))
+        found: dict[str, Any] = {name: head(h) for name, head in self.heads.items()}
+        found["semantics"] = {"logits": found["semantics"], "label": found["semantics"].argmax(-1)}
+        return {**found, "normals": None, "kind": "heads"}
+
+
+class ControlFlow(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.near, self.far, self.out = nn.Linear(7, 8), nn.Linear(3, 8), nn.Linear(8, 3)
+
+    def forward(self, x: Tensor, mode: str = "near", *, scale: float = 1.0, extra: Tensor | None = None) -> Tensor:
+        if x.shape[0] == 0:
+            return x.new_zeros(0, 3)
+        h = self.near(x) if mode == "near" and x.shape[-1] == 7 else self.far(x[..., :3])
+        if extra is not None:
+            h = h + extra
+        if self.training and scale > 1:
+            h = h * scale
+        while h.shape[-1] > 8:
+            h = h[..., :-1]
+        return self.out(torch.relu_(h))
+
+
+class Branches(nn.Module):
+    """view(-1, C), products of activations, chunks, in-place operations, buffers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("bands", 2.0 ** torch.arange(2))
+        self.fc, self.film, self.out = nn.Linear(12, 12), nn.Linear(12, 24), nn.Linear(12, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        waves = (x[..., :3, None] * self.bands).flatten(-2)
+        h = self.fc(torch.cat([waves.sin(), waves.cos()], -1))
+        gamma, beta = self.film(h).chunk(2, -1)
+        h = h * gamma
+        h += beta
+        h[..., :2] += 1
+        matrix = h.view(-1, 4, 3)
+        h = torch.bmm(matrix, matrix.transpose(1, 2)).view(-1, 16)[:, :12]
+        h = torch.softmax(h, -1) / h.norm(dim=-1, keepdim=True)
+        out = self.out(h)
+        return torch.cat([torch.sigmoid(out[..., :3]), out[..., 3:].clamp(min=0)], -1)
+
+
+class Normals(nn.Module):
+    """A gradient taken inside forward, and state kept on the module, as nerfstudio's fields do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sdf, self.colour = nn.Sequential(nn.Linear(3, 8), nn.Softplus(), nn.Linear(8, 5)), nn.Linear(10, 3)
+        self._points: Tensor | None = None
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        with torch.enable_grad():
+            self._points = x if x.requires_grad else x.detach().requires_grad_()
+            h = self.sdf(self._points)
+            (normal,) = torch.autograd.grad(h[:, 0].sum(), self._points, create_graph=True)
+        rgb = torch.sigmoid(self.colour(torch.cat([h[:, 1:], normal, x], -1)))
+        return h[:, :1], F.normalize(normal, dim=-1), rgb
+
+
+class Rgbs(NamedTuple):
+    rgb: Tensor
+    sigma: Tensor
+    extras: Any = None
+
+
+class Named(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Linear(7, 4)
+
+    def forward(self, x: Tensor) -> Rgbs:
+        h = self.fc(x)
+        return Rgbs(h[..., :3].sigmoid(), h[..., 3].exp(), [x[..., :3], None])
+
+
+@dataclass
+class Query:
+    points: Tensor
+    features: dict[str, Tensor]
+    flags: tuple[bool, str] = (True, "x")
+
+
+class TakesContainers(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Linear(10, 2)
+
+    def forward(self, query: Query, views: list[Tensor], options: dict[str, Any] | None = None) -> Query:
+        h = self.fc(torch.cat([query.points, query.features["f"], *views], -1))
+        return Query(h, {"both": h * 2 if options and options["double"] else h}, query.flags)
+
+
+class PerRay(nn.Module):
+    """A latent code for each ray, or object, that modulates the features of its samples."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc, self.film, self.out = nn.Linear(3, 8), nn.Linear(5, 16), nn.Linear(8, 2)
+
+    def forward(self, x: Tensor, z: Tensor) -> Tensor:
+        gamma, beta = self.film(z).chunk(2, -1)
+        if x.dim() == 3 and z.dim() == 2:
+            gamma, beta = gamma[:, None], beta[:, None]
+        return self.out(F.relu(self.fc(x) * gamma + beta))
+
+
+class Evaluations(nn.Module):
+    """Several evaluations of a network for each sample, as for normals by finite differences."""
+
+    def __init__(self, way: str) -> None:
+        super().__init__()
+        self.way = way
+        self.sdf = nn.Sequential(nn.Linear(3, 8), nn.Softplus(), nn.Linear(8, 1))
+        self.register_buffer("steps", 0.1 * torch.eye(3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.way == "interleaved":
+            around = (x[:, None] + self.steps).view(-1, 3)
+            return self.sdf(around).view(-1, 3) - self.sdf(x)
+        if self.way == "one after the other":
+            parts = self.sdf(torch.cat([x, *(x + step for step in self.steps)], 0)).chunk(4, 0)
+        elif self.way == "repeated":
+            parts = self.sdf(x.repeat(4, 1) + torch.cat([torch.zeros(1, 3), self.steps]).repeat_interleave(len(x), 0))
+            parts = parts.view(4, -1, 1)
+        else:
+            parts = self.sdf(torch.stack([x, *(x + step for step in self.steps)]))
+        return torch.cat([part - parts[0] for part in parts[1:]], -1)
+
+
+class RowOrder(nn.Module):
+    """Samples taken apart and put together again inside forward."""
+
+    def __init__(self, way: str) -> None:
+        super().__init__()
+        self.way = way
+        self.net = nn.Sequential(nn.Linear(7, 8), nn.ReLU(), nn.Linear(8, 3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.way == "box":
+            inside = (x[:, :3].abs() < 0.6).all(-1)
+            out = x.new_zeros(len(x), 3)
+            out[inside] = self.net(x[inside])
+            return out
+        if self.way == "chunks":
+            return torch.cat([self.net(part) for part in x.split(8)])
+        if self.way == "loop":
+            return torch.stack([self.net(row) for row in x])
+        order = x[:, 3].argsort()
+        return self.net(x[order])[order.argsort()]
+
+
+def squareplus(x: Tensor, b: float) -> Tensor:
+    return 0.5 * (x + torch.sqrt(x * x + b))
+
+
+with warnings.catch_warnings():  # it is deprecated, and old code uses it
+    warnings.simplefilter("ignore", DeprecationWarning)
+    scripted = torch.jit.script(squareplus)
+
+
+class Scripted(nn.Module):
+    """A function compiled by TorchScript, which no PyTorch function mode sees into."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc, self.out = nn.Linear(7, 8), nn.Linear(8, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(scripted(self.fc(x), 4.0))
+
+
+class Operations(nn.Module):
+    """Functions along features that are neither products nor elementwise."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc, self.out = nn.Linear(7, 9), nn.Linear(17, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.fc(x)
+        a, b, c = h.unflatten(-1, (3, 3)).unbind(1)
+        cross = torch.linalg.cross(a, b)
+        h = torch.where(h > 0, h, 0.1 * h)
+        h[h > 0.5] = 0.5
+        best = h.topk(2, -1).values
+        index = c.argmax(-1, keepdim=True)
+        chosen = torch.gather(a, 1, index)
+        parts = [cross, best, chosen, h.cumsum(-1)[:, -2:], h.index_select(1, torch.tensor([4, 2]))]
+        parts += [h.sort(dim=-1)[0][:, :3], F.normalize(c, dim=1), (a * b).sum(1, keepdim=True)]
+        return self.out(torch.hstack(parts))
+
+
+def query(lead: tuple[int, ...]) -> Any:
+    return (Query(uniform(lead), {"f": uniform(lead)}), [uniform(lead, 1), uniform(lead)]), {
+        "options": {"double": True}
+    }
+
+
+CALLS = [
+    Case("heads", Heads, one(), first),
+    Case("control flow, near", ControlFlow, lambda lead: ((uniform(lead, 7),), {"scale": 2.0}), first),
+    Case(
+        "control flow, far", ControlFlow, lambda lead: ((uniform(lead, 7), "far"), {"extra": uniform(lead, 8)}), first
+    ),
+    Case("branches", Branches, one(3), first),
+    Case("normals inside", Normals, one(3), first),
+    *(
+        Case(f"evaluations, {way}", lambda way=way: Evaluations(way), one(3), first, one_pass=None)
+        for way in ("interleaved", "one after the other", "repeated", "stacked")
+    ),
+    *(
+        Case(f"row order, {way}", lambda way=way: RowOrder(way), one(), first, one_pass=None)
+        for way in ("box", "chunks", "loop", "sorted")
+    ),
+    Case("scripted", Scripted, one(), first, one_pass=None),
+    Case("operations", Operations, one(), first, one_pass=None),
+    Case("named tuple", Named, one(), first, lead=RAYS),
+    Case(
+        "containers",
+        TakesContainers,
+        query,
+        lambda query, *_, **__: query.points,
+        options={"coords": lambda query, *_, **__: query.points},
+    ),
+    Case("code per ray", PerRay, lambda lead: ((uniform(lead), uniform(lead[:1], 5)), {}), first, RAYS),
+]

@@ -1,0 +1,300 @@
+"""Fields that nobody listed, by what they do with their parameters: layers, norms, weights made by hand, tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from convention_harness import Case
+from convention_listed import first, one, pair, uniform
+from torch import Tensor, nn
+
+
+class Siren(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.ModuleList([nn.Linear(3, 9), nn.Linear(9, 9), nn.Linear(9, 1)])
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.net[:-1]:
+            x = torch.sin(3 * layer(x))
+        return self.net[-1](x).squeeze(-1)  # [n]
+
+
+class LearnedScale(nn.Module):
+    """Parameters used elementwise: [d], [1, d] and a number (VolSDF's beta, NeuS's variance)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc, self.out = nn.Linear(7, 6), nn.Linear(6, 3)
+        self.scale, self.shift = nn.Parameter(torch.ones(6)), nn.Parameter(torch.zeros(1, 6))
+        self.beta = nn.Parameter(torch.tensor(0.1))
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        h = torch.tanh(self.scale * self.fc(x) + self.shift)
+        inverse = torch.ones([len(x), 1], dtype=x.dtype) * torch.exp(self.beta * 10.0)
+        return self.out(h) * self.beta.abs().clamp(min=1e-4), inverse
+
+
+class OldWeightNorm(nn.Module):
+    """NeuS's SDF network: weight_norm by hooks, softplus of beta 100, a skip divided by the root of two."""
+
+    def __init__(self, norm: Callable[[nn.Module], nn.Module]) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList([norm(nn.Linear(3, 8)), norm(nn.Linear(11, 8)), norm(nn.Linear(8, 4))])
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = F.softplus(self.layers[0](x), beta=100)
+        h = F.softplus(self.layers[1](torch.cat([h, x], 1) / math.sqrt(2)), beta=100)
+        return self.layers[2](h)
+
+    def sdf(self, x: Tensor) -> Tensor:
+        return self.forward(x)[:, :1]
+
+
+class Residual(nn.Module):
+    def __init__(self, norm: Callable[[], nn.Module]) -> None:
+        super().__init__()
+        self.stem = nn.Linear(7, 8)
+        self.blocks = nn.ModuleList(nn.Sequential(norm(), nn.Linear(8, 8), nn.SiLU(), nn.Linear(8, 8)) for _ in "ab")
+        self.head = nn.Sequential(nn.LayerNorm(8), nn.Linear(8, 4))
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.stem(x)
+        for block in self.blocks:
+            h = h + block(h)
+        return self.head(h)
+
+
+class Activations(nn.Module):
+    """Elementwise modules with parameters and without."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.Linear(7, 8), nn.PReLU(), nn.Linear(8, 8), nn.PReLU(8), nn.Linear(8, 8), nn.GELU(), nn.Dropout(0.0)
+        )
+        self.out = nn.Linear(8, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(F.leaky_relu(self.net(x)))
+
+
+class RawWeights(nn.Module):
+    """No nn.Linear at all: every way to write a product with a weight."""
+
+    def __init__(self, way: str) -> None:
+        super().__init__()
+        self.way = way
+        self.w, self.v = nn.Parameter(torch.randn(8, 7) / 3), nn.Parameter(torch.randn(8, 4) / 3)
+        self.b, self.c = nn.Parameter(torch.zeros(8)), nn.Parameter(torch.zeros(4))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.way == "linear":
+            h = torch.sigmoid(F.linear(x, self.w, self.b))
+            return F.linear(h, self.v.t(), self.c)
+        if self.way == "matmul":
+            h = torch.sigmoid(x @ self.w.T + self.b)
+            return torch.matmul(h, self.v) + self.c
+        if self.way == "addmm":
+            h = torch.sigmoid(torch.addmm(self.b, x, self.w.t()))
+            return torch.mm(h, self.v).add(self.c)
+        if self.way == "transposed":
+            h = torch.sigmoid(self.w @ x.T + self.b[:, None])
+            return (self.v.T @ h).T + self.c
+        h = torch.sigmoid(torch.einsum("ni,oi->no", x, self.w) + self.b)
+        return torch.einsum("nd,dc->nc", h, self.v) + self.c[None, :]
+
+
+class ReadsWeights(nn.Module):
+    """Weights and sizes read from the layers themselves."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b, self.c = nn.Linear(4, 6), nn.Linear(6, 6, bias=False), nn.Linear(9, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        split = self.a.weight.shape[1]
+        assert self.a.weight.dim() == 2 and self.c.in_features == 9 and self.b.bias is None
+        h = F.relu(F.linear(x[..., :split].to(self.a.weight.dtype), self.a.weight, self.a.bias))
+        h = F.relu(h @ self.b.weight.t())
+        return self.c(torch.cat([h, x[..., split:]], -1))
+
+
+class Tied(nn.Module):
+    """One layer used twice, and two layers with one weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem, self.shared, self.twin = nn.Linear(7, 8), nn.Linear(8, 8), nn.Linear(8, 8)
+        self.twin.weight = self.shared.weight
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = F.relu(self.stem(x))
+        h = F.relu(self.shared(h)) + F.relu(self.shared(F.relu(self.twin(h))))
+        return F.linear(h, self.stem.weight.t())
+
+
+class LatentCode(nn.Module):
+    """A vector of the module's own, repeated for every sample."""
+
+    def __init__(self, way: str) -> None:
+        super().__init__()
+        self.way = way
+        self.code, self.table = nn.Parameter(torch.randn(1, 4)), nn.Parameter(torch.randn(6, 4))
+        self.fc = nn.Linear(11, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.way == "expand":
+            code = self.code.expand(x.shape[0], -1)
+        elif self.way == "repeat":
+            code = self.code.repeat(len(x), 1)
+        elif self.way == "index":
+            code = self.table[(x[:, 0] > 0).long() + 2]
+        elif self.way == "row":
+            code = self.table[3].expand(len(x), 4)
+        elif self.way == "ones":
+            code = torch.ones((*x.shape[:-1], 4), dtype=x.dtype) * self.table.mean(dim=0)
+        else:
+            code = self.table.mean(dim=0).expand(len(x), 4)
+        return self.fc(torch.cat([x, code], -1))
+
+
+class Lookup(nn.Module):
+    """Appearance by image: an Embedding, its average, and F.embedding."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.embedding, self.fc = nn.Embedding(6, 4), nn.Linear(11, 3)
+
+    def forward(self, x: Tensor, image: Tensor | None = None) -> Tensor:
+        if image is None:
+            code = self.embedding.weight.mean(dim=0).expand(x.shape[0], -1)
+        else:
+            code = self.embedding(image) + F.embedding(image, self.embedding.weight)
+        return self.fc(torch.cat([x, code], -1))
+
+
+class LowRank(nn.Module):
+    """LoRA: a weight computed from parameters."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.base, self.out = nn.Linear(7, 8), nn.Linear(8, 3)
+        self.a, self.b = nn.Parameter(torch.randn(2, 7)), nn.Parameter(torch.randn(8, 2))
+        self.base.weight.requires_grad_(False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(F.relu(F.linear(x, self.base.weight + 0.5 * self.b @ self.a, self.base.bias)))
+
+
+class Lipschitz(nn.Module):
+    """Rows of a weight scaled to a learned bound (Liu et al. 2022)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc, self.out, self.bound = nn.Linear(7, 8), nn.Linear(8, 3), nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, x: Tensor) -> Tensor:
+        scale = torch.clamp(F.softplus(self.bound) / self.fc.weight.abs().sum(1), max=1.0)
+        return self.out(torch.tanh(F.linear(x, self.fc.weight * scale[:, None], self.fc.bias)))
+
+
+class Convolution(nn.Module):
+    """A convolution over features: no sample sees another, and no grouped version."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv, self.fc = nn.Conv1d(1, 2, 3), nn.Linear(10, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        assert x.shape[0] > 0, "called without rows"
+        return self.fc(self.conv(x[:, None]).flatten(1))
+
+
+class Bilinear(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc, self.mix = nn.Linear(3, 4), nn.Bilinear(4, 3, 2)
+
+    def forward(self, x: Tensor, d: Tensor) -> Tensor:
+        return self.mix(torch.relu(self.fc(x)), d)
+
+
+class Grid(nn.Module):
+    """A dense grid of features beside a network (DVGO)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.grid, self.fc = nn.Parameter(torch.randn(1, 4, 3, 3, 3)), nn.Linear(4, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        found = F.grid_sample(self.grid, x[:, :3].view(1, 1, 1, -1, 3), align_corners=True)
+        return self.fc(found.view(4, -1).t())
+
+
+class FourierFeatures(nn.Module):
+    """Random frequencies in a buffer (Tancik et al. 2020), the same in every module."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("frequencies", torch.randn(3, 4, generator=torch.Generator().manual_seed(0)))
+        self.net = nn.Sequential(nn.Linear(8, 8), nn.ReLU(), nn.Linear(8, 3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        waves = x @ self.frequencies
+        return self.net(torch.cat([waves.sin(), waves.cos()], -1))
+
+
+def images(lead: tuple[int, ...]) -> Any:
+    return (uniform(lead, 7), torch.randint(0, 6, lead)), {}
+
+
+LAYERS = [
+    Case("siren", Siren, one(3), first, smooth=True),
+    Case("learned scale", LearnedScale, one(), first, smooth=True),
+    Case(
+        "weight_norm by hooks",
+        lambda: OldWeightNorm(torch.nn.utils.weight_norm),
+        one(3),
+        first,
+        options={"coords": "first3", "methods": ["sdf"]},
+        method="sdf",
+        one_pass=None,
+        smooth=True,
+    ),
+    Case(
+        "weight_norm by parametrization",
+        lambda: OldWeightNorm(torch.nn.utils.parametrizations.weight_norm),
+        one(3),
+        first,
+        one_pass=None,
+        smooth=True,
+    ),
+    Case("layer norm", lambda: Residual(lambda: nn.LayerNorm(8)), one(), first, smooth=True),
+    Case("group norm", lambda: Residual(lambda: nn.GroupNorm(2, 8)), one(), first, one_pass=None),
+    Case("rms norm", lambda: Residual(lambda: nn.RMSNorm(8)), one(), first, one_pass=None),
+    Case("activations", Activations, one(), first),
+    *(Case(f"raw weights, {way}", lambda way=way: RawWeights(way), one(), first) for way in ("linear", "matmul")),
+    *(
+        Case(f"raw weights, {way}", lambda way=way: RawWeights(way), one(), first, one_pass=None)
+        for way in ("addmm", "transposed", "einsum")
+    ),
+    Case("reads its weights", ReadsWeights, one(), first),
+    Case("tied", Tied, one(), first),
+    *(
+        Case(f"latent code, {way}", lambda way=way: LatentCode(way), one(), first, one_pass=None)
+        for way in ("expand", "repeat", "index", "row", "mean", "ones")
+    ),
+    Case("embedding", Lookup, images, first),
+    Case("embedding's average", Lookup, one(), first, one_pass=None),
+    Case("low rank", LowRank, one(), first, one_pass=None),
+    Case("lipschitz", Lipschitz, one(), first, one_pass=None),
+    Case("fourier features", FourierFeatures, one(3), first, one_pass=None),
+    Case("convolution", Convolution, one(), first, one_pass=None),
+    Case("bilinear", Bilinear, pair, first, one_pass=None),
+    Case("grid", Grid, one(3), first, one_pass=None),
+]

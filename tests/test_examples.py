@@ -1,0 +1,49 @@
+"""The scripts of examples/ run as they are, and the training loop gains its cells by three lines."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+from convention_harness import EXAMPLES
+
+SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem != "nerf_pytorch_style")
+
+
+def run(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", [str(path), *arguments])
+    monkeypatch.syspath_prepend(str(path.parent))  # as `python path` does
+    runpy.run_path(str(path), run_name="__main__")
+
+
+def test_there_is_a_script_for_each_codebase() -> None:
+    assert len(SCRIPTS) == 8
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_script(path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each compares its field before and after by itself."""
+    run(path, monkeypatch)
+    assert re.search(r"\d+ (cells|modules in one router)", capsys.readouterr().out)
+
+
+SMALL = {"downscale": 5, "seconds": 1.5, "width": 16, "depth": 3, "rays": 256, "samples": 16, "views": 2, "lr": 0.01}
+
+
+@pytest.mark.parametrize("voronoi", [False, True], ids=["one network", "cells"])
+def test_training_loop(voronoi: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    options = [f"--{name}={value}" for name, value in SMALL.items()]
+    run(EXAMPLES / "nerf_pytorch_style.py", monkeypatch, "builtin", *options, *["--voronoi"] * voronoi)
+    last = capsys.readouterr().out.splitlines()[-1]
+    found = re.fullmatch(r"(16 cells|one network) of width 16: (\d+) steps in (\d+) s, test PSNR ([\d.]+) dB", last)
+    assert found is not None, last
+    assert found[1] == ("16 cells" if voronoi else "one network")
+    assert float(found[4]) > 8
+
+
+def test_three_lines_are_changed() -> None:
+    lines = (EXAMPLES / "nerf_pytorch_style.py").read_text().splitlines()
+    assert sum(line.endswith("# changed") for line in lines) == 3
