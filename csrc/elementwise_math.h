@@ -27,17 +27,26 @@ VN_INLINE F32 less_multiple_of_pi(F32 angle, F32 multiple) {
 }
 
 // sin(angle + half * pi) for |angle| <= kLargestAngle, half 0 or 0.5 (the cosine). With angle = (m - half) pi + r,
-// |r| <= pi / 2, it is (-1)^m sin r; pi in parts makes r exact to rounding. The polynomial's own error is 5e-9.
+// |r| <= pi / 2, it is (-1)^m sin r; pi in parts makes r exact to rounding. The polynomial's own error is 5e-9. N at a
+// time, step by step: one is a chain of a dozen operations that wait for each other.
+template <int N>
+VN_INLINE void sines(F32* angle, const F32* half) {
+  F32 shifted[N], r[N], u[N], p[N];
+  for (int i = 0; i < N; ++i) shifted[i] = fma(angle[i], splat(0.318309886f), half[i]) + splat(kRound);
+  for (int i = 0; i < N; ++i) r[i] = less_multiple_of_pi(angle[i], shifted[i] - splat(kRound) - half[i]);
+  for (int i = 0; i < N; ++i) u[i] = r[i] * r[i];
+  for (int i = 0; i < N; ++i) p[i] = fma(u[i], splat(2.59944752e-06f), splat(-1.98063418e-04f));
+  for (int i = 0; i < N; ++i) p[i] = fma(u[i], p[i], splat(8.33301353e-03f));
+  for (int i = 0; i < N; ++i) p[i] = fma(u[i], p[i], splat(-1.66666569e-01f));
+  for (int i = 0; i < N; ++i) {
+    const F32 value = fma(r[i] * u[i], p[i], r[i]);
+    angle[i] = reinterpret_cast<F32>(reinterpret_cast<Bits>(value) ^ (reinterpret_cast<Bits>(shifted[i]) << 31));
+  }
+}
+
 VN_INLINE F32 sine(F32 angle, F32 half) {
-  const F32 shifted = fma(angle, splat(0.318309886f), half) + splat(kRound);
-  const F32 multiple = shifted - splat(kRound) - half;
-  const F32 r = less_multiple_of_pi(angle, multiple);
-  const F32 u = r * r;
-  F32 p = fma(u, splat(2.59944752e-06f), splat(-1.98063418e-04f));
-  p = fma(u, p, splat(8.33301353e-03f));
-  p = fma(u, p, splat(-1.66666569e-01f));
-  const F32 value = fma(r * u, p, r);
-  return reinterpret_cast<F32>(reinterpret_cast<Bits>(value) ^ (reinterpret_cast<Bits>(shifted) << 31));
+  sines<1>(&angle, &half);
+  return angle;
 }
 
 // e^x = scale (1 + p), x clamped to what float32 holds; NaN passes.

@@ -63,17 +63,51 @@ void encode_row_exactly(const float* x, const float* table, int64_t stride, cons
   }
 }
 
-// A row by lanes: d <= kLanes, all angles small. `raw`: the lanes of the first vector that hold x itself.
-VN_INLINE void encode_row(const float* x, const float* table, Bits raw, int64_t stride, float* out) {
-  const F32 features = load(x);
-  for (int64_t column = 0; column < stride; column += kLanes) {
-    Bits index;
+// What the lanes of a vector of columns compute. `raw`: those that hold x itself.
+struct Lanes {
+  Bits index, raw;
+  F32 scale, phase;
+
+  Lanes(const float* table, int64_t stride, int64_t column, const Columns& columns)
+      : scale(load(table + stride + column)), phase(load(table + 2 * stride + column)) {
     __builtin_memcpy(&index, table + column, sizeof index);
-    const F32 angle = permute(features, index) * load(table + stride + column);
-    F32 value = sine(angle, load(table + 2 * stride + column));
-    if (column == 0) value = raw ? angle : value;
-    store(out + column, value);
+    for (int lane = 0; lane < kLanes; ++lane) raw[lane] = column + lane < columns.first() ? -1 : 0;
   }
+};
+
+// V neighbouring vectors of columns of R rows from `row` on: d <= kLanes, all angles small. Side by side, so that the
+// steps of one fill the time in which another waits. `out` and `pairs` as in `encode`, either may be null.
+template <int R, int V>
+VN_INLINE void encode_block(const float* x, int64_t x_stride, int64_t row, const Lanes* lanes, float* out,
+                            int64_t stride, float* pairs) {
+  F32 value[R * V], angle[R * V], phase[R * V];
+  for (int i = 0; i < R * V; ++i) {
+    value[i] = angle[i] = permute(load(x + (row + i / V) * x_stride), lanes[i % V].index) * lanes[i % V].scale;
+    phase[i] = lanes[i % V].phase;
+  }
+  sines<R * V>(value, phase);
+  for (int i = 0; i < R * V; ++i) value[i] = lanes[i % V].raw ? angle[i] : value[i];
+  for (int i = 0; out != nullptr && i < R * V; ++i) store(out + (row + i / V) * stride + i % V * kLanes, value[i]);
+#if VN_HALF
+  for (int r = 0; pairs != nullptr && r < R; ++r) {
+    float* to = pairs + (row + r) * stride / 2;
+    if constexpr (V == 2) {
+      store(to, joined(value[2 * r], value[2 * r + 1]));
+    } else {
+      _mm512_mask_storeu_ps(to, 0xff, joined(value[r], splat(0.0f)));
+    }
+  }
+#else
+  static_cast<void>(pairs);
+#endif
+}
+
+template <int R, int V>
+VN_INLINE void encode_strip(const float* x, int64_t x_stride, int64_t rows, const Lanes* lanes, float* out,
+                            int64_t stride, float* pairs) {
+  int64_t row = 0;
+  for (; row + R <= rows; row += R) encode_block<R, V>(x, x_stride, row, lanes, out, stride, pairs);
+  for (; row < rows; ++row) encode_block<1, V>(x, x_stride, row, lanes, out, stride, pairs);
 }
 
 // Any number of features.
@@ -90,14 +124,18 @@ void encode_row_slowly(const float* x, const float* table, int64_t stride, int64
 }
 
 VN_INLINE bool all_small(const float* x, int64_t count, float largest) {
-  bool small = true;
-  for (int64_t i = 0; i < count; ++i) small &= __builtin_fabsf(x[i]) < largest;
-  return small;
+  unsigned small = ~0u;
+  int64_t i = 0;
+  for (; i + kLanes <= count; i += kLanes) small &= bits(less(abs(load(x + i)), splat(largest)));
+  bool rest = (small & ((1u << kLanes) - 1u)) == (1u << kLanes) - 1u;
+  for (; i < count; ++i) rest &= __builtin_fabsf(x[i]) < largest;
+  return rest;
 }
 
-// Rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride].
+// Rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride]; with
+// bfloat16 operands also `pairs` [rows][stride / 2], if not null, and then out only where it is `kept`.
 void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
-            int64_t stride) {
+            int64_t stride, float* pairs = nullptr, bool kept = true) {
   const int64_t d = columns.d;
   const bool waves = columns.octaves > 0;
   const float largest = waves ? kLargestAngle / table[stride + columns.width() - 1] : 0.0f;
@@ -108,19 +146,33 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
     for (int64_t row = 0; lanes && row < rows; ++row) lanes = all_small(x + row * x_stride, d, largest);
   }
   if (lanes) {
-    Bits raw;
-    for (int lane = 0; lane < kLanes; ++lane) raw[lane] = lane < columns.first() ? -1 : 0;
-    for (int64_t row = 0; row < rows; ++row) encode_row(x + row * x_stride, table, raw, stride, out + row * stride);
+    int64_t column = 0;
+#if VN_HALF
+    for (; pairs != nullptr && column + 2 * kLanes <= stride; column += 2 * kLanes) {
+      const Lanes both[] = {{table, stride, column, columns}, {table, stride, column + kLanes, columns}};
+      encode_strip<2, 2>(x, x_stride, rows, both, kept ? out + column : nullptr, stride, pairs + column / 2);
+    }
+#endif
+    for (; column < stride; column += kLanes) {
+      const Lanes one(table, stride, column, columns);
+      encode_strip<VN_ISA == 2 ? 4 : 2, 1>(x, x_stride, rows, &one, kept ? out + column : nullptr, stride,
+                                           pairs == nullptr ? nullptr : pairs + column / 2);
+    }
     return;
   }
-  for (int64_t row = 0; row < rows; ++row, x += x_stride, out += stride) {
-    if (waves && all_small(x, d, largest)) {
-      encode_row_slowly(x, table, stride, d, out);
+  for (int64_t row = 0; row < rows; ++row) {
+    const float* from = x + row * x_stride;
+    float* to = out + row * stride;
+    if (waves && all_small(from, d, largest)) {
+      encode_row_slowly(from, table, stride, d, to);
     } else if (waves) {
-      encode_row_exactly(x, table, stride, columns, out);
+      encode_row_exactly(from, table, stride, columns, to);
     }
-    for (int64_t f = 0; f < columns.first(); ++f) out[f] = x[f];
+    for (int64_t f = 0; f < columns.first(); ++f) to[f] = from[f];
   }
+#if VN_HALF
+  if (pairs != nullptr) narrow(out, stride, columns.width(), rows, pairs);
+#endif
 }
 
 // What the variances leave of encoded rows: d <= kLanes, no input among the columns, rows as in `encode`.

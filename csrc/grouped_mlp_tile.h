@@ -111,14 +111,22 @@ struct Tile {
         for (int64_t f = 0; f < input.raw; ++f) staged[row * stride + f] = raw[from * input.raw + f];
       }
     }
+#if VN_HALF
+    float* const pairs = at(input.narrow);
+#else
+    float* const pairs = nullptr;
+#endif
     if (encoded) {
       const Columns columns = columns_of(input);
       const float* table = workspace + input.table;
-      encode(staged, stride, table, rows, columns, at(input.value), input.value.stride);
-      if (input.integrated) blur(staged + columns.d, stride, table, rows, at(input.value), input.value.stride);
+      const bool last = !input.integrated;
+      encode(staged, stride, table, rows, columns, at(input.value), input.value.stride, last ? pairs : nullptr,
+             pairs == nullptr || plan.gradients || !last);
+      if (last) return;
+      blur(staged + columns.d, stride, table, rows, at(input.value), input.value.stride);
     }
 #if VN_HALF
-    narrow(at(input.value), input.value.stride, input.width, rows, at(input.narrow));
+    narrow(at(input.value), input.value.stride, input.width, rows, pairs);
 #endif
   }
 
