@@ -242,7 +242,7 @@ def _composite_work(n: int, packed: bool, direction: str, compiled: bool, device
 
     functions: dict[str, Function] = (
         {"torch, running sum + index_add": functools.partial(_composite_packed, ray_offsets)}
-        if packed
+        if ray_offsets is not None
         else {"torch cumprod": _composite_cumprod, "torch cumsum": _composite_cumsum}
     )
     # Read density, colour, depth and length of a sample, write its weight; the backward reads them once more and writes

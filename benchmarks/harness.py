@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import platform
 import re
 import statistics
@@ -154,6 +155,31 @@ def measure(
 
 def _done(seconds: list[float], batch: int, limit: float) -> bool:
     return len(seconds) >= MOST or (len(seconds) >= FEWEST and sum(seconds) * batch >= limit)
+
+
+class Others:
+    """How busy everything else keeps the machine, since this was made: timings mean little where it is not idle."""
+
+    def __init__(self) -> None:
+        self.start = self._now()
+
+    def cores(self) -> float | None:
+        """Cores' worth of time that other processes, or other guests of the host, had; None where that is unknown."""
+        now = self._now()
+        if now is None or self.start is None or now[0] <= self.start[0]:
+            return None
+        wall, everything, own = (after - before for after, before in zip(now, self.start))
+        return max(everything - own, 0.0) / wall
+
+    @staticmethod
+    def _now() -> tuple[float, float, float] | None:
+        """Seconds: wall, those of all cores that were not idle, those of this process."""
+        try:
+            fields = [int(field) for field in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
+        except (OSError, ValueError):
+            return None
+        # user, nice, system, idle, iowait, irq, softirq, steal: in hundredths of a second on every Linux.
+        return time.perf_counter(), (sum(fields) - fields[3] - fields[4]) / 100, sum(os.times()[:4])
 
 
 class Peaks:

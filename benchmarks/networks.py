@@ -133,7 +133,8 @@ class Batch:
 
 def parameters(net: MLP, k: int, features: int, dtype: torch.dtype, device: torch.device) -> list[list[Tensor]]:
     """Random weights and biases that keep activations of order one."""
-    random, lists = generator(7), [[], []]
+    random = generator(7)
+    lists: list[list[Tensor]] = [[], []]
     for o, i in net.weight_shapes(features, 3):
         lists[0].append(torch.randn(k, o, i, generator=random) * (2 / i) ** 0.5)
         lists[1].append(torch.randn(k, o, generator=random) * 0.1)

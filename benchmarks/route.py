@@ -155,6 +155,11 @@ def encoded_directions(batch: Batch, dtype: torch.dtype) -> Tensor | None:
     return None if batch.directions is None or octaves is None else torch_encode(batch.directions, octaves, dtype)
 
 
+def _of_rows(batch: Batch, directions: Tensor | None, rows: Tensor) -> Tensor | None:
+    """Encoded directions of the samples that an index or a mask names."""
+    return None if directions is None or batch.direction_index is None else directions[batch.direction_index[rows]]
+
+
 def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece: int | None) -> Contender:
     """Sort by cell with the narrowest key, then each cell's network on its rows; results back by index."""
     lookup, own, net = find(), Parameters(batch, dtype), batch.net
@@ -167,9 +172,8 @@ def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece
         edges = torch.searchsorted(keys.int(), bounds).tolist()
         for cell, first, last in row_pieces(edges, piece):
             rows = order[first:last]
-            d = None if directions is None else directions[batch.direction_index[rows]]
             x = torch_encode(points[rows], net.position_octaves or 0, dtype)
-            yield rows, own.network(net, cell, x, d)
+            yield rows, own.network(net, cell, x, _of_rows(batch, directions, rows))
 
     return _contender(batch, parts, own, dtype)
 
@@ -186,8 +190,8 @@ def masked_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Co
             x = points[mask]
             if x.shape[0] == 0:
                 continue
-            d = None if directions is None else directions[batch.direction_index[mask]]
-            yield mask, own.network(net, cell, torch_encode(x, net.position_octaves or 0, dtype), d)
+            encoded = torch_encode(x, net.position_octaves or 0, dtype)
+            yield mask, own.network(net, cell, encoded, _of_rows(batch, directions, mask))
 
     return _contender(batch, parts, own, dtype)
 

@@ -180,7 +180,8 @@ ELSEWHERE = (
 
 def reached(rows: Sequence[Row]) -> list[tuple[Target, float | None]]:
     """Every target with the figure of the rows; None where a row is missing."""
-    native, found = Rows(rows), []
+    native = Rows(rows)
+    found: list[tuple[Target, float | None]] = []
     for target in TARGETS:
         try:
             found.append((target, target.reach(native)))

@@ -31,7 +31,7 @@ import cases_network
 import cases_sampling
 import torch
 from case import Case, Contender, NotApplicable, Work, dtype_name
-from harness import Peaks, Stopwatch, Timing, instruction_set, measure, metadata
+from harness import Others, Peaks, Stopwatch, Timing, instruction_set, measure, metadata
 from targets import architecture_lines, target_lines
 
 from voronerf import backends
@@ -42,6 +42,8 @@ OPTIONAL = {"scipy": "scipy", "faiss": "faiss-cpu", "jax": "jax", "pykeops": "py
 LIMITS = {"ours": 1.0, "alternative": 0.8}
 QUICK_LIMITS = {"ours": 0.3, "alternative": 0.25}
 """Seconds of timings of one contender, at three timings or more: see ``harness.measure``."""
+DISTURBED = 0.1
+"""Cores that other processes may keep busy before a row's timings are reported as disturbed."""
 SLOW = ("compile", "jax", "F.grouped_mm")
 """Parts of the names of alternatives that take seconds to compile or to run, which --quick leaves out."""
 
@@ -156,14 +158,17 @@ class Bench:
         before = self.peaks(work.bound) if work.bound else None
         limits = {name: self.limits["ours" if name in names else "alternative"] for name in contenders}
         runs = {name: contender.run for name, contender in contenders.items()}
+        others = Others()
         timings = measure(runs, limits, self.stopwatch, warm)
+        disturbed = others.cores()
         after = before if self.quick or not work.bound else self.peaks(work.bound)
         peak = max((found for found in (before, after) if found), key=lambda found: found[1], default=None)
         alternatives = {
             name: _milliseconds(timings.get(name)) for name in work.alternatives if name in (*timings, *notes)
         }
         notes.update({name: "capped" for name, timing in timings.items() if timing.capped})
-        return [self._row(case, work, name, timings[name], alternatives, errors[name], peak, notes) for name in names]
+        rows = [self._row(case, work, name, timings[name], alternatives, errors[name], peak, notes) for name in names]
+        return [{**row, "other_load": disturbed} for row in rows]
 
     def _check(self, contender: Contender, work: Work) -> tuple[float, float]:
         """Calls a contender for the first time: error, seconds."""
@@ -179,9 +184,9 @@ class Bench:
             error, warm[name] = self._check(contender, work)
         except NotApplicable:
             raise
-        except Exception as error:  # an alternative may fail in its own ways, which is a result too
-            first = (str(error).strip().splitlines() or [""])[0]
-            raise NotApplicable(f"{type(error).__name__}: {first}"[:300]) from error
+        except Exception as failure:  # an alternative may fail in its own ways, which is a result too
+            first = (str(failure).strip().splitlines() or [""])[0]
+            raise NotApplicable(f"{type(failure).__name__}: {first}"[:300]) from failure
         if not error <= work.tolerance:
             raise NotApplicable(f"its error of {error:.2g} is above {work.tolerance:.2g}")
         return contender
@@ -277,6 +282,8 @@ def main(arguments: list[str] | None = None) -> None:
             progress(f"    left out: none of {', '.join(case.backends)} runs {case.op} here")
         for row in rows:
             print("\n".join(lines(row, last=row is rows[-1])), flush=True)
+        if rows and (rows[0]["other_load"] or 0.0) > DISTURBED:
+            progress(f"    disturbed: other processes kept {rows[0]['other_load']:.1f} cores busy during this row")
     if options.targets:
         print("\n".join(["", *target_lines(bench.rows), "", *architecture_lines(bench.rows)]))
     if options.json is not None:

@@ -111,6 +111,18 @@ def test_short_calls_are_timed_in_batches_behind_an_untimed_one(load: Callable[[
     assert timing.median_ms == pytest.approx(1.0) and timing.iqr_ms == pytest.approx(0.0)
 
 
+@pytest.mark.skipif(not Path("/proc/stat").is_file(), reason="the kernel's counters are Linux's")
+def test_other_processes_are_noticed(load: Callable[[str], Any]) -> None:
+    import time
+
+    others = load("harness").Others()
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
+        time.sleep(1.0)
+        found = others.cores()
+        process.kill()
+    assert found is not None and found > 0.3
+
+
 def test_quartiles(load: Callable[[str], Any]) -> None:
     timing = load("harness").Timing([0.001, 0.002, 0.003, 0.004, 0.1])
     assert timing.median_ms == pytest.approx(3) and timing.iqr_ms == pytest.approx(2)
