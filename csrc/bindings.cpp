@@ -5,6 +5,7 @@
 
 #include <cstdint>
 
+#include "bindings_cuda.h"
 #include "bindings_march.h"
 #include "bindings_mlp.h"
 #include "bindings_sampling.h"
@@ -12,7 +13,6 @@
 #include "cell_sort.h"
 #include "common.h"
 #include "isa.h"
-#include "launchers.h"
 #include "locate_cell.h"
 #include "measure_peak.h"
 #include "nearest_centre.h"
@@ -23,7 +23,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 5;
+constexpr int INTERFACE = 6;
 
 using Address = std::uintptr_t;
 
@@ -55,34 +55,6 @@ bool cell_sort(Address cells, Address order, Address offsets, Address workspace,
 double measure_peak(int kind, int isa, int threads) {
   return voronerf::measure_peak(static_cast<voronerf::Peak>(kind), static_cast<voronerf::Isa>(isa), threads);
 }
-
-#ifdef VN_WITH_CUDA
-
-template <typename T>
-void nearest_centre_cuda(Address points, Address centres, Address weights, Address cells, int64_t n, int64_t k,
-                         int device, Address stream) {
-  const voronerf::CudaDevice current(device);
-  voronerf::nearest_centre_cuda(at<const T>(points), at<const T>(centres), at<const T>(weights), at<int32_t>(cells), n,
-                                k, at<void>(stream));
-}
-
-template <typename T>
-void locate_cell_cuda(Address points, Address centres, Address weights, Address child_offsets, Address child,
-                      Address leaves, int64_t n, int64_t m, int64_t g, int depth, int device, Address stream) {
-  const voronerf::CudaDevice current(device);
-  voronerf::locate_cell_cuda(at<const T>(points), at<const T>(centres), at<const T>(weights),
-                             at<const int32_t>(child_offsets), at<const int32_t>(child), at<int32_t>(leaves), n, m, g,
-                             depth, at<void>(stream));
-}
-
-void cell_sort_cuda(Address cells, Address order, Address offsets, Address workspace, int64_t n, int64_t k, int device,
-                    Address stream) {
-  const voronerf::CudaDevice current(device);
-  voronerf::cell_sort_cuda(at<const int32_t>(cells), at<int32_t>(order), at<int32_t>(offsets), at<int32_t>(workspace),
-                           n, k, at<void>(stream));
-}
-
-#endif
 
 }  // namespace
 
@@ -117,10 +89,6 @@ PYBIND11_MODULE(_C, module) {
   bind_march(module);
 
 #ifdef VN_WITH_CUDA
-  module.def("nearest_centre_cuda_float32", &nearest_centre_cuda<float>, no_gil);
-  module.def("nearest_centre_cuda_float64", &nearest_centre_cuda<double>, no_gil);
-  module.def("locate_cell_cuda_float32", &locate_cell_cuda<float>, no_gil);
-  module.def("locate_cell_cuda_float64", &locate_cell_cuda<double>, no_gil);
-  module.def("cell_sort_cuda", &cell_sort_cuda, no_gil);
+  bind_cuda(module);
 #endif
 }

@@ -8,7 +8,7 @@
 // and their first lane moves the counter. There are no atomics, and every row has one possible place: the result is
 // that of the CPU, bit for bit. Bucket 0 is for cells below 0 and bucket k + 1 for cells from k on.
 #include "cell_sort.h"
-#include "common.h"
+#include "cuda_wrappers.h"
 #include "launchers.h"
 
 namespace voronerf {
@@ -95,7 +95,7 @@ __device__ int32_t scan_block(int32_t value, int32_t* warp_sums, int32_t& total)
 
 __global__ void __launch_bounds__(kScanThreads)
     scan_sums(const int32_t* __restrict__ counts, int32_t* __restrict__ tile_sums, int64_t size) {
-  __shared__ int32_t warp_sums[32];
+  VN_SHARED(warp_sums, int32_t[32]);
   const int64_t first = blockIdx.x * kScanTile + static_cast<int64_t>(threadIdx.x) * kScanItems;
   int32_t sum = 0, total;
   for (int item = 0; item < kScanItems; ++item) {
@@ -107,7 +107,7 @@ __global__ void __launch_bounds__(kScanThreads)
 
 // One block turns the sums of the tiles into their exclusive scan.
 __global__ void __launch_bounds__(kScanThreads) scan_tiles(int32_t* tile_sums, int64_t tiles) {
-  __shared__ int32_t warp_sums[32];
+  VN_SHARED(warp_sums, int32_t[32]);
   int32_t carry = 0;
   for (int64_t start = 0; start < tiles; start += kScanThreads) {
     const int64_t i = start + threadIdx.x;
@@ -122,7 +122,7 @@ __global__ void __launch_bounds__(kScanThreads) scan_tiles(int32_t* tile_sums, i
 __global__ void __launch_bounds__(kScanThreads)
     scan_places(int32_t* __restrict__ counts, const int32_t* __restrict__ tile_sums, int32_t* __restrict__ offsets,
                 int64_t size, int64_t chunks) {
-  __shared__ int32_t warp_sums[32];
+  VN_SHARED(warp_sums, int32_t[32]);
   const int64_t first = blockIdx.x * kScanTile + static_cast<int64_t>(threadIdx.x) * kScanItems;
   int32_t value[kScanItems], sum = 0, total;
   for (int item = 0; item < kScanItems; ++item) {
@@ -154,16 +154,11 @@ void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, int3
   int32_t* counts = workspace;
   int32_t* tile_sums = workspace + size;
   VN_CUDA_CHECK(cudaMemsetAsync(counts, 0, sizeof(int32_t) * size, stream));
-  cell_sort_count<<<blocks, kThreads, 0, stream>>>(cells, counts, chunks, rows, n, k);
-  VN_CUDA_CHECK(cudaGetLastError());
-  scan_sums<<<tiles, kScanThreads, 0, stream>>>(counts, tile_sums, size);
-  VN_CUDA_CHECK(cudaGetLastError());
-  scan_tiles<<<1, kScanThreads, 0, stream>>>(tile_sums, tiles);
-  VN_CUDA_CHECK(cudaGetLastError());
-  scan_places<<<tiles, kScanThreads, 0, stream>>>(counts, tile_sums, offsets, size, chunks);
-  VN_CUDA_CHECK(cudaGetLastError());
-  cell_sort_scatter<<<blocks, kThreads, 0, stream>>>(cells, counts, order, chunks, rows, n, k);
-  VN_CUDA_CHECK(cudaGetLastError());
+  VN_LAUNCH(cell_sort_count, blocks, kThreads, 0, stream, cells, counts, chunks, rows, n, k);
+  VN_LAUNCH(scan_sums, tiles, kScanThreads, 0, stream, counts, tile_sums, size);
+  VN_LAUNCH(scan_tiles, 1, kScanThreads, 0, stream, tile_sums, tiles);
+  VN_LAUNCH(scan_places, tiles, kScanThreads, 0, stream, counts, tile_sums, offsets, size, chunks);
+  VN_LAUNCH(cell_sort_scatter, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);
 }
 
 }  // namespace voronerf

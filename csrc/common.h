@@ -12,8 +12,12 @@
 #include <omp.h>
 #endif
 
+#if defined(__CUDACC__) || defined(VN_EMULATE)
 #ifdef __CUDACC__
 #include <cuda_runtime.h>
+#else
+#include "emulation.h"
+#endif
 // A CUDA error becomes an exception that names the call. Launches are checked with cudaGetLastError(), which does not
 // synchronise: a fault inside a kernel shows at the caller's next synchronisation.
 #define VN_CUDA_CHECK(call)                                                               \

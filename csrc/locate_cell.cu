@@ -1,7 +1,7 @@
 // The nested query on CUDA: a thread a point walks down the tree. Each level is nearest_centre of one diagram, screened
 // in float32 and decided in float64 where float32 cannot (nearest_centre_math.h). Neighbouring samples of a ray share
 // their diagrams, so that the centres come from the first-level cache.
-#include "common.h"
+#include "cuda_wrappers.h"
 #include "launchers.h"
 #include "nearest_centre_math.h"
 
@@ -61,9 +61,8 @@ void locate_cell_cuda(const T* points, const T* centres, const T* weights, const
                       const int32_t* child, int32_t* leaves, int64_t n, int64_t m, int64_t g, int depth, void* stream) {
   if (n == 0) return;
   const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
-  locate_cell_kernel<T><<<blocks, kThreads, 0, static_cast<cudaStream_t>(stream)>>>(
-      points, centres, weights, child_offsets, child, leaves, n, m, g, depth);
-  VN_CUDA_CHECK(cudaGetLastError());
+  VN_LAUNCH((locate_cell_kernel<T>), blocks, kThreads, 0, stream, points, centres, weights, child_offsets, child,
+            leaves, n, m, g, depth);
 }
 
 template void locate_cell_cuda(const float*, const float*, const float*, const int32_t*, const int32_t*, int32_t*,

@@ -1,7 +1,7 @@
 // Nearest centre on CUDA: a thread a point, centres through shared memory in tiles that every thread of the block reads
 // at the same address (a broadcast). Float32 input is screened and, rarely, decided again in float64 by
 // nearest_centre_math.h, with the same answer as on the CPU to the last index.
-#include "common.h"
+#include "cuda_wrappers.h"
 #include "launchers.h"
 #include "nearest_centre_math.h"
 
@@ -15,7 +15,7 @@ constexpr int kTile = 512;  // centres: 8 KiB of shared memory with their weight
 __global__ void __launch_bounds__(kThreads)
     nearest_centre_kernel(const float* __restrict__ points, const float* __restrict__ centres,
                           const float* __restrict__ weights, int32_t* __restrict__ cells, int64_t n, int64_t k) {
-  __shared__ float4 tile[kTile];
+  VN_SHARED(tile, float4[kTile]);
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   // Threads past the end stay for the barriers, on the last point.
   const float* point = points + 3 * (i < n ? i : n - 1);
@@ -62,9 +62,7 @@ void nearest_centre_cuda(const T* points, const T* centres, const T* weights, in
                          void* stream) {
   if (n == 0) return;
   const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
-  nearest_centre_kernel<<<blocks, kThreads, 0, static_cast<cudaStream_t>(stream)>>>(points, centres, weights, cells, n,
-                                                                                    k);
-  VN_CUDA_CHECK(cudaGetLastError());
+  VN_LAUNCH(nearest_centre_kernel, blocks, kThreads, 0, stream, points, centres, weights, cells, n, k);
 }
 
 template void nearest_centre_cuda(const float*, const float*, const float*, int32_t*, int64_t, int64_t, void*);

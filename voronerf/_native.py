@@ -27,7 +27,7 @@ from voronerf.backends import BackendUnavailable
 
 ISAS = ("portable", "avx2", "avx512")
 # Number of csrc/bindings.cpp that this file and its companions are written for.
-INTERFACE = 5
+INTERFACE = 6
 
 # In the order of csrc/measure_peak.h.
 _PEAKS = ("float32", "bfloat16", "copy")
@@ -151,8 +151,8 @@ def _nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None) -> 
     cells = _allocate_rows(points)
     sizes = points.shape[0], centres.shape[0]
     arguments = *_addresses(points, centres, weights, cells), *sizes
-    if points.is_cuda:
-        _entry("nearest_centre_cuda", points.dtype)(*arguments, *_stream(points))
+    if on_cuda(points):
+        _entry("nearest_centre_cuda", points.dtype)(*arguments, *stream(points))
     else:
         _entry("nearest_centre", points.dtype)(*arguments, _ISA, torch.get_num_threads())
     return cells
@@ -167,8 +167,8 @@ def _locate_cell(
     leaves = _allocate_rows(points)
     n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
     addresses = _addresses(points, centres, weights, child_offsets, child, leaves)
-    if points.is_cuda:
-        _entry("locate_cell_cuda", points.dtype)(*addresses, n, m, g, depth, *_stream(points))
+    if on_cuda(points):
+        _entry("locate_cell_cuda", points.dtype)(*addresses, n, m, g, depth, *stream(points))
         return leaves
     fault = _C.locate_cell_fault(child_offsets.data_ptr(), child.data_ptr(), g, m)
     if fault is not None:
@@ -188,8 +188,8 @@ def _cell_sort(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:
     n = cells.shape[0]
     workspace = cells.new_empty(_C.cell_sort_workspace(n, k))
     addresses = _addresses(cells, order, offsets, workspace)
-    if cells.is_cuda:
-        _C.cell_sort_cuda(*addresses, n, k, *_stream(cells))
+    if on_cuda(cells):
+        _C.cell_sort_cuda(*addresses, n, k, *stream(cells))
     elif not _C.cell_sort(*addresses, n, k, torch.get_num_threads()):
         low, high = (int(bound) for bound in cells.aminmax())
         raise ValueError(f"cell_sort: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
@@ -243,7 +243,12 @@ def _entry(name: str, dtype: torch.dtype) -> Callable[..., Any]:
     return entry
 
 
-def _stream(tensor: Tensor) -> tuple[int, int]:
+def on_cuda(tensor: Tensor) -> bool:
+    """Whether the CUDA half of the module is to work on a tensor."""
+    return tensor.is_cuda
+
+
+def stream(tensor: Tensor) -> tuple[int, int]:
     """Device and current stream of a CUDA tensor."""
     index = tensor.device.index
     return index, torch.cuda.current_stream(index).cuda_stream

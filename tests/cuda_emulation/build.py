@@ -1,0 +1,66 @@
+"""Builds the emulated CUDA module: ``build.py [none|address|thread]`` prints where it is.
+
+The .cu files of csrc/ are compiled by g++ with emulation.h in place of CUDA; ninja redoes only what has changed. One
+module for each sanitizer, which are told nothing of the scheduler (emulation.cpp): it is what they must look through.
+"""
+
+from __future__ import annotations
+
+import platform
+import shlex
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+HERE = Path(__file__).resolve().parent
+SANITIZERS = {
+    "none": [],
+    "address": ["-fsanitize=address"],
+    "thread": ["-fsanitize=thread"],
+}
+PLAIN = {"emulation.cpp", "module.cpp", "bindings_cuda.cpp"}
+"""Files with nothing to watch."""
+SHARED = ("grouped_mlp_cuda_plan.cpp",)
+"""What the launchers need of the C++ beside them."""
+
+
+def build(sanitizer: str = "none") -> Path:
+    """The module, built where it was not up to date."""
+    import pybind11
+
+    out = ROOT / "build" / "cuda-emulation" / f"{platform.machine()}-{sys.implementation.cache_tag}"
+    (out / sanitizer).mkdir(parents=True, exist_ok=True)
+    module = out / sanitizer / f"voronerf_emulation{sysconfig.get_config_var('EXT_SUFFIX')}"
+    sources = [*sorted((ROOT / "csrc").glob("*.cu")), *sorted(HERE.glob("*.cu")), *sorted(HERE.glob("*.cpp"))]
+    sources += [ROOT / "csrc" / name for name in ("bindings_cuda.cpp", *SHARED) if (ROOT / "csrc" / name).exists()]
+    includes = [ROOT / "csrc", HERE, Path(pybind11.get_include()), Path(sysconfig.get_path("include"))]
+    flags = ["-std=c++17", "-O1", "-g1", "-fPIC", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=hidden"]
+    flags += ["-Wall", "-Wextra", "-Werror", "-DVN_EMULATE", "-DVN_WITH_CUDA"]
+    flags += [f"-I{path}" for path in includes[:2]] + [f"-isystem{path}" for path in includes[2:]]
+    watched = SANITIZERS[sanitizer]
+    lines = [
+        "rule cxx",
+        f"  command = g++ {shlex.join(flags)} $flags -MMD -MF $out.d -c -x c++ $in -o $out",
+        "  depfile = $out.d",
+        "  deps = gcc",
+        "rule link",
+        f"  command = g++ -shared $in {shlex.join(watched)} -o $out",
+    ]
+    objects = []
+    for source in sources:
+        plain = source.name in PLAIN
+        objects.append(f"{'plain' if plain else sanitizer}/{source.name}.o")
+        lines += [f"build {objects[-1]}: cxx {source}", f"  flags = {shlex.join([] if plain else watched)}"]
+    lines += [f"build {sanitizer}/{module.name}: link {' '.join(objects)}", ""]
+    (out / f"{sanitizer}.ninja").write_text("\n".join(lines))
+    command = [sys.executable, "-m", "ninja", "-C", str(out), "-f", f"{sanitizer}.ninja", f"{sanitizer}/{module.name}"]
+    result = subprocess.run(command, capture_output=True, text=True)
+    if result.returncode != 0:
+        raise RuntimeError(f"the emulated module does not compile:\n{result.stdout}{result.stderr}")
+    return module
+
+
+if __name__ == "__main__":
+    print(build(*sys.argv[1:]))

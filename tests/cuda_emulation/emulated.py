@@ -1,0 +1,59 @@
+"""The CUDA half of the native backend on CPU tensors: ``with emulated(): voronerf.nearest_centre(...)``.
+
+Everything from the public function to the kernel is what runs on a GPU; only the compiled module is the emulated one,
+and the question whether a tensor is on CUDA is answered with yes.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+from unittest import mock
+
+from voronerf import _native
+
+
+@functools.cache
+def module() -> ModuleType:
+    """The emulated module, built if need be."""
+    here = os.path.dirname(__file__)
+    spec = importlib.util.spec_from_file_location("cuda_emulation_build", os.path.join(here, "build.py"))
+    assert spec is not None and spec.loader is not None
+    build = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build)
+    spec = importlib.util.spec_from_file_location("voronerf_emulation", build.build())
+    assert spec is not None and spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+class _Both:
+    """The compiled module with the emulated entries over its own."""
+
+    def __init__(self, over: Any, under: Any) -> None:
+        self._over, self._under = over, under
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._over if hasattr(self._over, name) else self._under, name)
+
+
+@contextmanager
+def emulated(*, seed: int = 0, capability: int = 90, shared_bytes: int = 227 * 1024) -> Iterator[ModuleType]:
+    """The native backend on the emulated device: its compute capability and shared memory of a block."""
+    loaded = module()
+    loaded.seed(seed)
+    loaded.device(capability, shared_bytes)
+    _native._entry.cache_clear()
+    with (
+        mock.patch.object(_native, "_C", _Both(loaded, _native._C)),
+        mock.patch.object(_native, "on_cuda", lambda tensor: True),
+        mock.patch.object(_native, "stream", lambda tensor: (0, 0)),
+    ):
+        yield loaded
+    _native._entry.cache_clear()

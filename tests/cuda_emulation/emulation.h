@@ -1,0 +1,285 @@
+// What nvcc gives to a .cu file, for g++: the same sources run on the CPU, a grid block by block, every thread a fiber.
+//
+// Test only: csrc/cuda_wrappers.h includes it under VN_EMULATE. Threads of a block run in an order shuffled by a seed,
+// and are stopped at barriers and at operations of the warp, where all lanes must meet. Shared memory is poisoned
+// before every block. It proves logic, not speed; there are no partial warps (every mask names all 32 lanes).
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <type_traits>
+
+#define __global__
+#define __device__
+#define __host__
+#define __forceinline__ inline
+#define __launch_bounds__(...)
+
+struct dim3 {
+  unsigned x, y, z;
+  dim3(unsigned x_ = 1, unsigned y_ = 1, unsigned z_ = 1) : x(x_), y(y_), z(z_) {}
+};
+
+struct alignas(8) float2 {
+  float x, y;
+};
+struct alignas(16) float4 {
+  float x, y, z, w;
+};
+inline float2 make_float2(float x, float y) {
+  return {x, y};
+}
+inline float4 make_float4(float x, float y, float z, float w) {
+  return {x, y, z, w};
+}
+
+// The part of the runtime that launchers use.
+using cudaStream_t = void*;
+using cudaError_t = int;
+constexpr cudaError_t cudaSuccess = 0;
+enum cudaFuncAttribute { cudaFuncAttributeMaxDynamicSharedMemorySize };
+enum cudaDeviceAttr {
+  cudaDevAttrMaxSharedMemoryPerBlockOptin,
+  cudaDevAttrMultiProcessorCount,
+  cudaDevAttrComputeCapabilityMajor,
+  cudaDevAttrComputeCapabilityMinor,
+};
+inline const char* cudaGetErrorString(cudaError_t) {
+  return "error of the emulation";
+}
+inline cudaError_t cudaGetLastError() {
+  return cudaSuccess;
+}
+inline cudaError_t cudaGetDevice(int* device) {
+  *device = 0;
+  return cudaSuccess;
+}
+inline cudaError_t cudaSetDevice(int) {
+  return cudaSuccess;
+}
+inline cudaError_t cudaMemsetAsync(void* to, int value, size_t size, cudaStream_t) {
+  std::memset(to, value, size);
+  return cudaSuccess;
+}
+template <typename Kernel>
+cudaError_t cudaFuncSetAttribute(Kernel, cudaFuncAttribute, int) {
+  return cudaSuccess;
+}
+
+namespace vn_emulation {
+
+constexpr size_t kSlot = 64;  // bytes a lane may hand to the others of its warp
+
+struct Settings {
+  uint64_t seed = 0;
+  int capability = 90;      // of the device that is played
+  int multiprocessors = 2;  // few, so that loops over a grid are walked
+  int shared = 227 * 1024;  // bytes a block may ask for
+};
+Settings& settings();
+
+// One launch: run(context) is the kernel. Throws std::runtime_error for what would hang or fault.
+void launch(void (*run)(void*), void* context, dim3 grid, dim3 block, size_t dynamic_bytes);
+
+// Memory that the threads of a block share: one piece for each place in the source, named by `key`.
+void* shared(const void* key, size_t size);
+void* dynamic_shared();
+
+// All threads of the block meet; those of the warp meet, each with `size` bytes, and get all lanes' [32][kSlot].
+void block_barrier();
+const unsigned char* meet(const char* operation, const void* mine, size_t size);
+int lane();
+
+struct Index {
+  unsigned x = 0, y = 0, z = 0;
+};
+extern Index thread_index, block_index;
+extern dim3 block_size, grid_size;
+
+template <typename Launch>
+void launch_of(const Launch& run, dim3 grid, dim3 block, size_t dynamic_bytes) {
+  launch([](void* context) { (*static_cast<const Launch*>(context))(); }, const_cast<Launch*>(&run), grid, block,
+         dynamic_bytes);
+}
+
+template <typename T>
+T from_lane(const unsigned char* slots, int lane) {
+  T value;
+  std::memcpy(&value, slots + lane * kSlot, sizeof(T));
+  return value;
+}
+
+void require_all(unsigned mask);
+
+}  // namespace vn_emulation
+
+inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, int) {
+  const auto& settings = vn_emulation::settings();
+  switch (attribute) {
+    case cudaDevAttrMaxSharedMemoryPerBlockOptin:
+      *value = settings.shared;
+      break;
+    case cudaDevAttrMultiProcessorCount:
+      *value = settings.multiprocessors;
+      break;
+    case cudaDevAttrComputeCapabilityMajor:
+      *value = settings.capability / 10;
+      break;
+    case cudaDevAttrComputeCapabilityMinor:
+      *value = settings.capability % 10;
+      break;
+  }
+  return cudaSuccess;
+}
+
+#define threadIdx vn_emulation::thread_index
+#define blockIdx vn_emulation::block_index
+#define blockDim vn_emulation::block_size
+#define gridDim vn_emulation::grid_size
+
+#define VN_LAUNCH(kernel, grid, block, bytes, stream, ...) \
+  ((void)(stream), vn_emulation::launch_of([&] { kernel(__VA_ARGS__); }, grid, block, bytes))
+#define VN_SHARED(name, ...)        \
+  using name##_type = __VA_ARGS__;  \
+  static const char name##_key = 0; \
+  name##_type& name = *static_cast<name##_type*>(vn_emulation::shared(&name##_key, sizeof(name##_type)))
+#define VN_DYN_SHARED(T, name) T* name = static_cast<T*>(vn_emulation::dynamic_shared())
+
+// Functions that CUDA has and C++ has not. Every lane of a warp must come to the same one.
+
+inline void __syncthreads() {
+  vn_emulation::block_barrier();
+}
+
+inline void __syncwarp(unsigned mask = 0xffffffffu) {
+  vn_emulation::require_all(mask);
+  vn_emulation::meet("__syncwarp", nullptr, 0);
+}
+
+template <typename T>
+T __shfl_sync(unsigned mask, T value, int source) {
+  vn_emulation::require_all(mask);
+  return vn_emulation::from_lane<T>(vn_emulation::meet("__shfl_sync", &value, sizeof value), source & 31);
+}
+
+template <typename T>
+T __shfl_up_sync(unsigned mask, T value, unsigned delta) {
+  vn_emulation::require_all(mask);
+  const int source = vn_emulation::lane() - static_cast<int>(delta);
+  const unsigned char* slots = vn_emulation::meet("__shfl_up_sync", &value, sizeof value);
+  return source < 0 ? value : vn_emulation::from_lane<T>(slots, source);
+}
+
+template <typename T>
+T __shfl_down_sync(unsigned mask, T value, unsigned delta) {
+  vn_emulation::require_all(mask);
+  const int source = vn_emulation::lane() + static_cast<int>(delta);
+  const unsigned char* slots = vn_emulation::meet("__shfl_down_sync", &value, sizeof value);
+  return source > 31 ? value : vn_emulation::from_lane<T>(slots, source);
+}
+
+template <typename T>
+T __shfl_xor_sync(unsigned mask, T value, int other) {
+  vn_emulation::require_all(mask);
+  const int source = vn_emulation::lane() ^ other;
+  return vn_emulation::from_lane<T>(vn_emulation::meet("__shfl_xor_sync", &value, sizeof value), source);
+}
+
+template <typename T>
+unsigned __match_any_sync(unsigned mask, T value) {
+  vn_emulation::require_all(mask);
+  const unsigned char* slots = vn_emulation::meet("__match_any_sync", &value, sizeof value);
+  unsigned peers = 0;
+  for (int lane = 0; lane < 32; ++lane) {
+    if (vn_emulation::from_lane<T>(slots, lane) == value) peers |= 1u << lane;
+  }
+  return peers;
+}
+
+inline unsigned __ballot_sync(unsigned mask, int predicate) {
+  vn_emulation::require_all(mask);
+  const unsigned char* slots = vn_emulation::meet("__ballot_sync", &predicate, sizeof predicate);
+  unsigned votes = 0;
+  for (int lane = 0; lane < 32; ++lane) {
+    if (vn_emulation::from_lane<int>(slots, lane) != 0) votes |= 1u << lane;
+  }
+  return votes;
+}
+
+inline int __ffs(int x) {
+  return __builtin_ffs(x);
+}
+inline int __popc(unsigned x) {
+  return __builtin_popcount(x);
+}
+
+namespace voronerf {
+
+// The twins of the instructions in csrc/cuda_wrappers.h, by the fragment layouts of the PTX manual (section "Matrix
+// fragments for mma.m16n8k16" and after it).
+
+inline unsigned half_bits(float x, bool bfloat16) {
+  if (!bfloat16) {
+    const _Float16 rounded = static_cast<_Float16>(x);
+    uint16_t bits;
+    std::memcpy(&bits, &rounded, sizeof bits);
+    return bits;
+  }
+  uint32_t bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  if (std::isnan(x)) return 0x7fff;
+  return (bits + 0x7fffu + ((bits >> 16) & 1u)) >> 16;
+}
+
+inline float half_value(unsigned bits, bool bfloat16) {
+  if (bfloat16) {
+    const uint32_t wide = static_cast<uint32_t>(bits & 0xffffu) << 16;
+    float value;
+    std::memcpy(&value, &wide, sizeof value);
+    return value;
+  }
+  const uint16_t narrow = static_cast<uint16_t>(bits);
+  _Float16 value;
+  std::memcpy(&value, &narrow, sizeof value);
+  return static_cast<float>(value);
+}
+
+// d += a b with a 16 x k and b k x 8; `value(bits, part)` is one element of a register.
+template <int kDepth, int kPerRegister, typename Value>
+void emulated_mma(const char* name, float (&d)[4], const uint32_t* a, int a_count, const uint32_t* b, int b_count,
+                  const Value& value) {
+  struct Fragments {
+    uint32_t a[4], b[2];
+  } mine = {};
+  for (int i = 0; i < a_count; ++i) mine.a[i] = a[i];
+  for (int i = 0; i < b_count; ++i) mine.b[i] = b[i];
+  const int lane = vn_emulation::lane();
+  const unsigned char* slots = vn_emulation::meet(name, &mine, sizeof mine);
+  float left[16][kDepth], right[kDepth][8];
+  for (int other = 0; other < 32; ++other) {
+    const Fragments from = vn_emulation::from_lane<Fragments>(slots, other);
+    const int group = other / 4, member = other % 4;
+    for (int i = 0; i < a_count; ++i) {
+      for (int part = 0; part < kPerRegister; ++part) {
+        left[group + 8 * (i % 2)][member * kPerRegister + part + 4 * kPerRegister * (i / 2)] = value(from.a[i], part);
+      }
+    }
+    for (int i = 0; i < b_count; ++i) {
+      for (int part = 0; part < kPerRegister; ++part) {
+        right[member * kPerRegister + part + 4 * kPerRegister * i][group] = value(from.b[i], part);
+      }
+    }
+  }
+  for (int i = 0; i < 4; ++i) {
+    const int row = lane / 4 + 8 * (i / 2), column = 2 * (lane % 4) + i % 2;
+    double sum = d[i];
+    for (int k = 0; k < kDepth; ++k) sum += static_cast<double>(left[row][k]) * right[k][column];
+    d[i] = static_cast<float>(sum);
+  }
+}
+
+}  // namespace voronerf

@@ -1,0 +1,82 @@
+"""Every kernel once on a few blocks, for a process under a sanitizer: ``sanitize.py MODULE``.
+
+Without torch, which takes a sanitizer minutes. Results are test_ops.py's matter; here only memory and order count, and
+that every element of an output is written.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+GPU = (0, 0)
+"""Device and stream."""
+RANDOM = np.random.default_rng(0)
+
+
+def at(array: np.ndarray | None) -> int:
+    return 0 if array is None else array.ctypes.data
+
+
+def floats(*shape: int, dtype: Any = np.float32) -> np.ndarray:
+    return RANDOM.random(shape).astype(dtype)
+
+
+def integers(*values: int) -> np.ndarray:
+    return np.array(values, np.int32)
+
+
+def unwritten(*shape: int, dtype: Any = np.float32) -> np.ndarray:
+    return np.full(shape, np.nan if dtype is not np.int32 else -7777, dtype)
+
+
+def written(*arrays: np.ndarray) -> None:
+    for array in arrays:
+        assert not (np.isnan(array) if array.dtype != np.int32 else array == -7777).any()
+
+
+def nearest_centre(module: ModuleType) -> None:
+    for dtype, name in ((np.float32, "float32"), (np.float64, "float64")):
+        points, centres, weights, cells = floats(300, 3, dtype=dtype), floats(530, 3, dtype=dtype), None, None
+        for weights in (None, floats(530, dtype=dtype)):
+            cells = unwritten(300, dtype=np.int32)
+            arguments = at(points), at(centres), at(weights), at(cells), 300, 530
+            getattr(module, f"nearest_centre_cuda_{name}")(*arguments, *GPU)
+            written(cells)
+
+
+def locate_cell(module: ModuleType) -> None:
+    points, centres, leaves = floats(300, 3), floats(5, 3), unwritten(300, dtype=np.int32)
+    child_offsets, child = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
+    addresses = at(points), at(centres), 0, at(child_offsets), at(child), at(leaves)
+    module.locate_cell_cuda_float32(*addresses, 300, 5, 2, 2, *GPU)
+    written(leaves)
+
+
+def cell_sort(module: ModuleType) -> None:
+    for n, k in ((3000, 5), (9000, 2)):
+        cells = RANDOM.integers(-1, k + 1, n).astype(np.int32)
+        order, offsets = unwritten(n, dtype=np.int32), unwritten(k + 1, dtype=np.int32)
+        counts = -(-n // 2048) * (k + 2)
+        workspace = unwritten(counts + -(-counts // 4096), dtype=np.int32)
+        module.cell_sort_cuda(at(cells), at(order), at(offsets), at(workspace), n, k, *GPU)
+        assert (np.sort(order) == np.arange(n)).all()
+        written(offsets)
+
+
+def main(path: str) -> None:
+    spec = importlib.util.spec_from_file_location("voronerf_emulation", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    for run in (nearest_centre, locate_cell, cell_sort):
+        run(module)
+    print("clean")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
