@@ -14,7 +14,7 @@ CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
 
 SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
 
-.PHONY: demo test bench check cuda-check sanitize clean
+.PHONY: demo test bench check cuda-check emulate-cuda sanitize clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -37,6 +37,10 @@ check: $(VENV)/.built
 
 cuda-check:
 	@$(PYTHON) .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
+
+# The tests of the operations on CUDA kernels that run on the CPU, threads in several orders.
+emulate-cuda: $(VENV)/.built
+	@for seed in 1 2 3; do OMP_NUM_THREADS=1 $(BIN)/pytest -q tests/ops -k native-cpu --emulate-cuda $$seed || exit 1; done
 
 # The C++ of grouped_mlp under AddressSanitizer and UndefinedBehaviorSanitizer, with random networks and cells.
 sanitize:

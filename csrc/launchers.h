@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "composite.h"
+
 namespace voronerf {
 
 // Makes a device current for this thread while it lives, so that launches go where the caller's stream is. The static
@@ -33,5 +35,20 @@ void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, int3
 template <typename T>
 void locate_cell_cuda(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
                       const int32_t* child, int32_t* leaves, int64_t n, int64_t m, int64_t g, int depth, void* stream);
+
+// Encodings (encode.h); variances and grad_variances are null for the plain one.
+void encode_cuda(const float* x, const float* variances, float* out, int64_t n, int64_t d, int64_t octaves,
+                 bool include_input, void* stream);
+void encode_backward_cuda(const float* gradient, const float* x, const float* variances, float* grad_x,
+                          float* grad_variances, int64_t n, int64_t d, int64_t octaves, bool include_input,
+                          void* stream);
+
+// workspace: r s doubles.
+void resample_cuda(const float* weights, const float* edges, const float* uniforms, float* depths, double* workspace,
+                   int64_t r, int64_t s, int64_t count, void* stream);
+
+// Offsets that fall or exceed m are not refused: samples outside are not touched.
+void composite_cuda(const CompositeInputs& in, const CompositeOutputs& out, void* stream);
+void composite_backward_cuda(const CompositeInputs& in, const CompositeGradients& gradients, void* stream);
 
 }  // namespace voronerf

@@ -13,11 +13,16 @@ CPU::
 
 ``@pytest.mark.native``, ``@pytest.mark.cuda`` and ``@pytest.mark.warp`` say that a test needs that part. What is absent
 is a skip with its reason; ``--require native,cuda,warp`` turns those skips into failures.
+
+``--emulate-cuda SEED`` runs the native backend's CUDA kernels in place of its CPU ones, on the CPU (cuda_emulation/).
 """
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -31,6 +36,9 @@ pytest_plugins = ("pytester",)
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--require", default="", help=f"parts that must be present, from {','.join(PARTS)}")
+    parser.addoption(
+        "--emulate-cuda", type=int, metavar="SEED", help="run the native backend's CUDA kernels on the CPU"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -68,6 +76,18 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 @pytest.fixture(autouse=True)
 def _same_seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _emulated_cuda(request: pytest.FixtureRequest) -> Iterator[None]:
+    seed = request.config.getoption("--emulate-cuda")
+    with contextlib.ExitStack() as stack:
+        if seed is not None:
+            sys.path.append(str(Path(__file__).parent / "cuda_emulation"))
+            from emulated import emulated
+
+            stack.enter_context(emulated(seed=seed))
+        yield
 
 
 @pytest.hookimpl(tryfirst=True)

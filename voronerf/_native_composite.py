@@ -34,19 +34,21 @@ def composite(
     return Composite(*(part.to(rgb.dtype) for part in parts))
 
 
-@torch.library.custom_op("voronerf::composite_native", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::composite_native", mutates_args=(), device_types=("cpu", "cuda"))
 def _forward(
     sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     inputs = _contiguous(sigma, rgb, depths, deltas, ray_offsets, background)
     results = _allocate(sigma, rgb, ray_offsets)
-    _native._C.composite(
-        _addresses(inputs), _sizes(sigma, rgb, ray_offsets, background), _addresses(results), *_machine()
-    )
+    arguments = _addresses(inputs), _sizes(sigma, rgb, ray_offsets, background), _addresses(results)
+    if _native.on_cuda(sigma):
+        _native._C.composite_cuda(*arguments, *_native.stream(sigma))
+    else:
+        _native._C.composite(*arguments, *_machine())
     return results
 
 
-@torch.library.custom_op("voronerf::composite_native_backward", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::composite_native_backward", mutates_args=(), device_types=("cpu", "cuda"))
 def _backward(
     colour: Tensor | None,
     opacity: Tensor | None,
@@ -68,7 +70,7 @@ def _backward(
     gradients = _contiguous(colour, opacity, depth, weights)
     workspace = sigma.new_empty(0 if background is None else _rays(sigma, ray_offsets))
     results = _allocate_gradients(sigma, rgb, depths, deltas, background, wanted)
-    _native._C.composite_backward(
+    arguments = (
         _addresses(inputs),
         _sizes(sigma, rgb, ray_offsets, background),
         _addresses(gradients),
@@ -76,8 +78,11 @@ def _backward(
             *(address if want else 0 for address, want in zip(_addresses(results), [True, *wanted[1:]])),
             workspace.data_ptr(),
         ],
-        *_machine(),
     )
+    if _native.on_cuda(sigma):
+        _native._C.composite_backward_cuda(*arguments, *_native.stream(sigma))
+    else:
+        _native._C.composite_backward(*arguments, *_machine())
     return results
 
 

@@ -38,36 +38,46 @@ def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | N
     return depths.to(edges.dtype)
 
 
-@torch.library.custom_op("voronerf::encode_native", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::encode_native", mutates_args=(), device_types=("cpu", "cuda"))
 def _encode(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Tensor:
     """The frequency encoding or, with variances, the integrated one."""
     out = _allocate(x, octaves, include_input)
     kept = [x.contiguous(), None if variances is None else variances.contiguous()]
-    workspace = _workspace(x, octaves)
-    addresses = [_address(tensor) for tensor in (*kept, out, workspace)]
-    _native._C.encode(*addresses, *_rest(x, octaves, include_input))
+    addresses = [_address(tensor) for tensor in (*kept, out)]
+    if _native.on_cuda(x):
+        _native._C.encode_cuda(*addresses, *x.shape, octaves, include_input, *_native.stream(x))
+    else:
+        workspace = _workspace(x, octaves)
+        _native._C.encode(*addresses, workspace.data_ptr(), *_rest(x, octaves, include_input))
     return out
 
 
-@torch.library.custom_op("voronerf::encode_native_backward", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::encode_native_backward", mutates_args=(), device_types=("cpu", "cuda"))
 def _encode_backward(
     gradient: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool
 ) -> list[Tensor]:
     """Gradients to x and to the variances, the second empty without them."""
     results = _allocate_gradients(x, variances)
     kept = [gradient.contiguous(), x.contiguous(), None if variances is None else variances.contiguous()]
-    workspace = _workspace(x, octaves)
-    addresses = [_address(tensor) for tensor in (*kept, *results, workspace)]
-    _native._C.encode_backward(*addresses, *_rest(x, octaves, include_input))
+    addresses = [_address(tensor) for tensor in (*kept, *results)]
+    if _native.on_cuda(x):
+        _native._C.encode_backward_cuda(*addresses, *x.shape, octaves, include_input, *_native.stream(x))
+    else:
+        workspace = _workspace(x, octaves)
+        _native._C.encode_backward(*addresses, workspace.data_ptr(), *_rest(x, octaves, include_input))
     return results
 
 
-@torch.library.custom_op("voronerf::resample_native", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::resample_native", mutates_args=(), device_types=("cpu", "cuda"))
 def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
     depths = _allocate_depths(edges, count)
     kept = [weights.contiguous(), edges.contiguous(), None if uniforms is None else uniforms.contiguous()]
     addresses = [_address(tensor) for tensor in (*kept, depths)]
-    _native._C.resample(*addresses, *weights.shape, count, torch.get_num_threads())
+    if _native.on_cuda(weights):
+        workspace = weights.new_empty(weights.shape, dtype=torch.float64)
+        _native._C.resample_cuda(*addresses, workspace.data_ptr(), *weights.shape, count, *_native.stream(weights))
+    else:
+        _native._C.resample(*addresses, *weights.shape, count, torch.get_num_threads())
     return depths
 
 

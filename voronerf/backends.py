@@ -95,10 +95,14 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("grouped_linear", "native"): Implementation("voronerf._native_mlp:grouped_linear", ("cpu",), _FLOATS),
     ("grouped_mlp", "native"): Implementation("voronerf._native_mlp:grouped_mlp", ("cpu",), _FLOATS),
     ("routed_mlp", "native"): Implementation("voronerf._native_route:routed_mlp", ("cpu",), _FLOATS),
-    ("composite", "native"): Implementation("voronerf._native_composite:composite", ("cpu",), _FLOATS),
-    ("frequency_encode", "native"): Implementation("voronerf._native_sampling:frequency_encode", ("cpu",), _FLOATS),
-    ("integrated_encode", "native"): Implementation("voronerf._native_sampling:integrated_encode", ("cpu",), _FLOATS),
-    ("resample", "native"): Implementation("voronerf._native_sampling:resample", ("cpu",), _FLOATS),
+    ("composite", "native"): Implementation("voronerf._native_composite:composite", ("cpu", "cuda"), _FLOATS),
+    ("frequency_encode", "native"): Implementation(
+        "voronerf._native_sampling:frequency_encode", ("cpu", "cuda"), _FLOATS
+    ),
+    ("integrated_encode", "native"): Implementation(
+        "voronerf._native_sampling:integrated_encode", ("cpu", "cuda"), _FLOATS
+    ),
+    ("resample", "native"): Implementation("voronerf._native_sampling:resample", ("cpu", "cuda"), _FLOATS),
     ("march_rays", "native"): Implementation("voronerf._native_march:march_rays", ("cpu",), (torch.float32,)),
     ("update_occupancy", "native"): Implementation(
         "voronerf._native_march:update_occupancy", ("cpu",), (torch.float32,)

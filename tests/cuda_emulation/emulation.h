@@ -213,6 +213,9 @@ inline unsigned __ballot_sync(unsigned mask, int predicate) {
 inline int __ffs(int x) {
   return __builtin_ffs(x);
 }
+inline int __clz(int x) {
+  return x == 0 ? 32 : __builtin_clz(static_cast<unsigned>(x));
+}
 inline int __popc(unsigned x) {
   return __builtin_popcount(x);
 }

@@ -68,12 +68,51 @@ def cell_sort(module: ModuleType) -> None:
         written(offsets)
 
 
+def composite(module: ModuleType) -> None:
+    m, r = 180, 5
+    ray_offsets = integers(2, 2, 3, 73, 140, 177)
+    for c, background in ((3, floats(3)), (5, floats(r, 5)), (1, None)):
+        inputs = floats(m), floats(m, c), floats(m), floats(m), ray_offsets, background
+        sizes = [r, 0, m, c, int(background is not None and background.ndim == 2)]
+        results = unwritten(r, c), unwritten(r), unwritten(r), unwritten(m)
+        module.composite_cuda([at(x) for x in inputs], sizes, [at(x) for x in results], *GPU)
+        written(*results)
+        incoming = floats(r, c), floats(r), floats(r), floats(m)
+        outgoing = [unwritten(*x.shape) for x in inputs[:4]]
+        outgoing += [] if background is None else [unwritten(*background.shape)]
+        targets = [at(x) for x in outgoing] + [0] * (5 - len(outgoing)) + [at(workspace := unwritten(r))]
+        module.composite_backward_cuda([at(x) for x in inputs], sizes, [at(x) for x in incoming], targets, *GPU)
+        written(*outgoing, *([] if background is None else [workspace]))
+
+
+def encode(module: ModuleType) -> None:
+    x, gradient = floats(90, 3), floats(90, 27)
+    for variances, include in ((None, True), (None, False), (floats(90, 3), False)):
+        width = 3 * (8 + include)
+        out, grad_x, grad_variances = unwritten(90, width), unwritten(90, 3), unwritten(90, 3)
+        module.encode_cuda(at(x), at(variances), at(out), 90, 3, 4, include, *GPU)
+        second = None if variances is None else grad_variances
+        addresses = at(gradient), at(x), at(variances), at(grad_x), at(second)
+        module.encode_backward_cuda(*addresses, 90, 3, 4, include, *GPU)
+        written(out, grad_x, *([] if second is None else [second]))
+
+
+def resample(module: ModuleType) -> None:
+    r, s, count = 6, 45, 70
+    for uniforms in (None, floats(r, count)):
+        weights, edges = floats(r, s), np.cumsum(floats(r, s + 1), axis=1)
+        depths, workspace = unwritten(r, count), unwritten(r, s, dtype=np.float64)
+        addresses = at(weights), at(edges), at(uniforms), at(depths), at(workspace)
+        module.resample_cuda(*addresses, r, s, count, *GPU)
+        written(depths)
+
+
 def main(path: str) -> None:
     spec = importlib.util.spec_from_file_location("voronerf_emulation", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    for run in (nearest_centre, locate_cell, cell_sort):
+    for run in (nearest_centre, locate_cell, cell_sort, composite, encode, resample):
         run(module)
     print("clean")
 

@@ -10,6 +10,19 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).resolve().parent
+OPERATIONS = [
+    str(HERE.parent / "ops" / f"test_{op}.py")
+    for op in (
+        "nearest_centre",
+        "locate_cell",
+        "cell_sort",
+        "composite",
+        "frequency_encode",
+        "integrated_encode",
+        "resample",
+    )
+]
+"""Tests of the operations that have CUDA kernels."""
 BUGS = [
     (0, "none", "right"),
     (1, "none", "wrong"),
@@ -44,6 +57,13 @@ def test_finds(bug: int, sanitizer: str, expected: str) -> None:
 def test_kernels_are_clean(sanitizer: str) -> None:
     found = run([sys.executable, str(HERE / "sanitize.py"), module(sanitizer)], sanitizer)
     assert found.stdout.splitlines() == ["clean"], found.stdout
+
+
+def test_operations_pass_their_tests_on_the_emulated_device() -> None:
+    """The tests of the operations themselves; ``make emulate-cuda`` takes more seeds."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--emulate-cuda", "1"]
+    found = run([*command, "-k", "native-cpu and not compile", "-W", "ignore", *OPERATIONS])
+    assert found.returncode == 0 and " passed" in found.stdout, found.stdout
 
 
 def module(sanitizer: str) -> str:
