@@ -37,8 +37,8 @@ def test_unknown_names_list_the_choices() -> None:
 
 
 def test_named_backend_never_falls_back() -> None:
-    with pytest.raises(BackendUnavailable, match=r"there is no warp implementation of resample; use backend="):
-        resolve("resample", backend="warp", device=CPU, dtype=torch.float32)
+    with pytest.raises(BackendUnavailable, match=r"there is no warp implementation of grouped_mlp; use backend="):
+        resolve("grouped_mlp", backend="warp", device=CPU, dtype=torch.float32)
     with pytest.raises(BackendUnavailable, match="takes 'int32', not int64"):
         resolve("cell_sort", backend="native", device=CPU, dtype=torch.int64)
     with pytest.raises(BackendUnavailable, match=r"runs on 'cpu' \| 'cuda', not on meta"):

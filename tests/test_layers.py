@@ -79,7 +79,13 @@ def faults(source: str, module: str) -> list[str]:
         if name.split(".")[0] != "voronerf":
             allowed = OUTSIDE.get(own)
             top = name.split(".")[0]
-            if allowed is not None and top not in allowed | {"__future__", "typing", "collections", "functools"}:
+            if allowed is not None and top not in allowed | {
+                "__future__",
+                "typing",
+                "collections",
+                "contextlib",
+                "functools",
+            }:
                 wrong.append(f"{module}:{line} imports {top}; {own} may import {' and '.join(sorted(allowed))}")
             continue
         # A name of the package itself, such as __version__, is not a module.

@@ -8,14 +8,18 @@ and out. Second derivatives come from the reference formula. Shapes and dtypes h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf import _native
 from voronerf.reference.composite import Composite
-from voronerf.reference.composite import composite as _reference
+from voronerf.reference.second_derivatives import (
+    composite_backward_backward,
+    composite_backward_setup,
+    composite_forward_backward,
+    composite_forward_setup,
+)
 
 
 def composite(
@@ -147,58 +151,5 @@ def _(
     return _allocate_gradients(sigma, rgb, depths, deltas, background, wanted)
 
 
-def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*inputs)
-
-
-def _forward_backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-    inputs = ctx.saved_tensors
-    needs = ctx.needs_input_grad
-    if all(gradient is None for gradient in gradients):
-        return (None,) * len(inputs)
-    wanted = [*needs[:4], needs[5]]
-    results = _backward(*gradients, *inputs, wanted)
-    found = [result if need else None for result, need in zip(results, wanted)]
-    return (*found[:4], None, found[4])
-
-
-def _backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
-    *tensors, ctx.wanted = inputs
-    ctx.save_for_backward(*tensors)
-
-
-def _backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tuple[Tensor | None, ...]:
-    """Derivative of the gradients, through the reference formula."""
-    saved = ctx.saved_tensors
-    ray_offsets = saved[8]
-    with torch.enable_grad():
-        leaves = [
-            None if tensor is None or i == 8 else tensor.detach().requires_grad_() for i, tensor in enumerate(saved)
-        ]
-        gradients, inputs = leaves[:4], [*leaves[4:8], leaves[9]]
-        parts = _reference(*inputs[:4], ray_offsets=ray_offsets, background=inputs[4])  # type: ignore[arg-type]
-        outputs = [(part, gradient) for part, gradient in zip(parts, gradients) if gradient is not None]
-        pairs = [
-            (tensor, cotangent)
-            for tensor, cotangent, want in zip(inputs, cotangents, ctx.wanted)
-            if want and tensor is not None and cotangent is not None
-        ]
-        firsts = torch.autograd.grad(
-            [part for part, _ in outputs],
-            [tensor for tensor, _ in pairs],
-            [gradient for _, gradient in outputs],
-            create_graph=True,
-            allow_unused=True,
-            materialize_grads=True,
-        )
-        total = saved[4].new_zeros(())
-        for first, (_, cotangent) in zip(firsts, pairs):
-            total = total + (first * cotangent).sum()
-        present = [leaf for leaf in leaves if leaf is not None]
-        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
-    return (*(None if leaf is None else next(seconds) for leaf in leaves), None)
-
-
-_forward.register_autograd(_forward_backward, setup_context=_forward_setup)
-_backward.register_autograd(_backward_backward, setup_context=_backward_setup)
+_forward.register_autograd(composite_forward_backward(_backward), setup_context=composite_forward_setup)
+_backward.register_autograd(composite_backward_backward, setup_context=composite_backward_setup)

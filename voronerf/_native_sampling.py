@@ -8,14 +8,16 @@ derivatives come from the reference formulas. Shapes and dtypes have been valida
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from voronerf import _native
-from voronerf.reference.frequency_encode import frequency_encode as _frequency_reference
-from voronerf.reference.integrated_encode import integrated_encode as _integrated_reference
+from voronerf.reference.second_derivatives import (
+    encode_backward_backward,
+    encode_backward_setup,
+    encode_gradients,
+    encode_setup,
+)
 
 
 def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True) -> Tensor:
@@ -121,44 +123,5 @@ def _(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Te
     return _allocate_depths(edges, count)
 
 
-def _encode_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    x, variances, ctx.octaves, ctx.include_input = inputs
-    ctx.save_for_backward(x, variances)
-
-
-def _encode_gradients(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-    x, variances = ctx.saved_tensors
-    of_x, of_variances = _encode_backward(gradient, x, variances, ctx.octaves, ctx.include_input)
-    return of_x, None if variances is None else of_variances, None, None
-
-
-def _encode_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
-    gradient, x, variances, ctx.octaves, ctx.include_input = inputs
-    ctx.save_for_backward(gradient, x, variances)
-
-
-def _encode_second(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | None, ...]:
-    """Derivative of the gradients, through the reference formulas."""
-    with torch.enable_grad():
-        leaves = [None if tensor is None else tensor.detach().requires_grad_() for tensor in ctx.saved_tensors]
-        gradient, x, variances = leaves
-        assert x is not None
-        if variances is None:
-            out = _frequency_reference(x, ctx.octaves, include_input=ctx.include_input)
-            inputs = [x]
-        else:
-            out = _integrated_reference(x, variances, ctx.octaves)
-            inputs = [x, variances]
-        if not out.requires_grad:
-            return (None,) * 5
-        firsts = torch.autograd.grad(out, inputs, gradient, create_graph=True)
-        total = out.new_zeros(())
-        for first, cotangent in zip(firsts, cotangents):
-            total = total + (first * cotangent).sum()
-        present = [leaf for leaf in leaves if leaf is not None]
-        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
-    return (*(None if leaf is None else next(seconds) for leaf in leaves), None, None)
-
-
-_encode.register_autograd(_encode_gradients, setup_context=_encode_setup)
-_encode_backward.register_autograd(_encode_second, setup_context=_encode_backward_setup)
+_encode.register_autograd(encode_gradients(_encode_backward), setup_context=encode_setup)
+_encode_backward.register_autograd(encode_backward_backward, setup_context=encode_backward_setup)

@@ -87,6 +87,11 @@ class Row:
 _FLOATS = (torch.float32, torch.float16, torch.bfloat16)
 _COORDINATES = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 
+
+def _warp(op: str, *, file: str | None = None, dtypes: tuple[torch.dtype, ...] = _FLOATS) -> Implementation:
+    return Implementation(f"voronerf.kernels.{file or op}:{op}", ("cpu", "cuda"), dtypes)
+
+
 _REGISTRY: dict[tuple[str, str], Implementation] = {
     **{(op, "reference"): Implementation(f"voronerf.reference.{op}:{op}") for op in OPS},
     ("nearest_centre", "native"): Implementation("voronerf._native:nearest_centre", ("cpu", "cuda"), _COORDINATES),
@@ -107,9 +112,15 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("update_occupancy", "native"): Implementation(
         "voronerf._native_march:update_occupancy", ("cpu",), (torch.float32,)
     ),
-    ("nearest_centre", "warp"): Implementation(
-        "voronerf.kernels.nearest_centre:nearest_centre", ("cpu", "cuda"), _COORDINATES
-    ),
+    ("nearest_centre", "warp"): _warp("nearest_centre", dtypes=_COORDINATES),
+    ("locate_cell", "warp"): _warp("locate_cell", dtypes=_COORDINATES),
+    ("cell_sort", "warp"): _warp("cell_sort", dtypes=(torch.int32,)),
+    ("composite", "warp"): _warp("composite"),
+    ("frequency_encode", "warp"): _warp("frequency_encode", file="encode"),
+    ("integrated_encode", "warp"): _warp("integrated_encode", file="encode"),
+    ("resample", "warp"): _warp("resample"),
+    ("march_rays", "warp"): _warp("march_rays", dtypes=(torch.float32,)),
+    ("update_occupancy", "warp"): _warp("update_occupancy", dtypes=(torch.float32,)),
 }
 
 _FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {}

@@ -1,0 +1,39 @@
+"""What the kernels' files share: views of torch's tensors, and launches on torch's stream."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+
+def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float32) -> Any:
+    """A view of a tensor with its strides, nothing copied; for None an empty one of a dtype, on the device of `like`.
+
+    Kernels do not look at an array that is not there, but Warp wants one.
+    """
+    if tensor is None:
+        tensor = like.new_empty(0, dtype=dtype)
+    if tensor.dtype == torch.bool:
+        tensor = tensor.view(torch.uint8)
+    return wp.from_torch(tensor.detach())
+
+
+def on_stream(tensor: Tensor) -> AbstractContextManager[Any]:
+    """Makes torch's current stream Warp's, for what takes no stream as an argument."""
+    if not tensor.is_cuda:
+        return nullcontext()
+    context: AbstractContextManager[Any] = wp.ScopedStream(wp.stream_from_torch(tensor.device), sync_enter=False)
+    return context
+
+
+def launch(kernel: Any, threads: int | Sequence[int], inputs: Sequence[Any], tensor: Tensor) -> None:
+    """Runs a kernel with so many threads on a tensor's device, on torch's current stream there; none is no launch."""
+    if (threads if isinstance(threads, int) else min(threads)) == 0:
+        return
+    stream = wp.stream_from_torch(tensor.device) if tensor.is_cuda else None
+    wp.launch(kernel, dim=threads, inputs=inputs, device=wp.device_from_torch(tensor.device), stream=stream)

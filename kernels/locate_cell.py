@@ -1,0 +1,104 @@
+"""The nested query as a Warp kernel. n points, m centres of all diagrams together, g diagrams.
+
+A thread takes a point down the tree. Distances are those of the reference: float64, each operation rounded on its own.
+Nothing outside the tables is read; a walk that leads out of them or ends at no leaf gives a negative number.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from voronerf.kernels._launch import array, launch
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.kernel
+def _locate_cell_kernel(
+    points: wp.array2d(dtype=Any),
+    centres: wp.array2d(dtype=Any),
+    weights: wp.array(dtype=Any),
+    weighted: wp.bool,
+    child_offsets: wp.array(dtype=wp.int32),
+    child: wp.array(dtype=wp.int32),
+    depth: wp.int32,
+    leaves: wp.array(dtype=wp.int32),
+) -> None:
+    i = wp.tid()
+    x = wp.float64(points[i, 0])
+    y = wp.float64(points[i, 1])
+    z = wp.float64(points[i, 2])
+    # The diagram the point is in, or (negative) the leaf it has reached.
+    state = wp.int32(0)
+    for _ in range(depth):
+        if state >= 0 and state < child_offsets.shape[0] - 1:
+            first = wp.max(child_offsets[state], 0)
+            last = wp.min(child_offsets[state + 1], centres.shape[0])
+            best = wp.float64(1.7976931348623157e308)
+            nearest = first
+            for j in range(first, last):
+                dx = x - wp.float64(centres[j, 0])
+                dy = y - wp.float64(centres[j, 1])
+                dz = z - wp.float64(centres[j, 2])
+                value = dx * dx + dy * dy + dz * dz
+                if weighted:
+                    value = value - wp.float64(weights[j])
+                # Strict: ties keep the lowest index, and a point that is not finite takes the first centre.
+                if value < best:
+                    best = value
+                    nearest = j
+            if first < last:
+                state = child[nearest]
+            else:
+                state = child_offsets.shape[0]
+    leaves[i] = -state - 1
+
+
+for _scalar in (wp.float32, wp.float64):
+    wp.overload(
+        _locate_cell_kernel,
+        [
+            wp.array2d(dtype=_scalar),
+            wp.array2d(dtype=_scalar),
+            wp.array(dtype=_scalar),
+            wp.bool,
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=wp.int32),
+            wp.int32,
+            wp.array(dtype=wp.int32),
+        ],
+    )
+
+
+def locate_cell(
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, *, depth: int, weights: Tensor | None = None
+) -> Tensor:
+    """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
+    leaves: Tensor = _locate_cell(points, centres, child_offsets, child, depth, weights)
+    return leaves
+
+
+@torch.library.custom_op("voronerf::locate_cell_warp", mutates_args=())
+def _locate_cell(
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
+) -> Tensor:
+    given = (points, centres) if weights is None else (points, centres, weights)
+    dtype = torch.float64 if any(tensor.dtype == torch.float64 for tensor in given) else torch.float32
+    kept = [None if tensor is None else tensor.to(dtype) for tensor in (points, centres, weights)]
+    leaves = points.new_empty(points.shape[0], dtype=torch.int32)
+    arrays = [array(tensor, points, dtype) for tensor in kept]
+    tables = [array(tensor, points) for tensor in (child_offsets, child)]
+    inputs = [*arrays, weights is not None, *tables, depth, array(leaves, points)]
+    launch(_locate_cell_kernel, points.shape[0], inputs, points)
+    return leaves
+
+
+@_locate_cell.register_fake
+def _(
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
+) -> Tensor:
+    return points.new_empty(points.shape[0], dtype=torch.int32)

@@ -1,0 +1,268 @@
+"""Ray marching as Warp kernels. r rays, s strata of a ray, m samples of all rays (packed).
+
+A thread takes a ray. It walks the ray twice, once to count its samples and, when the offsets are known, once to write
+them, rather than keeping a bit for every stratum. Operations and their order are those of the reference, each rounded
+on its own (``fuse_fp`` off): a sample falls in the same cell.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from voronerf.checks import MAX_COUNT
+from voronerf.kernels._launch import array, launch
+from voronerf.reference.march_rays import March
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.func
+def _depth(near: wp.float32, far: wp.float32, fraction: wp.float32, disparity: wp.bool) -> wp.float32:
+    depth = near + (far - near) * fraction
+    if disparity:
+        inverse = far * (1.0 - fraction) + near * fraction
+        depth = near * far / wp.max(inverse, 1.17549435e-38)
+    return depth
+
+
+@wp.func
+def _edge(near: wp.float32, far: wp.float32, stratum: wp.int32, samples: wp.int32, disparity: wp.bool) -> wp.float32:
+    edge = far
+    if stratum < samples:
+        edge = _depth(near, far, wp.float32(stratum) / wp.float32(samples), disparity)
+    return edge
+
+
+@wp.func
+def _sample(
+    near: wp.float32,
+    far: wp.float32,
+    stratum: wp.int32,
+    inside: wp.float32,
+    samples: wp.int32,
+    disparity: wp.bool,
+    first: wp.float32,
+    last: wp.float32,
+) -> wp.float32:
+    at = _depth(near, far, (wp.float32(stratum) + inside) / wp.float32(samples), disparity)
+    # Not min and max, which would make a number of what is none.
+    if at < first:
+        at = first
+    if at > last:
+        at = last
+    return at
+
+
+@wp.func
+def _cell(
+    origin: wp.float32, direction: wp.float32, at: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32
+) -> wp.int32:
+    scale = wp.float32(size) / (high - low)
+    place = (origin + at * direction - low) * scale
+    cell = wp.int32(-1)
+    if place >= 0.0 and place <= wp.float32(size):
+        cell = wp.min(wp.int32(place), size - 1)
+    return cell
+
+
+@wp.kernel
+def _march_kernel(
+    origins: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.float32),
+    near: wp.array(dtype=wp.float32),
+    far: wp.array(dtype=wp.float32),
+    occupied: wp.array3d(dtype=wp.uint8),
+    box: wp.array2d(dtype=wp.float32),
+    uniforms: wp.array2d(dtype=wp.float32),
+    jittered: wp.bool,
+    start: wp.array(dtype=wp.int32),
+    started: wp.bool,
+    samples: wp.int32,
+    disparity: wp.bool,
+    most: wp.int32,
+    counting: wp.bool,
+    offsets: wp.array(dtype=wp.int32),
+    counts: wp.array(dtype=wp.int32),
+    ray_index: wp.array(dtype=wp.int32),
+    depths: wp.array(dtype=wp.float32),
+    deltas: wp.array(dtype=wp.float32),
+    stop: wp.array(dtype=wp.int32),
+) -> None:
+    ray = wp.tid()
+    begin = near[ray]
+    end = far[ray]
+    stratum = wp.int32(0)
+    if started:
+        stratum = wp.max(start[ray], 0)
+    row = wp.int32(0)
+    room = wp.int32(0)
+    if not counting:
+        row = offsets[ray]
+        room = offsets[ray + 1] - row
+    found = wp.int32(0)
+    going = end > begin and stratum < samples
+    while going:
+        first = _edge(begin, end, stratum, samples, disparity)
+        last = _edge(begin, end, stratum + 1, samples, disparity)
+        inside = wp.float32(0.5)
+        if jittered:
+            inside = uniforms[ray, stratum]
+        at = _sample(begin, end, stratum, inside, samples, disparity, first, last)
+        x = _cell(origins[ray, 0], directions[ray, 0], at, box[0, 0], box[1, 0], occupied.shape[0])
+        y = _cell(origins[ray, 1], directions[ray, 1], at, box[0, 1], box[1, 1], occupied.shape[1])
+        z = _cell(origins[ray, 2], directions[ray, 2], at, box[0, 2], box[1, 2], occupied.shape[2])
+        taken = wp.bool(False)
+        if x >= 0 and y >= 0 and z >= 0:
+            taken = occupied[x, y, z] != wp.uint8(0)
+        if taken and not counting:
+            if found == room:
+                # Cut: it goes on here.
+                going = wp.bool(False)
+            else:
+                ray_index[row + found] = ray
+                depths[row + found] = at
+                deltas[row + found] = last - first
+        if going:
+            stratum += 1
+            if taken:
+                found += 1
+            going = stratum < samples and found < most
+    if counting:
+        counts[ray] = found
+    elif end > begin:
+        stop[ray] = wp.min(stratum, samples)
+    else:
+        stop[ray] = samples
+
+
+def march_rays(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    samples: int,
+    *,
+    uniforms: Tensor | None = None,
+    disparity: bool = False,
+    start: Tensor | None = None,
+    most: int | None = None,
+    capacity: int | None = None,
+) -> March:
+    """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
+    rest = (samples, disparity, samples if most is None else most)
+    tensors = (origins, directions, near, far, occupied, box, uniforms, start)
+    offsets = _count(*tensors, *rest, MAX_COUNT if capacity is None else capacity)
+    rows = int(offsets[-1]) if capacity is None else capacity
+    return March(offsets, *_fill(*tensors, offsets, *rest, rows))
+
+
+@torch.library.custom_op("voronerf::march_rays_warp_count", mutates_args=())
+def _count(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    uniforms: Tensor | None,
+    start: Tensor | None,
+    samples: int,
+    disparity: bool,
+    most: int,
+    capacity: int,
+) -> Tensor:
+    offsets = near.new_zeros(near.shape[0] + 1, dtype=torch.int32)
+    counts = offsets[1:]
+    inputs = _inputs(origins, directions, near, far, occupied, box, uniforms, start, samples, disparity, most)
+    none, no_index = array(near[:0], near), array(offsets[:0], near)
+    results = [array(counts, near), no_index, none, none, no_index]
+    launch(_march_kernel, near.shape[0], [*inputs, True, no_index, *results], near)
+    # In int64: the sum of what all rays want may not fit, what there is room for does.
+    return offsets.cumsum(dim=0).clamp(max=capacity).to(torch.int32)
+
+
+@torch.library.custom_op("voronerf::march_rays_warp_fill", mutates_args=())
+def _fill(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    uniforms: Tensor | None,
+    start: Tensor | None,
+    offsets: Tensor,
+    samples: int,
+    disparity: bool,
+    most: int,
+    rows: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ray_index = near.new_zeros(rows, dtype=torch.int32)
+    depths, deltas = near.new_zeros(rows), near.new_zeros(rows)
+    stop = near.new_empty(near.shape[0], dtype=torch.int32)
+    inputs = _inputs(origins, directions, near, far, occupied, box, uniforms, start, samples, disparity, most)
+    results = [array(offsets[:0], near), *(array(tensor, near) for tensor in (ray_index, depths, deltas, stop))]
+    launch(_march_kernel, near.shape[0], [*inputs, False, array(offsets, near), *results], near)
+    return ray_index, depths, deltas, stop
+
+
+def _inputs(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    uniforms: Tensor | None,
+    start: Tensor | None,
+    samples: int,
+    disparity: bool,
+    most: int,
+) -> list[object]:
+    """What both launches read, in the kernel's order."""
+    places = near.new_empty(0, 0) if uniforms is None else uniforms
+    views = [array(tensor, near) for tensor in (origins, directions, near, far, occupied, box, places)]
+    first = [array(start, near, torch.int32), start is not None]
+    return [*views, uniforms is not None, *first, samples, disparity, most]
+
+
+@_count.register_fake
+def _(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    uniforms: Tensor | None,
+    start: Tensor | None,
+    samples: int,
+    disparity: bool,
+    most: int,
+    capacity: int,
+) -> Tensor:
+    return near.new_empty(near.shape[0] + 1, dtype=torch.int32)
+
+
+@_fill.register_fake
+def _(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    uniforms: Tensor | None,
+    start: Tensor | None,
+    offsets: Tensor,
+    samples: int,
+    disparity: bool,
+    most: int,
+    rows: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    index = near.new_empty(rows, dtype=torch.int32)
+    return index, near.new_empty(rows), near.new_empty(rows), near.new_empty(near.shape[0], dtype=torch.int32)

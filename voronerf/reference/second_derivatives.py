@@ -1,0 +1,124 @@
+"""Autograd of the kernels' ops: what native and Warp share, and second derivatives through the reference formulas.
+
+A kernel's op and its backward are custom ops of the same arguments in every backend; these functions are registered
+with both. Letters as in the ops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.reference.composite import composite
+from voronerf.reference.frequency_encode import frequency_encode
+from voronerf.reference.integrated_encode import integrated_encode
+
+
+def composite_forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    """Keeps sigma, rgb, depths, deltas, ray_offsets and background."""
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*inputs)
+
+
+def composite_forward_backward(backward: Callable[..., list[Tensor]]) -> Callable[..., tuple[Tensor | None, ...]]:
+    """Backward of composite by a backend's op, which takes the gradients of the four outputs (None for zero), the six
+    inputs and which of the five gradients are wanted."""
+
+    def run(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        inputs = ctx.saved_tensors
+        needs = ctx.needs_input_grad
+        if all(gradient is None for gradient in gradients):
+            return (None,) * len(inputs)
+        wanted = [*needs[:4], needs[5]]
+        results = backward(*gradients, *inputs, wanted)
+        found = [result if need else None for result, need in zip(results, wanted)]
+        return (*found[:4], None, found[4])
+
+    return run
+
+
+def composite_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
+    """Keeps the arguments of the backward op."""
+    *tensors, ctx.wanted = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def composite_backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tuple[Tensor | None, ...]:
+    """Derivative of the gradients of composite."""
+    saved = ctx.saved_tensors
+    ray_offsets = saved[8]
+    with torch.enable_grad():
+        leaves = [
+            None if tensor is None or i == 8 else tensor.detach().requires_grad_() for i, tensor in enumerate(saved)
+        ]
+        gradients, inputs = leaves[:4], [*leaves[4:8], leaves[9]]
+        parts = composite(*inputs[:4], ray_offsets=ray_offsets, background=inputs[4])  # type: ignore[arg-type]
+        outputs = [(part, gradient) for part, gradient in zip(parts, gradients) if gradient is not None]
+        pairs = [
+            (tensor, cotangent)
+            for tensor, cotangent, want in zip(inputs, cotangents, ctx.wanted)
+            if want and tensor is not None and cotangent is not None
+        ]
+        firsts = torch.autograd.grad(
+            [part for part, _ in outputs],
+            [tensor for tensor, _ in pairs],
+            [gradient for _, gradient in outputs],
+            create_graph=True,
+            allow_unused=True,
+            materialize_grads=True,
+        )
+        total = saved[4].new_zeros(())
+        for first, (_, cotangent) in zip(firsts, pairs):
+            total = total + (first * cotangent).sum()
+        present = [leaf for leaf in leaves if leaf is not None]
+        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
+    return (*(None if leaf is None else next(seconds) for leaf in leaves), None)
+
+
+def encode_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    """Keeps x, variances (None for the plain encoding), octaves and include_input."""
+    x, variances, ctx.octaves, ctx.include_input = inputs
+    ctx.save_for_backward(x, variances)
+
+
+def encode_gradients(backward: Callable[..., list[Tensor]]) -> Callable[..., tuple[Tensor | None, ...]]:
+    """Backward of the encodings by a backend's op, which takes the gradient and what `encode_setup` keeps."""
+
+    def run(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        x, variances = ctx.saved_tensors
+        of_x, of_variances = backward(gradient, x, variances, ctx.octaves, ctx.include_input)
+        return of_x, None if variances is None else of_variances, None, None
+
+    return run
+
+
+def encode_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
+    """Keeps the arguments of the backward op."""
+    gradient, x, variances, ctx.octaves, ctx.include_input = inputs
+    ctx.save_for_backward(gradient, x, variances)
+
+
+def encode_backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | None, ...]:
+    """Derivative of the gradients of the encodings."""
+    with torch.enable_grad():
+        leaves = [None if tensor is None else tensor.detach().requires_grad_() for tensor in ctx.saved_tensors]
+        gradient, x, variances = leaves
+        assert x is not None
+        if variances is None:
+            out = frequency_encode(x, ctx.octaves, include_input=ctx.include_input)
+            inputs = [x]
+        else:
+            out = integrated_encode(x, variances, ctx.octaves)
+            inputs = [x, variances]
+        if not out.requires_grad:
+            return (None,) * 5
+        firsts = torch.autograd.grad(out, inputs, gradient, create_graph=True)
+        total = out.new_zeros(())
+        for first, cotangent in zip(firsts, cotangents):
+            total = total + (first * cotangent).sum()
+        present = [leaf for leaf in leaves if leaf is not None]
+        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
+    return (*(None if leaf is None else next(seconds) for leaf in leaves), None, None)
