@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.layers import MLP
-from voronerf.ops import cell_sort, grouped_mlp
+from voronerf.ops import routed_mlp
 from voronerf.router.arguments import accepted_names
 from voronerf.router.calls import Call, Memory, run_grouped
 from voronerf.router.grouping import Grouping
@@ -34,6 +34,9 @@ from voronerf.router.parameters import (
 from voronerf.subdivision import split_diagram
 
 Assignment = Literal["nearest", "stochastic"]
+
+# Centres of a flat diagram beyond which it may look cells up by a grid of its own.
+_MANY = 256
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
 
@@ -276,34 +279,32 @@ class VoronoiRouter(nn.Module):
             )
 
         linears = self.field.linears()
-        weights = [layer.weight for layer in linears]
-        biases = [layer.bias for layer in linears]
-        if self.num_cells == 1:
-            offsets = torch.tensor([0, positions.shape[0]], dtype=torch.int32, device=positions.device)
-            order = None
-        else:
-            where = positions if coords is None else coords
-            order, offsets = cell_sort(self.assign(where.detach()), self.num_cells, backend=self.backend)
-            # Positions are three floats a sample, their encoding sixty-three: permute before encoding.
-            positions = positions[order]
-            if ray_index is not None:
-                ray_index = ray_index[order]
-            elif directions is not None:
-                directions = directions[order]
-        raw = grouped_mlp(
+        raw, _ = routed_mlp(
             positions,
-            offsets,
-            weights,
-            biases,
+            [layer.weight for layer in linears],
+            [layer.bias for layer in linears],
             layers=table,
             directions=directions,
             direction_index=ray_index,
             backend=self.backend,
+            **self._where(positions, coords),
         )
-        if order is not None:
-            # index_copy rather than indexing by the inverse order: its backward is a gather, not a scatter-add.
-            raw = torch.zeros_like(raw).index_copy(0, order.long(), raw)
         return self.field.activate(raw)
+
+    def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
+        """What tells ``routed_mlp`` the cells: the diagram's tables, or the cells themselves.
+
+        They are given where they are drawn, and for many centres, which the diagram looks up faster than in turn.
+        """
+        diagram = self.diagram
+        if self.num_cells == 1:
+            return {}
+        if (self.assignment == "stochastic" and self.training) or (diagram.depth == 1 and self.num_cells > _MANY):
+            return {"cells": self.assign((positions if coords is None else coords).detach())}
+        tables = {"centres": diagram.centres, "centre_weights": diagram.power, "coords": coords}
+        if diagram.depth == 1:
+            return tables
+        return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
 
     def cell(self, index: int) -> nn.Module:
         """A plain copy of one cell's module, with parameters of its own.

@@ -120,7 +120,7 @@ class Trainer:
         self.device = torch.device(config.device)
         # Every op of a step is looked up now: a backend that cannot train should say so before anything is written.
         marching = ("march_rays", "update_occupancy") if config.occupancy else ()
-        for op in ("nearest_centre", "locate_cell", "grouped_mlp", "composite", *marching):
+        for op in ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", *marching):
             backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
         backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
         self.generator = torch.Generator().manual_seed(config.seed)
