@@ -48,7 +48,7 @@ class Case:
         options: of the router.
         given: whether positions are passed at the call.
         method: what is called.
-        one_pass: the module runs once for all cells; None: that or cell by cell.
+        one_pass: the module and each of its functions run once for all cells; else they may run cell by cell.
         rank: dimensions of a sample's tensors as the loop passes them; 3 is [m, 1, d].
         smooth: whether second derivatives are compared.
     """
@@ -61,7 +61,7 @@ class Case:
     options: dict[str, Any] = dataclasses.field(default_factory=lambda: {"coords": "first3"})
     given: bool = False
     method: str = "forward"
-    one_pass: bool | None = True
+    one_pass: bool = True
     rank: int = 2
     smooth: bool = False
 

@@ -263,7 +263,6 @@ LAYERS = [
         first,
         options={"coords": "first3", "methods": ["sdf"]},
         method="sdf",
-        one_pass=None,
         smooth=True,
     ),
     Case(
@@ -271,30 +270,28 @@ LAYERS = [
         lambda: OldWeightNorm(torch.nn.utils.parametrizations.weight_norm),
         one(3),
         first,
-        one_pass=None,
         smooth=True,
     ),
     Case("layer norm", lambda: Residual(lambda: nn.LayerNorm(8)), one(), first, smooth=True),
-    Case("group norm", lambda: Residual(lambda: nn.GroupNorm(2, 8)), one(), first, one_pass=None),
-    Case("rms norm", lambda: Residual(lambda: nn.RMSNorm(8)), one(), first, one_pass=None),
+    Case("group norm", lambda: Residual(lambda: nn.GroupNorm(2, 8)), one(), first),
+    Case("rms norm", lambda: Residual(lambda: nn.RMSNorm(8)), one(), first),
     Case("activations", Activations, one(), first),
-    *(Case(f"raw weights, {way}", lambda way=way: RawWeights(way), one(), first) for way in ("linear", "matmul")),
     *(
-        Case(f"raw weights, {way}", lambda way=way: RawWeights(way), one(), first, one_pass=None)
-        for way in ("addmm", "transposed", "einsum")
+        Case(f"raw weights, {way}", lambda way=way: RawWeights(way), one(), first, one_pass=way != "transposed")
+        for way in ("linear", "matmul", "addmm", "transposed", "einsum")
     ),
     Case("reads its weights", ReadsWeights, one(), first),
     Case("tied", Tied, one(), first),
     *(
-        Case(f"latent code, {way}", lambda way=way: LatentCode(way), one(), first, one_pass=None)
+        Case(f"latent code, {way}", lambda way=way: LatentCode(way), one(), first, one_pass=way != "index")
         for way in ("expand", "repeat", "index", "row", "mean", "ones")
     ),
     Case("embedding", Lookup, images, first),
-    Case("embedding's average", Lookup, one(), first, one_pass=None),
-    Case("low rank", LowRank, one(), first, one_pass=None),
-    Case("lipschitz", Lipschitz, one(), first, one_pass=None),
-    Case("fourier features", FourierFeatures, one(3), first, one_pass=None),
-    Case("convolution", Convolution, one(), first, one_pass=None),
-    Case("bilinear", Bilinear, pair, first, one_pass=None),
-    Case("grid", Grid, one(3), first, one_pass=None),
+    Case("embedding's average", Lookup, one(), first),
+    Case("low rank", LowRank, one(), first),
+    Case("lipschitz", Lipschitz, one(), first),
+    Case("fourier features", FourierFeatures, one(3), first),
+    Case("convolution", Convolution, one(), first, one_pass=False),
+    Case("bilinear", Bilinear, pair, first, one_pass=False),
+    Case("grid", Grid, one(3), first, one_pass=False),
 ]

@@ -208,7 +208,7 @@ LISTED = [
         first,
         options=NGP,
         method="color",
-        one_pass=None,  # the module takes some of its rows, so that cells end elsewhere
+        one_pass=False,  # the module takes some of its rows, so that cells end elsewhere
     ),
     Case("mega-nerf", mega_field(), mega_arguments(False), first),
     Case("mega-nerf affine with noise", mega_field(affine=True), mega_arguments(True), first),

@@ -1,0 +1,191 @@
+"""Fields whose forward depends on more than its arguments: what a router learned of one call may not hold for the next.
+
+All have the shape that the fused kernels know, and leave it by an attribute, a buffer, a hook, a mode or a value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from convention_harness import randomised
+from convention_listed import nerf_pytorch, uniform
+from torch import Tensor, nn
+
+from voronerf import VoronoiRouter
+
+
+class Net(nn.Module):
+    """Linear layers and ReLU, the plainest of fields, with something beside."""
+
+    def __init__(self, beside: Callable[[Any, Tensor], Tensor] = lambda net, h: h) -> None:
+        super().__init__()
+        self.a, self.b, self.c = nn.Linear(15, 12), nn.Linear(12, 12), nn.Linear(12, 4)
+        self.beside, self.progress, self.calls = beside, 0.0, 0
+        self.register_buffer("mask", torch.ones(12))
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.calls += 1
+        h = F.relu(self.b(F.relu(self.a(x))))
+        return self.c(self.beside(self, h))
+
+
+def encoded(n: int = 50) -> Tensor:
+    return nerf_pytorch.encode(uniform((n,)), 2)
+
+
+def agree(router: VoronoiRouter, field: nn.Module, x: Tensor | None = None) -> None:
+    x = encoded() if x is None else x
+    for _ in range(2):
+        torch.testing.assert_close(router(x), field(x), rtol=1e-4, atol=1e-5)
+
+
+@pytest.fixture
+def pair() -> Callable[..., tuple[VoronoiRouter, Any]]:
+    def make(field: nn.Module) -> tuple[VoronoiRouter, Any]:
+        field = randomised(field)
+        router = VoronoiRouter(field, torch.rand(5, 3) * 2 - 1, coords="first3")
+        agree(router, field)
+        return router, field
+
+    return make
+
+
+def test_a_number_that_changes(pair: Any) -> None:
+    """BARF and Nerfies open the frequencies of their encoding by a number that grows during training."""
+    router, field = pair(Net(lambda net, h: h * net.progress if net.progress > 0 else h))
+    for progress in (0.25, 0.5, 1.0):
+        router.module.progress = field.progress = progress
+        agree(router, field)
+
+
+def test_a_buffer_that_changes(pair: Any) -> None:
+    router, field = pair(Net(lambda net, h: h * net.mask))
+    for mask in (torch.rand(12), torch.zeros(12)):
+        router.module.mask.copy_(mask)
+        field.mask.copy_(mask)
+        agree(router, field)
+    router.module.mask, field.mask = torch.ones(12) * 3, torch.ones(12) * 3
+    agree(router, field)
+
+
+def test_a_function_that_is_replaced(pair: Any) -> None:
+    router, field = pair(Net())
+    for beside in (lambda net, h: F.softplus(h), lambda net, h: h - h.mean(1, keepdim=True)):
+        router.module.beside = field.beside = beside
+        agree(router, field)
+
+
+def test_a_forward_that_counts_its_calls(pair: Any) -> None:
+    """Every call of the router is one of the module's, also where no Python of it would have to run."""
+    router, field = pair(Net(lambda net, h: h if net.calls % 2 else torch.sin(h)))
+    x = encoded()
+    odd, even = (field.c(f(F.relu(field.b(F.relu(field.a(x)))))) for f in (lambda h: h, torch.sin))
+    results = [router(x) for _ in range(4)]
+    for first, second in (results[:2], results[2:]):
+        found = (first, second) if torch.allclose(first, odd, atol=1e-5) else (second, first)
+        torch.testing.assert_close(found, (odd, even), rtol=1e-4, atol=1e-5)
+
+
+def test_training_and_evaluation_modes(pair: Any) -> None:
+    router, field = pair(Net(lambda net, h: h * 2 if net.training else h))
+    for mode in (False, True, False):
+        router.train(mode)
+        field.train(mode)
+        agree(router, field)
+    # dropout: zeroed in one mode only
+    router, field = pair(nn.Sequential(nn.Linear(15, 8), nn.ReLU(), nn.Dropout(0.5), nn.Linear(8, 3)).eval())
+    router.eval()
+    agree(router, field)
+    router.train()
+    x = encoded()
+    assert not torch.equal(router(x), router(x))
+
+
+@pytest.mark.parametrize(
+    "activation",
+    [
+        lambda h: F.softplus(h, beta=100),
+        lambda h: F.softplus(h - 1),
+        lambda h: F.softplus(h, 1, 0.1),
+        lambda h: F.leaky_relu(h, 0.01),
+        lambda h: F.threshold(h, 0.3, 0.0),
+        lambda h: h.clamp(min=0, max=1),
+        lambda h: h.clamp_min(-0.1),
+        lambda h: torch.sin(30 * h),
+        lambda h: torch.maximum(h, torch.zeros_like(h)),
+        lambda h: F.relu(h) ** 2,
+        lambda h: torch.sigmoid(2 * h),
+        lambda h: torch.where(h > 0, h, torch.zeros_like(h)) + 1e-3,
+        lambda h: F.relu(h).detach() + 0.5 * h,
+        lambda h: F.relu(-h),
+    ],
+)
+def test_activations_that_look_like_known_ones(activation: Callable[[Tensor], Tensor], pair: Any) -> None:
+    router, field = pair(Net(lambda net, h: activation(h)))
+    x = encoded()
+    first, second = x.clone().requires_grad_(), x.clone().requires_grad_()
+    found = torch.autograd.grad(router(first).square().sum(), [first])
+    torch.testing.assert_close(found, torch.autograd.grad(field(second).square().sum(), [second]), rtol=1e-3, atol=1e-3)
+
+
+def test_hooks_of_inner_layers_run(pair: Any) -> None:
+    router, field = pair(Net())
+    seen: list[tuple[int, ...]] = []
+    handles = [module.b.register_forward_hook(lambda m, a, out: 2 * out) for module in (router.module, field)]
+    handles.append(router.module.a.register_forward_hook(lambda m, a, out: seen.append(tuple(out.shape))))
+    agree(router, field)
+    assert seen
+    for handle in handles:
+        handle.remove()
+    agree(router, field)
+
+
+def test_a_layer_that_is_replaced_or_frozen(pair: Any) -> None:
+    router, field = pair(Net())
+    router.module.b = nn.Identity()
+    field.b = nn.Identity()
+    agree(router, field)
+    router.module.a.requires_grad_(False)
+    router(encoded()).sum().backward()
+    assert router.module.a.weight.grad is None and router.module.c.weight.grad is not None
+    router.module.a.requires_grad_(True)
+    router(encoded()).sum().backward()
+    assert router.module.a.weight.grad is not None
+
+
+def test_parameters_that_are_written(pair: Any) -> None:
+    router, field = pair(Net())
+    with torch.no_grad():
+        for name, parameter in field.named_parameters():
+            parameter.mul_(0.5)
+            router.module.get_parameter(name).mul_(0.5)
+    agree(router, field)
+    for name, parameter in field.named_parameters():
+        router.module.get_parameter(name).data = parameter.data.expand(5, *parameter.shape).clone()
+    agree(router, field)
+
+
+def test_other_sizes_and_types(pair: Any) -> None:
+    """The same module with more samples, other leading shapes, a wider input type, no gradients."""
+    router, field = pair(Net())
+    for x in (encoded(1), encoded(0), encoded(333), encoded(12).reshape(3, 4, 15), encoded(9).t().contiguous().t()):
+        agree(router, field, x)
+    with torch.no_grad():
+        agree(router, field)
+    with torch.inference_mode():
+        agree(router, field)
+    router, field = router.double(), field.double()
+    agree(router, field, encoded().double())
+
+
+def test_values_that_are_not_finite_stay_with_their_samples(pair: Any) -> None:
+    router, field = pair(Net())
+    x = encoded()
+    x[3, 7], x[11, 9], x[20] = float("nan"), float("inf"), float("nan")
+    found, expected = router(x), field(x)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5, equal_nan=True)
+    assert found[[0, 4, 12, 19, 21]].isfinite().all()
