@@ -21,9 +21,11 @@ template <typename T>
 float nearest_centre_weight_bound(const T* weights, int64_t k) {
   if (weights == nullptr) return 0.0f;
   double bound = 0.0;
-  // An infinite weight is no part of the bound: it makes its value infinite, which the screening leaves to float64.
   for (int64_t j = 0; j < k; ++j) {
-    if (std::isfinite(weights[j])) bound = std::max(bound, std::fabs(static_cast<double>(weights[j])));
+    // A weight of minus infinity never wins. One of infinity, or none at all, is left to float64, as are all points.
+    if (weights[j] == -std::numeric_limits<T>::infinity()) continue;
+    bound = std::max(bound, std::isnan(weights[j]) ? std::numeric_limits<double>::infinity()
+                                                   : std::fabs(static_cast<double>(weights[j])));
   }
   // Where D overflows float32 but D - w does not, screening is void; an infinite bound sends every point to float64.
   return bound > 1e30 ? std::numeric_limits<float>::infinity() : static_cast<float>(bound);

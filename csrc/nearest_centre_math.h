@@ -11,6 +11,9 @@
 // v_b + kMargin (|v_b| + W) + kFloor, nothing beats b: kMargin = 2e-6 covers 2g and the roundings of this sum (3u),
 // kFloor the underflow of the squares, flushed to zero or not. NaN and overflow fail the comparison and are decided in
 // float64.
+//
+// The CPU takes v + W instead, which is not negative, at one more rounding of at most 2u W, and keeps an index in its
+// lowest b bits, which changes it by less than t = 2^(b-23) of itself: nearest_margin adds 2.5 t >= (1+t)/(1-t) - 1.
 #pragma once
 
 #include <cstdint>
@@ -21,6 +24,11 @@ namespace voronerf {
 
 constexpr float kMargin = 2e-6f;
 constexpr float kFloor = 1e-36f;
+
+// kMargin for values whose lowest bits are an index.
+VN_HD float nearest_margin(int index_bits) {
+  return kMargin + 2.5f * static_cast<float>(1 << index_bits) / 8388608.0f;
+}
 
 // Whether float32 has decided: `second` is the smallest computed value but that of the best index.
 VN_HD bool nearest_is_certain(float best, float second, float weight_bound) {
