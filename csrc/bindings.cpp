@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "bindings_cuda.h"
+#include "bindings_grid.h"
 #include "bindings_march.h"
 #include "bindings_mlp.h"
 #include "bindings_sampling.h"
@@ -23,7 +24,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 6;
+constexpr int INTERFACE = 7;
 
 using Address = std::uintptr_t;
 
@@ -87,6 +88,7 @@ PYBIND11_MODULE(_C, module) {
   bind_composite(module);
   bind_sampling(module);
   bind_march(module);
+  bind_grid(module);
 
 #ifdef VN_WITH_CUDA
   bind_cuda(module);

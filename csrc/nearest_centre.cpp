@@ -7,6 +7,7 @@
 #include <limits>
 
 #include "common.h"
+#include "parallel.h"
 
 namespace voronerf {
 
@@ -41,13 +42,11 @@ template <typename T>
 void nearest_centre_cpu(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
                         Isa isa, int threads) {
   const float weight_bound = nearest_centre_weight_bound(weights, k);
-  const int64_t blocks = ceil_div(n, kBlock);
-#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1 && blocks > 1)
-  for (int64_t b = 0; b < blocks; ++b) {
+  parallel_for(ceil_div(n, kBlock), 1, threads, [&](int64_t b) {
     const int64_t start = b * kBlock;
     nearest_centre_serial(points + 3 * start, centres, weights, weight_bound, cells + start,
                           std::min(kBlock, n - start), k, isa);
-  }
+  });
 }
 
 template void nearest_centre_cpu(const float*, const float*, const float*, int32_t*, int64_t, int64_t, Isa, int);

@@ -16,6 +16,7 @@ LAYERS = (
     {
         "_native",
         "_native_composite",
+        "_native_grid",
         "_native_march",
         "_native_mlp",
         "_native_route",

@@ -8,8 +8,10 @@ from voronerf.diagram import VoronoiDiagram, uniform_centres
 from voronerf.fields import NeRF
 from voronerf.layers import MLP, Layer
 from voronerf.ops import (
+    CentreGrid,
     Composite,
     cell_sort,
+    centre_grid,
     composite,
     frequency_encode,
     grouped_linear,
@@ -31,6 +33,7 @@ __all__ = [
     "MLP",
     "BackendUnavailable",
     "Balance",
+    "CentreGrid",
     "Composite",
     "Layer",
     "NeRF",
@@ -41,6 +44,7 @@ __all__ = [
     "VoronoiRouter",
     "balance",
     "cell_sort",
+    "centre_grid",
     "composite",
     "frequency_encode",
     "grouped_linear",

@@ -27,6 +27,8 @@ BACKENDS = ("reference", "native", "warp")
 ORDER = {"cpu": ("native", "reference"), "cuda": ("native", "warp", "reference")}
 OPS = (
     "nearest_centre",
+    "centre_grid",
+    "nearest_centre_grid",
     "locate_cell",
     "cell_sort",
     "grouped_linear",
@@ -94,7 +96,12 @@ def _warp(op: str, *, file: str | None = None, dtypes: tuple[torch.dtype, ...] =
 
 _REGISTRY: dict[tuple[str, str], Implementation] = {
     **{(op, "reference"): Implementation(f"voronerf.reference.{op}:{op}") for op in OPS},
+    ("nearest_centre_grid", "reference"): Implementation("voronerf.reference.centre_grid:nearest_centre_grid"),
     ("nearest_centre", "native"): Implementation("voronerf._native:nearest_centre", ("cpu", "cuda"), _COORDINATES),
+    ("centre_grid", "native"): Implementation("voronerf._native_grid:centre_grid", ("cpu",), _COORDINATES),
+    ("nearest_centre_grid", "native"): Implementation(
+        "voronerf._native_grid:nearest_centre_grid", ("cpu",), _COORDINATES
+    ),
     ("locate_cell", "native"): Implementation("voronerf._native:locate_cell", ("cpu", "cuda"), _COORDINATES),
     ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
     ("grouped_linear", "native"): Implementation("voronerf._native_mlp:grouped_linear", ("cpu",), _FLOATS),

@@ -22,9 +22,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf import ops
+from voronerf import backends, ops
 
 _CHUNK_ELEMENTS = 1 << 22  # distances held at once by sample_cell: 16 MiB in float32
+# From this many centres on a grid answers sooner than a search of all, and once this many points have been asked about,
+# making it has cost less than going on without (see ops.centre_grid).
+_GRID_CENTRES = 384
+_GRID_POINTS = 1 << 17
 
 
 class VoronoiDiagram(nn.Module):
@@ -50,6 +54,8 @@ class VoronoiDiagram(nn.Module):
     depth: int
     num_cells: int
     _widest: int
+    _grid: ops.CentreGrid | None = None
+    _points_located: int = 0
 
     def __init__(self, centres: Tensor, *, weights: Tensor | None = None) -> None:
         """Makes a flat diagram; a single centre is legal and means one cell, all of space.
@@ -147,6 +153,9 @@ class VoronoiDiagram(nn.Module):
     def locate(self, points: Tensor, *, backend: str = "auto") -> Tensor:
         """The leaf that each point lies in.
 
+        On the CPU a flat diagram of many centres makes itself a grid of candidates once it has been asked often enough
+        (`ops.centre_grid`), which changes the time but no answer.
+
         Args:
             points: floating [..., 3]; half types are compared in float32, float64 points in float64.
             backend: see `voronerf.backends`.
@@ -162,12 +171,32 @@ class VoronoiDiagram(nn.Module):
         flat, centres = flat.to(dtype), self.centres.to(dtype)
         weights = None if self.power is None else self.power.to(dtype)
         if self.depth == 1:
-            cells = ops.nearest_centre(flat, centres, weights=weights, backend=backend)
+            grid = self._centre_grid(flat.shape[0], backend)
+            cells = ops.nearest_centre(flat, centres, weights=weights, grid=grid, backend=backend)
         else:
             cells = ops.locate_cell(
                 flat, centres, self.child_offsets, self.child, depth=self.depth, weights=weights, backend=backend
             )
         return cells.reshape(points.shape[:-1])
+
+    def _centre_grid(self, n: int, backend: str) -> ops.CentreGrid | None:
+        """A grid of the present centres if one pays for n more points, or None."""
+        if self.centres.shape[0] < _GRID_CENTRES or backend not in ("auto", "native") or torch.compiler.is_compiling():
+            return None
+        if backends.why_not("nearest_centre_grid", "native", self.centres.device) is not None:
+            return None
+        # Buffers may be written to from outside, as by DistributedDataParallel.
+        if self._grid is not None and not self._grid.belongs_to(self.centres, self.power):
+            self._grid = None
+        self._points_located += n
+        if self._grid is None and self._points_located >= _GRID_POINTS:
+            self._grid = ops.centre_grid(self.centres, weights=self.power)
+            self._points_located = 0
+        return self._grid
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is copied and pickled: all but the grid, which can be made again."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_grid", "_points_located")}
 
     def sample_cell(self, points: Tensor, *, temperature: float, generator: torch.Generator | None = None) -> Tensor:
         """Draws the leaf of each point at random, near centres being likelier (the paper's stochastic assignment).

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from voronerf.layers import MLP, Layer
-from voronerf.ops import grouped_mlp
+from voronerf.ops.grouped_mlp import grouped_mlp
 
 #: Density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2:
 #: translucent enough that every sample of a ray receives a gradient, opaque enough that the colours do as well.

@@ -7,6 +7,7 @@ of arrays sorted by cell.
 
 from voronerf.layers import MLP, Layer
 from voronerf.ops.cell_sort import cell_sort
+from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
@@ -21,10 +22,12 @@ from voronerf.ops.update_occupancy import update_occupancy
 
 __all__ = [
     "MLP",
+    "CentreGrid",
     "Composite",
     "Layer",
     "March",
     "cell_sort",
+    "centre_grid",
     "composite",
     "frequency_encode",
     "grouped_linear",

@@ -1,0 +1,247 @@
+"""The centre grid finds, to the last index, what a search of all centres finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from op_cases import refused
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.diagram import VoronoiDiagram, uniform_centres
+from voronerf.ops import CentreGrid, centre_grid, nearest_centre
+from voronerf.reference.centre_grid import GridTables
+
+native = pytest.mark.native
+BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+
+
+def clustered(k: int) -> Tensor:
+    return torch.cat([2 * torch.rand(k // 4, 3) - 1, 0.3 + 1e-3 * torch.rand(k - k // 4, 3)])
+
+
+def shell(k: int) -> Tensor:
+    centres = torch.randn(k, 3)
+    return centres / centres.norm(dim=1, keepdim=True) + 0.02 * torch.randn(k, 3)
+
+
+def flat(k: int) -> Tensor:
+    return torch.cat([torch.rand(k, 2), torch.full((k, 1), 0.25)], dim=1)
+
+
+def in_line(k: int) -> Tensor:
+    return torch.linspace(-1, 1, k)[:, None] * torch.tensor([1.0, 2, 0.5])
+
+
+SCENES: dict[str, Callable[[], Tensor]] = {
+    "one": lambda: torch.rand(1, 3),
+    "two": lambda: torch.rand(2, 3),
+    "random": lambda: 2 * torch.rand(130, 3) - 1,
+    "lattice": lambda: torch.randint(-3, 4, (400, 3)).float(),
+    "kilonerf": lambda: uniform_centres(BOX, 512),
+    "clustered": lambda: clustered(120),
+    "shell": lambda: shell(300),
+    "flat": lambda: flat(200),
+    "in line": lambda: in_line(100),
+    "all the same": lambda: torch.full((100, 3), 0.7),
+    "shifted": lambda: torch.rand(100, 3) + 1000.0,
+    "tiny": lambda: 1e-30 * torch.rand(100, 3),
+    "at the end of the range": lambda: 3e38 * (2 * torch.rand(50, 3) - 1),
+    "unequal axes": lambda: torch.rand(200, 3) * torch.tensor([1.0, 1e-3, 1e3]),
+}
+
+
+def points_around(centres: Tensor) -> Tensor:
+    """Among the centres, on them, half way between two, far out along axes and diagonals, and no points at all."""
+    k = len(centres)
+    low, high = centres.amin(0), centres.amax(0)
+    size = torch.maximum((high / 2 - low / 2).max(), 1e-6 * centres.abs().max()).clamp(min=1e-37)
+    middle = low / 2 + high / 2
+    pairs = torch.randint(k, (2, 300))
+    near = [middle + scale * size * (2 * torch.rand(400, 3) - 1) for scale in (1, 3, 30)]
+    away = torch.randint(-1, 2, (200, 3)) * size * 10 ** (6 * torch.rand(200, 1))
+    odd = torch.tensor([[torch.nan, 0, 0], [0, torch.inf, 0], [-torch.inf, torch.nan, 1], [3e38, 3e38, -3e38]])
+    between = centres[pairs[0]] / 2 + centres[pairs[1]] / 2
+    return torch.cat([*near, centres[pairs[0]], between, middle + away, odd]).to(centres.dtype)
+
+
+@pytest.mark.op("nearest_centre_grid")
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_finds_what_all_centres_give(backend: str, scene: str, dtype: torch.dtype) -> None:
+    if backend == "reference" and scene in ("kilonerf", "lattice", "shell"):
+        pytest.skip("slow, and tested with fewer centres")
+    centres = SCENES[scene]().to(dtype)
+    points = points_around(centres)
+    lightest = centres.double().diff(dim=0).square().sum(1).mean().item() if len(centres) > 1 else 0.0
+    weights = (torch.rand(len(centres)) * min(lightest, 1e38)).to(dtype)
+    for power in (None, weights):
+        grid = centre_grid(centres, weights=power, backend=backend)
+        found = nearest_centre(points, centres, weights=power, grid=grid, backend=backend)
+        assert found.dtype == torch.int32
+        assert torch.equal(found, nearest_centre(points, centres, weights=power, backend="reference"))
+
+
+@native
+@pytest.mark.parametrize("k", [512, 4096])
+def test_ties_of_a_regular_grid(k: int) -> None:
+    """On the faces, edges and corners of equal cubes, where up to eight centres are equally near."""
+    side = round(k ** (1 / 3))
+    steps = torch.arange(side).float()
+    centres = torch.cartesian_prod(steps, steps, steps) + 0.5
+    grid = centre_grid(centres)
+    points = torch.randint(-2, 2 * side + 3, (20_000, 3)).float() / 2
+    found = nearest_centre(points, centres, grid=grid)
+    assert torch.equal(found, nearest_centre(points, centres, backend="native"))
+    inside = ((points > 0) & (points < side)).all(1)
+    lowest = (points[inside].ceil() - 1).long()
+    assert torch.equal(found[inside].long(), (lowest * torch.tensor([side * side, side, 1])).sum(1))
+
+
+@native
+@pytest.mark.parametrize("isa", ["portable", "avx2", "avx512"])
+def test_instruction_sets_and_threads_build_the_same_grid(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from voronerf import _native
+
+    index = _native.ISAS.index(isa)
+    if not _native._C.isa_supported(index):
+        pytest.skip(f"this processor has no {isa}")
+    centres, weights = clustered(700), torch.rand(700) / 100
+    points = points_around(centres)[:-1].repeat(3, 1)
+    expected = centre_grid(centres, weights=weights)
+    cells = nearest_centre(points, centres, weights=weights, backend="reference")
+    monkeypatch.setattr(_native, "_ISA", index)
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            grid = centre_grid(centres, weights=weights)
+            assert all(torch.equal(a, b) for a, b in zip(grid.tables[:4], expected.tables[:4]))
+            for n in (0, 1, 15, 17, len(points)):
+                assert torch.equal(nearest_centre(points[:n], centres, weights=weights, grid=grid), cells[:n])
+    finally:
+        torch.set_num_threads(before)
+
+
+@native
+@pytest.mark.parametrize("scene", ["random", "clustered", "flat"])
+def test_lists_hold_every_centre_that_is_nearest_somewhere(scene: str) -> None:
+    """The tables of one backend serve the other, and those of the kernel are shorter."""
+    centres = SCENES[scene]()
+    points = points_around(centres)
+    own, plain = centre_grid(centres, backend="native"), centre_grid(centres, backend="reference")
+    expected = nearest_centre(points, centres, backend="reference")
+    swapped = CentreGrid(centres, None, plain.tables)
+    assert torch.equal(nearest_centre(points, centres, grid=swapped, backend="native"), expected)
+    assert torch.equal(nearest_centre(points, centres, grid=own, backend="reference"), expected)
+    assert mean_length(own.tables) <= mean_length(plain.tables)
+
+
+def mean_length(tables: GridTables) -> float:
+    """Of the lists of the root grid, bricks of 4^3 cells averaged."""
+    entries, lists = tables.entries.long(), tables.lists
+
+    def length(entry: int) -> float:
+        if entry >= 0:
+            return float(lists[entry])
+        return sum(length(int(entries[~entry + i])) for i in range(64)) / 64
+
+    rows = entries[: 8**tables.bits : 37]
+    return sum(length(int(entry)) for entry in rows) / len(rows)
+
+
+@native
+@pytest.mark.parametrize("scale", [1.0, 1e160])
+def test_memory_is_bounded_where_no_centre_can_be_left_out(scale: float) -> None:
+    """All centres are candidates around the middle of a sphere, and everywhere where their squares overflow."""
+    centres = torch.randn(300, 3, dtype=torch.float64)
+    centres /= centres.norm(dim=1, keepdim=True)
+    points = torch.cat([centres, 1e-3 * torch.randn(50, 3, dtype=torch.float64)]) * scale
+    grid = centre_grid(centres * scale)
+    assert grid.nbytes < 10e6
+    expected = nearest_centre(points, centres * scale, backend="reference")
+    assert torch.equal(nearest_centre(points, centres * scale, grid=grid), expected)
+
+
+def test_errors() -> None:
+    points, centres, weights = torch.rand(4, 3), torch.rand(5, 3), torch.rand(5)
+    grid = centre_grid(centres)
+    with refused(ValueError, "nearest_centre: grid must be made from these centres and weights, got that of others"):
+        nearest_centre(points, centres + 1, grid=grid)
+    with refused(ValueError, "nearest_centre: grid must be made from these centres and weights, got that of others"):
+        nearest_centre(points, centres[:4], grid=grid)
+    with refused(ValueError, "nearest_centre: grid must be made from these centres and weights, got that of others"):
+        nearest_centre(points, centres, weights=weights, grid=grid)
+    with refused(TypeError, "nearest_centre: grid must be a CentreGrid, got Tensor"):
+        nearest_centre(points, centres, grid=centres)  # type: ignore[arg-type]
+    with refused(ValueError, "centre_grid: centres must have shape [k, 3], got [5, 2]"):
+        centre_grid(centres[:, :2])
+    with refused(ValueError, "centre_grid: centres must hold at least one centre, got none"):
+        centre_grid(centres[:0])
+    with refused(ValueError, "centre_grid: centres must be finite, got NaN or infinity"):
+        centre_grid(torch.full((2, 3), torch.inf))
+    with refused(ValueError, "centre_grid: weights must be finite, got NaN or infinity"):
+        centre_grid(centres, weights=torch.full((5,), torch.nan))
+    with refused(TypeError, "centre_grid: centres must have dtype ... or float64, got int64"):
+        centre_grid(centres.long())
+    with refused(ValueError, "centre_grid: weights must have shape [k] with k = 5, got [4]"):
+        centre_grid(centres, weights=weights[:4])
+
+
+@native
+def test_grid_keeps_its_own_centres() -> None:
+    centres, points = torch.rand(50, 3), torch.rand(100, 3)
+    grid = centre_grid(centres)
+    half = centres.half()
+    assert torch.equal(
+        nearest_centre(points, half, grid=centre_grid(half)), nearest_centre(points, half, backend="reference")
+    )
+    assert torch.equal(nearest_centre(points.double(), centres, grid=grid), nearest_centre(points.double(), centres))
+    centres += 1
+    with pytest.raises(ValueError, match="grid must be made from these centres"):
+        nearest_centre(points, centres, grid=grid)
+
+
+@native
+def test_ops_pass_opcheck_and_compile_whole() -> None:
+    from voronerf import _native_grid
+
+    points, centres, weights = torch.rand(50, 3), torch.rand(70, 3), torch.rand(70)
+    grid = centre_grid(centres, weights=weights)
+    torch.library.opcheck(_native_grid._nearest_centre_grid, (points, centres, weights, *grid.tables))
+    torch.library.opcheck(_native_grid._centre_grid, (centres.double(), weights.double()))
+    compiled = torch.compile(
+        lambda p: nearest_centre(p * 2, centres, weights=weights, grid=grid) + 1, fullgraph=True, backend="aot_eager"
+    )
+    assert torch.equal(compiled(points), nearest_centre(points * 2, centres, weights=weights) + 1)
+
+
+@native
+def test_diagrams_make_a_grid_where_it_pays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("voronerf.diagram._GRID_POINTS", 1500)
+    points = 4 * torch.rand(1000, 3) - 2
+    for weights in (None, torch.rand(512) / 100):
+        diagram = VoronoiDiagram(2 * torch.rand(512, 3) - 1, weights=weights)
+        expected = diagram.locate(points, backend="reference")
+        assert torch.equal(diagram.locate(points), expected) and diagram._grid is None
+        for dtype in (torch.float32, torch.float64):
+            assert torch.equal(diagram.locate(points.to(dtype)), diagram.locate(points.to(dtype), backend="reference"))
+        assert diagram._grid is not None
+        kept = diagram._grid
+        diagram.locate(points)
+        assert diagram._grid is kept
+        # Whoever writes to the buffers gets the cells of what is written.
+        with torch.no_grad():
+            diagram.centres.copy_(diagram.centres.flip(0))
+        assert torch.equal(diagram.locate(points), diagram.locate(points, backend="reference"))
+        assert "_grid" not in diagram.__getstate__()
+    small = VoronoiDiagram(torch.rand(64, 3))
+    for _ in range(3):
+        small.locate(points)
+    assert small._grid is None
+
+
+def test_backends_list_the_grid() -> None:
+    assert {"centre_grid", "nearest_centre_grid"} <= set(backends.OPS)
