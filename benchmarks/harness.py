@@ -28,8 +28,10 @@ Run = Callable[[int], Any]
 FEWEST = 3
 """Timings below which a row says that it was capped."""
 MOST = 200
-TOO_SLOW = 3
-"""Limits that a warm-up may take for its contender to be timed at all apart from it."""
+SLOW = 2
+"""Limits that a single call may take for its contender to get ``FEWEST`` timings."""
+TOO_SLOW = 5
+"""Limits that a warm-up may take for its contender to be called again at all."""
 BATCH_SECONDS = 5e-3
 """Calls shorter than this are timed several at a time, after one that is not: what ran before has left its own code and
 data in the caches, and its threads spinning."""
@@ -113,13 +115,13 @@ def measure(
     """Times contenders in turns; each has been called once (call 0) before.
 
     A contender is out of the game when its timings add up to its limit, but not before ``FEWEST`` timings. Where a
-    single call exceeds the limit, that one is all there is, and the timing is capped.
+    single call takes more than ``SLOW`` limits, that one is all there is, and the timing is capped.
 
     Args:
         contenders: what to run, by name, in the order of their turns.
         limits: seconds for each of them.
         stopwatch: seconds of calls ``first`` to ``first + count`` of a contender; a :class:`Stopwatch`.
-        warm: seconds of call 0, where known. A contender that took a multiple of its limit then is not called again.
+        warm: seconds of call 0, where known. Above ``TOO_SLOW`` limits it is the timing.
 
     Returns:
         A timing for each contender.
@@ -134,7 +136,7 @@ def measure(
             seconds = (warm or {}).get(name, 0.0)
             if seconds <= TOO_SLOW * limits[name]:
                 seconds = stopwatch(run, 1, 1)
-            slow = seconds > limits[name]
+            slow = seconds > SLOW * limits[name]
             timings[name] = Timing([seconds] if slow else [], slow)
             batch[name] = max(1, round(BATCH_SECONDS / max(seconds, 1e-7)))
         active = [name for name, timing in timings.items() if not timing.capped]

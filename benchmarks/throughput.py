@@ -39,8 +39,8 @@ from voronerf.training.files import write_text
 
 OPTIONAL = {"scipy": "scipy", "faiss": "faiss-cpu", "jax": "jax", "pykeops": "pykeops", "warp": "warp-lang"}
 """Packages that are used where they are installed, and what to install."""
-LIMITS = {"ours": 1.0, "alternative": 0.8}
-QUICK_LIMITS = {"ours": 0.3, "alternative": 0.25}
+LIMITS = {"ours": 0.8, "alternative": 0.5}
+QUICK_LIMITS = {"ours": 0.3, "alternative": 0.15}
 """Seconds of timings of one contender, at three timings or more: see ``harness.measure``."""
 DISTURBED = 0.1
 """Cores that other processes may keep busy before a row's timings are reported as disturbed."""

@@ -79,7 +79,7 @@ def test_balance_runs_as_a_script(tmp_path: Path) -> None:
 
 
 def test_contenders_take_turns_and_slow_ones_are_capped(load: Callable[[str], Any]) -> None:
-    harness, cost, turns = load("harness"), {"fast": 0.25, "middle": 0.5, "slow": 2.0, "slowest": 2.0}, []
+    harness, cost, turns = load("harness"), {"fast": 0.25, "middle": 0.5, "slow": 2.5, "slowest": 2.5}, []
 
     def stopwatch(run: Callable[[int], Any], first: int, count: int) -> float:
         assert count == 1
