@@ -28,6 +28,8 @@ Run = Callable[[int], Any]
 FEWEST = 3
 """Timings below which a row says that it was capped."""
 MOST = 200
+DISTURBED_PEAK = 0.9
+"""Share of the best measurement of a limit below which another one was disturbed, and the best stands for it."""
 SLOW = 2
 """Limits that a single call may take for its contender to get ``FEWEST`` timings."""
 TOO_SLOW = 5
@@ -185,7 +187,7 @@ class Others:
 
 
 class Peaks:
-    """The machine's limits, measured when asked for; the best of all measurements with one instruction set is kept.
+    """The machine's limits, measured whenever asked for, so that they keep step with the clock of the processor.
 
     On the CPU by ``voronerf._native.measure_peak``; on CUDA by torch's product of large matrices and a large copy,
     which are what a user can reach rather than the limit itself.
@@ -213,8 +215,8 @@ class Peaks:
             return None if kind != "bfloat16" else self("float32")
 
     def _keep(self, name: str, value: float) -> tuple[str, float]:
-        self.found[name] = max(value, self.found.get(name, 0.0))
-        return name, value
+        best = self.found[name] = max(value, self.found.get(name, 0.0))
+        return name, value if value > DISTURBED_PEAK * best else best
 
 
 def _cuda_peak(kind: str, device: torch.device) -> float:

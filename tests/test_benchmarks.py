@@ -398,3 +398,11 @@ def test_targets_name_rows_that_the_benchmark_has(load: Callable[[str], Any]) ->
     for pattern in load("table").README:
         known = "frozen" not in pattern or not frozen
         assert not known or any(re.search(pattern, case.key) for case in cases), pattern
+
+
+def test_a_disturbed_limit_does_not_flatter(load: Callable[[str], Any]) -> None:
+    peaks = load("harness").Peaks(CPU)
+    assert peaks._keep("copy", 100.0) == ("copy", 100.0)
+    assert peaks._keep("copy", 95.0) == ("copy", 95.0)
+    assert peaks._keep("copy", 50.0) == ("copy", 100.0)
+    assert peaks.found == {"copy": 100.0}
