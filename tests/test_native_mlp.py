@@ -455,21 +455,15 @@ def test_second_derivatives() -> None:
 def test_opcheck() -> None:
     native = pytest.importorskip("voronerf._native_mlp")
     given = cast(arguments(nerf(6, 2), [5, 0, 8], rays=4), torch.float32)
-    table = [3, 3, 4, 2, 0, 0, 0, *native._flatten(given["layers"])]
+    passed = [given[name] for name in ("positions", "weights", "biases", "layers", "directions")]
+    table = native.network(*passed).table
     shared = (given["positions"], given["offsets"], given["weights"], given["biases"], table)
     directions = (given["directions"], given["direction_index"])
     torch.library.opcheck(native._forward, (*shared, *directions))
     gradient = torch.randn(13, 4, requires_grad=True)
     order = torch.randperm(13, dtype=torch.int32)
     torch.library.opcheck(native._backward, (gradient, *shared, *directions, order, [True, True, True]))
-    assert native._unflatten(table) == given["layers"]
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_width_of_the_output(name: str) -> None:
-    native = pytest.importorskip("voronerf._native_mlp")
-    table = [3, 3, -1, -1, 0, 0, 0, *native._flatten(NETWORKS[name])]
-    assert native._out_features(table) == NETWORKS[name].out_features
+    assert native._layers(table, given["weights"]) == given["layers"]
 
 
 def test_compiles_whole() -> None:

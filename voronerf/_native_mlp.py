@@ -10,19 +10,23 @@ have been validated by ``voronerf.ops``.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from voronerf import _native
-from voronerf.layers import ACTIVATIONS, DIRECTIONS, ENCODINGS, MLP, POSITIONS, Layer
+from voronerf.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_mlp import grouped_mlp as _reference
 from voronerf.reference.specification import encode_positions
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
+# Of one layer, whose width does not matter here.
+_LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
 # Operations by the numbers of MlpCaller in csrc/grouped_mlp.h.
 CALLERS = ("grouped_mlp", "grouped_linear", "routed_mlp")
 
@@ -52,8 +56,7 @@ def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer."""
-    layers = [1, 1, weight.shape[1], ACTIVATIONS.index(activation), 1, _OUTSIDE[POSITIONS], 0]
-    given = _cast(x, [weight], [bias], [x.shape[1], 0, -1, -1], [CALLERS.index("grouped_linear"), 0, *layers], None)
+    given = _cast(x, [weight], [bias], "grouped_linear", [], _LINEAR[activation], None)
     out: Tensor = _forward(given.positions, offsets, given.weights, given.biases, given.table, None, None)
     return out.to(given.dtype)
 
@@ -64,7 +67,7 @@ class Network(NamedTuple):
     positions: Tensor
     weights: list[Tensor]
     biases: list[Tensor]
-    table: list[int]
+    table: str
     directions: Tensor | None
     dtype: torch.dtype
 
@@ -78,26 +81,30 @@ def network(
     caller: str = "grouped_mlp",
 ) -> Network:
     """What the ops take for a layer table. Positions and directions in float64 are encoded in float64, beforehand."""
-    octaves, integrated = [layers.position_octaves, layers.direction_octaves], layers.integrated
-    if positions.dtype == torch.float64 and octaves[0] is not None:
-        positions, octaves[0], integrated = encode_positions(positions, layers), None, False
-    if directions is not None and directions.dtype == torch.float64 and octaves[1] is not None:
-        directions, octaves[1] = frequency_encode(directions, octaves[1]), None
-    widths = positions.shape[1], 0 if directions is None else directions.shape[1]
-    encodings = [-1 if count is None else count for count in octaves]
-    rest = [CALLERS.index(caller), int(integrated), *_flatten(layers)]
-    return _cast(positions, weights, biases, [*widths, *encodings], rest, directions)
+    encoded = []
+    if positions.dtype == torch.float64 and layers.position_octaves is not None:
+        positions = encode_positions(positions, layers)
+        encoded.append(POSITIONS)
+    if directions is not None and directions.dtype == torch.float64 and layers.direction_octaves is not None:
+        directions = frequency_encode(directions, layers.direction_octaves)
+        encoded.append(DIRECTIONS)
+    return _cast(positions, weights, biases, caller, encoded, layers.text, directions)
 
 
 def _cast(
     positions: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor | None],
-    begin: list[int],
-    rest: list[int],
+    caller: str,
+    encoded: Sequence[str],
+    text: str,
     directions: Tensor | None,
 ) -> Network:
-    """Everything in float32. Between the parts of the table belongs whether to multiply in bfloat16."""
+    """Everything in float32, and the table for the ops: a string, since a list of numbers costs them 15 us a call.
+
+    No number is written into it here, since it may be symbolic under ``torch.compile``; widths are those of the
+    weights. ``encoded``: what is encoded already, whatever ``text`` says.
+    """
     dtype, kind = weights[0].dtype, positions.device.type
     if torch.is_autocast_enabled(kind):
         dtype = torch.get_autocast_dtype(kind)
@@ -106,44 +113,54 @@ def _cast(
         [weight.float() for weight in weights],
         # Autograd takes no list of optional tensors; an empty one stands for no bias.
         [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in biases],
-        [*begin, int(dtype == torch.bfloat16), *rest],
+        " ".join((caller, "bfloat16" if dtype == torch.bfloat16 else "float32", "+".join(encoded), text)),
         None if directions is None else directions.float(),
         dtype,
     )
 
 
-def _flatten(layers: MLP) -> list[int]:
-    """Layers and outputs of a table as csrc/bindings_mlp.cpp reads them, after the seven numbers before them."""
-    flat = [len(layers.layers), len(layers.outputs)]
+class _Table(NamedTuple):
+    """What the string of ``_cast`` says."""
+
+    layers: MLP  # with the widths of ``text``, not of the weights
+    numbers: list[int]  # as csrc/bindings_mlp.cpp reads them, but for p, q and the widths
+    widths: list[int]  # where in ``numbers`` the width of each layer belongs
+
+
+@functools.lru_cache(maxsize=256)
+def _read(table: str) -> _Table:
+    caller, operands, encoded, text = table.split(" ", 3)
+    layers = MLP.parse(text)
+    if POSITIONS in encoded:
+        layers = replace(layers, position_octaves=None, position_encoding="frequency")
+    if DIRECTIONS in encoded:
+        layers = replace(layers, direction_octaves=None)
+    octaves = [-1 if count is None else count for count in (layers.position_octaves, layers.direction_octaves)]
+    numbers = [0, 0, *octaves, int(operands == "bfloat16"), CALLERS.index(caller), int(layers.integrated)]
+    numbers += [len(layers.layers), len(layers.outputs)]
+    widths = []
     for layer in layers.layers:
+        widths.append(len(numbers))
         sources = [_OUTSIDE[source] if isinstance(source, str) else source for source in layer.inputs]
-        flat += [layer.width, ACTIVATIONS.index(layer.activation), len(sources), *sources]
-    return [*flat, *layers.outputs]
+        numbers += [0, ACTIVATIONS.index(layer.activation), len(sources), *sources]
+    return _Table(layers, [*numbers, *layers.outputs], widths)
 
 
-def _out_features(flat: Sequence[int]) -> int:
-    """Width of the output. Under ``torch.compile`` entries may be symbolic, which can be added up but not hashed."""
-    count, outputs = flat[7:9]
-    widths, at = [], 9
-    for _ in range(count):
-        widths.append(flat[at])
-        at += 3 + flat[at + 2]
-    return sum(widths[output] for output in flat[at : at + outputs])
+def _numbers(table: str, positions: Tensor, weights: Sequence[Tensor], directions: Tensor | None) -> list[int]:
+    """The table for csrc/bindings_mlp.cpp."""
+    given = _read(table)
+    numbers = given.numbers.copy()
+    numbers[0], numbers[1] = positions.shape[1], 0 if directions is None else directions.shape[1]
+    for at, weight in zip(given.widths, weights):
+        numbers[at] = weight.shape[1]
+    return numbers
 
 
-def _unflatten(flat: Sequence[int]) -> MLP:
-    """The table of a whole flat list."""
-    position_octaves, direction_octaves = (None if count < 0 else count for count in flat[2:4])
-    numbers = iter(flat[7:])
-    count, outputs = next(numbers), next(numbers)
-    names = {number: name for name, number in _OUTSIDE.items()}
-    layers = []
-    for _ in range(count):
-        width, activation, sources = next(numbers), next(numbers), next(numbers)
-        inputs = [next(numbers) for _ in range(sources)]
-        layers.append(Layer(tuple(names.get(source, source) for source in inputs), width, ACTIVATIONS[activation]))
-    ends = tuple(next(numbers) for _ in range(outputs))
-    return MLP(tuple(layers), ends, position_octaves, direction_octaves, ENCODINGS[flat[6]])
+def _layers(table: str, weights: Sequence[Tensor]) -> MLP:
+    """The layer table, with the widths of the weights."""
+    given = _read(table).layers
+    layers = tuple(replace(layer, width=int(weight.shape[1])) for layer, weight in zip(given.layers, weights))
+    return replace(given, layers=layers)
 
 
 @torch.library.custom_op("voronerf::grouped_mlp_native", mutates_args=(), device_types="cpu")
@@ -152,7 +169,7 @@ def _forward(
     offsets: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
-    table: Sequence[int],
+    table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
 ) -> Tensor:
@@ -164,16 +181,22 @@ def run(
     offsets: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
-    table: Sequence[int],
+    table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
     order: Tensor | None,
 ) -> Tensor:
     """The forward pass on sorted rows, or on those that ``order`` int32 [n] sorts."""
     kept = _Arguments(positions, offsets, weights, biases, directions, direction_index, order)
-    out = _allocate(positions, table)
+    out = _allocate(positions, table, weights)
     _native._C.grouped_mlp(
-        list(table), kept.inputs, kept.weights, kept.biases, out.data_ptr(), _native._ISA, torch.get_num_threads()
+        _numbers(table, positions, weights, directions),
+        kept.inputs,
+        kept.weights,
+        kept.biases,
+        out.data_ptr(),
+        _native._ISA,
+        torch.get_num_threads(),
     )
     return out
 
@@ -185,7 +208,7 @@ def _backward(
     offsets: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
-    table: Sequence[int],
+    table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
     order: Tensor | None,
@@ -196,7 +219,7 @@ def _backward(
     count, gradient = len(weights), gradient.contiguous()
     addresses = [_address(result) for result in results]
     _native._C.grouped_mlp_backward(
-        list(table),
+        _numbers(table, positions, weights, directions),
         kept.inputs,
         kept.weights,
         kept.biases,
@@ -238,8 +261,9 @@ def _address(tensor: Tensor | None) -> int:
     return 0 if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
 
 
-def _allocate(positions: Tensor, table: Sequence[int]) -> Tensor:
-    return positions.new_empty(positions.shape[0], _out_features(table))
+def _allocate(positions: Tensor, table: str, weights: Sequence[Tensor]) -> Tensor:
+    features = sum(weights[output].shape[1] for output in _read(table).layers.outputs)
+    return positions.new_empty(positions.shape[0], features)
 
 
 def _allocate_gradients(
@@ -265,11 +289,11 @@ def _(
     offsets: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
-    table: Sequence[int],
+    table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
 ) -> Tensor:
-    return _allocate(positions, table)
+    return _allocate(positions, table, weights)
 
 
 @_backward.register_fake
@@ -279,7 +303,7 @@ def _(
     offsets: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
-    table: Sequence[int],
+    table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
     order: Tensor | None,
@@ -341,7 +365,7 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
             offsets,
             [_given(weight) for weight in leaves[:count]],
             [bias if _given(bias).numel() else None for bias in leaves[count : 2 * count]],
-            layers=_unflatten(ctx.table),
+            layers=_layers(ctx.table, parameters[:count]),
             directions=seen,
             direction_index=direction_index,
         )

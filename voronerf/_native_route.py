@@ -59,7 +59,7 @@ def _forward(
     positions: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
-    table: Sequence[int],
+    table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
     cells: Tensor | None,
@@ -139,7 +139,7 @@ def _(
     positions: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
-    table: Sequence[int],
+    table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
     cells: Tensor | None,
@@ -150,7 +150,7 @@ def _(
     centre_weights: Tensor | None,
     depth: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    out = positions.new_empty(positions.shape[0], _native_mlp._out_features(table))
+    out = _native_mlp._allocate(positions, table, weights)
     return out, *_allocate(positions, weights[0].shape[0], cells, centres)
 
 

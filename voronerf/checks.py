@@ -45,19 +45,27 @@ def check_shape(
     """
     check_tensor(op, name, tensor)
     known = {} if sizes is None else sizes
-    found = dict(known)
-    fits = tensor.dim() == len(shape)
+    # Letters met for the first time; apart, since an error names those known before. A small network is run in the time
+    # of a few dozen checks, so that these look at each size once.
+    found: dict[str, int] = {}
+    came = tensor.shape
+    fits = len(came) == len(shape)
     if fits:
-        for entry, size in zip(shape, tensor.shape):
-            letter, extra = (entry[:-2], 1) if isinstance(entry, str) and entry.endswith("+1") else (entry, 0)
-            expected = letter if isinstance(letter, int) else found.setdefault(letter, size - extra)
-            fits = fits and size == expected + extra and size >= extra
+        for entry, size in zip(shape, came):
+            if isinstance(entry, int):
+                fits = size == entry
+            else:
+                letter, extra = (entry[:-2], 1) if entry[-2:] == "+1" else (entry, 0)
+                bound = known if letter in known else found
+                fits = size == bound.setdefault(letter, size - extra) + extra and size >= extra
+            if not fits:
+                break
     if not fits:
         # Here alone: torch.compile cannot turn a symbolic size into text.
         wanted = [str(entry) for entry in shape]
         letters = dict.fromkeys(entry.removesuffix("+1") for entry in wanted)
-        bound = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in known)
-        rule = f"[{', '.join(wanted)}]" + (f" with {bound}" if bound else "")
+        values = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in known)
+        rule = f"[{', '.join(wanted)}]" + (f" with {values}" if values else "")
         raise ValueError(f"{op}: {name} must have shape {rule}, got {list(tensor.shape)}")
     known.update(found)
 
