@@ -179,12 +179,22 @@ class RowMode(TorchFunctionMode):
         if isinstance(kwargs.get("out"), Tensor):
             changed.append(kwargs["out"])
         if not results and not changed:
+            self._check_read(func, result, marks[0])
             return
         lost = next((mark.lost for mark in marks if mark.lost), "")
         if not lost and not self._keeps_rows(func, args, kwargs, result, results, operands):
             lost = name_of(func)
         for tensor in (*results, *changed):
             self.mark(tensor, lost)
+
+    def _check_read(self, func: Any, result: Any, mark: Mark) -> None:
+        """Refuses values of samples on the host, which a loop over cells would read for each cell alone."""
+        if result is None or isinstance(result, (str, torch.dtype, torch.device, torch.Size)):
+            return
+        # What is true of no sample is true of none in every cell, and what of all of all.
+        if isinstance(result, bool) and mark.lost.endswith("all" if result else "any"):
+            return
+        raise self.fail(f"it reads values of the samples with {name_of(func)}")
 
     def _keeps_rows(
         self, func: Any, args: Any, kwargs: Any, result: Any, results: list[Tensor], operands: list[Tensor]

@@ -7,6 +7,7 @@ works sample by sample runs cell by cell on contiguous rows, and never on none.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -141,9 +142,18 @@ def _elementwise(mode: RowMode, func: Any, args: Any, kwargs: Any) -> Tensor | N
         return None
     if getattr(func, "__name__", "").rstrip("_") != getattr(func, "__name__", "") and isinstance(args[0], PerCell):
         raise mode.fail(f"{name_of(func)} writes samples into a parameter")
-    given = replace(
-        (args, kwargs), lambda value: _expand_like(mode, value, dim, m) if isinstance(value, PerCell) else value
-    )
+    wide = [tensor.dtype for tensor in tensors if tensor.dim() > 0 and tensor.is_floating_point()]
+
+    def expanded(value: Any) -> Any:
+        if not isinstance(value, PerCell):
+            return value
+        parameter = _expand_like(mode, value, dim, m)
+        # A tensor without dimensions does not decide the dtype of a result, and its repetition must not either.
+        if value.dim() == 0 and parameter is not None and wide:
+            return parameter.to(functools.reduce(torch.promote_types, wide))
+        return parameter
+
+    given = replace((args, kwargs), expanded)
     result: Tensor = func(*given[0], **given[1])
     return result
 
