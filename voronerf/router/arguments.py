@@ -279,25 +279,37 @@ def narrow(value: Any, rows: Callable[[Tensor], bool], first: int, last: int) ->
     return part
 
 
-def map_result(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """A result of any structure (tuple, named tuple, list, dict, dataclass) with every tensor changed."""
-    if isinstance(value, Tensor):
+def map_result(value: Any, change: Callable[[Any], Any], leaf: type = Tensor, depth: int = 0) -> Any:
+    """A result of any structure (tuple, named tuple, list, dict, object) with every tensor, or ``leaf``, changed.
+
+    What holds none is passed on as it is.
+    """
+    if isinstance(value, leaf):
         return change(value)
     if isinstance(value, dict):
-        items = {key: map_result(item, change) for key, item in value.items()}
-        if type(value) is dict:
-            return items
-        changed = copy.copy(value)
-        changed.update(items)
-        return changed
-    if isinstance(value, (list, tuple)) and not isinstance(value, torch.Size):
-        parts = [map_result(item, change) for item in value]
-        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
-    if not _holds_attributes(value) or not tensors_of(value):
+        old = value
+    elif isinstance(value, (list, tuple)) and not isinstance(value, torch.Size):
+        old = dict(enumerate(value))
+    elif _holds_attributes(value):
+        old = vars(value)
+    else:
         return value
+    if depth > _DEEPEST:
+        return value
+    new = {key: map_result(item, change, leaf, depth + 1) for key, item in old.items()}
+    if all(new[key] is item for key, item in old.items()):
+        return value
+    if isinstance(value, (list, tuple)):
+        parts = list(new.values())
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    if type(value) is dict:
+        return new
     changed = copy.copy(value)
-    for key, item in vars(value).items():
-        object.__setattr__(changed, key, map_result(item, change))
+    if isinstance(value, dict):
+        changed.update(new)
+        return changed
+    for key, item in new.items():
+        object.__setattr__(changed, key, item)
     return changed
 
 

@@ -7,18 +7,23 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
+from enum import Enum
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.router.arguments import Layout, Reordering, argument_names, map_result
+from voronerf.router.fusion import Plan, Unrecognised, agree
 from voronerf.router.grouping import Grouping, PerCell
 from voronerf.router.loop import run_cells
 from voronerf.router.parameters import as_per_cell, in_place_of_parameters
+from voronerf.router.recording import Program, Recorder
 from voronerf.router.rows import RowMode, Trials, Ungroupable
+from voronerf.router.snapshot import Snapshot
 
 _OP = "VoronoiRouter"
+_STATES = 16  # of a module that calls of one kind are recorded in, before its state counts as one that never recurs
 
 
 class Assignments:
@@ -78,6 +83,10 @@ class Memory(Trials):
         assignments: the last one.
         by_cell: why calls of a kind have to run cell by cell, once that is known.
         separate: the kinds of calls that have been found to treat samples one by one.
+        plans: for calls in a state of the module, how the fused network runs them; a recording until it is confirmed
+            by a second call; or why there is none.
+        recorded: how many states calls of a kind have been recorded in.
+        snapshot: reads the state of the module.
     """
 
     def __init__(self) -> None:
@@ -89,6 +98,9 @@ class Memory(Trials):
         self.assignments = Assignments()
         self.by_cell: dict[Any, str] = {}
         self.separate: set[Any] = set()
+        self.plans: dict[Any, Plan | Program | str] = {}
+        self.recorded: dict[Any, int] = {}
+        self.snapshot: Snapshot | None = None
 
     def __deepcopy__(self, memo: Any) -> Memory:
         return Memory()
@@ -186,6 +198,37 @@ class Call:
         parts = [describe(value) for value in (*self.args, *self.kwargs.values())]
         return (self.method, training, len(layout.lead), tuple(self.kwargs), *parts)
 
+    def state(self, memory: Memory, module: nn.Module, kind: Any, device: torch.device) -> Any:
+        """All that the steps of a call may depend on beside the rows; None where it cannot be told."""
+        if memory.snapshot is None:
+            memory.snapshot = Snapshot(module)
+        state = memory.snapshot.key()
+        if state is None:
+            memory.snapshot = None
+            return None
+        values = [value for value in (*self.args, *self.kwargs.values()) if not isinstance(value, Tensor)]
+        autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
+        try:
+            numbers = [_constant(value) for value in values]
+        except TypeError:
+            return None
+        return (kind, autocast, *numbers, *state)
+
+
+def _constant(value: Any, depth: int = 0) -> Any:
+    """An argument as a key, tensors by what they are like; raises TypeError for what cannot be one."""
+    if isinstance(value, Tensor):
+        return value.dim(), value.dtype
+    if isinstance(value, (list, tuple)):
+        return tuple(_constant(item, depth + 1) for item in value)
+    if isinstance(value, dict):
+        return tuple((key, _constant(item, depth + 1)) for key, item in value.items())
+    if isinstance(value, (bool, int, float, str, type(None), Enum, torch.dtype, torch.device)) or callable(value):
+        return value
+    if hasattr(value, "__dict__") and depth < 4:
+        return type(value), tuple((key, _constant(item, depth + 1)) for key, item in vars(value).items())
+    raise TypeError
+
 
 def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory) -> Any:
     """Runs a module for all cells, in one pass where that is possible.
@@ -200,8 +243,21 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
     kind = call.kind(layout, module.training)
     if kind in memory.by_cell:
         return _run_by_cell(module, call, layout, grouping, memory, kind)
+    state = None
+    if layout.n >= 2 and memory.recorded.get(kind, 0) < _STATES:
+        state = call.state(memory, module, kind, grouping.device)
+    plan = None if state is None else memory.plans.get(state)
+    if isinstance(plan, Plan) and plan.fits(layout.n):
+        return _run_plan(plan, call, layout, grouping)
     try:
-        return _run_at_once(module, call, layout, grouping, memory)
+        if state is None or isinstance(plan, (Plan, str)):
+            return _run_at_once(module, call, layout, grouping, memory, None)
+        recorder = Recorder.of(module, layout.n)
+        result = _run_at_once(module, call, layout, grouping, memory, recorder)
+        memory.plans[state] = _next_plan(plan, recorder, call, layout, grouping, result)
+        if plan is None:
+            memory.recorded[kind] = memory.recorded.get(kind, 0) + 1
+        return result
     except Ungroupable as error:
         reason, failure = str(error), None
     except Exception as error:
@@ -221,13 +277,52 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
     return result
 
 
-def _run_at_once(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory) -> Any:
-    mode = RowMode(grouping, memory)
-    args, kwargs = call.arranged(Reordering(layout, grouping, mode.mark))
+def _next_plan(
+    recorded: Program | None, recorder: Recorder, call: Call, layout: Layout, grouping: Grouping, result: Any
+) -> Plan | Program | str:
+    """What to remember after a call was recorded: a plan, where it is the second of its kind and the plan is right."""
+    program = recorder.program
+    if program is None:
+        return recorder.refused
+    if recorded is None or (recorded.only_n is not None and recorded.only_n != layout.n):
+        return program
+    if not recorded.same(program):
+        return "two calls took different steps"
+    try:
+        plan = Plan(program)
+        with torch.no_grad():
+            found = _run_plan(plan, call, layout, grouping)
+    except Unrecognised as error:
+        return str(error)
+    return plan if agree(found, result) else "its results differ"
+
+
+def _run_plan(plan: Plan, call: Call, layout: Layout, grouping: Grouping) -> Any:
+    inputs: list[Tensor] = []
+    call.arranged(Reordering(layout, None, inputs.append))
+    result = plan.run(inputs, grouping.cells, layout.n, grouping.backend)
+    if len(layout.lead) == 1:
+        return result
+    return map_result(result, lambda rows: layout.restore(rows) if rows.shape[0] == layout.n else rows)
+
+
+def _run_at_once(
+    module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory, recorder: Recorder | None
+) -> Any:
+    mode = RowMode(grouping, memory, recorder)
+
+    def mark(tensor: Tensor) -> None:
+        mode.mark(tensor)
+        if recorder is not None:
+            recorder.input(tensor)
+
+    args, kwargs = call.arranged(Reordering(layout, grouping, mark))
     with in_place_of_parameters(module, as_per_cell(module)), mode:
         result = call.function(*args, **kwargs)
     if mode.failed:
         raise Ungroupable(mode.failed)
+    if recorder is not None:
+        recorder.finish(result)
 
     def finish(tensor: Tensor) -> Tensor:
         if isinstance(tensor, PerCell):

@@ -34,6 +34,11 @@ _RANDOM = """
     rand_like randn_like randint_like bernoulli normal_ uniform_ bernoulli_ exponential_ random_ cauchy_ log_normal_
     geometric_
 """
+_MOVES = """
+    cat concat concatenate hstack dstack stack split chunk tensor_split unbind __getitem__ narrow select index_select
+    permute transpose swapaxes swapdims movedim moveaxis reshape view view_as reshape_as flatten unflatten unsqueeze
+    squeeze expand expand_as broadcast_to contiguous clone repeat tile flip roll dropout
+"""
 _LIKE = "zeros_like ones_like full_like empty_like"
 _CREATE = "zeros ones full empty rand randn randint new_zeros new_ones new_full new_empty"
 _READ_NOTHING = """
@@ -73,6 +78,9 @@ CREATE = _find(_CREATE, torch, torch.Tensor)
 VIEWS = _find(_VIEWS, torch, torch.Tensor)
 """The same entries in the same order under other sizes (or repeated, where sizes grow)."""
 
+MOVES = _find(_MOVES, torch, torch.Tensor, F)
+"""What may move entries about without changing them."""
+
 _TENSOR_PROPERTIES = {"T", "H", "mT", "mH", "data", "grad", "real", "imag", "_base"}
 METADATA = frozenset(
     getattr(torch.Tensor, name).__get__
@@ -85,7 +93,6 @@ METADATA = frozenset(
 MATRIX_PRODUCTS = _find("matmul mm __matmul__", torch, torch.Tensor)
 TO = _find("to type_as", torch.Tensor)
 EXPAND = _find("expand broadcast_to repeat", torch, torch.Tensor)
-SPLIT_NAMES = _find("split chunk tensor_split unbind", torch, torch.Tensor)
 
 
 def name_of(function: Any) -> str:

@@ -57,22 +57,36 @@ class Grouping:
         n: samples.
         k: cells.
         cells: int32 [n], the cell of each sample in the original order; None where there is one cell.
-        order: int32 [n], the original row of each sorted row; None where there is one cell.
-        offsets: int32 [k + 1]; cell c owns sorted rows ``offsets[c]`` to ``offsets[c + 1]``.
+        device: of the samples.
         backend: of the operations on the sorted rows.
     """
 
     def __init__(self, cells: Tensor | None, n: int, k: int, device: torch.device, backend: str) -> None:
         self.n, self.k, self.backend, self.cells = n, k, backend, cells
-        self.order: Tensor | None = None
-        if cells is None:
-            self.offsets = torch.tensor([0, n], dtype=torch.int32, device=device)
-        else:
-            self.order, self.offsets = ops.cell_sort(cells, k, backend=backend)
+        self.device = device
+        self._sorted: tuple[Tensor | None, Tensor] | None = None
         self._inverse: Tensor | None = None
         self._sorted_cells: Tensor | None = None
-        self._offsets = {1: self.offsets}
+        self._offsets: dict[int, Tensor] = {}
         self._bounds: list[int] | None = None
+
+    def _sort(self) -> tuple[Tensor | None, Tensor]:
+        if self._sorted is None:
+            if self.cells is None:
+                self._sorted = None, torch.tensor([0, self.n], dtype=torch.int32, device=self.device)
+            else:
+                self._sorted = ops.cell_sort(self.cells, self.k, backend=self.backend)
+        return self._sorted
+
+    @property
+    def order(self) -> Tensor | None:
+        """int32 [n], the original row of each sorted row; None where there is one cell."""
+        return self._sort()[0]
+
+    @property
+    def offsets(self) -> Tensor:
+        """int32 [k + 1]; cell c owns sorted rows ``offsets[c]`` to ``offsets[c + 1]``."""
+        return self._sort()[1]
 
     @property
     def inverse(self) -> Tensor | None:
@@ -94,6 +108,8 @@ class Grouping:
 
     def scaled_offsets(self, m: int) -> Tensor:
         """``offsets`` of tensors with m entries a sample."""
+        if m == 1:
+            return self.offsets
         if m not in self._offsets:
             self._offsets[m] = self.offsets * m
         return self._offsets[m]

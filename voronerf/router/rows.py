@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -24,6 +24,9 @@ from torch.overrides import TorchFunctionMode
 
 from voronerf.router.functions import CREATE, ELEMENTWISE, METADATA, RANDOM, VIEWS, name_of
 from voronerf.router.grouping import Grouping, PerCell
+
+if TYPE_CHECKING:
+    from voronerf.router.recording import Recorder
 
 _MARK = "_voronerf_mark"
 _TRIED_ROWS = 6
@@ -99,15 +102,16 @@ class RowMode(TorchFunctionMode):
     Args:
         grouping: of the samples; two at least, so that rows can be told from sizes of 1.
         memory: of the router.
+        recorder: takes down what is done.
 
     Attributes:
         failed: why the pass is not valid, also where the module caught the error; empty if it is.
     """
 
-    def __init__(self, grouping: Grouping, memory: Trials) -> None:
+    def __init__(self, grouping: Grouping, memory: Trials, recorder: Recorder | None = None) -> None:
         super().__init__()
         assert grouping.n >= 2
-        self.grouping, self.memory, self.n = grouping, memory, grouping.n
+        self.grouping, self.memory, self.n, self.recorder = grouping, memory, grouping.n, recorder
         self.failed = ""
         self._rows = Mark(grouping)
 
@@ -173,6 +177,10 @@ class RowMode(TorchFunctionMode):
                 for tensor in results:
                     if tensor.dim() > 0 and tensor.shape[0] == self.n:
                         self.mark(tensor)
+                        if self.recorder is not None:
+                            self.recorder.step(func, args, kwargs, result, [])
+            if self.recorder is not None and func in RANDOM:
+                self.recorder.refuse("random numbers")
             return
         name = getattr(func, "__name__", "")
         changed = [operands[0]] if name == "__setitem__" or (name.endswith("_") and not name.startswith("__")) else []
@@ -186,6 +194,11 @@ class RowMode(TorchFunctionMode):
             lost = name_of(func)
         for tensor in (*results, *changed):
             self.mark(tensor, lost)
+        if self.recorder is not None:
+            if not lost:
+                self.recorder.step(func, args, kwargs, result, changed)
+            elif changed:
+                self.recorder.refuse("a tensor that is written to")
 
     def _check_read(self, func: Any, result: Any, mark: Mark) -> None:
         """Refuses values of samples on the host, which a loop over cells would read for each cell alone."""
@@ -193,6 +206,8 @@ class RowMode(TorchFunctionMode):
             return
         # What is true of no sample is true of none in every cell, and what of all of all.
         if isinstance(result, bool) and mark.lost.endswith("all" if result else "any"):
+            if self.recorder is not None:
+                self.recorder.refuse("a decision by values of the samples")
             return
         raise self.fail(f"it reads values of the samples with {name_of(func)}")
 
@@ -316,6 +331,8 @@ class RowMode(TorchFunctionMode):
 
     def _gradients(self, func: Any, args: Any, kwargs: Any) -> Any:
         """``torch.autograd.grad``: of rows, or of their sum, with respect to rows."""
+        if self.recorder is not None:
+            self.recorder.refuse("gradients taken inside")
         names = ("outputs", "inputs", "grad_outputs")
         given = {**dict(zip(names, args, strict=False)), **kwargs}
         result = func(*args, **kwargs)

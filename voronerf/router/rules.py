@@ -45,11 +45,15 @@ def run(mode: RowMode, func: Any, args: Any, kwargs: Any) -> Any:
     elif func in MATRIX_PRODUCTS:
         result = _matmul(mode, *args, **kwargs)
     elif rule is not None:
-        bound = inspect.signature(rule).bind(mode, *args, **kwargs)
+        bound = _SIGNATURES[rule].bind(mode, *args, **kwargs)
         result = rule(*bound.args, **bound.kwargs)
+        if rule is _linear and result is not None and mode.recorder is not None:
+            given = bound.arguments
+            mode.recorder.linear(given["input"], given["weight"], given.get("bias"), result)
+    if mode.recorder is not None and (rule is not _linear or result is None):
+        mode.recorder.refuse(f"parameters in {name_of(func)}")
     if result is None:
-        result = _cell_by_cell(mode, func, args, kwargs)
-        return result
+        return _cell_by_cell(mode, func, args, kwargs)
     return mode.mark(result)
 
 
@@ -380,3 +384,4 @@ _RULES: dict[Any, Rule] = {
     F.prelu: _prelu,
     F.embedding: _embedding,
 }
+_SIGNATURES = {rule: inspect.signature(rule) for rule in _RULES.values()}
