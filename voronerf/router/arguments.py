@@ -132,16 +132,13 @@ class Reordering:
     def __init__(self, layout: Layout, grouping: Grouping | None, mark: Callable[[Tensor], Any]) -> None:
         self.layout, self.mark = layout, mark
         self.grouping = grouping
+        self.n = max(layout.n, 2) if grouping is None else grouping.n
         self._rays: Tensor | None = None
 
     def _ray_of_rows(self, device: torch.device) -> Tensor:
         if self._rays is None:
-            samples = self.layout.lead[-1]
-            if self.grouping is None or self.grouping.order is None:
-                rows = torch.arange(self.layout.n, dtype=torch.int32, device=device)
-            else:
-                rows = self.grouping.order
-            self._rays = torch.div(rows, samples, rounding_mode="floor")
+            grouping = self.grouping or Grouping(None, self.layout.n, 1, device, "auto")
+            self._rays = grouping.rays(self.layout.lead[-1])
         return self._rays
 
     def tensor(self, name: str, tensor: Tensor, nested: bool = False) -> Tensor:
@@ -161,10 +158,9 @@ class Reordering:
             rows = flat[:1].expand(2, *flat.shape[1:]).clone() if flat.shape[0] else _placeholder(flat)
         elif kind == RAY:
             rows = flat.index_select(0, self._ray_of_rows(flat.device))
-        elif self.grouping is None or self.grouping.order is None:
-            rows = flat.view_as(flat)
         else:
-            rows = self.grouping.sort(flat)
+            rows = flat if self.grouping is None else self.grouping.sort(flat)
+            rows = rows.view_as(rows) if rows is flat else rows  # a tensor of its own, to be marked
         return self.layout.arrange(rows, kind)
 
     def value(self, name: str, value: Any, nested: bool = False) -> Any:
@@ -195,12 +191,12 @@ class Reordering:
             flat = flat[torch.zeros(2, dtype=torch.int64, device=device)]
         elif shape != lead:
             flat = flat[self._ray_of_rows(device).long()]
-        elif self.grouping is not None and self.grouping.order is not None:
-            flat = flat[self.grouping.order.long()]
+        elif self.grouping is not None:
+            flat = flat[self.grouping.sort(torch.arange(n, device=device))]
         ones = len(shape) - 1
-        rows = flat.reshape((max(n, 2), *[1] * ones)) if ones else flat
+        rows = flat.reshape((self.n, *[1] * ones)) if ones else flat
         for tensor in tensors_of(rows):
-            if tensor.dim() > 0 and tensor.shape[0] == max(n, 2):
+            if tensor.dim() > 0 and tensor.shape[0] == self.n:
                 self.mark(tensor)
         return rows
 
@@ -220,7 +216,7 @@ class Reordering:
             early = {key: changed.pop(key) for key in given & changed.keys()}
             rebuilt = dataclasses.replace(cast(Any, value), **early)
             for tensor in tensors_of(rebuilt):  # __post_init__ may have made new tensors of those given
-                if tensor.dim() > 0 and tensor.shape[0] == max(self.layout.n, 2):
+                if tensor.dim() > 0 and tensor.shape[0] == self.n:
                     self.mark(tensor)
         else:
             rebuilt = copy.copy(value)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
@@ -87,6 +88,7 @@ class Memory(Trials):
             by a second call; or why there is none.
         recorded: how many states calls of a kind have been recorded in.
         snapshot: reads the state of the module.
+        names: of the positional arguments of methods.
     """
 
     def __init__(self) -> None:
@@ -101,6 +103,19 @@ class Memory(Trials):
         self.plans: dict[Any, Plan | Program | str] = {}
         self.recorded: dict[Any, int] = {}
         self.snapshot: Snapshot | None = None
+        self.names: dict[tuple[str, int], list[str]] = {}
+        self._rows_at_once = 0
+
+    def rows_at_once(self, module: nn.Module) -> int:
+        """Rows that a module runs on at once on a CPU.
+
+        An activation is then at most 16 MiB for the widest layer: the C library gives larger memory back to the
+        system after each use, and fetching it again costs more than the products.
+        """
+        if not self._rows_at_once:
+            widest = max((part.out_features for part in module.modules() if isinstance(part, nn.Linear)), default=64)
+            self._rows_at_once = min(max(2**22 // widest, 2**12), 2**16)
+        return self._rows_at_once
 
     def __deepcopy__(self, memo: Any) -> Memory:
         return Memory()
@@ -120,10 +135,18 @@ class Call:
     """
 
     def __init__(
-        self, method: str, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+        self,
+        method: str,
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        memory: Memory,
     ) -> None:
         self.method, self.function, self.args, self.kwargs = method, function, args, kwargs
-        self.names = argument_names(function, len(args))
+        names = memory.names.get((method, len(args)))
+        if names is None:
+            names = memory.names[method, len(args)] = argument_names(function, len(args))
+        self.names = names
 
     def locate(
         self, coords: Any, per_ray: Sequence[str | int] | None, shared: Sequence[str | int]
@@ -252,7 +275,7 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
     try:
         if state is None or isinstance(plan, (Plan, str)):
             return _run_at_once(module, call, layout, grouping, memory, None)
-        recorder = Recorder.of(module, layout.n)
+        recorder = Recorder.of(module)
         result = _run_at_once(module, call, layout, grouping, memory, recorder)
         memory.plans[state] = _next_plan(plan, recorder, call, layout, grouping, result)
         if plan is None:
@@ -300,7 +323,7 @@ def _next_plan(
 def _run_plan(plan: Plan, call: Call, layout: Layout, grouping: Grouping) -> Any:
     inputs: list[Tensor] = []
     call.arranged(Reordering(layout, None, inputs.append))
-    result = plan.run(inputs, grouping.cells, layout.n, grouping.backend)
+    result = plan.run(inputs, grouping)
     if len(layout.lead) == 1:
         return result
     return map_result(result, lambda rows: layout.restore(rows) if rows.shape[0] == layout.n else rows)
@@ -309,34 +332,63 @@ def _run_plan(plan: Plan, call: Call, layout: Layout, grouping: Grouping) -> Any
 def _run_at_once(
     module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory, recorder: Recorder | None
 ) -> Any:
-    mode = RowMode(grouping, memory, recorder)
+    parts = grouping.parts(memory.rows_at_once(module)) if grouping.device.type == "cpu" else [grouping]
+    results: list[_Result] = []
+    for part in parts:
+        results.append(_run_part(module, call, layout, part, memory, recorder if not results else None))
+    if len(parts) == 1:
+        rows = [[tensor] for tensor in results[0].rows]
+    else:
+        rows = [list(pieces) for pieces in zip(*[result.rows for result in results], strict=True)]
+    whole = iter([pieces[0] if len(pieces) == 1 else torch.cat(pieces) for pieces in rows])
+    return map_result(results[0].value, lambda slot: _in_original_order(next(whole), layout, grouping), leaf=_Slot)
+
+
+class _Slot:
+    """The place of a tensor of rows in a result."""
+
+
+@dataclass(frozen=True)
+class _Result:
+    """What a module returned for a part of the rows: tensors of rows, and the structure they stand in."""
+
+    rows: list[Tensor]
+    value: Any
+
+
+def _run_part(
+    module: nn.Module, call: Call, layout: Layout, part: Grouping, memory: Memory, recorder: Recorder | None
+) -> _Result:
+    mode = RowMode(part, memory, recorder)
 
     def mark(tensor: Tensor) -> None:
         mode.mark(tensor)
         if recorder is not None:
             recorder.input(tensor)
 
-    args, kwargs = call.arranged(Reordering(layout, grouping, mark))
+    args, kwargs = call.arranged(Reordering(layout, part, mark))
     with in_place_of_parameters(module, as_per_cell(module)), mode:
         result = call.function(*args, **kwargs)
     if mode.failed:
         raise Ungroupable(mode.failed)
     if recorder is not None:
         recorder.finish(result)
+    rows: list[Tensor] = []
 
-    def finish(tensor: Tensor) -> Tensor:
+    def finish(tensor: Tensor) -> Any:
         if isinstance(tensor, PerCell):
             raise Ungroupable("a result is made of parameters alone, and belongs to no sample")
         mark = mode.mark_of(tensor)
         if mark is None:
-            if tensor.shape[:1] == (grouping.n,):
+            if tensor.shape[:1] == (part.n,):
                 raise Ungroupable("a result has a row for each sample, by a way that cannot be followed")
             return tensor
         if mark.lost:
             raise Ungroupable(f"after {mark.lost} rows are no longer single samples")
-        return _in_original_order(tensor, layout, grouping)
+        rows.append(tensor)
+        return _Slot()
 
-    return map_result(result, finish)
+    return _Result(rows, map_result(result, finish))
 
 
 def _run_by_cell(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory, kind: Any) -> Any:

@@ -24,6 +24,7 @@ from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
 from voronerf.router.arguments import map_result, tensors_of
 from voronerf.router.functions import MOVES
+from voronerf.router.grouping import Grouping
 from voronerf.router.recording import Program, Ref, Slot, Step
 from voronerf.router.rows import replace, tensors_in
 
@@ -246,15 +247,14 @@ class Plan:
 
     # Running ----------------------------------------------------------------------------------------------------------
 
-    def run(self, inputs: Sequence[Tensor], cells: Tensor | None, n: int, backend: str) -> Any:
+    def run(self, inputs: Sequence[Tensor], grouping: Grouping) -> Any:
         """The module's results for rows in the original order.
 
         Args:
             inputs: the tensors of rows among the arguments.
-            cells: int32 [n], or None where there is one cell.
-            n: samples.
-            backend: of the network.
+            grouping: of the samples, which need not have been located yet.
         """
+        n = grouping.n
         values: dict[int, Tensor] = dict(enumerate(inputs))
         for step in self._before:
             _do(step, values)
@@ -268,9 +268,18 @@ class Plan:
             biases.append(offset if whole or offset is None else offset[:, start:stop])
         if positions is None:
             raise Unrecognised("its layers read no input")
-        raw, _ = routed_mlp(
-            positions, weights, biases, layers=self.table, cells=cells, directions=directions, backend=backend
+        where = {"cells": grouping.cells} if grouping.tables is None else grouping.tables
+        raw, cells = routed_mlp(
+            positions,
+            weights,
+            biases,
+            layers=self.table,
+            directions=directions,
+            backend=grouping.backend,
+            **where,
         )
+        if grouping.tables is not None:
+            grouping.found(cells)
         for value in self._needed:
             values[value] = self._from_raw(values, raw, value, n)
         for step in self._behind:

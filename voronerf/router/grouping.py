@@ -5,6 +5,8 @@ n samples, k cells. A sorted tensor may have m entries a sample: its first dimen
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -56,19 +58,39 @@ class Grouping:
     Attributes:
         n: samples.
         k: cells.
-        cells: int32 [n], the cell of each sample in the original order; None where there is one cell.
+        tables: what ``routed_mlp`` finds the cells with; None where there is one cell or the cells are given.
         device: of the samples.
         backend: of the operations on the sorted rows.
     """
 
-    def __init__(self, cells: Tensor | None, n: int, k: int, device: torch.device, backend: str) -> None:
-        self.n, self.k, self.backend, self.cells = n, k, backend, cells
+    def __init__(
+        self,
+        cells: Tensor | Callable[[], Tensor] | None,
+        n: int,
+        k: int,
+        device: torch.device,
+        backend: str,
+        tables: dict[str, Any] | None = None,
+    ) -> None:
+        self.n, self.k, self.backend, self.tables, self._cells = n, k, backend, tables, cells
         self.device = device
         self._sorted: tuple[Tensor | None, Tensor] | None = None
         self._inverse: Tensor | None = None
         self._sorted_cells: Tensor | None = None
         self._offsets: dict[int, Tensor] = {}
         self._bounds: list[int] | None = None
+
+    @property
+    def cells(self) -> Tensor | None:
+        """int32 [n], the cell of each sample in the original order; None where there is one cell."""
+        if not (self._cells is None or isinstance(self._cells, Tensor)):
+            self.found(self._cells())
+        assert self._cells is None or isinstance(self._cells, Tensor)
+        return self._cells
+
+    def found(self, cells: Tensor) -> None:
+        """Takes over cells that ``tables`` gave."""
+        self._cells, self.tables = cells, None
 
     def _sort(self) -> tuple[Tensor | None, Tensor]:
         if self._sorted is None:
@@ -121,9 +143,24 @@ class Grouping:
         pairs = zip(self._bounds, self._bounds[1:], strict=False)
         return [(cell, first, last) for cell, (first, last) in enumerate(pairs) if last > first]
 
+    def parts(self, rows: int) -> list[Grouping]:
+        """Consecutive sorted rows in parts of about equal size, at most ``rows`` each; itself where that is enough."""
+        count = -(-self.n // rows)
+        if count <= 1:
+            return [self]
+        edges = [self.n * i // count for i in range(count + 1)]
+        return [_Part(self, first, last) for first, last in itertools.pairwise(edges)]
+
     def sort(self, x: Tensor) -> Tensor:
         """[n, ...] in the original order -> sorted by cell."""
         return x if self.order is None else permute(x, self.order, self.inverse)
+
+    def rays(self, samples: int) -> Tensor:
+        """int32 [n], the ray of each sorted row, for a number of samples a ray."""
+        rows = self.order
+        if rows is None:
+            rows = torch.arange(self.n, dtype=torch.int32, device=self.device)
+        return torch.div(rows, samples, rounding_mode="floor")
 
     def unsort(self, x: Tensor) -> Tensor:
         """[n, ...] sorted by cell -> the original order."""
@@ -141,6 +178,28 @@ class Grouping:
         with torch.autocast(stacked.device.type, enabled=False):
             rows = ops.grouped_linear(ones, self.scaled_offsets(m), weight, backend=self.backend)
         return rows.reshape(self.n * m, *stacked.shape[1:])
+
+
+class _Part(Grouping):
+    """Sorted rows ``first`` to ``last`` of a grouping, whose arguments are found in those of all samples."""
+
+    def __init__(self, whole: Grouping, first: int, last: int) -> None:
+        super().__init__(None, last - first, whole.k, whole.device, whole.backend)
+        order = whole.order
+        self._sorted = (None if order is None else order[first:last]), whole.offsets.clamp(first, last) - first
+        self._sorted_cells = whole.sorted_cells[first:last]
+        self._first = first
+
+    def sort(self, x: Tensor) -> Tensor:
+        """[samples of the whole, ...] in the original order -> this part's rows."""
+        return x[self._first : self._first + self.n] if self.order is None else x.index_select(0, self.order)
+
+    def rays(self, samples: int) -> Tensor:
+        """int32 [n], the ray of each sorted row, for a number of samples a ray."""
+        rows = self.order
+        if rows is None:
+            rows = torch.arange(self._first, self._first + self.n, dtype=torch.int32, device=self.device)
+        return torch.div(rows, samples, rounding_mode="floor")
 
 
 class _Permute(torch.autograd.Function):

@@ -100,14 +100,14 @@ class Recorder:
     """Takes down the steps of one call, as :class:`voronerf.router.rows.RowMode` carries them out.
 
     Attributes:
-        n: samples of the call.
         slots: parameters by the id of their stacked tensor.
+        n: rows of the call.
         refused: why the call cannot be done again from its steps; empty if it can.
         program: the steps, once the call is over and can be done again.
     """
 
-    n: int
     slots: dict[int, Slot]
+    n: int = 0
     refused: str = ""
     program: Program | None = None
     _program: Program = field(default_factory=lambda: Program(0, [], []))
@@ -115,9 +115,9 @@ class Recorder:
     _known: dict[int, tuple[Tensor, int]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, module: nn.Module, n: int) -> Recorder:
+    def of(cls, module: nn.Module) -> Recorder:
         """A recorder for a module with stacked parameters."""
-        return cls(n, {id(parameter): (owner, name) for owner, name, parameter in owned_parameters(module)})
+        return cls({id(parameter): (owner, name) for owner, name, parameter in owned_parameters(module)})
 
     def refuse(self, reason: str) -> None:
         """Notes that the call cannot be done again."""

@@ -230,7 +230,7 @@ class VoronoiRouter(nn.Module):
     @torch.compiler.disable
     def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """One call of a method of the module. ``torch.compile`` leaves it as it is and goes on behind it."""
-        call = Call(method, getattr(self.module, method), args, kwargs)
+        call = Call(method, getattr(self.module, method), args, kwargs, self._memory)
         rule = coords if coords is not None else self.coords
         layout, positions, source = call.locate(rule, self.per_ray, self.shared)
         grouping = self._memory.assignments.find(method, source, positions, self._assignment_key())
@@ -240,12 +240,21 @@ class VoronoiRouter(nn.Module):
         return run_grouped(self.module, call, layout, grouping, self._memory)
 
     def _group(self, positions: Tensor, n: int) -> Grouping:
-        flat = positions.detach().reshape(-1, 3)
-        cells = self.assign(flat) if n and self.num_cells > 1 else None
-        if self.num_cells > 1 and n < 2:
+        flat, k = positions.detach().reshape(-1, 3), self.num_cells
+        cells: Tensor | Callable[[], Tensor] | None = None
+        tables: dict[str, Any] | None = None
+        if k > 1 and n < 2:
             # The module runs on two rows, since sizes of 0 and 1 leave open what is a row.
-            cells = torch.zeros(2, dtype=torch.int32, device=flat.device) if cells is None else cells.expand(2).clone()
-        return Grouping(cells, max(n, 2), self.num_cells, positions.device, self.backend)
+            cells = self.assign(flat).expand(2).clone() if n else torch.zeros(2, dtype=torch.int32, device=flat.device)
+        elif k > 1 and self.assignment == "stochastic":
+            cells = self.assign(flat)
+        elif k > 1:
+            cells, tables = functools.partial(self.assign, flat), {"coords": flat, "centres": self.diagram.centres}
+            tables["centre_weights"] = self.diagram.power
+            if self.diagram.depth > 1:
+                tables["child_offsets"], tables["child"] = self.diagram.child_offsets, self.diagram.child
+                tables["depth"] = self.diagram.depth
+        return Grouping(cells, max(n, 2), k, positions.device, self.backend, tables)
 
     def _assignment_key(self) -> tuple[Any, ...]:
         drawn = self.assignment == "stochastic" and self.training

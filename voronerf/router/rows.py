@@ -112,6 +112,8 @@ class RowMode(TorchFunctionMode):
         super().__init__()
         assert grouping.n >= 2
         self.grouping, self.memory, self.n, self.recorder = grouping, memory, grouping.n, recorder
+        if recorder is not None:
+            recorder.n = grouping.n
         self.failed = ""
         self._rows = Mark(grouping)
 
