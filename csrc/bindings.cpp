@@ -5,6 +5,7 @@
 
 #include <cstdint>
 
+#include "bindings_balance.h"
 #include "bindings_cuda.h"
 #include "bindings_grid.h"
 #include "bindings_march.h"
@@ -24,7 +25,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 7;
+constexpr int INTERFACE = 8;
 
 using Address = std::uintptr_t;
 
@@ -89,6 +90,7 @@ PYBIND11_MODULE(_C, module) {
   bind_sampling(module);
   bind_march(module);
   bind_grid(module);
+  bind_balance(module);
 
 #ifdef VN_WITH_CUDA
   bind_cuda(module);

@@ -15,6 +15,7 @@ LAYERS = (
     {"backends", "checks", "layers"},
     {
         "_native",
+        "_native_balance",
         "_native_composite",
         "_native_grid",
         "_native_march",

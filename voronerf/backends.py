@@ -40,6 +40,9 @@ OPS = (
     "resample",
     "march_rays",
     "update_occupancy",
+    "balance_centres",
+    "camera_rays",
+    "select_heaviest",
 )
 
 
@@ -127,6 +130,12 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("integrated_encode", "warp"): _warp("integrated_encode", file="encode"),
     ("resample", "warp"): _warp("resample"),
     ("march_rays", "warp"): _warp("march_rays", dtypes=(torch.float32,)),
+    ("balance_centres", "native"): Implementation(
+        "voronerf._native_balance:balance_centres", ("cpu",), (torch.float32,)
+    ),
+    ("balance_centres", "warp"): _warp("balance_centres", dtypes=(torch.float32,)),
+    ("camera_rays", "warp"): _warp("camera_rays", dtypes=(torch.float32,)),
+    ("select_heaviest", "warp"): _warp("select_heaviest", dtypes=(torch.float32,)),
     ("update_occupancy", "warp"): _warp("update_occupancy", dtypes=(torch.float32,)),
 }
 

@@ -103,7 +103,7 @@ def balance(
             "weighted": distinct samples drawn one by one with probability proportional to importance (default of
             "transport"). "uniform": `uniform_centres` over the bounding box of the samples.
         generator: CPU generator of the draws; None for torch's global one.
-        backend: of the cell queries, see `voronerf.backends`.
+        backend: of the ops, see `voronerf.backends`.
 
     Raises:
         ValueError: a wrong shape, an unknown choice, a value that is not finite, a negative importance, no importance
@@ -135,9 +135,16 @@ def balance(
         centres, power = transport(samples, masses, centres, generator=generator)
         after = weigh(centres, power)
     elif k > 1:
-        for _ in range(steps):
-            centres = published_step(centres, after, alpha=alpha, neighbours=neighbours, normalise=normalise)
-            after = weigh(centres)
+        centres, after = ops.balance_centres(
+            samples,
+            masses,
+            centres,
+            steps=steps,
+            alpha=alpha,
+            neighbours=neighbours,
+            global_norm=normalise == "global",
+            backend=backend,
+        )
     device = points.device
     return Balance(
         centres=centres.to(device),
@@ -147,20 +154,6 @@ def balance(
         imbalance_before=imbalance(before),
         imbalance_after=imbalance(after),
     )
-
-
-def published_step(centres: Tensor, weights: Tensor, *, alpha: float, neighbours: int, normalise: str) -> Tensor:
-    """One update of all centres [k, 3], k >= 2, from the importance [k] of their cells; see `balance`."""
-    nearby = min(neighbours, centres.shape[0] - 1)
-    distances = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(float("inf"))
-    others = distances.topk(nearby, largest=False).indices
-    weights = weights.to(centres.dtype)
-    heaviest = weights.max()
-    if normalise == "neighbourhood":
-        heaviest = torch.maximum(weights[others].amax(1), weights)[:, None]
-    # A neighbourhood without any weight has only zero differences: any positive divisor does.
-    pull = (weights[others] - weights[:, None]) / heaviest.clamp(min=torch.finfo(centres.dtype).tiny)
-    return centres + alpha * ((centres[others] - centres[:, None]) * pull[:, :, None]).mean(1)
 
 
 def first_centres(samples: Tensor, masses: Tensor, k: int, *, init: str, generator: torch.Generator | None) -> Tensor:

@@ -6,6 +6,8 @@ of arrays sorted by cell.
 """
 
 from voronerf.layers import MLP, Layer
+from voronerf.ops.balance_centres import balance_centres
+from voronerf.ops.camera_rays import camera_rays
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
@@ -18,6 +20,7 @@ from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.select_heaviest import select_heaviest
 from voronerf.ops.update_occupancy import update_occupancy
 
 __all__ = [
@@ -26,6 +29,8 @@ __all__ = [
     "Composite",
     "Layer",
     "March",
+    "balance_centres",
+    "camera_rays",
     "cell_sort",
     "centre_grid",
     "composite",
@@ -38,5 +43,6 @@ __all__ = [
     "nearest_centre",
     "resample",
     "routed_mlp",
+    "select_heaviest",
     "update_occupancy",
 ]

@@ -17,7 +17,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-NEWTON_STEPS = 12
+from voronerf.ops.camera_rays import camera_rays
+from voronerf.reference.camera_rays import distort, undistort
+
+__all__ = [
+    "Cameras",
+    "Rays",
+    "distort",
+    "focus_point",
+    "look_at",
+    "orbit_cameras",
+    "turntable_cameras",
+    "undistort",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,15 +132,19 @@ class Cameras:
             x: [b] column. Integers name pixels (the ray goes through their centre), floats are positions in the image.
             y: [b] row, likewise.
         """
-        u, v = self._image_plane(image_index, _position(x), _position(y))
-        pose = self.poses[image_index]
-        local = torch.stack((u, -v, -torch.ones_like(u)), dim=-1)
         if isinstance(image_index, int):
-            directions = local @ pose[:3, :3].T
+            chosen, camera = self[[image_index]], None
         else:
-            directions = (pose[:, :3, :3] * local[:, None, :]).sum(-1)
-        directions = torch.nn.functional.normalize(directions, dim=-1)
-        return Rays(pose[..., :3, 3].expand_as(directions), directions)
+            chosen, camera = self, image_index.to(torch.int32)
+        origins, directions = camera_rays(
+            chosen.poses,
+            chosen.intrinsics,
+            _position(x).to(self.poses.dtype),
+            _position(y).to(self.poses.dtype),
+            camera=camera,
+            distortion=chosen.distortion,
+        )
+        return Rays(origins, directions)
 
     def image_rays(self, index: int) -> Rays:
         """Rays through all pixel centres of one camera, row by row: [height * width]."""
@@ -158,58 +174,6 @@ class Cameras:
             u, v = distort(u, v, self.distortion[index])
         fx, fy, cx, cy = self.intrinsics[index].unbind(-1)
         return torch.stack((u * fx + cx, v * fy + cy), dim=-1), depth
-
-    def _image_plane(self, image_index: Tensor | int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Undistorted image-plane coordinates of pixel positions; all [b]."""
-        if self.distortion is None:
-            fx, fy, cx, cy = self.intrinsics[image_index].unbind(-1)
-            return (x - cx) / fx, (y - cy) / fy
-        # float64: a millionth of a pixel is below the resolution of float32
-        fx, fy, cx, cy = self.intrinsics[image_index].double().unbind(-1)
-        u, v = undistort((x - cx) / fx, (y - cy) / fy, self.distortion[image_index].double())
-        return u.to(self.poses.dtype), v.to(self.poses.dtype)
-
-
-def distort(u: Tensor, v: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-    """OpenCV's lens model: where the lens puts the ideal image-plane point (u, v).
-
-    Source: OpenCV, "Camera Calibration and 3D Reconstruction", radial-tangential model with k1, k2, p1, p2.
-
-    Args:
-        u: [n].
-        v: [n].
-        coefficients: (k1, k2, p1, p2), [4] or [n, 4].
-    """
-    k1, k2, p1, p2 = coefficients.unbind(-1)
-    r2 = u * u + v * v
-    radial = 1 + r2 * (k1 + r2 * k2)
-    return (
-        u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u),
-        v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v,
-    )
-
-
-def undistort(u: Tensor, v: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse of `distort` by Newton's method, from the distorted point itself.
-
-    Converges quadratically wherever the lens model is invertible between the start and the solution, which holds inside
-    the image of any lens this model describes; a fixed number of steps keeps the device out of the host's hands. Give
-    float64 for an error below a millionth of a pixel.
-    """
-    k1, k2, p1, p2 = coefficients.unbind(-1)
-    a, b = u, v
-    for _ in range(NEWTON_STEPS):
-        r2 = a * a + b * b
-        radial = 1 + r2 * (k1 + r2 * k2)
-        slope = 2 * k1 + 4 * k2 * r2  # d radial / d r2, times 2
-        du, dv = distort(a, b, coefficients)
-        du, dv = du - u, dv - v
-        aa = radial + a * a * slope + 2 * p1 * b + 6 * p2 * a
-        ab = a * b * slope + 2 * p1 * a + 2 * p2 * b
-        bb = radial + b * b * slope + 6 * p1 * b + 2 * p2 * a
-        determinant = aa * bb - ab * ab
-        a, b = a - (bb * du - ab * dv) / determinant, b - (aa * dv - ab * du) / determinant
-    return a, b
 
 
 def focus_point(cameras: Cameras) -> Tensor | None:

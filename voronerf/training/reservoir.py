@@ -10,6 +10,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from voronerf.ops.select_heaviest import select_heaviest
+
 
 class SampleReservoir:
     """A ring of the heaviest samples of the last `batches` batches.
@@ -64,12 +66,11 @@ class SampleReservoir:
         device = self._points.device
         points = points.detach().reshape(-1, 3).to(device, torch.float32)
         importance = importance.detach().reshape(-1).to(device, torch.float32)
-        valid = (importance > 0) & torch.isfinite(importance) & torch.isfinite(points).all(1)
-        kept, index = torch.where(valid, importance, 0).topk(min(self.quota, importance.shape[0]))
+        heaviest, kept = select_heaviest(points, importance, self.quota)
         slot = self._added % self.batches
         self._importance[slot] = 0
         self._importance[slot, : kept.shape[0]] = kept
-        self._points[slot, : kept.shape[0]] = points[index]
+        self._points[slot, : kept.shape[0]] = heaviest
         self._added += 1
 
     def samples(self) -> tuple[Tensor, Tensor]:

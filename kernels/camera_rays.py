@@ -1,0 +1,102 @@
+"""Rays through pixels as a Warp kernel. c cameras, b pixels.
+
+A thread takes a pixel. The distortion of the lens is undone in float64 by the reference's fixed number of Newton steps.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from voronerf.kernels._launch import array, launch
+from voronerf.reference.camera_rays import NEWTON_STEPS
+
+wp.set_module_options({"enable_backward": False})
+
+_STEPS = wp.constant(NEWTON_STEPS)
+
+
+@wp.kernel
+def _camera_rays_kernel(
+    poses: wp.array3d(dtype=wp.float32),
+    intrinsics: wp.array2d(dtype=wp.float32),
+    x: wp.array(dtype=wp.float32),
+    y: wp.array(dtype=wp.float32),
+    camera: wp.array(dtype=wp.int32),
+    several: wp.bool,
+    distortion: wp.array2d(dtype=wp.float32),
+    distorted: wp.bool,
+    origins: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.float32),
+) -> None:
+    i = wp.tid()
+    c = wp.int32(0)
+    if several:
+        c = wp.clamp(camera[i], 0, poses.shape[0] - 1)
+    u = (wp.float64(x[i]) - wp.float64(intrinsics[c, 2])) / wp.float64(intrinsics[c, 0])
+    v = (wp.float64(y[i]) - wp.float64(intrinsics[c, 3])) / wp.float64(intrinsics[c, 1])
+    if distorted:
+        k1 = wp.float64(distortion[c, 0])
+        k2 = wp.float64(distortion[c, 1])
+        p1 = wp.float64(distortion[c, 2])
+        p2 = wp.float64(distortion[c, 3])
+        one = wp.float64(1.0)
+        two = wp.float64(2.0)
+        six = wp.float64(6.0)
+        a = u
+        b = v
+        for _ in range(_STEPS):
+            r2 = a * a + b * b
+            radial = one + r2 * (k1 + r2 * k2)
+            slope = two * k1 + two * two * k2 * r2
+            du = a * radial + two * p1 * a * b + p2 * (r2 + two * a * a) - u
+            dv = b * radial + p1 * (r2 + two * b * b) + two * p2 * a * b - v
+            aa = radial + a * a * slope + two * p1 * b + six * p2 * a
+            ab = a * b * slope + two * p1 * a + two * p2 * b
+            bb = radial + b * b * slope + six * p1 * b + two * p2 * a
+            determinant = aa * bb - ab * ab
+            a = a - (bb * du - ab * dv) / determinant
+            b = b - (aa * dv - ab * du) / determinant
+        u = a
+        v = b
+    along = wp.vec3(wp.float32(u), -wp.float32(v), -1.0)
+    direction = wp.vec3(0.0, 0.0, 0.0)
+    for axis in range(3):
+        direction[axis] = poses[c, axis, 0] * along[0] + poses[c, axis, 1] * along[1] + poses[c, axis, 2] * along[2]
+        origins[i, axis] = poses[c, axis, 3]
+    direction = direction / wp.max(wp.length(direction), 1.0e-12)
+    for axis in range(3):
+        directions[i, axis] = direction[axis]
+
+
+def camera_rays(
+    poses: Tensor, intrinsics: Tensor, x: Tensor, y: Tensor, *, camera: Tensor | None, distortion: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Origins and unit directions; see ``voronerf.ops.camera_rays``."""
+    origins, directions = _camera_rays(poses, intrinsics, x, y, camera, distortion)
+    return origins, directions
+
+
+@torch.library.custom_op("voronerf::camera_rays_warp", mutates_args=())
+def _camera_rays(
+    poses: Tensor, intrinsics: Tensor, x: Tensor, y: Tensor, camera: Tensor | None, distortion: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    results = _allocate(poses, x)
+    given = [array(tensor, poses) for tensor in (poses, intrinsics, x, y)]
+    lens = array(intrinsics[:0] if distortion is None else distortion, poses)
+    choice = [array(camera, poses, torch.int32), camera is not None, lens, distortion is not None]
+    inputs = [*given, *choice, *(array(tensor, poses) for tensor in results)]
+    launch(_camera_rays_kernel, x.shape[0], inputs, poses)
+    return results
+
+
+@_camera_rays.register_fake
+def _(
+    poses: Tensor, intrinsics: Tensor, x: Tensor, y: Tensor, camera: Tensor | None, distortion: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    return _allocate(poses, x)
+
+
+def _allocate(poses: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    return poses.new_empty(x.shape[0], 3), poses.new_empty(x.shape[0], 3)

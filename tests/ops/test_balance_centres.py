@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from op_cases import refused, strided
+from torch import Tensor
+
+from voronerf.ops import balance_centres
+
+pytestmark = pytest.mark.op("balance_centres")
+
+
+def samples(m: int) -> tuple[Tensor, Tensor]:
+    points = torch.nn.functional.normalize(torch.randn(m, 3), dim=1) * (1 + 0.05 * torch.randn(m, 1))
+    return points, torch.randn(m, dtype=torch.float64).exp() * (1 + 3 * points[:, 0].clamp(min=0))
+
+
+def slow(points: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, nearby: int, norm: bool):
+    """Sample by sample and neighbour by neighbour; centres are float32 between the steps."""
+
+    def weigh() -> list[float]:
+        weights = [0.0] * len(places)
+        for point, mass in zip(points.tolist(), masses.tolist()):
+            weights[min(range(len(places)), key=lambda i: math.dist(point, places[i]))] += mass
+        return weights
+
+    places = centres.tolist()
+    for _ in range(steps):
+        weights, moved = weigh(), []
+        for i, place in enumerate(places):
+            others = sorted((j for j in range(len(places)) if j != i), key=lambda j: math.dist(place, places[j]))
+            others = others[:nearby]
+            heaviest = max(weights) if norm else max(weights[j] for j in [i, *others])
+            pulls = [(weights[j] - weights[i]) / heaviest if heaviest > 0 else 0.0 for j in others]
+            shift = [sum((places[j][axis] - place[axis]) * p for j, p in zip(others, pulls)) for axis in range(3)]
+            moved.append([place[axis] + alpha * shift[axis] / len(others) for axis in range(3)])
+        places = torch.tensor(moved).tolist()
+    return torch.tensor(places), torch.tensor(weigh(), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("global_norm", [False, True])
+@pytest.mark.parametrize(("k", "neighbours"), [(2, 8), (5, 2), (9, 8), (20, 8), (12, 1)])
+def test_equals_slow_loops(device: torch.device, backend: str, k: int, neighbours: int, global_norm: bool) -> None:
+    points, masses = samples(300)
+    found = balance_centres(
+        points.to(device),
+        masses.to(device),
+        points[:k].to(device),
+        steps=3,
+        alpha=0.3,
+        neighbours=neighbours,
+        global_norm=global_norm,
+        backend=backend,
+    )
+    centres, weights = slow(points, masses, points[:k], 3, 0.3, neighbours, global_norm)
+    torch.testing.assert_close(found[0].cpu(), centres, rtol=0, atol=2e-6)
+    torch.testing.assert_close(found[1].cpu(), weights, rtol=1e-12, atol=1e-12)
+
+
+def test_balances_and_repeats_itself(device: torch.device, backend: str) -> None:
+    points, masses = samples(2000)
+    given = points.to(device), masses.to(device), points[:16].to(device)
+    start, end = (balance_centres(*given, steps=steps, backend=backend) for steps in (0, 300))
+    assert torch.equal(start[0], given[2])
+    before, after = (float((part[1] / part[1].max()).std(correction=0)) for part in (start, end))
+    assert before > 0.2 and after < before / 3
+    again = balance_centres(*(strided(tensor) for tensor in given), steps=300, backend=backend)
+    assert torch.equal(again[0], end[0]) and torch.equal(again[1], end[1])
+
+
+def test_cells_and_samples_without_mass(device: torch.device, backend: str) -> None:
+    points = torch.rand(20, 3, device=device)
+    nothing = torch.zeros(20, dtype=torch.float64, device=device)
+    centres = torch.rand(4, 3, device=device)
+    for masses, rows in ((nothing, 20), (nothing[:0], 0)):
+        moved, weights = balance_centres(points[:rows], masses, centres, steps=5, backend=backend)
+        assert torch.equal(moved, centres) and torch.equal(weights, torch.zeros_like(weights))
+    moved, weights = balance_centres(points, nothing + 1, centres[:1], steps=5, backend=backend)
+    assert torch.equal(moved, centres[:1]) and weights.tolist() == [20.0]
+
+
+@pytest.mark.native
+def test_same_bits_for_any_number_of_threads() -> None:
+    points, masses = samples(9000)
+    before = torch.get_num_threads()
+    found = []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            found.append(balance_centres(points, masses, points[:150], steps=5, backend="native"))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
+
+
+@pytest.mark.native
+@pytest.mark.warp
+def test_opcheck() -> None:
+    points, masses = samples(9)
+    for backend in ("native", "warp"):
+        balance_centres(points, masses, points[:3], steps=0, backend=backend)
+        op = getattr(torch.ops.voronerf, f"balance_centres_{backend}").default
+        torch.library.opcheck(op, (points, masses, points[:3], 2, 0.1, 8, False))
+
+
+def test_refuses_what_makes_no_sense() -> None:
+    points, masses = samples(5)
+    with refused(ValueError, "balance_centres: masses must have shape [m] with m = 5, got [4]"):
+        balance_centres(points, masses[:4], points[:2])
+    with refused(TypeError, "balance_centres: masses must have dtype float64, got float32"):
+        balance_centres(points, masses.float(), points[:2])
+    with refused(TypeError, "balance_centres: samples must have dtype float32, got float64"):
+        balance_centres(points.double(), masses, points[:2])
+    with refused(ValueError, "balance_centres: centres must hold at least one centre, got none"):
+        balance_centres(points, masses, points[:0])
+    with refused(ValueError, "balance_centres: steps must be at least 0, got -1"):
+        balance_centres(points, masses, points[:2], steps=-1)
+    with refused(ValueError, "balance_centres: neighbours must be at least 1, got 0"):
+        balance_centres(points, masses, points[:2], neighbours=0)

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import refused, strided
+from torch import Tensor
+
+from voronerf.ops import camera_rays
+from voronerf.rendering.cameras import Cameras, look_at
+
+pytestmark = pytest.mark.op("camera_rays")
+
+
+def cameras(count: int, distorted: bool) -> Cameras:
+    poses = look_at(torch.randn(count, 3) * 3, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    intrinsics = torch.tensor([[80.0, 75.0, 31.0, 25.0]]) + torch.rand(count, 4)
+    lens = torch.randn(count, 4) * torch.tensor([0.05, 0.02, 0.005, 0.005]) if distorted else None
+    return Cameras(poses, intrinsics, 64, 48, lens)
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+@pytest.mark.parametrize("b", [0, 1, 300])
+def test_rays_pass_through_their_pixels(device: torch.device, backend: str, b: int, distorted: bool) -> None:
+    some = cameras(3, distorted)
+    camera = torch.randint(0, 3, (b,), dtype=torch.int32)
+    x, y = 64 * torch.rand(b), 48 * torch.rand(b)
+
+    def run(given: Cameras, index: Tensor | None) -> list[Tensor]:
+        tensors = (strided(tensor.to(device)) for tensor in (given.poses, given.intrinsics, x, y))
+        lens = None if given.distortion is None else strided(given.distortion.to(device))
+        which = None if index is None else strided(index.to(device))
+        return [part.cpu() for part in camera_rays(*tensors, camera=which, distortion=lens, backend=backend)]
+
+    origins, directions = run(some, camera)
+    assert origins.shape == directions.shape == (b, 3)
+    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(b))
+    for number in range(3):
+        mine = camera == number
+        assert torch.equal(origins[mine], some.origins[number].expand(int(mine.sum()), 3))
+        pixels, depth = some.project(origins[mine] + 2 * directions[mine], number)
+        assert bool((depth > 0).all())
+        torch.testing.assert_close(pixels, torch.stack((x, y), dim=-1)[mine], atol=2e-4, rtol=0)
+    expected = run(some, torch.full((b,), 2, dtype=torch.int32))
+    for found, want in zip(run(some[2:], None), expected):
+        torch.testing.assert_close(found, want, atol=1e-6, rtol=0)
+
+
+@pytest.mark.warp
+def test_opcheck() -> None:
+    some = cameras(2, True)
+    x = torch.rand(5)
+    index = torch.tensor([0, 1, 1, 0, 1], dtype=torch.int32)
+    for camera, lens in ((index, some.distortion), (None, None)):
+        camera_rays(some.poses, some.intrinsics, x, x, camera=camera, distortion=lens, backend="warp")
+        given = (some.poses, some.intrinsics, x, x, camera, lens)
+        torch.library.opcheck(torch.ops.voronerf.camera_rays_warp.default, given)
+
+
+def test_refuses_what_makes_no_sense() -> None:
+    some, x = cameras(2, True), torch.rand(5)
+    with refused(ValueError, "camera_rays: poses must have shape [c, 4, 4], got [2, 3, 4]"):
+        camera_rays(some.poses[:, :3], some.intrinsics, x, x)
+    with refused(ValueError, "camera_rays: y must have shape [b] with b = 5, got [4]"):
+        camera_rays(some.poses, some.intrinsics, x, x[1:])
+    with refused(TypeError, "camera_rays: camera must have dtype int32, got int64"):
+        camera_rays(some.poses, some.intrinsics, x, x, camera=torch.zeros(5, dtype=torch.int64))
+    with refused(ValueError, "camera_rays: distortion must have shape [c, 4] with c = 2, got [1, 4]"):
+        camera_rays(some.poses, some.intrinsics, x, x, distortion=torch.zeros(1, 4))
+    with refused(TypeError, "camera_rays: poses must have dtype float32, got float64"):
+        camera_rays(some.poses.double(), some.intrinsics, x, x)
+    with refused(ValueError, "camera_rays: poses must hold at least one camera, got none"):
+        camera_rays(some.poses[:0], some.intrinsics[:0], x, x)

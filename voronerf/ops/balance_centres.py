@@ -1,0 +1,73 @@
+"""Balancing a diagram's cells. m samples, k centres."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_shape
+
+_OP = "balance_centres"
+
+
+def balance_centres(
+    samples: Tensor,
+    masses: Tensor,
+    centres: Tensor,
+    *,
+    steps: int = 500,
+    alpha: float = 0.05,
+    neighbours: int = 8,
+    global_norm: bool = False,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Moves centres `steps` times towards cells of equal mass, all centres at once; see ``voronerf.balance``.
+
+    ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i``, where N(i) are the `neighbours`
+    closest centres, of those equally far the first, and all others where there are fewer (Elsner et al. 2023, section
+    4). Updates are computed in float64 and kept in float32, and the result is the same at every call. Not
+    differentiable.
+
+    Args:
+        samples: float32 [m, 3], finite.
+        masses: float64 [m], >= 0 and finite.
+        centres: float32 [k, 3], finite, k >= 1.
+        steps: number of updates, >= 0.
+        alpha: step size, no unit.
+        neighbours: size of N(i), >= 1.
+        global_norm: norm_i is the largest W of all cells rather than of i and N(i).
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        (centres float32 [k, 3], weights float64 [k], the mass in each cell of the returned centres).
+
+    Raises:
+        ValueError: shapes, devices, counts or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "samples", samples, ("m", 3), sizes)
+    check_shape(_OP, "masses", masses, ("m",), sizes)
+    check_shape(_OP, "centres", centres, ("k", 3), sizes)
+    check_dtype(_OP, "samples", samples, (torch.float32,))
+    check_dtype(_OP, "masses", masses, (torch.float64,))
+    check_dtype(_OP, "centres", centres, (torch.float32,))
+    check_same_device(_OP, samples=samples, masses=masses, centres=centres)
+    check_count(_OP, "samples", sizes["m"])
+    check_integer(_OP, "steps", steps, 0)
+    check_integer(_OP, "neighbours", neighbours, 1)
+    if sizes["k"] < 1:
+        raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
+    run = backends.resolve(_OP, backend=backend, device=samples.device, dtype=samples.dtype)
+    moved, weights = run(
+        samples.detach(),
+        masses.detach(),
+        centres.detach(),
+        steps=steps,
+        alpha=float(alpha),
+        neighbours=neighbours,
+        global_norm=global_norm,
+    )
+    return moved, weights

@@ -1,0 +1,64 @@
+"""Rays through pixels. c cameras, b pixels. Frames and the lens model are those of ``voronerf.rendering.cameras``."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
+
+_OP = "camera_rays"
+
+
+def camera_rays(
+    poses: Tensor,
+    intrinsics: Tensor,
+    x: Tensor,
+    y: Tensor,
+    *,
+    camera: Tensor | None = None,
+    distortion: Tensor | None = None,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Rays through positions in images, the distortion of the lens undone by Newton's method in float64.
+
+    Not differentiable.
+
+    Args:
+        poses: float32 [c, 4, 4], camera to world, OpenGL axes.
+        intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
+        x: float32 [b], to the right, in pixels; the centre of the first column is at 0.5.
+        y: float32 [b], downwards.
+        camera: int32 [b], each in 0 to c - 1, which is not checked; None for the first camera throughout.
+        distortion: float32 [c, 4], OpenCV's (k1, k2, p1, p2), or None.
+        backend: "auto", "reference" or "warp".
+
+    Returns:
+        (origins float32 [b, 3], directions float32 [b, 3] of unit length).
+
+    Raises:
+        ValueError: shapes, devices or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "poses", poses, ("c", 4, 4), sizes)
+    check_shape(_OP, "intrinsics", intrinsics, ("c", 4), sizes)
+    check_shape(_OP, "x", x, ("b",), sizes)
+    check_shape(_OP, "y", y, ("b",), sizes)
+    check_dtype(_OP, "poses", poses, (torch.float32,))
+    if camera is not None:
+        check_shape(_OP, "camera", camera, ("b",), sizes)
+        check_dtype(_OP, "camera", camera, INDEX)
+    if distortion is not None:
+        check_shape(_OP, "distortion", distortion, ("c", 4), sizes)
+    check_same_dtype(_OP, poses=poses, intrinsics=intrinsics, x=x, y=y, distortion=distortion)
+    check_same_device(_OP, poses=poses, intrinsics=intrinsics, x=x, y=y, camera=camera, distortion=distortion)
+    check_count(_OP, "x", sizes["b"])
+    if sizes["c"] < 1:
+        raise ValueError(f"{_OP}: poses must hold at least one camera, got none")
+    run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
+    tensors = (tensor.detach() for tensor in (poses, intrinsics, x, y))
+    origins, directions = run(*tensors, camera=camera, distortion=distortion)
+    return origins, directions

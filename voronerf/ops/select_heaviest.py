@@ -1,0 +1,44 @@
+"""The heaviest samples of a batch. n samples, q of them kept."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_shape
+
+_OP = "select_heaviest"
+
+
+def select_heaviest(points: Tensor, importance: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
+    """The `count` samples of largest importance, heaviest first; no device value is read on the host.
+
+    A sample counts if its importance is positive and finite and its point finite. Which of equally heavy samples comes
+    first is open. Not differentiable.
+
+    Args:
+        points: float32 [n, 3].
+        importance: float32 [n].
+        count: at least 1.
+        backend: "auto", "reference" or "warp".
+
+    Returns:
+        (points float32 [q, 3], importance float32 [q]) with q = min(count, n); rows for which no sample counts are 0.
+
+    Raises:
+        ValueError: shapes, devices, count or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "points", points, ("n", 3), sizes)
+    check_shape(_OP, "importance", importance, ("n",), sizes)
+    check_dtype(_OP, "points", points, (torch.float32,))
+    check_dtype(_OP, "importance", importance, (torch.float32,))
+    check_same_device(_OP, points=points, importance=importance)
+    check_count(_OP, "points", sizes["n"])
+    check_integer(_OP, "count", count, 1)
+    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
+    kept_points, kept = run(points.detach(), importance.detach(), count)
+    return kept_points, kept
