@@ -13,8 +13,9 @@ from route import route_work
 
 FULL, HALF = torch.float32, torch.bfloat16
 BASE = 1 << 18
-TOLERANCE = {(FULL, FORWARD): 1e-4, (FULL, BACKWARD): 0.02, (HALF, FORWARD): 0.05, (HALF, BACKWARD): 0.3}
-"""Largest error of an alternative. A unit of ReLU near 0 that rounding turns changes gradients by per cents."""
+TOLERANCE = {(FULL, FORWARD): 1e-4, (FULL, BACKWARD): 0.02, (HALF, FORWARD): 0.05, (HALF, BACKWARD): 0.9}
+"""Largest error of an alternative. A unit of ReLU near 0 that rounding turns changes gradients by per cents, in
+bfloat16 by half of the largest; gradients that are missing have an error of 1."""
 BOTH = ("native", "reference")
 
 # (network, n, k, dtype, direction); the first of each small network, dtype and direction also on the reference.

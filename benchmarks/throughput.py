@@ -279,7 +279,8 @@ def main(arguments: list[str] | None = None) -> None:
         progress(f"[{number}/{len(cases)}, {time.perf_counter() - start:.0f} s] {case.key}")
         rows = bench.run(case)
         if not rows:
-            progress(f"    left out: none of {', '.join(case.backends)} runs {case.op} here")
+            reasons = [backends.why_not(case.op, name, bench.device, case.dtype) for name in case.backends]
+            progress(f"    left out: {'; '.join(filter(None, reasons)) or 'not among --backends'}")
         for row in rows:
             print("\n".join(lines(row, last=row is rows[-1])), flush=True)
         if rows and (rows[0]["other_load"] or 0.0) > DISTURBED:
