@@ -190,6 +190,27 @@ def test_copies_are_independent(field: NeRF, generator: torch.Generator, clone: 
     assert not torch.equal(other(positions, directions)[0], before)
 
 
+@pytest.mark.parametrize("kind", ["flat", "nested", "power", "many"])
+def test_every_kind_of_diagram_equals_the_loop(
+    kind: str, field: NeRF, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    diagram = VoronoiDiagram(torch.randn(4, 3, generator=generator))
+    if kind == "nested":
+        diagram, _ = diagram.refine({1: torch.randn(3, 3, generator=generator)})
+    if kind == "power":
+        diagram = VoronoiDiagram(diagram.centres, weights=torch.rand(4, generator=generator))
+    if kind == "many":  # as if this were so many that the diagram looks cells up by itself
+        monkeypatch.setattr("voronerf.router.router._MANY", 3)
+    router = perturbed(VoronoiRouter(field, diagram), generator)
+    positions, directions = samples(50, generator)
+    rgb, sigma, _ = loop(router, positions, directions)
+    found, density = router(positions, directions)
+    torch.testing.assert_close(found, rgb)
+    torch.testing.assert_close(density, sigma)
+    shifted, _ = router(positions, directions, coords=positions + 1)
+    assert not torch.allclose(shifted, rgb)
+
+
 def test_stochastic_assignment_is_for_training_only(field: NeRF, generator: torch.Generator) -> None:
     router = VoronoiRouter(field, torch.randn(8, 3, generator=generator), assignment="stochastic", temperature=0.3)
     router.generator = torch.Generator().manual_seed(0)
