@@ -42,9 +42,10 @@ cuda-check:
 emulate-cuda: $(VENV)/.built
 	@for seed in 1 2 3; do OMP_NUM_THREADS=1 $(BIN)/pytest -q tests/ops -k native-cpu --emulate-cuda $$seed || exit 1; done
 
-# The C++ of grouped_mlp under AddressSanitizer and UndefinedBehaviorSanitizer, with random networks and cells.
+# The C++ of the CPU kernels under AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer, with random inputs.
 sanitize:
 	@tests/cpp/sanitize.sh
+	@tests/cpp/sanitize_ops.sh
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info voronerf/_C.*.so .mypy_cache .pytest_cache .ruff_cache

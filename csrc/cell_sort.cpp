@@ -7,6 +7,9 @@
 #include "cell_sort.h"
 
 #include <algorithm>
+#include <atomic>
+
+#include "parallel.h"
 
 namespace voronerf {
 
@@ -19,10 +22,8 @@ constexpr int kRun = 16;
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
                    int threads) {
   const int64_t rows = cell_sort_chunk_rows(k), chunks = cell_sort_chunks(n, k);
-  bool valid = true;
-#pragma omp parallel for schedule(dynamic, kRun) num_threads(threads) \
-    reduction(&& : valid) if (threads > 1 && chunks > kRun)
-  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+  std::atomic<bool> valid{true};
+  parallel_for(chunks, kRun, threads, [&](int64_t chunk) {
     int32_t* count = workspace + chunk * k;
     std::fill(count, count + k, 0);
     bool inside = true;
@@ -34,8 +35,8 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32
         inside = false;
       }
     }
-    valid = valid && inside;
-  }
+    if (!inside) valid.store(false, std::memory_order_relaxed);
+  });
   if (!valid) return false;
 
   // In place, a count becomes the first place of that cell's rows of that chunk: walk the chunks once for the cells'
@@ -59,13 +60,12 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32
     }
   }
 
-#pragma omp parallel for schedule(dynamic, kRun) num_threads(threads) if (threads > 1 && chunks > kRun)
-  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+  parallel_for(chunks, kRun, threads, [&](int64_t chunk) {
     int32_t* place = workspace + chunk * k;
     for (int64_t i = chunk * rows, end = std::min(n, i + rows); i < end; ++i) {
       order[place[cells[i]]++] = static_cast<int32_t>(i);
     }
-  }
+  });
   return true;
 }
 

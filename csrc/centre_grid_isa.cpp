@@ -155,8 +155,8 @@ int32_t centre_grid_prune(const double* box, const double* centres, const int32_
   // Bounds of each value at the corners, margin included: the first candidate loses to the second where all of its
   // lower bounds are above the other's upper ones. The margin is convex, so it covers the inside of the box too.
   double *lower = workspace, *upper = workspace + kCorners * static_cast<int64_t>(count), least = 0.0;
-  F64 lowest[kVectors];
-  I64 nearest[kVectors];
+  F64 lowest[kVectors] = {};
+  I64 nearest[kVectors] = {};
   int64_t strong[kCorners + 1] = {};
   for (int32_t i = 0; i < count; ++i) {
     const double* c = centres + 4 * static_cast<int64_t>(in[i]);
@@ -167,7 +167,7 @@ int32_t centre_grid_prune(const double* box, const double* centres, const int32_
       const F64 a = value - margin, b = value + margin;
       __builtin_memcpy(lower + kCorners * static_cast<int64_t>(i) + kDoubles * v, &a, sizeof a);
       __builtin_memcpy(upper + kCorners * static_cast<int64_t>(i) + kDoubles * v, &b, sizeof b);
-      if (i == 0) lowest[v] = value, nearest[v] = I64{};
+      if (i == 0) lowest[v] = value;
       const I64 less = value < lowest[v];
       nearest[v] = less ? I64{} + i : nearest[v];
       lowest[v] = less ? value : lowest[v];

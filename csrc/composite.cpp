@@ -7,6 +7,7 @@
 #include <string>
 
 #include "composite_isa.h"
+#include "parallel.h"
 
 namespace voronerf {
 
@@ -43,8 +44,7 @@ int64_t first_sample(const CompositeInputs& in, int64_t ray) {
 
 template <typename Run>
 void for_each_ray(const CompositeInputs& in, int threads, const Run& run) {
-#pragma omp parallel for schedule(dynamic, kRays) num_threads(threads) if (threads > 1 && in.r > kRays)
-  for (int64_t ray = 0; ray < in.r; ++ray) run(ray, first_sample(in, ray), first_sample(in, ray + 1));
+  parallel_for(in.r, kRays, threads, [&](int64_t ray) { run(ray, first_sample(in, ray), first_sample(in, ray + 1)); });
 }
 
 // Samples of no ray.

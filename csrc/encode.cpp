@@ -5,6 +5,7 @@
 #include <algorithm>
 
 #include "common.h"
+#include "parallel.h"
 
 namespace voronerf {
 
@@ -25,11 +26,10 @@ void over_ranges(const Encoding& in, float* workspace, int threads, const Run& r
   const int64_t tiles = ceil_div(in.n, kEncodeRows);
   const int64_t ranges = std::min<int64_t>(std::max(threads, 1), tiles);
   const int64_t rows = ceil_div(tiles, ranges) * kEncodeRows;
-#pragma omp parallel for schedule(static, 1) num_threads(threads) if (ranges > 1)
-  for (int64_t i = 0; i < ranges; ++i) {
+  parallel_for(ranges, 1, threads, [&](int64_t i) {
     run(workspace + i * workspace_of_thread(in.d, in.octaves), std::min(in.n, i * rows),
         std::min(in.n, (i + 1) * rows));
-  }
+  });
 }
 
 void forward_rows(const Encoding& in, float* out, float* workspace, int64_t stride, int64_t begin, int64_t end,

@@ -5,9 +5,11 @@
 #include "locate_cell.h"
 
 #include <algorithm>
+#include <atomic>
 
 #include "common.h"
 #include "nearest_centre.h"
+#include "parallel.h"
 
 namespace voronerf {
 
@@ -110,15 +112,18 @@ bool locate_cell_cpu(const T* points, const T* centres, const T* weights, const 
                      Isa isa, int threads) {
   const Tree<T> tree{centres, weights, nearest_centre_weight_bound(weights, m), child_offsets, child, depth, isa};
   const int64_t blocks = ceil_div<int64_t>(n, kBlock);
-  bool arrived = true;
-#pragma omp parallel for schedule(dynamic) num_threads(threads) reduction(&& : arrived) if (threads > 1 && blocks > 1)
-  for (int64_t b = 0; b < blocks; ++b) {
-    int32_t* place = workspace + thread_number() * m;
-    const int64_t start = b * kBlock;
-    const int32_t rows = static_cast<int32_t>(std::min<int64_t>(kBlock, n - start));
-    const bool all = locate_block(tree, points + 3 * start, leaves + start, rows, place);
-    arrived = arrived && all;
-  }
+  std::atomic<bool> arrived{true};
+  Items items(blocks);
+  parallel(static_cast<int>(std::min<int64_t>(threads, blocks)), [&](int thread) {
+    for (int64_t b, end; items.take(b, end);) {
+      int32_t* place = workspace + thread * m;
+      const int64_t start = b * kBlock;
+      const int32_t rows = static_cast<int32_t>(std::min<int64_t>(kBlock, n - start));
+      if (!locate_block(tree, points + 3 * start, leaves + start, rows, place)) {
+        arrived.store(false, std::memory_order_relaxed);
+      }
+    }
+  });
   return arrived;
 }
 

@@ -7,6 +7,7 @@
 #include <cmath>
 
 #include "common.h"
+#include "parallel.h"
 
 namespace voronerf {
 
@@ -59,14 +60,13 @@ void resample_ray(const float* weights, const float* edges, const float* uniform
 
 void resample_cpu(const float* weights, const float* edges, const float* uniforms, float* depths, int64_t r, int64_t s,
                   int64_t count, int threads) {
-  const int64_t rays = std::max<int64_t>(kBlock / (s + count), 1), blocks = ceil_div(r, rays);
-#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1 && blocks > 1)
-  for (int64_t b = 0; b < blocks; ++b) {
+  const int64_t rays = std::max<int64_t>(kBlock / (s + count), 1);
+  parallel_for(ceil_div(r, rays), 1, threads, [&](int64_t b) {
     for (int64_t i = b * rays, end = std::min(r, i + rays); i < end; ++i) {
       resample_ray(weights + i * s, edges + i * (s + 1), uniforms == nullptr ? nullptr : uniforms + i * count,
                    depths + i * count, s, count);
     }
-  }
+  });
 }
 
 }  // namespace voronerf

@@ -1,0 +1,303 @@
+// Every CPU kernel but the networks', over random and edge sizes, for a build with sanitizers:
+//
+//   tests/cpp/sanitize_ops.sh
+//
+// Numbers are compared in Python (tests/); here every array has exactly its size, so that its ends are guarded, outputs
+// start poisoned, every eighth case has NaN and infinity among its inputs, and one and three threads must agree bit for
+// bit.
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <limits>
+#include <random>
+#include <string>
+#include <vector>
+
+#include "cell_sort.h"
+#include "centre_grid.h"
+#include "composite.h"
+#include "encode.h"
+#include "locate_cell.h"
+#include "nearest_centre.h"
+#include "resample.h"
+
+namespace {
+
+using voronerf::Isa;
+template <typename T>
+using Array = std::vector<T>;
+
+std::mt19937 generator(0);
+bool wild = false;  // NaN and infinity among the inputs
+
+int64_t below(int64_t n) {
+  return static_cast<int64_t>(generator() % static_cast<uint32_t>(n));
+}
+
+template <typename T>
+Array<T> uniform(int64_t size) {
+  Array<T> values(size);
+  for (T& value : values) {
+    value = static_cast<T>(generator()) / static_cast<T>(4294967296.0) * 2 - 1;
+    if (wild && below(9) == 0) {
+      const T odd[] = {std::numeric_limits<T>::quiet_NaN(), std::numeric_limits<T>::infinity(),
+                       -std::numeric_limits<T>::infinity(), std::numeric_limits<T>::max(),
+                       std::numeric_limits<T>::denorm_min()};
+      value = odd[below(5)];
+    }
+  }
+  return values;
+}
+
+// Points on a coarse lattice too, so that there are ties.
+template <typename T>
+Array<T> lattice(int64_t size) {
+  Array<T> values(size);
+  for (T& value : values) value = static_cast<T>(below(7) - 3) / 2;
+  return values;
+}
+
+Array<float> poisoned(int64_t size) {
+  return Array<float>(size, std::nanf(""));
+}
+
+void fail(const std::string& what) {
+  std::fprintf(stderr, "%s\n", what.c_str());
+  std::exit(1);
+}
+
+template <typename T>
+void same(const Array<T>& a, const Array<T>& b, const char* what) {
+  if (a.size() != b.size() || (!a.empty() && std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) != 0)) {
+    fail(std::string(what) + ": results depend on the number of threads");
+  }
+}
+
+void within(const Array<int32_t>& cells, int64_t k, const char* what) {
+  for (const int32_t cell : cells) {
+    if (cell < 0 || cell >= k) fail(std::string(what) + ": cell " + std::to_string(cell) + " of " + std::to_string(k));
+  }
+}
+
+int64_t some_rows() {
+  const int64_t sizes[] = {0, 1, below(20), 15 + below(4), 2047 + below(4), below(9000)};
+  return sizes[below(6)];
+}
+
+template <typename T>
+const T* or_null(const Array<T>& array) {
+  return array.empty() ? nullptr : array.data();
+}
+
+template <typename T>
+void search(Isa isa) {
+  const int64_t counts[] = {1, 2, 16, 17, 255, 256, 257, 300 + below(300)};
+  const int64_t n = some_rows(), k = counts[below(8)];
+  const Array<T> points = below(2) == 0 ? uniform<T>(3 * n) : lattice<T>(3 * n);
+  const bool was_wild = wild;
+  wild = false;  // centres and weights are finite
+  const Array<T> centres = below(2) == 0 ? uniform<T>(3 * k) : lattice<T>(3 * k);
+  const Array<T> weights = below(2) == 0 ? Array<T>() : uniform<T>(k);
+  wild = was_wild;
+  Array<int32_t> found(n, -7), again(n, -7), by_grid(n, -7);
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), or_null(weights), found.data(), n, k, isa, 1);
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), or_null(weights), again.data(), n, k, isa, 3);
+  same(found, again, "nearest_centre");
+  within(found, k, "nearest_centre");
+
+  const Array<double> exact(centres.begin(), centres.end()), power(weights.begin(), weights.end());
+  const auto tables = voronerf::centre_grid_build(exact.data(), or_null(power), k, isa, 1);
+  const auto others = voronerf::centre_grid_build(exact.data(), or_null(power), k, isa, 3);
+  same(tables->entries, others->entries, "centre_grid");
+  same(tables->lists, others->lists, "centre_grid");
+  Array<float> table;
+  for (int64_t i = 0; i < k; ++i) {
+    for (int a = 0; a < 3; ++a) table.push_back(static_cast<float>(centres[3 * i + a]));
+    table.push_back(weights.empty() ? 0.0f : static_cast<float>(weights[i]));
+  }
+  const voronerf::CentreGrid grid{tables->frame, tables->entries.data(), tables->lists.data(), table.data(),
+                                  tables->bits};
+  for (const int threads : {1, 3}) {
+    voronerf::nearest_centre_grid_cpu(points.data(), centres.data(), or_null(weights), grid, by_grid.data(), n, k, isa,
+                                      threads);
+    if (by_grid != found) fail("nearest_centre_grid: not what all centres give");
+  }
+}
+
+template <typename T>
+void locate(Isa isa) {
+  // A root whose every other centre is refined, by diagrams of different sizes.
+  const int64_t n = some_rows(), root = 1 + below(20);
+  Array<int32_t> offsets = {0, static_cast<int32_t>(root)}, child(root);
+  int32_t leaves = 0;
+  for (int64_t i = 0; i < root; ++i) {
+    if (i % 2 == 0) {
+      child[i] = -1 - leaves++;
+      continue;
+    }
+    child[i] = static_cast<int32_t>(offsets.size() - 1);
+    const int32_t size = static_cast<int32_t>(1 + below(17));
+    for (int32_t j = 0; j < size; ++j) child.push_back(-1 - leaves++);
+    offsets.push_back(offsets.back() + size);
+  }
+  const int64_t m = offsets.back();
+  const Array<T> points = uniform<T>(3 * n), centres = lattice<T>(3 * m);
+  const Array<T> weights = below(2) == 0 ? Array<T>() : lattice<T>(m);
+  if (voronerf::locate_cell_fault(offsets.data(), child.data(), static_cast<int64_t>(offsets.size()) - 1, m)) {
+    fail("locate_cell: a sound tree refused");
+  }
+  Array<int32_t> results[2];
+  for (int i = 0; i < 2; ++i) {
+    const int threads = 1 + 2 * i;
+    results[i].assign(n, -7);
+    Array<int32_t> workspace(voronerf::locate_cell_workspace(m, threads));
+    if (!voronerf::locate_cell_cpu(points.data(), centres.data(), or_null(weights), offsets.data(), child.data(),
+                                   results[i].data(), workspace.data(), n, m, 2, isa, threads)) {
+      fail("locate_cell: did not arrive");
+    }
+  }
+  same(results[0], results[1], "locate_cell");
+  within(results[0], leaves, "locate_cell");
+}
+
+void sort() {
+  const int64_t counts[] = {1, 2, 255, 256, 5000};
+  const int64_t n = below(3) == 0 ? 70000 + below(9) : some_rows(), k = counts[below(5)];
+  Array<int32_t> cells(n);
+  for (int32_t& cell : cells) cell = static_cast<int32_t>(below(2) == 0 ? k - 1 : below(k));
+  const bool broken = n > 0 && below(4) == 0;
+  if (broken) cells[below(n)] = below(2) == 0 ? -1 : static_cast<int32_t>(k);
+  Array<int32_t> order[2], offsets[2];
+  for (int i = 0; i < 2; ++i) {
+    order[i].assign(n, -7);
+    offsets[i].assign(k + 1, -7);
+    Array<int32_t> workspace(voronerf::cell_sort_workspace(n, k));
+    const bool valid = voronerf::cell_sort_cpu(cells.data(), order[i].data(), offsets[i].data(), workspace.data(), n, k,
+                                               1 + 2 * i);
+    if (valid == broken) fail("cell_sort: cells out of range not told from those in range");
+  }
+  if (broken) return;
+  same(order[0], order[1], "cell_sort");
+  same(offsets[0], offsets[1], "cell_sort");
+  for (int64_t i = 1; i < n; ++i) {
+    const int32_t a = order[0][i - 1], b = order[0][i];
+    if (cells[a] > cells[b] || (cells[a] == cells[b] && a >= b)) fail("cell_sort: not in order");
+  }
+}
+
+void composite(Isa isa) {
+  const int64_t r = below(100), s = below(40), c = 1 + below(5);
+  const bool packed = below(2) == 0, background = below(2) == 0, per_ray = below(2) == 0;
+  Array<int32_t> offsets;
+  int64_t m = r * s;
+  if (packed) {
+    m = below(3);
+    for (int64_t i = 0; i <= r; ++i) {
+      offsets.push_back(static_cast<int32_t>(m));
+      if (i < r) m += below(3) == 0 ? 0 : below(70);
+    }
+    m += below(3);  // samples of no ray
+  }
+  const Array<float> sigma = uniform<float>(m), rgb = uniform<float>(m * c), depths = uniform<float>(m);
+  const Array<float> deltas = uniform<float>(m), behind = uniform<float>(background ? (per_ray ? r * c : c) : 0);
+  const voronerf::CompositeInputs in{sigma.data(),  rgb.data(), depths.data(), deltas.data(), or_null(offsets),
+                                     background ? behind.data() : nullptr, per_ray, r, s, m, c};
+  const Array<float> to_colour = uniform<float>(r * c), to_opacity = uniform<float>(r), to_depth = uniform<float>(r);
+  const Array<float> to_weights = uniform<float>(m);
+  const int64_t asked = below(16);
+  Array<float> results[2][10];
+  for (int i = 0; i < 2; ++i) {
+    Array<float>* out = results[i];
+    const int64_t sizes[] = {r * c, r, r, m, m, m * c, m, m, static_cast<int64_t>(behind.size()), r};
+    for (int j = 0; j < 10; ++j) out[j] = poisoned(sizes[j]);
+    voronerf::composite_cpu(in, {out[0].data(), out[1].data(), out[2].data(), out[3].data()}, isa, 1 + 2 * i);
+    const voronerf::CompositeGradients gradients{asked & 1 ? to_colour.data() : nullptr,
+                                                 asked & 2 ? to_opacity.data() : nullptr,
+                                                 asked & 4 ? to_depth.data() : nullptr,
+                                                 asked & 8 ? to_weights.data() : nullptr,
+                                                 out[4].data(),
+                                                 out[5].data(),
+                                                 out[6].data(),
+                                                 asked & 1 ? out[7].data() : nullptr,
+                                                 background ? out[8].data() : nullptr,
+                                                 out[9].data()};
+    voronerf::composite_backward_cpu(in, gradients, isa, 1 + 2 * i);
+  }
+  for (int j = 0; j < 9; ++j) {
+    same(results[0][j], results[1][j], "composite");
+    if (wild || (j == 7 && (asked & 1) == 0)) continue;
+    for (const float value : results[0][j]) {
+      if (!std::isfinite(value)) fail("composite: result " + std::to_string(j) + " is not finite");
+    }
+  }
+}
+
+void encode(Isa isa) {
+  const bool integrated = below(3) == 0, include = !integrated && below(2) == 0;
+  const int64_t n = below(3) == 0 ? below(3) : below(200), d = integrated ? 3 : below(9), octaves = below(12);
+  const int64_t width = d * (2 * octaves + (include ? 1 : 0));
+  const Array<float> x = uniform<float>(n * d);
+  Array<float> variances = uniform<float>(integrated ? n * d : 0);
+  for (float& variance : variances) variance = std::fabs(variance);
+  const Array<float> gradient = uniform<float>(n * width);
+  const voronerf::Encoding in{x.data(), integrated ? variances.data() : nullptr, n, d, octaves, include, width};
+  Array<float> results[2][3];
+  for (int i = 0; i < 2; ++i) {
+    const int threads = 1 + 2 * i;
+    results[i][0] = poisoned(n * width);
+    results[i][1] = poisoned(n * d);
+    results[i][2] = poisoned(variances.size());
+    Array<float> workspace = poisoned(voronerf::encode_workspace(d, octaves, threads));
+    voronerf::encode_cpu(in, results[i][0].data(), workspace.data(), isa, threads);
+    workspace = poisoned(voronerf::encode_workspace(d, octaves, threads));
+    voronerf::encode_backward_cpu(in, gradient.data(), results[i][1].data(),
+                                  integrated ? results[i][2].data() : nullptr, workspace.data(), isa, threads);
+  }
+  for (int j = 0; j < 3; ++j) {
+    same(results[0][j], results[1][j], "encode");
+    for (const float value : results[0][j]) {
+      if (!wild && !std::isfinite(value)) {
+        fail("encode: result " + std::to_string(j) + " is not finite for d = " + std::to_string(d) + ", octaves = " +
+             std::to_string(octaves) + (include ? ", input included" : ""));
+      }
+    }
+  }
+}
+
+void resample() {
+  const int64_t r = below(4) == 0 ? 300 : below(9), s = 1 + below(70), count = 1 + below(70);
+  const Array<float> weights = uniform<float>(r * s), uniforms = uniform<float>(below(2) * r * count);
+  Array<float> edges = uniform<float>(r * (s + 1));
+  Array<float> depths[2];
+  for (int i = 0; i < 2; ++i) {
+    depths[i] = poisoned(r * count);
+    voronerf::resample_cpu(weights.data(), edges.data(), or_null(uniforms), depths[i].data(), r, s, count, 1 + 2 * i);
+  }
+  same(depths[0], depths[1], "resample");
+  for (const float depth : depths[0]) {
+    if (!wild && !std::isfinite(depth)) fail("resample: a depth is not finite");
+  }
+}
+
+}  // namespace
+
+int main(int count, char** arguments) {
+  const int cases = count > 1 ? std::atoi(arguments[1]) : 60;
+  for (int i = 0; i < cases; ++i) {
+    wild = i % 8 == 7;
+    for (const Isa isa : {Isa::portable, Isa::avx2, Isa::avx512}) {
+      if (!voronerf::isa_supported(isa)) continue;
+      search<float>(isa);
+      if (i % 4 == 0) search<double>(isa);
+      locate<float>(isa);
+      if (i % 4 == 0) locate<double>(isa);
+      composite(isa);
+      encode(isa);
+    }
+    sort();
+    resample();
+  }
+  std::printf("%d cases\n", cases);
+  return 0;
+}

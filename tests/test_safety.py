@@ -1,0 +1,164 @@
+"""Kernels under what programs do to them: several Python threads, forked children, thread counts, odd numbers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+import voronerf as v
+
+pytestmark = pytest.mark.native
+
+BAD = (torch.nan, torch.inf, -torch.inf)
+
+
+def network(points: Tensor, weight: Tensor) -> Tensor:
+    offsets = torch.tensor([0, len(points) // 2, len(points)], dtype=torch.int32)
+    return v.grouped_linear(points, offsets, weight)
+
+
+def calls(seed: int) -> list[Callable[[], tuple[Tensor, ...]]]:
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(5000, 3, generator=generator)
+    centres = torch.rand(400, 3, generator=generator)
+    weight = torch.rand(2, 7, 3, generator=generator)
+    grid = v.centre_grid(centres)
+    cells = v.nearest_centre(points, centres)
+    ray = [torch.rand(100, 50, generator=generator) for _ in range(3)]
+    rgb = torch.rand(100, 50, 3, generator=generator)
+    edges = torch.rand(100, 51, generator=generator).sort(dim=1).values
+
+    def gradient() -> tuple[Tensor, ...]:
+        own = weight.clone().requires_grad_()
+        return torch.autograd.grad(network(points, own).square().sum(), own)
+
+    return [
+        lambda: (v.nearest_centre(points, centres),),
+        lambda: (v.nearest_centre(points, centres, grid=grid),),
+        lambda: tuple(v.centre_grid(centres).tables[1:3]),
+        lambda: v.cell_sort(cells, 400),
+        lambda: (network(points, weight),),
+        gradient,
+        lambda: (v.frequency_encode(points, 6),),
+        lambda: tuple(v.composite(ray[0], rgb, ray[1], ray[2])),
+        lambda: (v.resample(ray[0], edges, 30),),
+    ]
+
+
+def test_calls_from_several_python_threads_at_once() -> None:
+    everything = [calls(seed) for seed in range(4)]
+    expected = [[call() for call in own] for own in everything]
+    wrong: list[object] = []
+
+    def work(which: int) -> None:
+        try:
+            torch.set_num_threads(1 + which % 2)
+            for _ in range(5):
+                for i, call in enumerate(everything[which]):
+                    if not all(torch.equal(a, b) for a, b in zip(call(), expected[which][i], strict=True)):
+                        wrong.append((which, i))
+        except Exception as error:  # a thread's exception would be lost
+            wrong.append(error)
+
+    before = torch.get_num_threads()
+    threads = [threading.Thread(target=work, args=(which,)) for which in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    torch.set_num_threads(before)
+    assert not wrong
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks")
+def test_a_forked_child_runs_on_one_thread() -> None:
+    """After the parent has used a team; with more than one thread the child would wait for it, as torch's own do."""
+    code = """
+import os, torch, voronerf
+torch.set_num_threads(2)
+points, centres = torch.rand(20000, 3), torch.rand(16, 3)
+expected = voronerf.nearest_centre(points, centres)
+child = os.fork()
+if child == 0:
+    torch.set_num_threads(1)
+    cells = voronerf.nearest_centre(points, centres)
+    order, offsets = voronerf.cell_sort(cells, 16)
+    out = voronerf.grouped_linear(points[order.long()], offsets, torch.rand(16, 8, 3))
+    os._exit(0 if torch.equal(cells, expected) and out.isfinite().all() else 1)
+raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, result.stderr
+
+
+def test_set_num_threads_is_honoured() -> None:
+    """A team of the asked size and no larger: threads of the process before and after."""
+    code = """
+import os, torch, voronerf
+torch.set_num_threads(1)
+points, centres = torch.rand(50000, 3), torch.rand(16, 3)
+before = len(os.listdir("/proc/self/task"))
+voronerf.nearest_centre(points, centres)
+voronerf.cell_sort(voronerf.nearest_centre(points, centres), 16)
+assert len(os.listdir("/proc/self/task")) == before
+torch.set_num_threads(3)
+voronerf.nearest_centre(points, centres)
+assert len(os.listdir("/proc/self/task")) == before + 2
+"""
+    if sys.platform != "linux":
+        pytest.skip("counts threads in /proc")
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, result.stderr
+
+
+def agree(native: Tensor, reference: Tensor) -> None:
+    """NaN where the reference has NaN, the same infinities, close elsewhere."""
+    torch.testing.assert_close(native, reference, equal_nan=True, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_odd_numbers_propagate_as_in_the_reference(bad: float) -> None:
+    points = torch.rand(70, 3)
+    points[::9, 1] = bad
+    centres, weight = torch.rand(5, 3), torch.rand(5, 6, 3) - 0.5
+    cells = v.nearest_centre(points, centres)
+    assert torch.equal(cells, v.nearest_centre(points, centres, backend="reference"))
+    assert cells[::9].eq(0).all()
+    order, offsets = v.cell_sort(cells, 5)
+    rows = points[order.long()]
+    for broken in (weight, weight.masked_fill(torch.rand(weight.shape) < 0.05, bad)):
+        both = [v.grouped_linear(rows, offsets, broken, backend=backend) for backend in ("native", "reference")]
+        agree(*both)
+    for octaves in (0, 4):
+        agree(*[v.frequency_encode(points, octaves, backend=backend) for backend in ("native", "reference")])
+    variances = torch.rand(70, 3)
+    variances[::7, 2] = bad
+    finite = torch.rand(70, 3)
+    agree(*[v.integrated_encode(finite, variances.abs(), 4, backend=backend) for backend in ("native", "reference")])
+
+
+# A density is at least 0: minus infinity is outside of the contract.
+@pytest.mark.parametrize(
+    ("where", "bad"),
+    [(where, bad) for where in ("sigma", "rgb", "depths") for bad in BAD[: 2 if where == "sigma" else 3]],
+)
+def test_odd_numbers_along_rays(where: str, bad: float) -> None:
+    values = {"sigma": torch.rand(8, 20), "rgb": torch.rand(8, 20, 3), "depths": torch.rand(8, 20)}
+    values[where][3, 7] = bad
+    deltas = torch.rand(8, 20)
+    both = [
+        v.composite(values["sigma"], values["rgb"], values["depths"], deltas, backend=backend)
+        for backend in ("native", "reference")
+    ]
+    for native, reference in zip(*both):
+        agree(native, reference)
+        assert native[[0, 1, 2, 4, 5, 6, 7]].isfinite().all()
+    weights, edges = torch.rand(8, 20), torch.rand(8, 21).sort(dim=1).values
+    weights[3, 7] = bad
+    agree(*[v.resample(weights, edges, 9, backend=backend) for backend in ("native", "reference")])
