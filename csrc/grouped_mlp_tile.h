@@ -22,7 +22,19 @@ VN_INLINE void copy_row(const float* from, int64_t width, float* to) {
   }
   int64_t c = 0;
   for (; c + kLanes <= width; c += kLanes) store(to + c, load(from + c));
+  if (c < width && width >= kLanes) {
+    store(to + width - kLanes, load(from + width - kLanes));
+    return;
+  }
   for (; c < width; ++c) to[c] = from[c];
+}
+
+// Wide rows that are gathered follow no pattern that the processor foresees: they are asked for this many rows ahead
+// (63 features: 1.24 times the time of sorted rows without, 1.04 with it and whole vectors).
+constexpr int64_t kAhead = 8;
+
+VN_INLINE void prefetch(const float* row, int64_t width) {
+  for (int64_t c = 0; c < width; c += 16) __builtin_prefetch(row + c);
 }
 
 // How an input is encoded; one that is not has no octaves.
@@ -106,9 +118,13 @@ struct Tile {
     if (index == nullptr && data.order == nullptr && stride == input.raw) {
       __builtin_memcpy(staged, raw + begin * input.raw, sizeof(float) * rows * input.raw);
     } else {
+      const bool scattered = data.order != nullptr && index == nullptr && input.raw >= kGranule;
       for (int64_t row = 0; row < rows; ++row) {
         const int64_t from = index == nullptr ? place(row) : index[place(row)];
-        for (int64_t f = 0; f < input.raw; ++f) staged[row * stride + f] = raw[from * input.raw + f];
+        if (scattered && row + kAhead < rows) {
+          prefetch(raw + place(row + kAhead) * input.raw, input.raw);
+        }
+        copy_row(raw + from * input.raw, input.raw, staged + row * stride);
       }
     }
 #if VN_HALF

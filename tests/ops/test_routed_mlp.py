@@ -303,7 +303,7 @@ def test_cells_outside_are_refused(backend: str) -> None:
     case = Case.make("nerf", "cells")
     for value in (-1, 6):
         case.options["cells"][5] = value
-        with pytest.raises(ValueError, match=r"cells must lie in 0 to 5, got values from"):
+        with pytest.raises(ValueError, match=r"^routed_mlp: cells must lie in 0 to 5, got values from"):
             case.run(case.leaves, backend=backend)
 
 

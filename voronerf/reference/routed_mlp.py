@@ -70,6 +70,10 @@ def routed_mlp(
             cells = operations.nearest_centre(coords, centres, weights=centre_weights)
         else:
             cells = operations.locate_cell(coords, centres, child_offsets, child, depth=depth, weights=centre_weights)
+    if cells.device.type == "cpu" and n > 0 and not torch.compiler.is_compiling():
+        low, high = (int(bound) for bound in cells.aminmax())
+        if low < 0 or high >= k:
+            raise ValueError(f"routed_mlp: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
     order, offsets = operations.cell_sort(cells, k)
     if direction_index is not None:
         direction_index = direction_index[order]
