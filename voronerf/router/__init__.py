@@ -1,5 +1,6 @@
 """VoronoiRouter: any module as one network per Voronoi cell."""
 
-from voronerf.router.router import LayeredField, VoronoiRouter
+from voronerf.router.layered import LayeredField
+from voronerf.router.router import VoronoiRouter
 
 __all__ = ["LayeredField", "VoronoiRouter"]

@@ -32,11 +32,13 @@ class Layout:
         lead: leading dimensions of a tensor with an entry for each sample.
         per_ray: names of the arguments with an entry for each ray, or None to tell by shapes.
         shared: names of the arguments that are the same for all samples.
+        flat: for each tensor of a result, whether it is to stay [n, ...].
     """
 
     lead: tuple[int, ...]
     per_ray: frozenset[str] | None
     shared: frozenset[str]
+    flat: tuple[bool, ...] = ()
 
     @property
     def n(self) -> int:
@@ -102,9 +104,9 @@ class Layout:
         ones = max(len(self.lead) - (2 if kind == RAY else 1), 0)
         return rows.reshape(rows.shape[0], *[1] * ones, *rows.shape[1:]) if ones else rows
 
-    def restore(self, rows: Tensor) -> Tensor:
-        """A result [n, 1, ...] in the original order, with its leading dimensions as they came."""
-        if len(self.lead) == 1:
+    def restore(self, rows: Tensor, number: int) -> Tensor:
+        """Tensor ``number`` of a result, [n, 1, ...] in the original order, with the leading dimensions of the call."""
+        if len(self.lead) == 1 or (number < len(self.flat) and self.flat[number]):
             return rows
         ones = len(self.lead) - 1
         extra = rows.shape[1:]

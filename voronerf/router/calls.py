@@ -5,9 +5,10 @@ n samples in leading dimensions such as (rays, samples of a ray).
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import contextlib
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -15,113 +16,19 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.router.arguments import Layout, Reordering, argument_names, map_result
+from voronerf.router.checkpointing import rerun_in
 from voronerf.router.fusion import Plan, Unrecognised, agree
 from voronerf.router.grouping import Grouping, PerCell
 from voronerf.router.loop import run_cells
+from voronerf.router.memory import Memory
 from voronerf.router.parameters import as_per_cell, in_place_of_parameters
+from voronerf.router.rays import flattens
 from voronerf.router.recording import Program, Recorder
-from voronerf.router.rows import RowMode, Trials, Ungroupable
+from voronerf.router.rows import RowMode, Ungroupable
 from voronerf.router.snapshot import Snapshot
 
 _OP = "VoronoiRouter"
 _STATES = 16  # of a module that calls of one kind are recorded in, before its state counts as one that never recurs
-
-
-class Assignments:
-    """The last assignment, for other methods that are called with the same positions."""
-
-    def __init__(self) -> None:
-        self._key: tuple[Any, ...] = ()
-        self._source: weakref.ref[Tensor] | None = None
-        self._version = 0
-        self._positions: Tensor | None = None
-        self._methods: set[str] = set()
-        self._grouping: Grouping | None = None
-
-    def find(self, method: str, source: Tensor | None, positions: Tensor, key: tuple[Any, ...]) -> Grouping | None:
-        """The assignment made for the same positions, or None. One that was drawn serves each method once.
-
-        Args:
-            method: that is called.
-            source: the tensor that holds the positions, or None where they have been computed.
-            positions: [..., 3].
-            key: what else the assignment depends on.
-        """
-        if self._grouping is None or key != self._key or positions.numel() == 0:
-            return None
-        if source is not None:
-            known = self._source is not None and self._source() is source and source._version == self._version
-        else:
-            known = (
-                self._positions is not None
-                and self._positions.shape == positions.shape
-                and self._positions.device == positions.device
-                and torch.equal(self._positions, positions)
-            )
-        drawn = key[2]
-        if not known or (drawn and method in self._methods):
-            return None
-        self._methods.add(method)
-        return self._grouping
-
-    def keep(
-        self, method: str, source: Tensor | None, positions: Tensor, key: tuple[Any, ...], grouping: Grouping
-    ) -> None:
-        """Remembers an assignment."""
-        if source is not None and source.is_inference():  # has no version that would tell of changes
-            self._grouping = None
-            return
-        self._key, self._methods, self._grouping = key, {method}, grouping
-        self._source = None if source is None else weakref.ref(source)
-        self._version = 0 if source is None else source._version
-        self._positions = positions.detach().clone() if source is None else None
-
-
-class Memory(Trials):
-    """What a router remembers between calls. Copies of a router begin anew.
-
-    Attributes:
-        assignments: the last one.
-        by_cell: why calls of a kind have to run cell by cell, once that is known.
-        separate: the kinds of calls that have been found to treat samples one by one.
-        plans: for calls in a state of the module, how the fused network runs them; a recording until it is confirmed
-            by a second call; or why there is none.
-        recorded: how many states calls of a kind have been recorded in.
-        snapshot: reads the state of the module.
-        names: of the positional arguments of methods.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.forget()
-
-    def forget(self) -> None:
-        """Begins anew, after a change of diagram, dtype or device."""
-        self.assignments = Assignments()
-        self.by_cell: dict[Any, str] = {}
-        self.separate: set[Any] = set()
-        self.plans: dict[Any, Plan | Program | str] = {}
-        self.recorded: dict[Any, int] = {}
-        self.snapshot: Snapshot | None = None
-        self.names: dict[tuple[str, int], list[str]] = {}
-        self._rows_at_once = 0
-
-    def rows_at_once(self, module: nn.Module) -> int:
-        """Rows that a module runs on at once on a CPU.
-
-        An activation is then at most 16 MiB for the widest layer: the C library gives larger memory back to the
-        system after each use, and fetching it again costs more than the products.
-        """
-        if not self._rows_at_once:
-            widest = max((part.out_features for part in module.modules() if isinstance(part, nn.Linear)), default=64)
-            self._rows_at_once = min(max(2**22 // widest, 2**12), 2**16)
-        return self._rows_at_once
-
-    def __deepcopy__(self, memo: Any) -> Memory:
-        return Memory()
-
-    def __reduce__(self) -> tuple[type[Memory], tuple[()]]:
-        return Memory, ()
 
 
 class Call:
@@ -266,6 +173,10 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
     kind = call.kind(layout, module.training)
     if kind in memory.by_cell:
         return _run_by_cell(module, call, layout, grouping, memory, kind)
+    if len(layout.lead) > 1 and layout.lead[-1] > 1 and layout.n and kind not in memory.flat:
+        memory.flat[kind] = tuple(flattens(module, call, layout) or ())
+    if memory.flat.get(kind):
+        layout = replace(layout, flat=memory.flat[kind])
     state = None
     if layout.n >= 2 and memory.recorded.get(kind, 0) < _STATES:
         state = call.state(memory, module, kind, grouping.device)
@@ -326,7 +237,12 @@ def _run_plan(plan: Plan, call: Call, layout: Layout, grouping: Grouping) -> Any
     result = plan.run(inputs, grouping)
     if len(layout.lead) == 1:
         return result
-    return map_result(result, lambda rows: layout.restore(rows) if rows.shape[0] == layout.n else rows)
+    number = itertools.count()
+
+    def restore(rows: Tensor) -> Tensor:
+        return layout.restore(rows, next(number)) if rows.shape[0] == layout.n else rows
+
+    return map_result(result, restore)
 
 
 def _run_at_once(
@@ -340,8 +256,11 @@ def _run_at_once(
         rows = [[tensor] for tensor in results[0].rows]
     else:
         rows = [list(pieces) for pieces in zip(*[result.rows for result in results], strict=True)]
+    number = itertools.count()
     whole = iter([pieces[0] if len(pieces) == 1 else torch.cat(pieces) for pieces in rows])
-    return map_result(results[0].value, lambda slot: _in_original_order(next(whole), layout, grouping), leaf=_Slot)
+    return map_result(
+        results[0].value, lambda slot: _in_original_order(next(whole), next(number), layout, grouping), leaf=_Slot
+    )
 
 
 class _Slot:
@@ -367,7 +286,14 @@ def _run_part(
             recorder.input(tensor)
 
     args, kwargs = call.arranged(Reordering(layout, part, mark))
-    with in_place_of_parameters(module, as_per_cell(module)), mode:
+    stand_ins = as_per_cell(module)
+
+    @contextlib.contextmanager
+    def again() -> Iterator[Callable[[Tensor], Any]]:
+        with in_place_of_parameters(module, stand_ins), RowMode(part, memory) as second:
+            yield second.mark
+
+    with in_place_of_parameters(module, stand_ins), rerun_in(again, mode.is_rows), mode:
         result = call.function(*args, **kwargs)
     if mode.failed:
         raise Ungroupable(mode.failed)
@@ -400,13 +326,14 @@ def _run_by_cell(module: nn.Module, call: Call, layout: Layout, grouping: Groupi
     )
     if checked:
         memory.separate.add(kind)
-    return map_result(result, lambda tensor: _in_original_order(tensor, layout, grouping))
+    number = itertools.count()
+    return map_result(result, lambda tensor: _in_original_order(tensor, next(number), layout, grouping))
 
 
-def _in_original_order(rows: Tensor, layout: Layout, grouping: Grouping) -> Tensor:
+def _in_original_order(rows: Tensor, number: int, layout: Layout, grouping: Grouping) -> Tensor:
     """A result's rows [n * m, ...] as the caller's leading dimensions say."""
     m = rows.shape[0] // grouping.n
     if m > 1:
         rows = rows.reshape(grouping.n, m, *rows.shape[1:])
     rows = grouping.unsort(rows)[: layout.n]
-    return rows.reshape(layout.n * m, *rows.shape[2:]) if m > 1 else layout.restore(rows)
+    return rows.reshape(layout.n * m, *rows.shape[2:]) if m > 1 else layout.restore(rows, number)

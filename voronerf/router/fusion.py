@@ -13,7 +13,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -23,52 +22,14 @@ from torch import Tensor
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
 from voronerf.router.arguments import map_result, tensors_of
-from voronerf.router.functions import MOVES
+from voronerf.router.columns import Columns, Segment, join_segments, move_columns, refs_in
 from voronerf.router.grouping import Grouping
 from voronerf.router.recording import Program, Ref, Slot, Step
 from voronerf.router.rows import replace, tensors_in
 
-_ROWS = 3
-
 
 class Unrecognised(Exception):
     """A program is not a network that a layer table describes; the message says why."""
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Columns ``start`` to ``stop`` of a value, or of layer ``layer`` before or after its activation."""
-
-    value: int
-    layer: int
-    activated: bool
-    start: int
-    stop: int
-
-    def part(self, start: int, stop: int) -> Segment:
-        """Some of its columns, counted from its own first."""
-        return Segment(self.value, self.layer, self.activated, self.start + start, self.start + stop)
-
-    def follows(self, other: Segment) -> bool:
-        """Whether it goes on where another ends."""
-        return other == Segment(self.value, self.layer, self.activated, other.start, self.start)
-
-
-Columns = tuple[Segment, ...]
-
-
-def _merged(segments: Sequence[Segment]) -> Columns:
-    merged: list[Segment] = []
-    for segment in segments:
-        if merged and segment.follows(merged[-1]):
-            last = merged.pop()
-            segment = Segment(last.value, last.layer, last.activated, last.start, segment.stop)
-        merged.append(segment)
-    return tuple(merged)
-
-
-def _width(columns: Columns) -> int:
-    return sum(segment.stop - segment.start for segment in columns)
 
 
 def activation_of(step: Step) -> str | None:
@@ -122,7 +83,7 @@ class Plan:
         return (Segment(value, -1, False, 0, math.prod(self.program.sizes[value])),)
 
     def _place(self, step: Step, late: set[int]) -> None:
-        sources = [ref.value for ref in _refs((step.args, step.kwargs))]
+        sources = [ref.value for ref in refs_in((step.args, step.kwargs))]
         if step.layer is not None:
             (source,) = sources
             if source in late:
@@ -143,7 +104,7 @@ class Plan:
             name = activation_of(step)
             if name is not None and self._activate(step, sources, name):
                 return
-            moved = None if step.inplace else _moved(step, self.program, self._columns)
+            moved = None if step.inplace else move_columns(step, self.program, self._columns)
             if moved is not None:
                 self._columns.update(zip(step.values, moved, strict=True))
                 return
@@ -171,7 +132,7 @@ class Plan:
 
     def _make_table(self) -> None:
         program = self.program
-        behind = [ref.value for step in self._behind for ref in _refs((step.args, step.kwargs))]
+        behind = [ref.value for step in self._behind for ref in refs_in((step.args, step.kwargs))]
         results = [ref.value for ref in _refs_of_result(program.result)]
         self._needed = [v for v in dict.fromkeys(results + behind) if v in self._columns]
         self._needed = [v for v in self._needed if _from_layers(self._columns[v])]
@@ -190,7 +151,7 @@ class Plan:
                     run.append(segment)
                     continue
                 if run:
-                    block = _merged(run)
+                    block = join_segments(run)
                     if block not in blocks:
                         blocks.append(block)
                     inputs.append(self._source(blocks, block))
@@ -321,12 +282,6 @@ def _from_layers(columns: Columns) -> bool:
     return any(segment.layer >= 0 for segment in columns)
 
 
-def _refs(value: Any) -> list[Ref]:
-    found: list[Ref] = []
-    replace(value, lambda item: found.append(item) if isinstance(item, Ref) else None)
-    return found
-
-
 def _refs_of_result(value: Any) -> list[Ref]:
     if isinstance(value, Ref):
         return [value]
@@ -349,42 +304,6 @@ def _do(step: Step, values: dict[int, Tensor]) -> None:
     result = step.function(*given[0], **given[1])
     found = [given[0][0]] if step.inplace else list(tensors_in(result))
     values.update(zip(step.values, found, strict=True))
-
-
-def _moved(step: Step, program: Program, columns: dict[int, Columns]) -> list[Columns] | None:
-    """The columns of the results of a function that only moves columns; None for any other.
-
-    Found by running it on rows of numbers that name columns.
-    """
-    if step.function not in MOVES:
-        return None
-    names: list[Segment] = []
-    coded: dict[int, Tensor] = {}
-    for ref in _refs((step.args, step.kwargs)):
-        if ref.value not in coded:
-            singles = [s.part(i, i + 1) for s in columns[ref.value] for i in range(s.stop - s.start)]
-            codes = torch.arange(len(names), len(names) + len(singles), dtype=torch.float64)
-            names += singles
-            m, *sizes = program.sizes[ref.value]
-            rows = codes + 1e6 * torch.arange(_ROWS, dtype=torch.float64)[:, None]
-            coded[ref.value] = rows.reshape(_ROWS * m, *sizes)
-    given = replace((step.args, step.kwargs), lambda item: coded[item.value] if isinstance(item, Ref) else item)
-    try:
-        results = list(tensors_in(step.function(*given[0], **given[1])))
-    except Exception:
-        return None
-    if len(results) != len(step.values):
-        return None
-    found = []
-    for result, value in zip(results, step.values, strict=True):
-        m, *sizes = program.sizes[value]
-        if tuple(result.shape) != (_ROWS * m, *sizes) or result.dtype != torch.float64:
-            return None
-        rows = result.reshape(_ROWS, -1)
-        if not torch.equal(rows, rows[:1] + 1e6 * torch.arange(_ROWS, dtype=torch.float64)[:, None]):
-            return None
-        found.append(_merged([names[int(code)] for code in rows[0].tolist()]))
-    return found
 
 
 def agree(found: Any, expected: Any) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -10,12 +11,13 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.arguments import map_result, narrow, tensors_of
+from voronerf.router.checkpointing import rerun_in
 from voronerf.router.functions import RANDOM
 from voronerf.router.grouping import Grouping
 from voronerf.router.parameters import in_place_of_parameters, owned_parameters
 
 
-class _NoRandomness(TorchFunctionMode):
+class NoRandomness(TorchFunctionMode):
     """Random numbers are 0 and dropout does nothing, so that two calls can be compared."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -59,7 +61,14 @@ def run_cells(
 
     def on_cell(cell: int, first: int, last: int) -> Any:
         part = narrow((tuple(args), kwargs), rows, first, last)
-        with in_place_of_parameters(module, {key: values[cell] for key, values in pieces.items()}):
+        own = {key: values[cell] for key, values in pieces.items()}
+
+        @contextlib.contextmanager
+        def again() -> Iterator[Callable[[Tensor], Any]]:
+            with in_place_of_parameters(module, own):
+                yield lambda _: None
+
+        with in_place_of_parameters(module, own), rerun_in(again, lambda _: False):
             return call(*part[0], **part[1])
 
     occupied = grouping.occupied()
@@ -67,7 +76,7 @@ def run_cells(
     if check:
         cell, first, last = max(occupied, key=lambda bounds: bounds[2] - bounds[1])
         if last - first >= 2:
-            with torch.no_grad(), _NoRandomness():
+            with torch.no_grad(), NoRandomness():
                 _check_rows(module, on_cell, cell, first, last)
             checked = True
     results = [on_cell(*bounds) for bounds in occupied]
@@ -81,16 +90,18 @@ def _check_rows(module: nn.Module, on_cell: Callable[[int, int, int], Any], cell
     pairs = [(a[: middle - first], b) for a, b in zip(whole, tensors_of(on_cell(cell, first, middle)))]
     pairs += [(a[middle - first :], b) for a, b in zip(whole, tensors_of(on_cell(cell, middle, last)))]
     for a, b in pairs:
-        same = a.shape == b.shape and (
-            torch.allclose(a.double(), b.double(), rtol=1e-2, atol=1e-2 * _scale(a), equal_nan=True)
-            if a.is_floating_point()
-            else torch.equal(a, b)
-        )
-        if not same:
+        if a.shape != b.shape or not same(a, b):
             raise TypeError(
                 f"VoronoiRouter: module must treat samples one by one, but {type(module).__name__} gives other results "
                 "for a sample when other samples are left out: it mixes samples (attention or statistics over a batch)"
             )
+
+
+def same(a: Tensor, b: Tensor) -> bool:
+    """Whether two tensors are equal up to what the order of sums may change."""
+    if not a.is_floating_point():
+        return torch.equal(a, b)
+    return torch.allclose(a.double(), b.double(), rtol=1e-2, atol=1e-2 * _scale(a), equal_nan=True)
 
 
 def _scale(values: Tensor) -> float:

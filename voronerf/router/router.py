@@ -8,17 +8,17 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Protocol, cast, runtime_checkable
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.diagram import VoronoiDiagram
-from voronerf.layers import MLP
-from voronerf.ops import routed_mlp
 from voronerf.router.arguments import accepted_names
-from voronerf.router.calls import Call, Memory, run_grouped
+from voronerf.router.calls import Call, run_grouped
 from voronerf.router.grouping import Grouping
+from voronerf.router.layered import LayeredField, evaluate_table
+from voronerf.router.memory import Memory
 from voronerf.router.parameters import (
     check_module,
     check_optimizer,
@@ -38,21 +38,6 @@ Assignment = Literal["nearest", "stochastic"]
 # Centres of a flat diagram beyond which it may look cells up by a grid of its own.
 _MANY = 256
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
-
-
-@runtime_checkable
-class LayeredField(Protocol):
-    """A field that describes itself by a layer table, as :class:`voronerf.fields.NeRF` does."""
-
-    layers: MLP
-
-    def linears(self) -> list[nn.Linear]:
-        """The linear layers in the table's order."""
-        ...
-
-    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Turns the table's outputs [n, out] into what the field returns."""
-        ...
 
 
 class VoronoiRouter(nn.Module):
@@ -215,7 +200,7 @@ class VoronoiRouter(nn.Module):
             TypeError: When the module turns out to mix samples.
         """
         if self._layered:
-            return self._evaluate_table(*args, coords=coords, **kwargs)
+            return evaluate_table(self.field, self._where, self.backend, *args, coords=coords, **kwargs)
         return self._route("forward", args, kwargs, coords)
 
     def __getattr__(self, name: str) -> Any:
@@ -246,59 +231,15 @@ class VoronoiRouter(nn.Module):
         if k > 1 and n < 2:
             # The module runs on two rows, since sizes of 0 and 1 leave open what is a row.
             cells = self.assign(flat).expand(2).clone() if n else torch.zeros(2, dtype=torch.int32, device=flat.device)
-        elif k > 1 and self.assignment == "stochastic":
-            cells = self.assign(flat)
         elif k > 1:
-            cells, tables = functools.partial(self.assign, flat), {"coords": flat, "centres": self.diagram.centres}
-            tables["centre_weights"] = self.diagram.power
-            if self.diagram.depth > 1:
-                tables["child_offsets"], tables["child"] = self.diagram.child_offsets, self.diagram.child
-                tables["depth"] = self.diagram.depth
+            where = self._where(flat, flat)
+            cells = where.get("cells", functools.partial(self.assign, flat))
+            tables = None if "cells" in where else where
         return Grouping(cells, max(n, 2), k, positions.device, self.backend, tables)
 
     def _assignment_key(self) -> tuple[Any, ...]:
         drawn = self.assignment == "stochastic" and self.training
         return (id(self.diagram), self.diagram.centres._version, drawn, self.temperature, self.backend)
-
-    def _evaluate_table(
-        self,
-        positions: Tensor,
-        directions: Tensor | None = None,
-        ray_index: Tensor | None = None,
-        *,
-        coords: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        if positions.ndim != 2 or positions.shape[1] != 3:
-            raise ValueError(f"VoronoiRouter: positions must have shape [n, 3], got {list(positions.shape)}")
-        if coords is not None and coords.shape != positions.shape:
-            raise ValueError(
-                f"VoronoiRouter: coords must have the shape of positions, {list(positions.shape)}, got "
-                f"{list(coords.shape)}"
-            )
-        table = self.field.layers
-        needs_directions = table.uses_directions
-        if needs_directions and directions is None:
-            raise ValueError("VoronoiRouter: directions must be given, since the field's colour depends on them")
-        if not needs_directions:
-            directions = ray_index = None
-        if directions is not None and ray_index is None and directions.shape[0] != positions.shape[0]:
-            raise ValueError(
-                "VoronoiRouter: directions must have a row for each position, or come with ray_index, got "
-                f"{directions.shape[0]} rows for {positions.shape[0]} positions"
-            )
-
-        linears = self.field.linears()
-        raw, _ = routed_mlp(
-            positions,
-            [layer.weight for layer in linears],
-            [layer.bias for layer in linears],
-            layers=table,
-            directions=directions,
-            direction_index=ray_index,
-            backend=self.backend,
-            **self._where(positions, coords),
-        )
-        return self.field.activate(raw)
 
     def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
         """What tells ``routed_mlp`` the cells: the diagram's tables, or the cells themselves.

@@ -1,0 +1,85 @@
+"""Fields that describe themselves by a layer table, as one operation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+from torch import Tensor, nn
+
+from voronerf import ops
+from voronerf.layers import MLP
+
+
+@runtime_checkable
+class LayeredField(Protocol):
+    """A field that describes itself by a layer table, as :class:`voronerf.fields.NeRF` does."""
+
+    layers: MLP
+
+    def linears(self) -> list[nn.Linear]:
+        """The linear layers in the table's order."""
+        ...
+
+    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Turns the table's outputs [n, out] into what the field returns."""
+        ...
+
+
+def evaluate_table(
+    field: LayeredField,
+    where: Callable[[Tensor, Tensor | None], dict[str, Any]],
+    backend: str,
+    positions: Tensor,
+    directions: Tensor | None = None,
+    ray_index: Tensor | None = None,
+    *,
+    coords: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Evaluates a field with a layer table for all cells, its parameters being stacked.
+
+    Args:
+        field: the field.
+        where: gives for positions and coords what tells ``routed_mlp`` the cells.
+        backend: of the operation.
+        positions: [n, 3] in scene units.
+        directions: unit vectors, [n, 3], or [r, 3] together with ``ray_index``.
+        ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
+        coords: [n, 3] or None, positions that decide the cells in the place of ``positions``.
+
+    Returns:
+        What the field's ``activate`` gives: (colour [n, 3], density [n]).
+
+    Raises:
+        ValueError: for shapes that disagree, or directions that the field needs and did not get.
+    """
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"VoronoiRouter: positions must have shape [n, 3], got {list(positions.shape)}")
+    if coords is not None and coords.shape != positions.shape:
+        raise ValueError(
+            f"VoronoiRouter: coords must have the shape of positions, {list(positions.shape)}, got {list(coords.shape)}"
+        )
+    table = field.layers
+    needs_directions = table.uses_directions
+    if needs_directions and directions is None:
+        raise ValueError("VoronoiRouter: directions must be given, since the field's colour depends on them")
+    if not needs_directions:
+        directions = ray_index = None
+    if directions is not None and ray_index is None and directions.shape[0] != positions.shape[0]:
+        raise ValueError(
+            "VoronoiRouter: directions must have a row for each position, or come with ray_index, got "
+            f"{directions.shape[0]} rows for {positions.shape[0]} positions"
+        )
+
+    linears = field.linears()
+    raw, _ = ops.routed_mlp(
+        positions,
+        [layer.weight for layer in linears],
+        [layer.bias for layer in linears],
+        layers=table,
+        directions=directions,
+        direction_index=ray_index,
+        backend=backend,
+        **where(positions, coords),
+    )
+    return field.activate(raw)
