@@ -208,7 +208,8 @@ def move_state(
         Empty, or the name of an optimiser whose state could not be carried over, and begins anew.
     """
     for group in optimizer.param_groups:
-        group["params"] = [replaced.get(parameter, parameter) for parameter in group["params"]]
+        # The list stays the same object: LBFGS, for one, has taken it elsewhere.
+        group["params"][:] = [replaced.get(parameter, parameter) for parameter in group["params"]]
     known = isinstance(optimizer, _ELEMENTWISE_OPTIMIZERS)
     lost = ""
     for old, new in replaced.items():
@@ -228,6 +229,8 @@ def move_state(
     if not known:
         # Some keep what is not a parameter's own, such as the last flattened gradient; nothing of it fits any more.
         optimizer.state.clear()
+        if isinstance(optimizer, torch.optim.LBFGS):
+            optimizer._numel_cache = None  # the number of entries of all parameters together
     return lost
 
 

@@ -1,0 +1,475 @@
+"""VoronoiRouter in a training loop: arguments, methods, optimisers, copies, wrappers, errors."""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import torch
+import torch.distributed
+from router_fields import Heads, Sine, SkipNet, masked_loop, perturb
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from voronerf import VoronoiDiagram
+from voronerf.router import VoronoiRouter
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(11)
+
+
+def uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.rand(shape, generator=generator) * 2 - 1
+
+
+def router_of(module: nn.Module, generator: torch.Generator, k: int = 5, **options: Any) -> VoronoiRouter:
+    options = {"coords": "first3", **options}
+    return perturb(VoronoiRouter(module, uniform(generator, k, 3), **options), generator)
+
+
+# Arguments ------------------------------------------------------------------------------------------------------------
+
+
+def test_where_positions_are(generator: torch.Generator) -> None:
+    x = uniform(generator, 30, 15)
+    first = router_of(SkipNet(), generator)
+    for coords, shift in (("first3", 0), (slice(3, 6), 3), (lambda x: x[:, 6:9], 6)):
+        router = VoronoiRouter(SkipNet(), first.diagram, coords=coords)
+        router.load_state_dict(first.state_dict())
+        cells = router.diagram.locate(x[:, shift : shift + 3])
+        torch.testing.assert_close(router(x), masked_loop(router, cells, [x])[0][0])
+    elsewhere = uniform(generator, 30, 3)
+    expected = masked_loop(first, first.diagram.locate(elsewhere), [x])[0][0]
+    torch.testing.assert_close(first(x, coords=elsewhere), expected)
+
+
+class PerRay(nn.Module):
+    """Takes a view direction, a code and a time for each ray."""
+
+    def __init__(self, code: int = 5) -> None:
+        super().__init__()
+        self.net = nn.Linear(3 + 3 + code + 1, 4)
+
+    def forward(self, x: Tensor, d: Tensor, *, code: Tensor | None = None, time: Tensor | None = None) -> Tensor:
+        parts = [x, d.expand_as(x), code[:, None].expand(*x.shape[:-1], -1)]
+        return self.net(torch.cat([*parts, time[:, None, None].expand(*x.shape[:-1], 1)], -1))
+
+
+def test_per_ray_arguments(generator: torch.Generator) -> None:
+    x, d, code, time = (uniform(generator, *s) for s in ((6, 7, 3), (6, 1, 3), (6, 5), (6,)))
+    router = router_of(PerRay(), generator)
+    found = router(x, d, code=code, time=time)
+    assert found.shape == (6, 7, 4)
+    flat = [x.reshape(42, 1, 3), d.repeat_interleave(7, 0), code.repeat_interleave(7, 0), time.repeat_interleave(7, 0)]
+    cells = router.diagram.locate(flat[0][:, 0])
+    for cell in cells.unique().tolist():
+        rows = cells == cell
+        x_, d_, code_, time_ = (value[rows] for value in flat)
+        part = router.cell(cell)(x_, d_, code=code_, time=time_)[:, 0]
+        torch.testing.assert_close(found.reshape(42, 4)[rows], part)
+
+
+def test_per_ray_has_to_be_said_where_shapes_do_not_tell(generator: torch.Generator) -> None:
+    for rays, samples in ((6, 5), (4, 4)):
+        x, d, code, time = (uniform(generator, *s) for s in ((rays, samples, 3), (rays, 1, 3), (rays, 5), (rays,)))
+        router = router_of(PerRay(), generator)
+        with pytest.raises(ValueError, match=r"per_ray must say what code is.*per_ray=\['code'\]"):
+            router(x, d, code=code, time=time)
+        said = VoronoiRouter(PerRay(), router.diagram, coords="first3", per_ray=["code", "time"])
+        said.load_state_dict(router.state_dict())
+        longer = torch.cat([x, x], 1)
+        expected = router(longer, d, code=code, time=time)[:, :samples]
+        torch.testing.assert_close(said(x, d, code=code, time=time), expected)
+
+
+@dataclass
+class Frustums:
+    origins: Tensor
+    directions: Tensor
+    starts: Tensor
+
+    def positions(self) -> Tensor:
+        return self.origins + self.directions * self.starts
+
+
+@dataclass
+class Samples:
+    frustums: Frustums
+    camera: Tensor
+    name: str = "ray"
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+class TakesSamples(nn.Module):
+    """Takes samples as an object; returns one, with a result that depends on a code for each camera."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.table, self.net = nn.Embedding(4, 2), nn.Linear(8, 3)
+
+    def forward(self, samples: Samples) -> dict[str, Any]:
+        positions = samples.frustums.positions()
+        code = self.table(samples.camera[..., 0])
+        h = self.net(torch.cat([positions, samples.frustums.directions, code], -1))
+        return {"colour": h, "kept": Frustums(positions, h, h[..., :1]), "name": samples.name}
+
+
+def test_objects_that_hold_tensors(generator: torch.Generator) -> None:
+    shape = (4, 6)
+    frustums = Frustums(*(uniform(generator, *shape, d) for d in (3, 3, 1)))
+    camera = torch.randint(4, (*shape, 1), generator=generator)
+    samples = Samples(frustums, camera, metadata={"none": None})
+    router = router_of(TakesSamples(), generator, coords=lambda samples: samples.frustums.positions())
+    for _ in range(3):
+        found = router(samples)
+    flat = Samples(Frustums(*(value.reshape(24, 1, -1) for value in vars(frustums).values())), camera.reshape(24, 1, 1))
+    cells = router.diagram.locate(frustums.positions()).flatten()
+    for cell in cells.unique().tolist():
+        rows = cells == cell
+        part = Samples(Frustums(*(value[rows] for value in vars(flat.frustums).values())), flat.camera[rows])
+        torch.testing.assert_close(found["colour"].reshape(24, 3)[rows], router.cell(cell)(part)["colour"][:, 0])
+    assert found["name"] == "ray"
+    torch.testing.assert_close(found["kept"].origins, frustums.positions())
+
+
+def test_methods_share_an_assignment(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    router = router_of(Heads(), generator, methods=["density"], assignment="stochastic", temperature=0.5)
+    drawn = []
+    sample_cell = VoronoiDiagram.sample_cell
+    monkeypatch.setattr(
+        VoronoiDiagram, "sample_cell", lambda *args, **kwargs: drawn.append(sample_cell(*args, **kwargs)) or drawn[-1]
+    )
+    x, d = uniform(generator, 40, 3), uniform(generator, 40, 3)
+    _, sigma = router(x, d)
+    torch.testing.assert_close(router.density(x)["sigma"], sigma)
+    assert len(drawn) == 1
+    torch.testing.assert_close(sigma, masked_loop(router, drawn[0], [x, d])[0][1])
+    router.density(x)  # a second step with the same batch draws anew
+    x.add_(1)
+    router(x, d)
+    assert len(drawn) == 3
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_few_samples_keep_sizes_and_order(generator: torch.Generator, n: int) -> None:
+    router = router_of(Heads(), generator)
+    x, d = uniform(generator, 20, 3), uniform(generator, 20, 3)
+    whole = router(x, d)
+    part = router(x[:n].requires_grad_(), d[:n])
+    for a, b in zip(part, whole, strict=True):
+        torch.testing.assert_close(a, b[:n])
+    (part[0].sum() + part[1].sum()).backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in router.parameters())
+    assert router(x[:n].reshape(n, 1, 3), d[:n].reshape(n, 1, 3))[0].shape == (n, 1, 3)
+
+
+# Optimisers -----------------------------------------------------------------------------------------------------------
+
+OPTIMIZERS: dict[str, Callable[[Any], torch.optim.Optimizer]] = {
+    "Adam": lambda groups: torch.optim.Adam(groups, lr=1e-3, amsgrad=True),
+    "AdamW": lambda groups: torch.optim.AdamW(groups, lr=1e-3),
+    "RAdam": lambda groups: torch.optim.RAdam(groups, lr=1e-3),
+    "SGD": lambda groups: torch.optim.SGD(groups, lr=1e-3, momentum=0.9),
+    "Adagrad": lambda groups: torch.optim.Adagrad(groups, lr=1e-3),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_children_step_as_their_parent_would(generator: torch.Generator, name: str) -> None:
+    """A split that changes no assignment: both routers go on alike, at rates that the schedule sets."""
+    x = uniform(generator, 200, 3)
+    router = router_of(Sine(), generator, k=2)
+    router.module.b.requires_grad_(False)
+    frozen = router.module.b.weight.detach().clone()
+    trained = [p for p in router.parameters() if p.requires_grad]
+    optimizer = OPTIMIZERS[name]([{"params": trained[:2], "weight_decay": 0.1}, {"params": trained[2:]}])
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.5)
+
+    def step(router: VoronoiRouter, optimizer: torch.optim.Optimizer) -> None:
+        optimizer.zero_grad()
+        router(x).square().mean().backward()
+        optimizer.step()
+
+    for _ in range(3):
+        step(router, optimizer)
+    plain = copy.deepcopy(router)
+    other = OPTIMIZERS[name]([{"params": [p]} for p in plain.parameters() if p.requires_grad])
+    for a, b in zip(trained, (g["params"][0] for g in other.param_groups), strict=True):
+        other.state[b] = copy.deepcopy(optimizer.state[a])
+    # The new centre is far away: its cell has no samples, and the others keep theirs.
+    finer, parents = router.diagram.refine({0: torch.cat([router.diagram.centres[:1], torch.full((1, 3), 90.0)])})
+    router.subdivide(finer, parents, optimizer=optimizer)
+    schedule.step()
+    assert [group["lr"] for group in optimizer.param_groups] == [5e-4, 5e-4]
+    assert optimizer.param_groups[0]["weight_decay"] == 0.1
+    for group, twin in zip(optimizer.param_groups, (0, 2), strict=True):
+        group["lr"], group["weight_decay"] = 1e-3, other.param_groups[twin]["weight_decay"]
+    step(router, optimizer)
+    step(plain, other)
+    for (key, a), b in zip(router.module.named_parameters(), plain.module.parameters(), strict=True):
+        torch.testing.assert_close(a[[0, 2]], b, msg=lambda text, key=key: key + text)
+    assert torch.equal(router.module.b.weight[0], frozen[0]) and not router.module.b.weight.requires_grad
+
+
+def test_other_optimisers_begin_anew_and_say_so(generator: torch.Generator) -> None:
+    x = uniform(generator, 60, 3)
+    router = router_of(Sine(), generator, k=1)
+    optimizer = torch.optim.LBFGS(router.parameters(), max_iter=2)
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        loss = router(x).square().mean()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    with pytest.warns(UserWarning, match="state of LBFGS cannot be inherited"):
+        router.subdivide(VoronoiDiagram(uniform(generator, 3, 3)), optimizer=optimizer)
+    before = [p.detach().clone() for p in router.parameters()]
+    optimizer.step(closure)
+    assert any(not torch.equal(a, b) for a, b in zip(before, router.parameters(), strict=True))
+
+
+def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
+    router = router_of(Sine(), generator, k=1)
+    x = uniform(generator, 90, 3)
+    before = router(x)
+    parents = router.subdivide(4, points=x, weights=torch.rand(90, generator=generator))
+    assert router.num_cells == 4 and parents.tolist() == [0] * 4
+    parents = router.subdivide(2, points=x, weights=torch.rand(90, generator=generator), cells=[1])
+    assert parents.tolist() == [0, 1, 1, 2, 3] and router.diagram.depth == 2
+    torch.testing.assert_close(router(x), before)
+    with pytest.raises(ValueError, match="a number of children needs points and weights"):
+        router.subdivide(4)
+    with pytest.raises(TypeError, match="must be a VoronoiDiagram or a number of children, got float"):
+        router.subdivide(2.0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="points must come with a number of children"):
+        router.subdivide(router.diagram, points=x)
+    stranger = torch.optim.SGD([nn.Parameter(torch.zeros(1))])
+    with pytest.raises(ValueError, match="optimizer must hold the router's parameters"):
+        router.subdivide(router.diagram, optimizer=stranger)
+
+
+# Cells ----------------------------------------------------------------------------------------------------------------
+
+
+def test_separate_modules_become_cells(generator: torch.Generator) -> None:
+    centres, x = uniform(generator, 4, 3), uniform(generator, 50, 15)
+    modules = [SkipNet() for _ in range(4)]
+    router = VoronoiRouter.from_modules(modules, centres, coords="first3")
+    nearest = (x[:, None, :3] - centres).square().sum(-1).argmin(1)
+    expected = torch.stack([modules[c](x[i : i + 1])[0] for i, c in enumerate(nearest.tolist())])
+    torch.testing.assert_close(router(x), expected)
+    router.load_cell(2, modules[0])
+    for a, b in zip(router.cell(2).parameters(), modules[0].parameters(), strict=True):
+        assert torch.equal(a, b)
+    with pytest.raises(ValueError, match="a module for each of 4 cells, got 3"):
+        VoronoiRouter.from_modules(modules[:3], centres, coords="first3")
+    with pytest.raises(ValueError, match=r"trunk\.0\.weight must have shape \[12, 9\], got \[13, 9\]"):
+        router.load_cell(0, SkipNet(width=13))
+    other = Heads()
+    other.bands.mul_(3)
+    with pytest.raises(ValueError, match="buffer bands must be that of the routed one"):
+        router_of(Heads(), generator).load_cell(0, other)
+    with pytest.raises(IndexError, match="index must be below 4, got 4"):
+        router.load_cell(4, modules[0])
+
+
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda r: pickle.loads(pickle.dumps(r)), "state"])
+def test_copies(generator: torch.Generator, clone: Any) -> None:
+    router = router_of(SkipNet(), generator)
+    x = uniform(generator, 40, 15)
+    before = [router(x) for _ in range(3)][-1]
+    if clone == "state":
+        buffer = io.BytesIO()
+        torch.save(router.state_dict(), buffer)
+        buffer.seek(0)
+        other = VoronoiRouter(SkipNet(), torch.zeros(1, 3), coords="first3")
+        other.load_state_dict(torch.load(buffer, weights_only=True))
+    else:
+        other = clone(router)
+    torch.testing.assert_close(other(x), before)
+    perturb(other, generator)
+    assert torch.equal(router(x), before) and not torch.allclose(other(x), before)
+
+
+# Modes and wrappers ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("make", [SkipNet, Sine])
+def test_half_precision(generator: torch.Generator, dtype: torch.dtype, make: type[nn.Module]) -> None:
+    router = router_of(make(), generator)
+    x = uniform(generator, 64, 15 if make is SkipNet else 3).to(dtype)
+    exact = router(x.float())
+    router = router.to(dtype)
+    assert router.diagram.centres.dtype == torch.float32
+    for _ in range(3):
+        found = router(x)
+        assert found.dtype == dtype
+        torch.testing.assert_close(found.float(), exact, rtol=0.1, atol=0.05)
+
+
+@pytest.mark.parametrize("make", [SkipNet, Sine])
+def test_autocast(generator: torch.Generator, make: type[nn.Module]) -> None:
+    router = router_of(make(), generator)
+    x = uniform(generator, 64, 15 if make is SkipNet else 3)
+    exact = router(x)
+    for _ in range(3):
+        with torch.autocast("cpu", torch.bfloat16):
+            found = router(x)
+            assert found.dtype == router.cell(0)(x).dtype
+        torch.testing.assert_close(found.float(), exact, rtol=0.1, atol=0.05)
+        assert router(x).dtype == torch.float32
+
+
+def test_compile_checkpoint_and_functional_call(generator: torch.Generator) -> None:
+    router = router_of(SkipNet(), generator)
+    x = uniform(generator, 40, 15)
+    expected, parameters = router(x), list(router.parameters())
+    wanted = torch.autograd.grad(expected.square().sum(), parameters)
+    halves = {name: p.detach() / 2 for name, p in router.named_parameters()}
+    calls: list[Callable[[], Tensor]] = [
+        lambda: torch.compile(router, backend="eager")(x),
+        lambda: checkpoint(router, x, use_reentrant=False),
+        lambda: torch.func.functional_call(router, dict(router.named_parameters()), (x,)),
+    ]
+    for call in calls:
+        found = call()
+        torch.testing.assert_close(found, expected)
+        for a, b in zip(torch.autograd.grad(found.square().sum(), parameters), wanted, strict=True):
+            torch.testing.assert_close(a, b)
+    assert not torch.allclose(torch.func.functional_call(router, halves, (x,)), expected)
+    torch.testing.assert_close(router(x), expected)
+
+
+class Checkpointed(nn.Module):
+    def __init__(self, reentrant: bool) -> None:
+        super().__init__()
+        self.block, self.out, self.reentrant = nn.Sequential(nn.Linear(3, 8), nn.Tanh()), nn.Linear(8, 2), reentrant
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(checkpoint(self.block, x, use_reentrant=self.reentrant))
+
+
+@pytest.mark.parametrize("reentrant", [False, True])
+def test_checkpoints_inside(generator: torch.Generator, reentrant: bool) -> None:
+    router = router_of(Checkpointed(reentrant), generator)
+    x = uniform(generator, 30, 3).requires_grad_()
+    cells = router.diagram.locate(x)
+    (expected,), modules = masked_loop(router, cells, [x])
+    router(x).square().sum().backward()
+    expected.square().sum().backward()
+    for name, parameter in router.module.named_parameters():
+        theirs = [m.get_parameter(name) for m in modules]
+        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in theirs]
+        torch.testing.assert_close(parameter.grad, torch.stack(grads), rtol=1e-4, atol=1e-5)
+
+
+def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
+    router = router_of(SkipNet(), generator)
+    x = uniform(generator, 40, 15)
+    router(x).square().sum().backward()
+    wanted = [p.grad.clone() for p in router.parameters()]
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
+    try:
+        wrapped = nn.parallel.DistributedDataParallel(router)
+        for _ in range(3):
+            router.zero_grad()
+            wrapped(x).square().sum().backward()
+        for parameter, gradient in zip(router.parameters(), wanted, strict=True):
+            torch.testing.assert_close(parameter.grad, gradient)
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+def test_hooks_of_layers_run(generator: torch.Generator) -> None:
+    router = router_of(SkipNet(), generator)
+    x = uniform(generator, 40, 15)
+    for _ in range(3):
+        before = router(x)
+    seen = []
+    handle = router.module.alpha.register_forward_hook(lambda module, args, out: seen.append(out.shape) or out + 1)
+    torch.testing.assert_close(router(x)[:, 3], before[:, 3] + 1)
+    handle.remove()
+    torch.testing.assert_close(router(x), before)
+    assert seen == [(40, 1)]
+
+
+# Errors ---------------------------------------------------------------------------------------------------------------
+
+
+class Mixes(nn.Module):
+    def __init__(self, how: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.lin, self.out, self.how = nn.Linear(3, 4), nn.Linear(4, 2), [how]
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(self.how[0](self.lin(x)))
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        lambda h: torch.softmax(h @ h.T, -1) @ h,
+        lambda h: h - h.mean(0),
+        lambda h: h.cumsum(0),
+        lambda h: h.flip(0),
+        lambda h: torch.cat([h[1:], h[:1]]),
+        lambda h: h / h.norm(),
+        lambda h: h[torch.argsort(h[:, 0])],
+        lambda h: h * (1.0 if h.max() > 0.3 else -1.0) * float(h.sum()),
+    ],
+)
+def test_what_mixes_samples_is_refused(generator: torch.Generator, how: Callable[[Tensor], Tensor]) -> None:
+    router = router_of(Mixes(how), generator, k=3)
+    with pytest.raises(TypeError, match="must treat samples one by one, but Mixes gives other results"):
+        router(uniform(generator, 60, 3))
+
+
+def test_modules_that_cannot_be_cells_are_refused() -> None:
+    listed = nn.Linear(3, 2)
+    listed.extra = [nn.Parameter(torch.zeros(2))]
+    for module, says in (
+        (nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4)), "`1`, a BatchNorm1d, mixes the samples of a batch"),
+        (nn.LSTM(3, 4), "a LSTM is recurrent"),
+        (nn.LazyLinear(4), "has no sizes yet"),
+        (nn.utils.parametrizations.spectral_norm(nn.Linear(3, 4)), "keeps a state for each weight"),
+        (listed, "keeps parameters in the plain list `extra`"),
+    ):
+        with pytest.raises(TypeError, match=says):
+            VoronoiRouter(module, torch.zeros(2, 3))
+
+
+def test_errors_say_what_came(generator: torch.Generator) -> None:
+    centres, x = uniform(generator, 3, 3), uniform(generator, 10, 3)
+    for options, says in (
+        ({"coords": "last3"}, "coords must be 'first3', a slice or a function, got 'last3'"),
+        ({"methods": ["colour_of"]}, "methods must name methods of Heads, got 'colour_of'"),
+        ({"methods": ["cell"]}, "methods must name methods of Heads, got 'cell'"),
+        ({"per_ray": ["view"]}, "must name arguments of Heads, one of x, d, density_only, got 'view'"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            VoronoiRouter(Heads(), centres, **options)
+    with pytest.raises(TypeError, match="methods must be a list, got 'density'"):
+        VoronoiRouter(Heads(), centres, methods="density")
+    router = VoronoiRouter(Heads(), centres)
+    for call, says in (
+        (lambda: router(x), "coords must say where the positions are.*coords=positions"),
+        (lambda: router(x, coords=x[:, :2]), r"coords must have shape \[\.\.\., 3\].*got \[10, 2\]"),
+        (lambda: router(x, x[:4], coords=x), r"d must be per sample \[10, \.\.\.\], or named in shared=, got \[4, 3\]"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            call()
+    router = VoronoiRouter(SkipNet(), centres, coords="first3")
+    with pytest.raises(ValueError, match="must find a tensor among the arguments, got str"):
+        router("x")
+    with pytest.raises(RuntimeError, match="sizes"):
+        router(x)
