@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from convention_harness import Case
 from convention_listed import RAYS, first, one, uniform
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 
 class Heads(nn.Module):
@@ -81,6 +82,15 @@ class Normals(nn.Module):
             (normal,) = torch.autograd.grad(h[:, 0].sum(), self._points, create_graph=True)
         rgb = torch.sigmoid(self.colour(torch.cat([h[:, 1:], normal, x], -1)))
         return h[:, :1], F.normalize(normal, dim=-1), rgb
+
+
+class Checkpointed(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.block, self.out = nn.Sequential(nn.Linear(7, 8), nn.ReLU(), nn.Linear(8, 8)), nn.Linear(8, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(checkpoint(self.block, x, use_reentrant=False))
 
 
 class Rgbs(NamedTuple):
@@ -240,6 +250,7 @@ CALLS = [
     ),
     Case("scripted", Scripted, one(), first, one_pass=False),
     Case("operations", Operations, one(), first),
+    Case("checkpointed", Checkpointed, one(), first),
     Case("named tuple", Named, one(), first, lead=RAYS),
     Case(
         "containers",

@@ -71,6 +71,46 @@ class Neighbour(nn.Module):
         return self.fc(x + x.roll(1, 0))
 
 
+class AlongRays(nn.Module):
+    """Each sample sees those before it on its ray, in one of three ways."""
+
+    def __init__(self, way: str) -> None:
+        super().__init__()
+        self.way, self.fc = way, nn.Linear(3, 4)
+        self.conv, self.attention = nn.Conv1d(4, 4, 3, padding=1), nn.MultiheadAttention(4, 1, batch_first=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.fc(x)
+        if self.way == "convolution":
+            return self.conv(h.transpose(1, 2)).transpose(1, 2)
+        if self.way == "attention":
+            return h + self.attention(h, h, h)[0]
+        return torch.cumsum(h, 1)
+
+
+class FromFirst(nn.Module):
+    """Every sample sees the first of the batch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Linear(3, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc(x) + self.fc(x[:1])
+
+
+class ReadsValues(nn.Module):
+    """Scaled by the largest number of the batch, read on the host."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Linear(3, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.fc(x)
+        return h / h.abs().max().item()
+
+
 class Regularised(nn.Module):
     """Returns a number for the whole batch beside the samples' outputs."""
 
@@ -91,6 +131,11 @@ MIXING: list[tuple[Callable[[], nn.Module], tuple[int, ...], str]] = [
     (OwnAttention, (40,), "sample"),
     (Centred, (40,), "sample"),
     (Neighbour, (40,), "sample"),
+    (lambda: AlongRays("convolution"), RAYS, "sample"),
+    (lambda: AlongRays("attention"), RAYS, "sample"),
+    (lambda: AlongRays("sum"), RAYS, "sample"),
+    (FromFirst, (40,), "sample"),
+    (ReadsValues, (40,), "sample"),
     (Regularised, (40,), "sample"),
 ]
 
