@@ -20,7 +20,7 @@ namespace voronerf {
 namespace {
 
 // Rows of a task: enough to pay for packing the weights, few enough to keep every thread busy to the end.
-constexpr int64_t kFewestRows = 96, kMostRows = 2048, kFewestGradientRows = 384, kMostGradientRows = 4096;
+constexpr int64_t kFewestRows = 96, kMostRows = 1024, kFewestGradientRows = 384, kMostGradientRows = 4096;
 constexpr int64_t kTasks = 64;
 // ... in whole tiles or halves of one.
 constexpr int64_t kTaskUnit = 48;

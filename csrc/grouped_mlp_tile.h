@@ -231,9 +231,15 @@ struct Tile {
     const float* gradient = at(layer.gradient);
     float* bias = partial + layer.partial_bias;
     for (int64_t first = 0; first < layer.padded; first += kLanes) {
-      F32 sum = fill ? splat(0.0f) : load(bias + first);
-      for (int64_t row = 0; row < rows; ++row) sum = sum + load(gradient + row * layer.padded + first);
-      store(bias + first, sum);
+      // Four sums, or every addition waits for the one before.
+      F32 sums[4] = {fill ? splat(0.0f) : load(bias + first), splat(0.0f), splat(0.0f), splat(0.0f)};
+      const float* from = gradient + first;
+      int64_t row = 0;
+      for (; row + 4 <= rows; row += 4) {
+        for (int i = 0; i < 4; ++i, from += layer.padded) sums[i] = sums[i] + load(from);
+      }
+      for (; row < rows; ++row, from += layer.padded) sums[0] = sums[0] + load(from);
+      store(bias + first, (sums[0] + sums[1]) + (sums[2] + sums[3]));
     }
     Source output = {gradient, layer.padded, rows};
 #if VN_HALF
