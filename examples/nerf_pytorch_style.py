@@ -1,6 +1,8 @@
 """A training loop in the style of nerf-pytorch, and the three lines that give it Voronoi cells.
 
-    python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 120 [--width 64] [--voronoi]
+    python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 480                          # width 256
+    python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 480 --width 64
+    python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 480 --width 64 --voronoi
 
 `--voronoi` takes the lines marked `changed`; all else is the same with and without it, learning rate and schedule too.
 The seconds are of training, evaluation comes on top. The network is encoded outside, samples are stratified, and the
