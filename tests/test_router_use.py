@@ -425,6 +425,7 @@ class Mixes(nn.Module):
         lambda h: torch.cat([h[1:], h[:1]]),
         lambda h: h / h.norm(),
         lambda h: h[torch.argsort(h[:, 0])],
+        lambda h: torch.autograd.grad(h.square().sum() / h.shape[0], h, create_graph=True)[0],
         lambda h: h * (1.0 if h.max() > 0.3 else -1.0) * float(h.sum()),
     ],
 )
@@ -432,6 +433,36 @@ def test_what_mixes_samples_is_refused(generator: torch.Generator, how: Callable
     router = router_of(Mixes(how), generator, k=3)
     with pytest.raises(TypeError, match="must treat samples one by one, but Mixes gives other results"):
         router(uniform(generator, 60, 3))
+
+
+class Decides(nn.Module):
+    """Decides by what is true of any sample, directly or inverted."""
+
+    def __init__(self, inverted: bool) -> None:
+        super().__init__()
+        self.lin, self.inverted = nn.Linear(3, 2), inverted
+
+    def forward(self, x: Tensor) -> Tensor:
+        found = (x[:, 0] > 0.2).any()
+        if self.inverted:
+            return self.lin(x) if torch.logical_not(found) else -self.lin(x)
+        return -self.lin(x) if found else self.lin(x)
+
+
+@pytest.mark.filterwarnings("ignore:.*cell by cell")
+@pytest.mark.parametrize("inverted", [False, True])
+def test_decisions_are_those_of_each_cell_or_refused(generator: torch.Generator, inverted: bool) -> None:
+    router = router_of(Decides(inverted), generator)
+    x = uniform(generator, 60, 3)
+    x[:, 0] = -x[:, 0].abs()
+    torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    x[7, 0] = 0.5
+    try:
+        found = router(x)
+    except TypeError as error:
+        assert "mixes samples" in str(error)
+    else:
+        torch.testing.assert_close(found, masked_loop(router, router.diagram.locate(x), [x])[0][0])
 
 
 def test_modules_that_cannot_be_cells_are_refused() -> None:

@@ -76,7 +76,7 @@ def run_cells(
     if check:
         cell, first, last = max(occupied, key=lambda bounds: bounds[2] - bounds[1])
         if last - first >= 2:
-            with torch.no_grad(), NoRandomness():
+            with NoRandomness():  # with gradients, which the module may take inside
                 _check_rows(module, on_cell, cell, first, last)
             checked = True
     results = [on_cell(*bounds) for bounds in occupied]
@@ -99,6 +99,7 @@ def _check_rows(module: nn.Module, on_cell: Callable[[int, int, int], Any], cell
 
 def same(a: Tensor, b: Tensor) -> bool:
     """Whether two tensors are equal up to what the order of sums may change."""
+    a, b = a.detach(), b.detach()
     if not a.is_floating_point():
         return torch.equal(a, b)
     return torch.allclose(a.double(), b.double(), rtol=1e-2, atol=1e-2 * _scale(a), equal_nan=True)

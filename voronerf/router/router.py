@@ -52,6 +52,8 @@ class VoronoiRouter(nn.Module):
     How a call is carried out depends on the module:
 
     - A field with a layer table (:class:`LayeredField`) runs as one fused operation.
+    - A network that such a table describes, in whatever code, is recognised after two calls of a kind, by their steps,
+      and runs fused as well, without its ``forward``; changes of its flags, numbers, buffers and hooks are seen.
     - Any other module runs its own ``forward`` once, on the samples of all cells sorted by cell. Linear layers (also
       ``F.linear``, ``@``, ``einsum`` on a parameter), embeddings, normalisation layers, learned scales and PReLU have
       forms for all cells at once; other functions of parameters run cell by cell on contiguous rows, which is said

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 _MARK = "_voronerf_mark"
 _TRIED_ROWS = 6
 _CACHE_LIMIT = 4096
+_AFTER = " and what follows"
 
 
 class Ungroupable(Exception):
@@ -192,6 +193,8 @@ class RowMode(TorchFunctionMode):
             self._check_read(func, result, marks[0])
             return
         lost = next((mark.lost for mark in marks if mark.lost), "")
+        if lost and not lost.endswith(_AFTER):
+            lost += _AFTER  # a sum is a sum no longer once it is divided, nor "any" what it was once it is inverted
         if not lost and not self._keeps_rows(func, args, kwargs, result, results, operands):
             lost = name_of(func)
         for tensor in (*results, *changed):
