@@ -48,11 +48,11 @@ void march_rays_count(const std::vector<Address>& inputs, const std::vector<int6
 }
 
 void march_rays_fill(const std::vector<Address>& inputs, const std::vector<int64_t>& sizes, Address mask,
-                     Address offsets, int64_t rows, Address ray_index, Address depths, Address deltas, Address stop,
-                     int isa, int threads) {
+                     Address offsets, int64_t rows, Address ray_index, Address depths, Address deltas,
+                     Address positions, Address stop, int isa, int threads) {
   voronerf::march_rays_fill_cpu(read_inputs(inputs, sizes), at<const uint32_t>(mask), at<const int32_t>(offsets), rows,
-                                at<int32_t>(ray_index), at<float>(depths), at<float>(deltas), at<int32_t>(stop),
-                                static_cast<voronerf::Isa>(isa), threads);
+                                at<int32_t>(ray_index), at<float>(depths), at<float>(deltas), at<float>(positions),
+                                at<int32_t>(stop), static_cast<voronerf::Isa>(isa), threads);
 }
 
 bool update_occupancy(Address density, Address rows, Address values, Address result, Address occupied, int64_t n,

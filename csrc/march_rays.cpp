@@ -18,8 +18,8 @@ void count_block(Isa isa, const MarchInputs& in, uint32_t* mask, int32_t* counts
 }
 
 void fill_block(Isa isa, const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
-                float* depths, float* deltas, int32_t* stop, int64_t begin, int64_t end) {
-  VN_FOR_ISA(isa, march_fill(in, mask, offsets, ray_index, depths, deltas, stop, begin, end))
+                float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
+  VN_FOR_ISA(isa, march_fill(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end))
 }
 
 template <typename Run>
@@ -44,13 +44,15 @@ void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offset
 }
 
 void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,
-                         int32_t* ray_index, float* depths, float* deltas, int32_t* stop, Isa isa, int threads) {
+                         int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
+                         int threads) {
   for_each_block(in.r, threads, [&](int64_t begin, int64_t end) {
-    fill_block(isa, in, mask, offsets, ray_index, depths, deltas, stop, begin, end);
+    fill_block(isa, in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
   });
   std::fill(ray_index + offsets[in.r], ray_index + rows, 0);
   std::fill(depths + offsets[in.r], depths + rows, 0.0f);
   std::fill(deltas + offsets[in.r], deltas + rows, 0.0f);
+  std::fill(positions + 3 * int64_t{offsets[in.r]}, positions + 3 * rows, 0.0f);
 }
 
 }  // namespace voronerf

@@ -35,8 +35,9 @@ static inline int64_t march_words(int64_t s) {
 void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, Isa isa,
                           int threads);
 
-// rows: length of ray_index, depths and deltas, at least offsets[r]; what is beyond that becomes 0.
+// rows: length of ray_index, depths, deltas and positions [rows,3], at least offsets[r]; what is beyond that becomes 0.
 void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,
-                         int32_t* ray_index, float* depths, float* deltas, int32_t* stop, Isa isa, int threads);
+                         int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
+                         int threads);
 
 }  // namespace voronerf

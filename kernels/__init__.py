@@ -2,10 +2,16 @@
 
 On the CPU Warp runs on one thread, so there it is a path for checking. Importing this package raises
 ``BackendUnavailable`` where Warp is missing or too old; ``import voronerf`` never imports it.
+
+Kernels are compiled when they are first used, a file at a time, or all of them by `preload` (`voronerf preload`). What
+is compiled stays in Warp's cache, whose place is the environment variable WARP_CACHE_PATH or Warp's default.
 """
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
+import time
 from typing import Any
 
 import torch
@@ -39,6 +45,29 @@ def missing(device: torch.device) -> str | None:
     return None
 
 
+def preload(device: torch.device) -> dict[str, float]:
+    """Compiles every kernel for a device, or finds it in the cache; returns the seconds that each file took.
+
+    Raises:
+        BackendUnavailable: Warp cannot run on the device.
+    """
+    reason = missing(device)
+    if reason is not None:
+        raise BackendUnavailable(f"preload: {reason}")
+    seconds = {}
+    target = wp.device_from_torch(device)
+    for name in sorted(info.name for info in pkgutil.iter_modules(__path__) if not info.name.startswith("_")):
+        module = importlib.import_module(f"{__name__}.{name}")
+        started = time.perf_counter()
+        wp.load_module(module, device=target)
+        seconds[name] = time.perf_counter() - started
+    return seconds
+
+
 def describe() -> dict[str, Any]:
-    """Version and devices."""
-    return {"version": _VERSION, "devices": [str(device) for device in wp.get_devices()]}
+    """Version, devices, and where compiled kernels are kept."""
+    return {
+        "version": _VERSION,
+        "devices": [str(device) for device in wp.get_devices()],
+        "cache": str(wp.config.kernel_cache_dir),
+    }

@@ -88,6 +88,7 @@ def _march_kernel(
     ray_index: wp.array(dtype=wp.int32),
     depths: wp.array(dtype=wp.float32),
     deltas: wp.array(dtype=wp.float32),
+    positions: wp.array2d(dtype=wp.float32),
     stop: wp.array(dtype=wp.int32),
 ) -> None:
     ray = wp.tid()
@@ -124,6 +125,8 @@ def _march_kernel(
                 ray_index[row + found] = ray
                 depths[row + found] = at
                 deltas[row + found] = last - first
+                for axis in range(3):
+                    positions[row + found, axis] = origins[ray, axis] + at * directions[ray, axis]
         if going:
             stratum += 1
             if taken:
@@ -179,7 +182,7 @@ def _count(
     counts = offsets[1:]
     inputs = _inputs(origins, directions, near, far, occupied, box, uniforms, start, samples, disparity, most)
     none, no_index = array(near[:0], near), array(offsets[:0], near)
-    results = [array(counts, near), no_index, none, none, no_index]
+    results = [array(counts, near), no_index, none, none, array(origins[:0], near), no_index]
     launch(_march_kernel, near.shape[0], [*inputs, True, no_index, *results], near)
     # In int64: the sum of what all rays want may not fit, what there is room for does.
     return offsets.cumsum(dim=0).clamp(max=capacity).to(torch.int32)
@@ -200,14 +203,17 @@ def _fill(
     disparity: bool,
     most: int,
     rows: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     ray_index = near.new_zeros(rows, dtype=torch.int32)
-    depths, deltas = near.new_zeros(rows), near.new_zeros(rows)
+    depths, deltas, positions = near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3)
     stop = near.new_empty(near.shape[0], dtype=torch.int32)
     inputs = _inputs(origins, directions, near, far, occupied, box, uniforms, start, samples, disparity, most)
-    results = [array(offsets[:0], near), *(array(tensor, near) for tensor in (ray_index, depths, deltas, stop))]
+    results = [
+        array(offsets[:0], near),
+        *(array(tensor, near) for tensor in (ray_index, depths, deltas, positions, stop)),
+    ]
     launch(_march_kernel, near.shape[0], [*inputs, False, array(offsets, near), *results], near)
-    return ray_index, depths, deltas, stop
+    return ray_index, depths, deltas, positions, stop
 
 
 def _inputs(
@@ -263,6 +269,6 @@ def _(
     disparity: bool,
     most: int,
     rows: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    index = near.new_empty(rows, dtype=torch.int32)
-    return index, near.new_empty(rows), near.new_empty(rows), near.new_empty(near.shape[0], dtype=torch.int32)
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
+    return index, near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3), stop

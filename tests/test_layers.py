@@ -36,6 +36,9 @@ LAYERS = (
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
 # What a layer may import from outside, where that is limited.
 OUTSIDE = {"kernels": {"warp", "torch"}}
+STANDARD_OF_KERNELS = {
+    "__future__", "typing", "collections", "contextlib", "functools", "importlib", "pkgutil", "time",
+}  # fmt: skip
 STANDARD_OF_ISA_FILES = {"cstdint", "cstddef", "immintrin.h"}
 
 SOURCES = sorted([*(ROOT / "voronerf").rglob("*.py"), *(ROOT / "kernels").rglob("*.py")])
@@ -81,13 +84,7 @@ def faults(source: str, module: str) -> list[str]:
         if name.split(".")[0] != "voronerf":
             allowed = OUTSIDE.get(own)
             top = name.split(".")[0]
-            if allowed is not None and top not in allowed | {
-                "__future__",
-                "typing",
-                "collections",
-                "contextlib",
-                "functools",
-            }:
+            if allowed is not None and top not in allowed | STANDARD_OF_KERNELS:
                 wrong.append(f"{module}:{line} imports {top}; {own} may import {' and '.join(sorted(allowed))}")
             continue
         # A name of the package itself, such as __version__, is not a module.

@@ -87,7 +87,7 @@ def _fill(
     disparity: bool,
     most: int,
     rows: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     kept = _contiguous(origins, directions, near, far, occupied, box, uniforms, start)
     results = _allocate_fill(near, rows)
     sizes = [near.shape[0], samples, *occupied.shape, int(disparity), most]
@@ -126,10 +126,10 @@ def _allocate_count(near: Tensor, samples: int) -> tuple[Tensor, Tensor]:
     return mask, near.new_empty(near.shape[0] + 1, dtype=torch.int32)
 
 
-def _allocate_fill(near: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """ray_index, depths, deltas, stop."""
-    index = near.new_empty(rows, dtype=torch.int32)
-    return index, near.new_empty(rows), near.new_empty(rows), near.new_empty(near.shape[0], dtype=torch.int32)
+def _allocate_fill(near: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """ray_index, depths, deltas, positions, stop."""
+    index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
+    return index, near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3), stop
 
 
 def _allocate_update(density: Tensor) -> tuple[Tensor, Tensor]:
@@ -170,7 +170,7 @@ def _(
     disparity: bool,
     most: int,
     rows: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     return _allocate_fill(near, rows)
 
 

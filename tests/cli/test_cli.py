@@ -80,6 +80,26 @@ def test_info_names_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
         assert word in output
 
 
+@pytest.mark.warp
+def test_preload_compiles_into_the_cache_of_ones_choice(tmp_path: Path) -> None:
+    # In a process of its own, since Warp reads the place once; one file of kernels, since all take a while.
+    code = (
+        "import pkgutil, sys; every = pkgutil.iter_modules; "
+        "pkgutil.iter_modules = lambda path: [m for m in every(path) if m.name in ('update_occupancy', '_launch')]; "
+        "from voronerf.cli import main; sys.exit(main(['preload']))"
+    )
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert "update_occupancy" in done.stdout and "1 files in" in done.stdout and str(tmp_path) in done.stdout
+    assert any("update_occupancy" in str(path) for path in (tmp_path / "cache").rglob("*"))
+
+
+def test_preload_for_a_device_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of(capsys, "preload", "--device", "cuda:99")
+    assert "--device must name a device that is present, got 'cuda:99'" in error
+
+
 def test_resume_needs_no_setting_again(run: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)

@@ -51,6 +51,9 @@ def test_a_full_grid_gives_stratified_samples(device: torch.device, backend: str
         assert found.ray_offsets.tolist() == [33 * i for i in range(10)]
         assert found.ray_index.tolist() == [i // 33 for i in range(9 * 33)]
         assert found.stop.tolist() == [33] * 9
+        ray = found.ray_index.long()
+        places = given["origins"][ray] + found.depths[:, None] * given["directions"][ray]
+        torch.testing.assert_close(found.positions, places)
 
 
 def test_samples_are_those_in_occupied_cells(device: torch.device, backend: str) -> None:

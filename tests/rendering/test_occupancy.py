@@ -97,11 +97,11 @@ def test_images_are_the_same_with_a_fraction_of_the_samples() -> None:
     grid = tight_grid()
     quick = render_image(sparse, cameras(), 0, occupancy=grid, **options)
     assert sparse.asked * 8 < dense.asked
-    torch.testing.assert_close(quick.colour, plain.colour, atol=2e-3, rtol=0)
-    torch.testing.assert_close(quick.opacity, plain.opacity, atol=2e-3, rtol=0)
+    torch.testing.assert_close(quick.colour, plain.colour, atol=5e-3, rtol=0)
+    torch.testing.assert_close(quick.opacity, plain.opacity, atol=5e-3, rtol=0)
     solid = plain.opacity > 0.5
     assert solid.any() and not solid.all()
-    torch.testing.assert_close(quick.depth[solid], plain.depth[solid], atol=5e-3, rtol=0)
+    torch.testing.assert_close(quick.depth[solid], plain.depth[solid], atol=2e-2, rtol=0)
     torch.testing.assert_close(quick.heaviest[solid], plain.heaviest[solid], atol=1e-5, rtol=0)
     chunked = render_image(Ball(), cameras(), 0, occupancy=grid, chunk=50, **options)
     torch.testing.assert_close(chunked.colour, quick.colour)

@@ -1,7 +1,8 @@
-"""The commands behind ``voronerf train | eval | render | info``. Each returns the process's exit status."""
+"""The commands behind ``voronerf train | eval | render | info | preload``. Each returns the process's exit status."""
 
 from __future__ import annotations
 
+import importlib
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -198,6 +199,29 @@ def info() -> int:
     console.print(table)
     for reason, number in numbers.items():
         console.print(f"[{number}] {reason}", highlight=False, markup=False)
+    return 0
+
+
+def preload(device: str = "cpu") -> int:
+    """Compile the Warp kernels now rather than at their first use; WARP_CACHE_PATH says where they are kept.
+
+    Args:
+        device: Torch device to compile for.
+    """
+    check_device(device)
+    target = torch.device(device)
+    reason = backends.missing("warp", target)
+    if reason is not None:
+        raise backends.BackendUnavailable(f"preload: {reason}")
+    # By name and here, since importing it needs Warp.
+    kernels = importlib.import_module("voronerf.kernels")
+    seconds = kernels.preload(target)
+    table = Table("kernels", "seconds")
+    for name, took in seconds.items():
+        table.add_row(name, f"{took:.2f}")
+    console.print(table)
+    cache = kernels.describe()["cache"]
+    console.print(f"{len(seconds)} files in {sum(seconds.values()):.1f} s, kept in {cache}", highlight=False)
     return 0
 
 

@@ -41,6 +41,7 @@ def main(args: list[str] | None = None) -> int:
                 "eval": commands.evaluate_run,
                 "render": commands.render,
                 "info": commands.info,
+                "preload": commands.preload,
                 "demo": demo.demo,
             },
             prog="voronerf",

@@ -67,8 +67,8 @@ def march_rays(
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        March(ray_offsets, ray_index, depths, deltas, stop). Floating-point arguments share one dtype, which is that of
-        depths and deltas.
+        March(ray_offsets, ray_index, depths, deltas, positions, stop). Floating-point arguments share one dtype, which
+        is that of depths, deltas and positions.
 
     Raises:
         ValueError: shapes, devices, counts, an unknown spacing or backend.

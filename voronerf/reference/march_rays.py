@@ -20,6 +20,7 @@ class March(NamedTuple):
         ray_index: int32 [m], the ray of each sample.
         depths: [m], distance along the ray, rising along each ray.
         deltas: [m], length of the sample's stratum.
+        positions: [m, 3], where the samples are.
         stop: int32 [r], the stratum with which each ray would go on: s where the whole ray has been walked.
     """
 
@@ -27,6 +28,7 @@ class March(NamedTuple):
     ray_index: Tensor
     depths: Tensor
     deltas: Tensor
+    positions: Tensor
     stop: Tensor
 
 
@@ -85,12 +87,16 @@ def march_rays(
         torch.zeros(rows + 1, dtype=values.dtype, device=device).scatter(0, row, values.reshape(-1))[:rows]
         for values in (ray, at, edges.diff(dim=1))
     )
+    positions = depths.new_zeros(rows, 3)
+    if r > 0:
+        used = torch.arange(rows, device=device) < offsets[-1]
+        positions = torch.where(used[:, None], origins[ray_index] + depths[:, None] * directions[ray_index], 0)
     last = torch.where(taken_now, stratum[:-1], -1).amax(dim=1)
     waiting = torch.where(taken & ~taken_now, stratum[:-1], samples).amin(dim=1)
     # A ray that has got all it may goes on behind its last sample, one that was cut with the sample it did not get.
     full = (got == wanted) & (wanted == (samples if most is None else most))
     stop = torch.where(got < wanted, waiting, torch.where(full, last + 1, samples))
-    return March(offsets.to(torch.int32), ray_index, depths, deltas, stop.to(torch.int32))
+    return March(offsets.to(torch.int32), ray_index, depths, deltas, positions, stop.to(torch.int32))
 
 
 def _depth(near: Tensor, far: Tensor, fraction: Tensor, disparity: bool) -> Tensor:

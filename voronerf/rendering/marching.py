@@ -15,8 +15,8 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.occupancy import OccupancyGrid
 
-OPAQUE = 1e-3  # a ray that lets less than this through has ended: half a level of an 8-bit image is 2e-3
-FIRST_WAVE, LARGEST_WAVE = 4, 16  # samples of a ray
+OPAQUE = 4e-3  # a ray that lets less than this through, a level of an 8-bit image, has ended
+WAVE = 6  # samples of a ray in a wave: fewer make more waves, more are asked for in vain behind the surface
 
 
 class Marched(NamedTuple):
@@ -86,8 +86,7 @@ def render_marched(
         uniforms = torch.rand(len(rays), samples, device=device, dtype=near.dtype, generator=generator).to(near.device)
     march = grid.march(rays, near, far, samples, uniforms=uniforms, spacing=spacing, backend=backend)
     index = march.ray_index
-    positions = rays.origins[index] + march.depths[:, None] * rays.directions[index]
-    rgb, sigma = field(positions, rays.directions, index)
+    rgb, sigma = field(march.positions, rays.directions, index)
     # a field under autocast answers in a half type: the sums along a ray are float32's
     rgb, sigma = rgb.to(near.dtype), sigma.to(near.dtype)
     result = composite(
@@ -104,7 +103,7 @@ def render_marched(
         result.opacity,
         _normalised(result.depth, result.opacity, far),
         result.weights,
-        positions,
+        march.positions,
         rgb,
         index,
     )
@@ -143,27 +142,26 @@ def render_until_opaque(
     colour, opacity, depth = torch.zeros_like(rays.origins), torch.zeros_like(near), torch.zeros_like(near)
     through, top = torch.ones_like(near), torch.zeros_like(near)
     at = far.clone()
-    live, start, most = torch.arange(r, device=near.device), None, FIRST_WAVE
+    live, start = torch.arange(r, device=near.device), None
     while live.numel() > 0:
         whole = live.numel() == r
         now = rays if whole else rays[live]
         march = grid.march(
-            now, near[live], far[live], samples, spacing=spacing, start=start, most=most, backend=backend
+            now, near[live], far[live], samples, spacing=spacing, start=start, most=WAVE, backend=backend
         )
         index = march.ray_index
-        positions = now.origins[index] + march.depths[:, None] * now.directions[index]
-        rgb, sigma = field(positions, now.directions, index)
+        rgb, sigma = field(march.positions, now.directions, index)
         rgb, sigma = rgb.to(near.dtype), sigma.to(near.dtype)
         part = composite(sigma, rgb, march.depths, march.deltas, ray_offsets=march.ray_offsets, backend=backend)
         light = through[live]
         colour[live] += light[:, None] * part.colour
         opacity[live] += light * part.opacity
         depth[live] += light * part.depth
-        _keep_heaviest(top, at, live, light, part.weights, march.depths, march.ray_offsets, index, most)
+        _keep_heaviest(top, at, live, light, part.weights, march.depths, march.ray_offsets, index, WAVE)
         light = light * (1 - part.opacity)
         through[live] = light
         more = ((march.stop < samples) & (light > OPAQUE)).nonzero()[:, 0]
-        live, start, most = live[more], march.stop[more], min(2 * most, LARGEST_WAVE)
+        live, start = live[more], march.stop[more]
     if background is not None:
         colour += (1 - opacity)[:, None] * background.to(colour)
     heaviest = rays.origins + at[:, None] * rays.directions

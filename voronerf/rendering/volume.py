@@ -130,11 +130,11 @@ def render_image(
         occupancy: which cells of the box are empty; the field is asked about the others alone, up to where a ray is
             opaque. None asks about every sample.
         chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples of
-            a ray, 16,384.
+            a ray, 32,768.
         backend: of the ops.
     """
     if chunk is None:
-        chunk = 4096 if occupancy is None else 16_384
+        chunk = 4096 if occupancy is None else 32_768
     if chunk < 1:
         raise ValueError(f"render_image: chunk must be >= 1, got {chunk}")
     rays = cameras.image_rays(index)

@@ -1,0 +1,164 @@
+"""What skipping empty space gives: training with half the time, and pictures of a trained scene.
+
+    python benchmarks/occupancy.py --budget 60 --json benchmarks/results/occupancy.json
+
+Two runs of one scene take turns in one process: one without a grid, one with, which gets `--share` of the time. Then
+test views of the first run are rendered at `--size`, alternately asking the field for every sample and through a grid
+made from the field; the time to make the grid is given apart. The same for the run trained with the grid, by its own.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from harness import metadata
+
+from voronerf.cli.main import EXPECTED
+from voronerf.data import builtin_scene
+from voronerf.training.config import TrainConfig
+from voronerf.training.evaluation import render_view
+from voronerf.training.files import write_text
+from voronerf.training.metrics import psnr
+from voronerf.training.model import load_grid
+from voronerf.training.runs import read_metrics
+from voronerf.training.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class Options:
+    """How long to train, and what to render."""
+
+    budget: float = 60.0
+    """Training seconds of the run without a grid."""
+    share: float = 0.5
+    """Of them, what the run with a grid gets."""
+    turn: float = 5.0
+    """Seconds that the first run trains before the other has its turn."""
+    eval_views: int = 5
+    """Test views of each evaluation."""
+    size: int = 400
+    """Pixels along the side of the rendered pictures."""
+    views: int = 3
+    """Test views rendered."""
+    repeats: int = 3
+    """Times each is rendered; the median counts."""
+    seed: int = 0
+    """Of both runs."""
+    json: Path | None = None
+    """Where the results go; default: printed only."""
+
+
+def train(options: Options, folder: Path) -> dict[str, Trainer]:
+    """Both runs to the end of their time."""
+    scene = builtin_scene(100)
+    trainers = {}
+    for name, share in (("plain", 1.0), ("occupancy", options.share)):
+        config = TrainConfig(
+            out=folder / name,
+            budget=options.budget * share,
+            occupancy=name == "occupancy",
+            evaluations=4,
+            eval_views=options.eval_views,
+            final_views=options.eval_views,
+            seed=options.seed,
+            checkpoint_every=1e9,
+        )
+        trainers[name] = Trainer(config, scene, on_event=lambda line, label=name: print(f"{label:10} {line}"))
+    done = 0.0
+    while done < options.budget:
+        done += options.turn
+        trainers["plain"].advance(done)
+        trainers["occupancy"].advance(done * options.share)
+    for trainer in trainers.values():
+        trainer.run()
+    return trainers
+
+
+def render(options: Options, trainers: dict[str, Trainer]) -> list[dict[str, Any]]:
+    """Seconds and PSNR of test views, dense and through a grid in turn."""
+    scene = builtin_scene(options.size, train_views=1, test_views=options.views)
+    background = scene.background_colour()
+    results = []
+    for name, trainer in trainers.items():
+        samples = trainer.config.samples
+        started = time.perf_counter()
+        grid = load_grid(trainer.out, trainer.config, trainer.router, scene, wanted=True)
+        made_in = time.perf_counter() - started
+        assert grid is not None
+        ways = {"dense": None, "grid": grid} if name == "plain" else {"own grid": grid}
+        seconds: dict[str, list[float]] = {way: [] for way in ways}
+        scores: dict[str, list[float]] = {way: [] for way in ways}
+        for repeat in range(options.repeats + 1):
+            for view in range(options.views):
+                truth = scene.test.truth(view, background)
+                for way, occupancy in ways.items():
+                    started = time.perf_counter()
+                    image = render_view(
+                        trainer.router, scene, view, samples=samples, backend="auto", occupancy=occupancy
+                    )
+                    took = time.perf_counter() - started
+                    if repeat > 0:  # the first warms up
+                        seconds[way].append(took)
+                    else:
+                        scores[way].append(float(psnr(image.colour.clamp(0, 1), truth)))
+        for way, occupancy in ways.items():
+            results.append(
+                {
+                    "run": name,
+                    "way": way,
+                    "seconds": statistics.median(seconds[way]),
+                    "spread": [min(seconds[way]), max(seconds[way])],
+                    "psnr": statistics.fmean(scores[way]),
+                    "occupied": None if occupancy is None else occupancy.share,
+                    "grid_seconds": None if occupancy is None else made_in,
+                }
+            )
+    return results
+
+
+def main() -> int:
+    """Measures, prints and, where asked to, writes."""
+    options = tyro.cli(Options, description=__doc__)
+    with tempfile.TemporaryDirectory() as folder:
+        trainers = train(options, Path(folder))
+        pictures = render(options, trainers)
+        runs = [
+            {
+                "run": name,
+                "seconds": trainer.seconds,
+                "steps": trainer.step,
+                "psnr": trainer.metrics[-1]["psnr"],
+                "curve": read_metrics(trainer.out),
+            }
+            for name, trainer in trainers.items()
+        ]
+    for run in runs:
+        print(f"{run['run']:10} {run['seconds']:6.1f} s  {run['steps']:6d} steps  {run['psnr']:.2f} dB")
+    for row in pictures:
+        print(f"{row['run']:10} {row['way']:9} {row['seconds']:7.3f} s a picture  {row['psnr']:.2f} dB")
+    dense, grid = (next(row for row in pictures if row["way"] == way) for way in ("dense", "grid"))
+    print(f"rendering: {dense['seconds'] / grid['seconds']:.1f} x, {grid['psnr'] - dense['psnr']:+.3f} dB")
+    outcome = {
+        "metadata": metadata(
+            benchmark="occupancy", scene="builtin", budget=options.budget, share=options.share, size=options.size
+        ),
+        "results": {"training": runs, "rendering": pictures},
+    }
+    if options.json is not None:
+        write_text(options.json, json.dumps(outcome, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except EXPECTED as error:
+        sys.exit(f"occupancy: {error}")
