@@ -102,7 +102,13 @@ def render(options: Options, trainers: dict[str, Trainer]) -> list[dict[str, Any
                 for way, occupancy in ways.items():
                     started = time.perf_counter()
                     image = render_view(
-                        trainer.router, scene, view, samples=samples, backend="auto", occupancy=occupancy
+                        trainer.router,
+                        scene,
+                        view,
+                        samples=samples,
+                        backend="auto",
+                        occupancy=occupancy,
+                        heaviest=False,
                     )
                     took = time.perf_counter() - started
                     if repeat > 0:  # the first warms up

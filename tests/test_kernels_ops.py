@@ -10,7 +10,7 @@ import torch
 from test_native_composite import PARTS, dense, evaluate, leaves_of, scene
 from torch import Tensor
 
-from voronerf.ops import composite, frequency_encode, integrated_encode, march_rays, resample
+from voronerf.ops import centre_grid, composite, frequency_encode, integrated_encode, march_rays, resample
 
 pytestmark = pytest.mark.warp
 
@@ -123,6 +123,10 @@ def test_opcheck() -> None:
     check(op("resample_warp"), (torch.rand(4, 3), torch.rand(4, 4).cumsum(1), 6, torch.rand(4, 6)))
     tables = (torch.tensor([0, 4], dtype=torch.int32), torch.tensor([-1, -2, -3, -4], dtype=torch.int32))
     check(op("locate_cell_warp"), (torch.rand(5, 3), torch.rand(4, 3), *tables, 1, torch.rand(4)))
+    grid = centre_grid(torch.rand(9, 3)).tables
+    with_kernels("nearest_centre_grid")
+    searched = (torch.rand(5, 3), torch.rand(9, 3), torch.rand(9), grid.frame, grid.entries, grid.lists, grid.bits)
+    check(op("nearest_centre_grid_warp"), searched)
     check(op("cell_sort_warp"), (torch.tensor([2, 0, 1, 2], dtype=torch.int32), 3))
     cells = torch.tensor([3, 0], dtype=torch.int32)
     check(op("update_occupancy_warp"), (torch.rand(2, 2, 2), cells, torch.rand(2), 0.5, 0.1))
@@ -130,7 +134,7 @@ def test_opcheck() -> None:
     marched = [*rays, torch.rand(3, 3, 3) < 0.5, torch.tensor([[0.0] * 3, [2.0] * 3]), None, None]
     check(op("march_rays_warp_count"), (*marched, 6, False, 6, 99))
     offsets = op("march_rays_warp_count")(*marched, 6, False, 6, 99)
-    check(op("march_rays_warp_fill"), (*marched, offsets, 6, False, 6, 9))
+    check(op("march_rays_warp_fill"), (*marched, offsets, 6, False, 6, 4 * 6))
 
 
 def test_compiles_whole() -> None:

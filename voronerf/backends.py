@@ -123,6 +123,7 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
         "voronerf._native_march:update_occupancy", ("cpu",), (torch.float32,)
     ),
     ("nearest_centre", "warp"): _warp("nearest_centre", dtypes=_COORDINATES),
+    ("nearest_centre_grid", "warp"): _warp("nearest_centre_grid", dtypes=_COORDINATES),
     ("locate_cell", "warp"): _warp("locate_cell", dtypes=_COORDINATES),
     ("cell_sort", "warp"): _warp("cell_sort", dtypes=(torch.int32,)),
     ("composite", "warp"): _warp("composite"),

@@ -78,7 +78,8 @@ def test_finds_what_all_centres_give(backend: str, scene: str, dtype: torch.dtyp
     lightest = centres.double().diff(dim=0).square().sum(1).mean().item() if len(centres) > 1 else 0.0
     weights = (torch.rand(len(centres)) * min(lightest, 1e38)).to(dtype)
     for power in (None, weights):
-        grid = centre_grid(centres, weights=power, backend=backend)
+        # Warp asks the tables of others.
+        grid = centre_grid(centres, weights=power, backend="auto" if backend == "warp" else backend)
         found = nearest_centre(points, centres, weights=power, grid=grid, backend=backend)
         assert found.dtype == torch.int32
         assert torch.equal(found, nearest_centre(points, centres, weights=power, backend="reference"))

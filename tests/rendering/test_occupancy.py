@@ -105,6 +105,8 @@ def test_images_are_the_same_with_a_fraction_of_the_samples() -> None:
     torch.testing.assert_close(quick.heaviest[solid], plain.heaviest[solid], atol=1e-5, rtol=0)
     chunked = render_image(Ball(), cameras(), 0, occupancy=grid, chunk=50, **options)
     torch.testing.assert_close(chunked.colour, quick.colour)
+    bare = render_image(Ball(), cameras(), 0, occupancy=grid, heaviest=False, **options)
+    assert torch.equal(bare.colour, quick.colour) and not torch.equal(bare.heaviest, quick.heaviest)
     with pytest.raises(ValueError, match="chunk must be >= 1, got 0"):
         render_image(Ball(), cameras(), 0, occupancy=grid, chunk=0, **options)
 

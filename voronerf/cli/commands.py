@@ -169,6 +169,7 @@ def render(
             background=scene.background_colour(device),
             spacing=scene.spacing,
             occupancy=grid,
+            heaviest=False,
             backend=backend,
         )
         pictures.append((image.colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu())

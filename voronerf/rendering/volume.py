@@ -112,6 +112,7 @@ def render_image(
     background: Tensor | None = None,
     spacing: str = "linear",
     occupancy: OccupancyGrid | None = None,
+    heaviest: bool = True,
     chunk: int | None = None,
     backend: str = "auto",
 ) -> RenderedImage:
@@ -129,6 +130,7 @@ def render_image(
         spacing: of the strata.
         occupancy: which cells of the box are empty; the field is asked about the others alone, up to where a ray is
             opaque. None asks about every sample.
+        heaviest: whether to look for each ray's heaviest sample; without it the result has every ray's far end instead.
         chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples of
             a ray, 32,768.
         backend: of the ops.
@@ -142,7 +144,7 @@ def render_image(
     colour = torch.zeros_like(rays.origins) if background is None else background.to(rays.origins).repeat(len(rays), 1)
     opacity = torch.zeros_like(first)
     depth = torch.full_like(first, far)
-    heaviest = rays.origins + far * rays.directions
+    places = rays.origins + far * rays.directions
     for rows in hit.nonzero()[:, 0].split(chunk):
         if occupancy is not None:
             seen = render_until_opaque(
@@ -154,9 +156,10 @@ def render_image(
                 samples=samples,
                 background=background,
                 spacing=spacing,
+                heaviest=heaviest,
                 backend=backend,
             )
-            colour[rows], opacity[rows], depth[rows], heaviest[rows] = seen
+            colour[rows], opacity[rows], depth[rows], places[rows] = seen
             continue
         part = render_rays(
             field,
@@ -171,12 +174,11 @@ def render_image(
         colour[rows] = part.colour.to(colour.dtype)
         opacity[rows] = part.opacity.to(opacity.dtype)
         depth[rows] = part.depth.to(depth.dtype)
-        top = part.weights.argmax(-1)
-        heaviest[rows] = part.positions[torch.arange(len(rows), device=rows.device), top]
+        if heaviest:
+            top = part.weights.argmax(-1)
+            places[rows] = part.positions[torch.arange(len(rows), device=rows.device), top]
     size = (cameras.height, cameras.width)
-    return RenderedImage(
-        colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), heaviest.reshape(*size, 3)
-    )
+    return RenderedImage(colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3))
 
 
 def _per_ray(distance: Tensor | float, rays: Rays) -> Tensor:

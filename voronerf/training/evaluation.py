@@ -38,6 +38,7 @@ def render_view(
     samples: int,
     backend: str,
     occupancy: OccupancyGrid | None = None,
+    heaviest: bool = True,
 ) -> RenderedImage:
     """One test view as the router sees it, samples at the middle of their strata, those in empty cells left out."""
     device = next(router.parameters()).device
@@ -53,6 +54,7 @@ def render_view(
         background=scene.background_colour(device),
         spacing=scene.spacing,
         occupancy=occupancy,
+        heaviest=heaviest,
         backend=backend,
     )
 
@@ -70,7 +72,7 @@ def evaluate(
     device = next(router.parameters()).device
     scores = []
     for view in view_numbers(len(scene.test.names), views):
-        image = render_view(router, scene, view, samples=samples, backend=backend, occupancy=occupancy)
+        image = render_view(router, scene, view, samples=samples, backend=backend, occupancy=occupancy, heaviest=False)
         target = scene.test.truth(view, scene.background_colour()).to(device)
         colour = image.colour.clamp(0, 1)
         scores.append(ViewScore(scene.test.names[view], float(psnr(colour, target)), float(ssim(colour, target))))

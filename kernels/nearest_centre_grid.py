@@ -1,0 +1,133 @@
+"""Nearest of many frozen centres by a grid of candidate lists, as a Warp kernel. n points, k centres.
+
+A thread takes a point: its cell of the grid, through bricks of finer cells where there are some, and the candidates of
+that cell by their float64 distances, each operation rounded on its own. Tables are those of any backend
+(``voronerf/reference/centre_grid.py`` says what is in them); points that the grid does not reach meet every centre.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from voronerf.kernels._launch import array, launch
+from voronerf.reference.centre_grid import BRICK_BITS, CELL_BITS, REACH, GridTables
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+_BRICK = wp.constant(BRICK_BITS)
+_CELL = wp.constant(CELL_BITS)
+_REACH = wp.constant(wp.float64(REACH))
+
+
+@wp.func
+def _cell(u: wp.float64) -> wp.int32:
+    """Number of the finest cell along an axis: even steps in the middle, ever longer ones outside."""
+    one = wp.float64(1.0)
+    three = wp.float64(3.0)
+    p = u
+    if wp.abs(u) > one:
+        p = wp.sign(u) * (one + (one - one / wp.abs(u)) / three)
+    side = wp.float64(1 << _CELL)
+    return wp.clamp(wp.int32((p + wp.float64(4.0) / three) * wp.float64(0.375) * side), 0, (1 << _CELL) - 1)
+
+
+@wp.kernel
+def _nearest_centre_grid_kernel(
+    points: wp.array2d(dtype=Any),
+    centres: wp.array2d(dtype=Any),
+    weights: wp.array(dtype=Any),
+    weighted: wp.bool,
+    frame: wp.array2d(dtype=wp.float32),
+    entries: wp.array(dtype=wp.int32),
+    lists: wp.array(dtype=wp.int32),
+    bits: wp.int32,
+    cells: wp.array(dtype=wp.int32),
+) -> None:
+    i = wp.tid()
+    x = wp.float64(points[i, 0])
+    y = wp.float64(points[i, 1])
+    z = wp.float64(points[i, 2])
+    u = (x - wp.float64(frame[0, 0])) * wp.float64(frame[1, 0])
+    v = (y - wp.float64(frame[0, 1])) * wp.float64(frame[1, 1])
+    w = (z - wp.float64(frame[0, 2])) * wp.float64(frame[1, 2])
+    place = wp.int32(-1)
+    count = centres.shape[0]
+    if wp.abs(u) <= _REACH and wp.abs(v) <= _REACH and wp.abs(w) <= _REACH:
+        a = _cell(u)
+        b = _cell(v)
+        c = _cell(w)
+        shift = _CELL - bits
+        entry = entries[((((a >> shift) << bits) + (b >> shift)) << bits) + (c >> shift)]
+        while entry < 0 and shift >= _BRICK:
+            shift -= _BRICK
+            low = (1 << _BRICK) - 1
+            slot = (((((a >> shift) & low) << _BRICK) + ((b >> shift) & low)) << _BRICK) + ((c >> shift) & low)
+            entry = entries[-1 - entry + slot]
+        place = entry
+        count = lists[place]
+    best = wp.float64(1.7976931348623157e308)
+    cell = wp.int32(0)
+    for row in range(count):
+        j = row
+        if place >= 0:
+            j = lists[place + 1 + row]
+        dx = x - wp.float64(centres[j, 0])
+        dy = y - wp.float64(centres[j, 1])
+        dz = z - wp.float64(centres[j, 2])
+        value = dx * dx + dy * dy + dz * dz
+        if weighted:
+            value = value - wp.float64(weights[j])
+        # Strict: lists rise, so ties keep the lowest index.
+        if value < best:
+            best = value
+            cell = j
+    cells[i] = cell
+
+
+for _scalar in (wp.float32, wp.float64):
+    wp.overload(
+        _nearest_centre_grid_kernel,
+        [
+            wp.array2d(dtype=_scalar),
+            wp.array2d(dtype=_scalar),
+            wp.array(dtype=_scalar),
+            wp.bool,
+            wp.array2d(dtype=wp.float32),
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=wp.int32),
+            wp.int32,
+            wp.array(dtype=wp.int32),
+        ],
+    )
+
+
+def nearest_centre_grid(points: Tensor, centres: Tensor, grid: GridTables, *, weights: Tensor | None = None) -> Tensor:
+    """Index of the nearest centre of every point by the candidates of its cell; see ``voronerf.ops.nearest_centre``."""
+    cells: Tensor = _nearest(points, centres, weights, grid.frame, grid.entries, grid.lists, grid.bits)
+    return cells
+
+
+@torch.library.custom_op("voronerf::nearest_centre_grid_warp", mutates_args=())
+def _nearest(
+    points: Tensor, centres: Tensor, weights: Tensor | None, frame: Tensor, entries: Tensor, lists: Tensor, bits: int
+) -> Tensor:
+    given = (points, centres) if weights is None else (points, centres, weights)
+    dtype = torch.float64 if any(tensor.dtype == torch.float64 for tensor in given) else torch.float32
+    kept = [None if tensor is None else tensor.to(dtype) for tensor in (points, centres, weights)]
+    cells = points.new_empty(points.shape[0], dtype=torch.int32)
+    arrays = [array(tensor, points, dtype) for tensor in kept]
+    tables = [array(tensor, points) for tensor in (frame, entries, lists)]
+    inputs = [*arrays, weights is not None, *tables, bits, array(cells, points)]
+    launch(_nearest_centre_grid_kernel, points.shape[0], inputs, points)
+    return cells
+
+
+@_nearest.register_fake
+def _(
+    points: Tensor, centres: Tensor, weights: Tensor | None, frame: Tensor, entries: Tensor, lists: Tensor, bits: int
+) -> Tensor:
+    return points.new_empty(points.shape[0], dtype=torch.int32)
