@@ -10,6 +10,8 @@
 #include <vector>
 
 #include "bindings_composite.h"
+#include "bindings_mlp_table.h"
+#include "grouped_mlp_cuda.h"
 #include "launchers.h"
 
 namespace py = pybind11;
@@ -84,6 +86,79 @@ void resample_cuda(Address weights, Address edges, Address uniforms, Address dep
                           at<float>(depths), at<double>(workspace), r, s, count, at<void>(stream));
 }
 
+// precision: a number of MlpPrecision; the plan is made for the device that is current.
+const char* plan_of(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k, bool backward,
+                    voronerf::MlpCudaPlan& plan) {
+  return voronerf::mlp_cuda_plan(mlp_arguments::read_table(flat), static_cast<voronerf::MlpPrecision>(precision), n, k,
+                                 backward, voronerf::mlp_cuda_device(), plan);
+}
+
+// Bytes of workspace, or the rule that a table breaks for which there is no plan.
+py::object grouped_mlp_workspace_cuda(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k,
+                                      bool backward, bool parameters, int device) {
+  const voronerf::CudaDevice current(device);
+  voronerf::MlpCudaPlan plan;
+  if (const char* fault = plan_of(flat, precision, n, k, backward, plan)) return py::str(fault);
+  return py::int_(voronerf::mlp_cuda_workspace(plan, k, parameters).bytes);
+}
+
+voronerf::MlpCudaData data_of(const voronerf::MlpInputs& in) {
+  voronerf::MlpCudaData data{};
+  data.positions = in.positions;
+  data.directions = in.directions;
+  data.direction_index = in.direction_index;
+  data.order = in.order;
+  data.offsets = in.offsets;
+  data.n = in.n;
+  data.k = in.k;
+  return data;
+}
+
+voronerf::MlpCudaParameters parameters_of(const Addresses& weights, const Addresses& biases) {
+  voronerf::MlpCudaParameters parameters{};
+  for (size_t l = 0; l < weights.size() && l < voronerf::kMlpCudaLayers; ++l) {
+    parameters.weights[l] = at<const float>(weights[l]);
+    parameters.biases[l] = at<const float>(biases[l]);
+  }
+  return parameters;
+}
+
+void grouped_mlp_cuda(const std::vector<int64_t>& flat, const Addresses& arguments, const Addresses& weights,
+                      const Addresses& biases, Address out, int precision, Address workspace, int device,
+                      Address stream) {
+  const voronerf::CudaDevice current(device);
+  voronerf::MlpCudaData data = data_of(mlp_arguments::read_inputs(arguments, {}, {}));
+  data.out = at<float>(out);
+  voronerf::MlpCudaPlan plan;
+  const char* fault = plan_of(flat, precision, data.n, data.k, false, plan);
+  VN_CHECK(fault == nullptr, fault);
+  voronerf::grouped_mlp_cuda(plan, data, parameters_of(weights, biases), at<unsigned char>(workspace),
+                             at<void>(stream));
+}
+
+// As on the CPU, except that gradients of directions are one row a sample.
+void grouped_mlp_backward_cuda(const std::vector<int64_t>& flat, const Addresses& arguments, const Addresses& weights,
+                               const Addresses& biases, Address grad_out, const Addresses& grad_weights,
+                               const Addresses& grad_biases, Address grad_positions, Address grad_directions,
+                               int precision, Address workspace, int device, Address stream) {
+  const voronerf::CudaDevice current(device);
+  voronerf::MlpCudaData data = data_of(mlp_arguments::read_inputs(arguments, {}, {}));
+  data.grad_out = at<const float>(grad_out);
+  data.grad_positions = at<float>(grad_positions);
+  data.grad_directions = at<float>(grad_directions);
+  voronerf::MlpCudaPlan plan;
+  const char* fault = plan_of(flat, precision, data.n, data.k, true, plan);
+  VN_CHECK(fault == nullptr, fault);
+  voronerf::MlpCudaParameterGradients gradients{};
+  for (size_t l = 0; l < grad_weights.size(); ++l) {
+    gradients.weights[l] = at<float>(grad_weights[l]);
+    gradients.biases[l] = at<float>(grad_biases[l]);
+  }
+  voronerf::grouped_mlp_backward_cuda(plan, data, parameters_of(weights, biases),
+                                      grad_weights.empty() ? nullptr : &gradients, at<unsigned char>(workspace),
+                                      at<void>(stream));
+}
+
 }  // namespace
 
 void bind_cuda(py::module_& module) {
@@ -97,6 +172,9 @@ void bind_cuda(py::module_& module) {
   module.def("composite_backward_cuda", &composite_backward_cuda, no_gil);
   module.def("encode_cuda", &encode_cuda, no_gil);
   module.def("encode_backward_cuda", &encode_backward_cuda, no_gil);
+  module.def("grouped_mlp_workspace_cuda", &grouped_mlp_workspace_cuda);
+  module.def("grouped_mlp_cuda", &grouped_mlp_cuda, no_gil);
+  module.def("grouped_mlp_backward_cuda", &grouped_mlp_backward_cuda, no_gil);
   module.def("resample_cuda", &resample_cuda, no_gil);
 }
 

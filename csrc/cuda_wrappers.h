@@ -13,6 +13,9 @@
 #ifdef VN_EMULATE
 #include "emulation.h"
 #else
+#include <cuda_bf16.h>
+#include <cuda_fp16.h>
+
 #define VN_LAUNCH(kernel, grid, block, bytes, stream, ...)                          \
   do {                                                                              \
     kernel<<<grid, block, bytes, static_cast<cudaStream_t>(stream)>>>(__VA_ARGS__); \
@@ -30,5 +33,138 @@
 namespace voronerf {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
+
+// Largest value of float16: what is larger would become infinite, and infinities in a network soon are no numbers.
+constexpr float kLargestHalf = 65504.0f;
+
+// Two floats rounded to 16 bits each, the first in the low half.
+template <bool kBfloat16>
+__device__ __forceinline__ uint32_t pack_halves(float x, float y) {
+  if constexpr (!kBfloat16) {
+    // Comparisons keep what is no number.
+    x = x > kLargestHalf ? kLargestHalf : x < -kLargestHalf ? -kLargestHalf : x;
+    y = y > kLargestHalf ? kLargestHalf : y < -kLargestHalf ? -kLargestHalf : y;
+  }
+#ifdef VN_EMULATE
+  return half_bits(x, kBfloat16) | half_bits(y, kBfloat16) << 16;
+#else
+  uint32_t bits;
+  if constexpr (kBfloat16) {
+    const __nv_bfloat162 pair = __floats2bfloat162_rn(x, y);
+    memcpy(&bits, &pair, sizeof bits);
+  } else {
+    const __half2 pair = __floats2half2_rn(x, y);
+    memcpy(&bits, &pair, sizeof bits);
+  }
+  return bits;
+#endif
+}
+
+template <bool kBfloat16>
+__device__ __forceinline__ float unpack_half(uint16_t bits) {
+#ifdef VN_EMULATE
+  return half_value(bits, kBfloat16);
+#else
+  if constexpr (kBfloat16) {
+    return __uint_as_float(static_cast<uint32_t>(bits) << 16);
+  } else {
+    return __half2float(__ushort_as_half(bits));
+  }
+#endif
+}
+
+// x with the ten bits of fraction that tensor cores multiply, ties away from zero; as float32.
+__device__ __forceinline__ float round_to_tf32(float x) {
+#ifdef VN_EMULATE
+  uint32_t bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  if ((bits & 0x7f800000u) != 0x7f800000u) bits = (bits + 0x1000u) & 0xffffe000u;
+  std::memcpy(&x, &bits, sizeof x);
+  return x;
+#elif __CUDA_ARCH__ >= 800
+  uint32_t bits;
+  asm("cvt.rna.tf32.f32 %0, %1;" : "=r"(bits) : "f"(x));
+  return __uint_as_float(bits);
+#else
+  return x;
+#endif
+}
+
+// Loads four 8 x 8 matrices of 16-bit elements from shared memory: lane l gives the address of row l % 8 of matrix l /
+// 8 (16 bytes, aligned) and gets elements 2 (l % 4) and the next of row l / 4 of each; transposed, of column l / 4.
+template <bool kTransposed>
+__device__ __forceinline__ void load_matrices(uint32_t (&out)[4], const void* row) {
+#ifdef VN_EMULATE
+  emulated_ldmatrix(out, row, kTransposed);
+#else
+  const uint32_t address = static_cast<uint32_t>(__cvta_generic_to_shared(row));
+  if constexpr (kTransposed) {
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(out[0]), "=r"(out[1]), "=r"(out[2]), "=r"(out[3])
+                 : "r"(address)
+                 : "memory");
+  } else {
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(out[0]), "=r"(out[1]), "=r"(out[2]), "=r"(out[3])
+                 : "r"(address)
+                 : "memory");
+  }
+#endif
+}
+
+// d [16][8] += a [16][16] b [16][8] in float32; fragments as in the PTX manual. Before sm_80 float16 alone, in two
+// steps.
+template <bool kBfloat16>
+__device__ __forceinline__ void multiply_halves(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
+#ifdef VN_EMULATE
+  emulated_mma<16, 2>("mma.m16n8k16", d, a, b,
+                      [](uint32_t bits, int part) { return half_value(bits >> (16 * part), kBfloat16); });
+#elif __CUDA_ARCH__ >= 800
+  if constexpr (kBfloat16) {
+    asm volatile(
+        "mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, "
+        "%2, "
+        "%3};"
+        : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
+        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b[0]), "r"(b[1]));
+  } else {
+    asm volatile(
+        "mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, "
+        "%3};"
+        : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
+        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b[0]), "r"(b[1]));
+  }
+#else
+  if constexpr (!kBfloat16) {
+    for (int half = 0; half < 2; ++half) {
+      asm volatile(
+          "mma.sync.aligned.m16n8k8.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5}, {%6}, {%0, %1, %2, %3};"
+          : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
+          : "r"(a[2 * half]), "r"(a[2 * half + 1]), "r"(b[half]));
+    }
+  } else {
+    __trap();  // the launcher multiplies in float32 there
+  }
+#endif
+}
+
+// d [16][8] += a [16][8] b [8][8], operands rounded to tf32. From sm_80 on.
+__device__ __forceinline__ void multiply_tf32(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
+#ifdef VN_EMULATE
+  emulated_mma<8, 1>("mma.m16n8k8", d, a, b, [](uint32_t bits, int) {
+    float value;
+    std::memcpy(&value, &bits, sizeof value);
+    return value;
+  });
+#elif __CUDA_ARCH__ >= 800
+  asm volatile(
+      "mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, "
+      "%3};"
+      : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
+      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b[0]), "r"(b[1]));
+#else
+  __trap();  // the launcher multiplies in float32 there
+#endif
+}
 
 }  // namespace voronerf

@@ -29,6 +29,8 @@ _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
 _LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
 # Operations by the numbers of MlpCaller in csrc/grouped_mlp.h.
 CALLERS = ("grouped_mlp", "grouped_linear", "routed_mlp")
+# Types of products by the numbers of MlpPrecision in csrc/grouped_mlp_cuda_plan.h; the CPU has the first two.
+_OPERANDS = ("float32", "bfloat16", "float16", "tf32")
 
 
 def grouped_mlp(
@@ -113,10 +115,17 @@ def _cast(
         [weight.float() for weight in weights],
         # Autograd takes no list of optional tensors; an empty one stands for no bias.
         [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in biases],
-        " ".join((caller, "bfloat16" if dtype == torch.bfloat16 else "float32", "+".join(encoded), text)),
+        " ".join((caller, _operands(positions, dtype), "+".join(encoded), text)),
         None if directions is None else directions.float(),
         dtype,
     )
+
+
+def _operands(positions: Tensor, dtype: torch.dtype) -> str:
+    """Type of what is multiplied; CUDA alone has float16."""
+    if dtype == torch.float16 and _native.on_cuda(positions):
+        return "float16"
+    return "bfloat16" if dtype == torch.bfloat16 else "float32"
 
 
 class _Table(NamedTuple):
@@ -136,7 +145,7 @@ def _read(table: str) -> _Table:
     if DIRECTIONS in encoded:
         layers = replace(layers, direction_octaves=None)
     octaves = [-1 if count is None else count for count in (layers.position_octaves, layers.direction_octaves)]
-    numbers = [0, 0, *octaves, int(operands == "bfloat16"), CALLERS.index(caller), int(layers.integrated)]
+    numbers = [0, 0, *octaves, _OPERANDS.index(operands), CALLERS.index(caller), int(layers.integrated)]
     numbers += [len(layers.layers), len(layers.outputs)]
     widths = []
     for layer in layers.layers:
@@ -163,7 +172,7 @@ def _layers(table: str, weights: Sequence[Tensor]) -> MLP:
     return replace(given, layers=layers)
 
 
-@torch.library.custom_op("voronerf::grouped_mlp_native", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::grouped_mlp_native", mutates_args=(), device_types=("cpu", "cuda"))
 def _forward(
     positions: Tensor,
     offsets: Tensor,
@@ -189,19 +198,17 @@ def run(
     """The forward pass on sorted rows, or on those that ``order`` int32 [n] sorts."""
     kept = _Arguments(positions, offsets, weights, biases, directions, direction_index, order)
     out = _allocate(positions, table, weights)
-    _native._C.grouped_mlp(
-        _numbers(table, positions, weights, directions),
-        kept.inputs,
-        kept.weights,
-        kept.biases,
-        out.data_ptr(),
-        _native._ISA,
-        torch.get_num_threads(),
-    )
+    numbers = _numbers(table, positions, weights, directions)
+    given = numbers, kept.inputs, kept.weights, kept.biases, out.data_ptr()
+    if _native.on_cuda(positions):
+        device = _Device(kept, numbers, backward=False, parameters=False)
+        _native._C.grouped_mlp_cuda(*given, *device.arguments)
+    else:
+        _native._C.grouped_mlp(*given, _native._ISA, torch.get_num_threads())
     return out
 
 
-@torch.library.custom_op("voronerf::grouped_mlp_native_backward", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::grouped_mlp_native_backward", mutates_args=(), device_types=("cpu", "cuda"))
 def _backward(
     gradient: Tensor,
     positions: Tensor,
@@ -218,8 +225,9 @@ def _backward(
     results = _allocate_gradients(positions, weights, biases, directions, wanted)
     count, gradient = len(weights), gradient.contiguous()
     addresses = [_address(result) for result in results]
-    _native._C.grouped_mlp_backward(
-        _numbers(table, positions, weights, directions),
+    numbers = _numbers(table, positions, weights, directions)
+    given = (
+        numbers,
         kept.inputs,
         kept.weights,
         kept.biases,
@@ -227,11 +235,38 @@ def _backward(
         addresses[:count] if wanted[0] else [],
         addresses[count : 2 * count] if wanted[0] else [],
         addresses[-2] if wanted[1] else 0,
-        addresses[-1] if wanted[2] else 0,
-        _native._ISA,
-        torch.get_num_threads(),
     )
+    if not _native.on_cuda(positions):
+        to_directions = addresses[-1] if wanted[2] else 0
+        _native._C.grouped_mlp_backward(*given, to_directions, _native._ISA, torch.get_num_threads())
+        return results
+    device = _Device(kept, numbers, backward=True, parameters=wanted[0])
+    of_samples = results[-1]
+    if wanted[2] and direction_index is not None and directions is not None:
+        of_samples = positions.new_empty(positions.shape[0], directions.shape[1])
+    _native._C.grouped_mlp_backward_cuda(*given, _address(of_samples) if wanted[2] else 0, *device.arguments)
+    if of_samples is not results[-1] and direction_index is not None:
+        # torch adds in a fixed order where deterministic algorithms are asked for.
+        results[-1].zero_().index_add_(0, direction_index, of_samples)
     return results
+
+
+class _Device:
+    """What a CUDA call takes besides its tensors: the type of the products, a workspace, the device and its stream."""
+
+    def __init__(self, kept: _Arguments, numbers: list[int], *, backward: bool, parameters: bool) -> None:
+        positions = kept.tensors[0]
+        assert positions is not None
+        device, stream = _native.stream(positions)
+        precision = numbers[4]
+        if precision == 0 and torch.backends.cuda.matmul.fp32_precision == "tf32":
+            precision = _OPERANDS.index("tf32")
+        sizes = kept.inputs[5], kept.inputs[7]
+        size = _native._C.grouped_mlp_workspace_cuda(numbers, precision, *sizes, backward, parameters, device)
+        if isinstance(size, str):
+            raise ValueError(f"{CALLERS[numbers[5]]}: {size} on CUDA; use backend='reference'")
+        self.workspace = positions.new_empty(size, dtype=torch.uint8)
+        self.arguments = precision, self.workspace.data_ptr(), device, stream
 
 
 class _Arguments:

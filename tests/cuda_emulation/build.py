@@ -37,7 +37,7 @@ def build(sanitizer: str = "none") -> Path:
     sources += [ROOT / "csrc" / name for name in ("bindings_cuda.cpp", *SHARED) if (ROOT / "csrc" / name).exists()]
     includes = [ROOT / "csrc", HERE, Path(pybind11.get_include()), Path(sysconfig.get_path("include"))]
     flags = ["-std=c++17", "-O1", "-g1", "-fPIC", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=hidden"]
-    flags += ["-Wall", "-Wextra", "-Werror", "-DVN_EMULATE", "-DVN_WITH_CUDA"]
+    flags += ["-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-DVN_EMULATE", "-DVN_WITH_CUDA"]
     flags += [f"-I{path}" for path in includes[:2]] + [f"-isystem{path}" for path in includes[2:]]
     watched = SANITIZERS[sanitizer]
     lines = [

@@ -38,7 +38,7 @@ dim3 block_size, grid_size;
 
 namespace {
 
-constexpr size_t kStack = 64 * 1024;
+constexpr size_t kStack = 32 * 1024;
 constexpr unsigned kNoOrder = 1;         // a switch between fibers orders nothing
 constexpr unsigned char kPoison = 0xff;  // NaN as float32, bfloat16 and float16, and -1 as an index
 constexpr size_t kStaticShared = 48 * 1024;
@@ -260,6 +260,10 @@ int lane() {
 
 void require_all(unsigned mask) {
   if (mask != 0xffffffffu) fail("the emulation has no partial warps");
+}
+
+void misaligned(const char* operation) {
+  fail(std::string(operation) + " of an address that is not aligned");
 }
 
 void block_barrier() {

@@ -114,6 +114,7 @@ T from_lane(const unsigned char* slots, int lane) {
 }
 
 void require_all(unsigned mask);
+[[noreturn]] void misaligned(const char* operation);
 
 }  // namespace vn_emulation
 
@@ -251,37 +252,43 @@ inline float half_value(unsigned bits, bool bfloat16) {
   return static_cast<float>(value);
 }
 
-// d += a b with a 16 x k and b k x 8; `value(bits, part)` is one element of a register.
+// d += a b with a [16][kDepth] and b [kDepth][8], kPerRegister elements in a register; value(bits, part) is one of
+// them.
 template <int kDepth, int kPerRegister, typename Value>
-void emulated_mma(const char* name, float (&d)[4], const uint32_t* a, int a_count, const uint32_t* b, int b_count,
-                  const Value& value) {
+void emulated_mma(const char* name, float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2], const Value& value) {
   struct Fragments {
     uint32_t a[4], b[2];
-  } mine = {};
-  for (int i = 0; i < a_count; ++i) mine.a[i] = a[i];
-  for (int i = 0; i < b_count; ++i) mine.b[i] = b[i];
+  };
+  constexpr int kQuad = 4 * kPerRegister;  // elements of k that four lanes hold in one register each
+  static_assert(kDepth == 2 * kQuad, "two registers along k");
+  const Fragments mine = {{a[0], a[1], a[2], a[3]}, {b[0], b[1]}};
   const int lane = vn_emulation::lane();
   const unsigned char* slots = vn_emulation::meet(name, &mine, sizeof mine);
-  float left[16][kDepth], right[kDepth][8];
-  for (int other = 0; other < 32; ++other) {
-    const Fragments from = vn_emulation::from_lane<Fragments>(slots, other);
-    const int group = other / 4, member = other % 4;
-    for (int i = 0; i < a_count; ++i) {
-      for (int part = 0; part < kPerRegister; ++part) {
-        left[group + 8 * (i % 2)][member * kPerRegister + part + 4 * kPerRegister * (i / 2)] = value(from.a[i], part);
-      }
-    }
-    for (int i = 0; i < b_count; ++i) {
-      for (int part = 0; part < kPerRegister; ++part) {
-        right[member * kPerRegister + part + 4 * kPerRegister * i][group] = value(from.b[i], part);
-      }
-    }
-  }
   for (int i = 0; i < 4; ++i) {
-    const int row = lane / 4 + 8 * (i / 2), column = 2 * (lane % 4) + i % 2;
+    const int half = i / 2, column = 2 * (lane % 4) + i % 2;
     double sum = d[i];
-    for (int k = 0; k < kDepth; ++k) sum += static_cast<double>(left[row][k]) * right[k][column];
+    for (int k = 0; k < kDepth; ++k) {
+      const int member = k % kQuad / kPerRegister, part = k % kPerRegister, side = k / kQuad;
+      const auto left = vn_emulation::from_lane<Fragments>(slots, lane / 4 * 4 + member);
+      const auto right = vn_emulation::from_lane<Fragments>(slots, column * 4 + member);
+      sum += static_cast<double>(value(left.a[half + 2 * side], part)) * value(right.b[side], part);
+    }
     d[i] = static_cast<float>(sum);
+  }
+}
+
+// Four 8 x 8 matrices of 16-bit elements; lane l names row l % 8 of matrix l / 8.
+inline void emulated_ldmatrix(uint32_t (&out)[4], const void* row, bool transposed) {
+  if (reinterpret_cast<uintptr_t>(row) % 16 != 0) vn_emulation::misaligned("ldmatrix");
+  const int lane = vn_emulation::lane();
+  const unsigned char* slots = vn_emulation::meet(transposed ? "ldmatrix.trans" : "ldmatrix", &row, sizeof row);
+  for (int matrix = 0; matrix < 4; ++matrix) {
+    uint16_t parts[2];
+    for (int part = 0; part < 2; ++part) {
+      const int i = transposed ? 2 * (lane % 4) + part : lane / 4, j = transposed ? lane / 4 : 2 * (lane % 4) + part;
+      parts[part] = vn_emulation::from_lane<const uint16_t*>(slots, 8 * matrix + i)[j];
+    }
+    out[matrix] = parts[0] | static_cast<uint32_t>(parts[1]) << 16;
   }
 }
 

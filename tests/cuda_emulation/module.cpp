@@ -1,8 +1,11 @@
 // The CUDA half of voronerf._C, emulated: the bindings of csrc/bindings_cuda.cpp over .cu files compiled by g++.
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
 #include "bindings_cuda.h"
+#include "bindings_mlp_table.h"
 #include "emulation.h"
+#include "grouped_mlp_cuda.h"
 
 namespace py = pybind11;
 
@@ -15,6 +18,16 @@ PYBIND11_MODULE(voronerf_emulation, module) {
                planted(reinterpret_cast<const float*>(values), reinterpret_cast<float*>(out),
                        reinterpret_cast<int*>(counter), blocks, threads, bug);
              });
+  // Rows of a task, tasks, bytes of shared memory.
+  module.def(
+      "grouped_mlp_plan", [](const std::vector<int64_t>& table, int precision, int64_t n, int64_t k, bool backward) {
+        voronerf::MlpCudaPlan plan;
+        const char* fault =
+            voronerf::mlp_cuda_plan(mlp_arguments::read_table(table), static_cast<voronerf::MlpPrecision>(precision), n,
+                                    k, backward, voronerf::mlp_cuda_device(), plan);
+        VN_CHECK(fault == nullptr, fault);
+        return std::make_tuple(plan.task_rows, plan.tasks, plan.shared_bytes);
+      });
   module.def("seed", [](uint64_t seed) { vn_emulation::settings().seed = seed; });
   module.def("device", [](int capability, int shared_bytes) {
     vn_emulation::settings().capability = capability;

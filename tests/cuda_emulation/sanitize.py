@@ -107,12 +107,44 @@ def resample(module: ModuleType) -> None:
         written(depths)
 
 
+# Sine 20 of 2 octaves of positions, softplus 70 of that and positions, sigmoid 18 of that and directions; out come the
+# last and the first. As voronerf/_native_mlp.py writes it.
+TABLE = [3, 3, 2, -1, 0, 0, 0, 3, 2, 20, 4, 1, -1, 70, 2, 2, 0, -1, 18, 3, 2, 1, -2, 2, 0]
+SHAPES = [(20, 15), (70, 35), (18, 73)]
+
+
+def grouped_mlp(module: ModuleType) -> None:
+    counts = [37, 0, 20, 3]
+    n, k, r = 64, len(counts), 5
+    offsets = np.cumsum([2, *counts]).astype(np.int32)
+    positions, directions, gradient = floats(n, 3), floats(r, 3), floats(n, 38)
+    index, order = RANDOM.integers(0, r, n).astype(np.int32), RANDOM.permutation(n).astype(np.int32)
+    weights, biases = [floats(k, o, i) for o, i in SHAPES], [floats(k, o) for o, _ in SHAPES]
+    arguments = [at(positions), at(directions), at(index), at(offsets), at(order), n, r, k]
+    given = TABLE, arguments, [at(x) for x in weights], [at(x) for x in biases]
+    for precision, shared in ((0, 227), (1, 40), (3, 64)):
+        module.device(90, shared * 1024)
+
+        def workspace(backward: bool, precision: int = precision) -> np.ndarray:
+            size = module.grouped_mlp_workspace_cuda(TABLE, precision, n, k, backward, True, 0)
+            assert isinstance(size, int), size
+            return np.full(size, 255, np.uint8)
+
+        out, memory = unwritten(n, 38), workspace(False)
+        module.grouped_mlp_cuda(*given, at(out), precision, at(memory), *GPU)
+        grad_weights, grad_biases = [unwritten(*x.shape) for x in weights], [unwritten(*x.shape) for x in biases]
+        grad_positions, grad_directions, memory = unwritten(n, 3), unwritten(n, 3), workspace(True)
+        results = [at(x) for x in grad_weights], [at(x) for x in grad_biases], at(grad_positions), at(grad_directions)
+        module.grouped_mlp_backward_cuda(*given, at(gradient), *results, precision, at(memory), *GPU)
+        written(out, *grad_weights, *grad_biases, grad_positions, grad_directions)
+
+
 def main(path: str) -> None:
     spec = importlib.util.spec_from_file_location("voronerf_emulation", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    for run in (nearest_centre, locate_cell, cell_sort, composite, encode, resample):
+    for run in (nearest_centre, locate_cell, cell_sort, composite, encode, resample, grouped_mlp):
         run(module)
     print("clean")
 

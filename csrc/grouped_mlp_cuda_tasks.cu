@@ -1,0 +1,158 @@
+// What grouped_mlp does before and after its rows on CUDA: every cell's weights are rounded and packed as the kernels
+// want them in shared memory, so that loading them there is one straight copy; the tasks of all cells are numbered, so
+// that a block finds its rows without the host having read the offsets; rows of no cell are cleared; and the partial
+// weight gradients of a cell's tasks are summed in their order, which makes them the same every time.
+#include "grouped_mlp_cuda_tile.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kThreads = 256;
+constexpr int kScanThreads = 1024;
+
+// A block a cell and layer: grid (k, layers).
+template <typename Products>
+__global__ void __launch_bounds__(kThreads)
+    mlp_pack_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameters parameters) {
+  using Element = typename Products::Element;
+  const int64_t cell = blockIdx.x;
+  const MlpCudaLayer& layer = plan.layers[blockIdx.y];
+  unsigned char* packed = data.packed + cell * plan.packed_bytes;
+  Element* to = reinterpret_cast<Element*>(packed) + layer.weight;
+  float* biases = reinterpret_cast<float*>(packed + sizeof(Element) * plan.packed_weights) + layer.bias;
+  const float* weight = parameters.weights[blockIdx.y] + cell * layer.width * layer.inputs;
+  const float* bias = parameters.biases[blockIdx.y];
+  const int pairs = layer.weight_stride / 2;
+  for (int i = threadIdx.x; i < layer.padded * pairs; i += kThreads) {
+    const int row = i / pairs, column = 2 * (i - row * pairs);
+    float values[2] = {0.0f, 0.0f};
+    for (int s = 0; s < layer.source_count; ++s) {
+      const MlpCudaSource& source = layer.sources[s];
+      for (int part = 0; part < 2; ++part) {
+        const int feature = column + part - source.packed;
+        if (row < layer.width && feature >= 0 && feature < source.width) {
+          values[part] = weight[row * layer.inputs + source.column + feature];
+        }
+      }
+    }
+    Products::store(to + row * layer.weight_stride + column, values[0], values[1]);
+  }
+  for (int i = threadIdx.x; i < layer.padded; i += kThreads) {
+    biases[i] = bias == nullptr || i >= layer.width ? 0.0f : bias[cell * layer.width + i];
+  }
+}
+
+// first_task [k+1] by one block: the running sum of the cells' numbers of tasks.
+__global__ void __launch_bounds__(kScanThreads) mlp_tasks_kernel(const MlpCudaPlan plan, const MlpCudaData data) {
+  VN_SHARED(sums, int32_t[32]);
+  const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+  int32_t carry = 0;
+  for (int64_t start = 0; start < data.k; start += kScanThreads) {
+    const int64_t cell = start + threadIdx.x;
+    const int32_t tasks = cell < data.k ? static_cast<int32_t>(ceil_div(mlp_cell_rows(data, cell), plan.task_rows)) : 0;
+    int32_t running = tasks;
+    for (int step = 1; step < 32; step *= 2) {
+      const int32_t other = __shfl_up_sync(kAllLanes, running, step);
+      if (lane >= step) running += other;
+    }
+    if (lane == 31) sums[warp] = running;
+    __syncthreads();
+    int32_t before = carry, total = 0;
+    for (int i = 0; i < 32; ++i) {
+      if (i < warp) before += sums[i];
+      total += sums[i];
+    }
+    if (cell < data.k) data.first_task[cell] = before + running - tasks;
+    carry += total;
+    __syncthreads();  // the sums are read by all
+  }
+  // Cells that overlap, which offsets that fall make, would have more tasks than the grid has blocks.
+  if (threadIdx.x == 0) data.first_task[data.k] = carry < plan.tasks ? carry : static_cast<int32_t>(plan.tasks);
+}
+
+__global__ void __launch_bounds__(kThreads) mlp_strays_kernel(const MlpCudaData data, int width, float* rows) {
+  const int64_t first = data.offsets[0], last = data.offsets[data.k];
+  const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads;
+  for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < data.n; i += step) {
+    if (i >= first && i < last) continue;
+    const int64_t row = mlp_source_row(data, i);
+    for (int column = 0; column < width; ++column) rows[row * width + column] = 0.0f;
+  }
+}
+
+// A block a cell and layer: grid (k, layers).
+__global__ void __launch_bounds__(kThreads)
+    mlp_reduce_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameterGradients gradients) {
+  const int64_t cell = blockIdx.x;
+  const MlpCudaLayer& layer = plan.layers[blockIdx.y];
+  const int64_t first = data.first_task[cell], last = layer.live ? data.first_task[cell + 1] : first;
+  const auto sum = [&](int at) {
+    float total = 0.0f;
+    for (int64_t task = first; task < last; ++task) total += data.partials[task * plan.partial + at];
+    return total;
+  };
+  float* weights = gradients.weights[blockIdx.y];
+  float* biases = gradients.biases[blockIdx.y];
+  for (int s = 0; s < layer.source_count; ++s) {
+    const MlpCudaSource& source = layer.sources[s];
+    for (int i = threadIdx.x; i < layer.width * source.width; i += kThreads) {
+      const int row = i / source.width, feature = i - row * source.width;
+      weights[(cell * layer.width + row) * layer.inputs + source.column + feature] =
+          sum(layer.partial + row * layer.partial_stride + source.packed + feature);
+    }
+  }
+  for (int i = threadIdx.x; biases != nullptr && i < layer.width; i += kThreads) {
+    biases[cell * layer.width + i] = sum(layer.partial_bias + i);
+  }
+}
+
+template <typename Products>
+void pack(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters, void* stream) {
+  VN_LAUNCH((mlp_pack_kernel<Products>), dim3(static_cast<unsigned>(data.k), plan.layer_count), kThreads, 0, stream,
+            plan, data, parameters);
+}
+
+}  // namespace
+
+MlpCudaDevice mlp_cuda_device() {
+  int device = 0, major = 0, minor = 0;
+  MlpCudaDevice found{};
+  VN_CUDA_CHECK(cudaGetDevice(&device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&minor, cudaDevAttrComputeCapabilityMinor, device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.multiprocessors, cudaDevAttrMultiProcessorCount, device));
+  found.capability = 10 * major + minor;
+  return found;
+}
+
+void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
+                      void* stream) {
+  VN_LAUNCH(mlp_tasks_kernel, 1, kScanThreads, 0, stream, plan, data);
+  switch (plan.precision) {
+    case MlpPrecision::bfloat16:
+      return pack<HalfProducts<true>>(plan, data, parameters, stream);
+    case MlpPrecision::float16:
+      return pack<HalfProducts<false>>(plan, data, parameters, stream);
+    case MlpPrecision::tf32:
+      return pack<FloatProducts<true>>(plan, data, parameters, stream);
+    case MlpPrecision::float32:
+      return pack<FloatProducts<false>>(plan, data, parameters, stream);
+  }
+}
+
+void mlp_cuda_zero_strays(const MlpCudaData& data, int width, float* rows, void* stream) {
+  if (data.n == 0 || rows == nullptr) return;
+  const int64_t blocks = ceil_div<int64_t>(data.n, kThreads);
+  VN_LAUNCH(mlp_strays_kernel, static_cast<unsigned>(blocks < 1024 ? blocks : 1024), kThreads, 0, stream, data, width,
+            rows);
+}
+
+void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameterGradients& gradients,
+                     void* stream) {
+  VN_LAUNCH(mlp_reduce_kernel, dim3(static_cast<unsigned>(data.k), plan.layer_count), kThreads, 0, stream, plan, data,
+            gradients);
+}
+
+}  // namespace voronerf

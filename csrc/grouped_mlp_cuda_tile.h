@@ -1,0 +1,339 @@
+// What the forward and the backward kernel of grouped_mlp share: products of a warp's tiles, and the rows of a task.
+#pragma once
+
+#include "cuda_wrappers.h"
+#include "encode_math.h"
+#include "grouped_mlp_cuda.h"
+
+namespace voronerf {
+
+constexpr int kMlpTiles = kMlpChunk / 8;  // 8-column tiles that a warp has in registers
+
+// A warp's sums: [16 rows][8 columns] each, in the layout of mma's accumulators. Lane l has rows l / 4 and l / 4 + 8,
+// columns 2 (l % 4) and the next.
+template <int kRowTiles, int kTiles>
+using MlpSums = float[kRowTiles][kTiles][4];
+
+// An operand in shared memory: element (i, k) is at[i * stride + k], or transposed at[k * stride + i].
+//
+// 16-bit operands.
+template <bool kBfloat16>
+struct HalfProducts {
+  using Element = uint16_t;
+  static constexpr int kSkew = 8;
+
+  static __device__ void store(Element* to, float x, float y) {
+    *reinterpret_cast<uint32_t*>(to) = pack_halves<kBfloat16>(x, y);
+  }
+  static __device__ float load(const Element* from) { return unpack_half<kBfloat16>(*from); }
+
+  // sums += a b^T with a [16 kRowTiles][depth], b [8 tiles][depth]; depth a multiple of 16, tiles of 2.
+  template <bool kTransposedA, bool kTransposedB, int kRowTiles, int kTiles>
+  static __device__ void multiply(MlpSums<kRowTiles, kTiles>& sums, const Element* a, int a_stride, const Element* b,
+                                  int b_stride, int depth, int tiles) {
+    const int lane = threadIdx.x % 32, low = lane % 8, middle = lane / 8 % 2, high = lane / 16;
+    for (int k = 0; k < depth; k += 16) {
+      uint32_t left[kRowTiles][4];
+#pragma unroll
+      for (int r = 0; r < kRowTiles; ++r) {
+        const int row = 16 * r + low + 8 * middle, column = k + 8 * high;
+        if constexpr (kTransposedA) {
+          load_matrices<true>(left[r], a + (k + low + 8 * high) * a_stride + 16 * r + 8 * middle);
+        } else {
+          load_matrices<false>(left[r], a + row * a_stride + column);
+        }
+      }
+#pragma unroll
+      for (int tile = 0; tile < kTiles; tile += 2) {
+        if (tile < tiles) {
+          uint32_t right[4];
+          if constexpr (kTransposedB) {
+            load_matrices<true>(right, b + (k + low + 8 * middle) * b_stride + 8 * tile + 8 * high);
+          } else {
+            load_matrices<false>(right, b + (8 * tile + low + 8 * high) * b_stride + k + 8 * middle);
+          }
+          const uint32_t first[2] = {right[0], right[1]}, second[2] = {right[2], right[3]};
+#pragma unroll
+          for (int r = 0; r < kRowTiles; ++r) {
+            multiply_halves<kBfloat16>(sums[r][tile], left[r], first);
+            multiply_halves<kBfloat16>(sums[r][tile + 1], left[r], second);
+          }
+        }
+      }
+    }
+  }
+};
+
+// float32 operands: rounded to tf32 on tensor cores, or exactly, on the others.
+template <bool kTf32>
+struct FloatProducts {
+  using Element = float;
+  static constexpr int kSkew = 4;
+
+  static __device__ void store(Element* to, float x, float y) {
+    *reinterpret_cast<float2*>(to) = kTf32 ? make_float2(round_to_tf32(x), round_to_tf32(y)) : make_float2(x, y);
+  }
+  static __device__ float load(const Element* from) { return *from; }
+
+  template <bool kTransposed>
+  static __device__ float at(const Element* from, int stride, int i, int k) {
+    return kTransposed ? from[k * stride + i] : from[i * stride + k];
+  }
+  template <bool kTransposed>
+  static __device__ uint32_t bits(const Element* from, int stride, int i, int k) {
+    const float x = at<kTransposed>(from, stride, i, k);
+    uint32_t word;
+    memcpy(&word, &x, sizeof word);
+    return word;
+  }
+
+  template <bool kTransposedA, bool kTransposedB, int kRowTiles, int kTiles>
+  static __device__ void multiply(MlpSums<kRowTiles, kTiles>& sums, const Element* a, int a_stride, const Element* b,
+                                  int b_stride, int depth, int tiles) {
+    const int lane = threadIdx.x % 32, group = lane / 4, member = lane % 4;
+    if constexpr (kTf32) {
+      for (int k = 0; k < depth; k += 8) {
+        uint32_t left[kRowTiles][4];
+#pragma unroll
+        for (int r = 0; r < kRowTiles; ++r) {
+#pragma unroll
+          for (int i = 0; i < 4; ++i) {
+            left[r][i] = bits<kTransposedA>(a, a_stride, 16 * r + group + 8 * (i % 2), k + member + 4 * (i / 2));
+          }
+        }
+#pragma unroll
+        for (int tile = 0; tile < kTiles; ++tile) {
+          if (tile < tiles) {
+            const uint32_t right[2] = {bits<kTransposedB>(b, b_stride, 8 * tile + group, k + member),
+                                       bits<kTransposedB>(b, b_stride, 8 * tile + group, k + member + 4)};
+#pragma unroll
+            for (int r = 0; r < kRowTiles; ++r) multiply_tf32(sums[r][tile], left[r], right);
+          }
+        }
+      }
+    } else {
+      // Four steps of k at a time: untransposed operands come as vectors.
+      for (int k = 0; k < depth; k += 4) {
+        float left[2 * kRowTiles][4];
+#pragma unroll
+        for (int r = 0; r < 2 * kRowTiles; ++r) load_four<kTransposedA>(left[r], a, a_stride, group + 8 * r, k);
+#pragma unroll
+        for (int tile = 0; tile < kTiles; ++tile) {
+          if (tile < tiles) {
+#pragma unroll
+            for (int part = 0; part < 2; ++part) {
+              float right[4];
+              load_four<kTransposedB>(right, b, b_stride, 8 * tile + 2 * member + part, k);
+#pragma unroll
+              for (int r = 0; r < 2 * kRowTiles; ++r) {
+                float sum = sums[r / 2][tile][2 * (r % 2) + part];
+#pragma unroll
+                for (int step = 0; step < 4; ++step) sum = fmaf(left[r][step], right[step], sum);
+                sums[r / 2][tile][2 * (r % 2) + part] = sum;
+              }
+            }
+          }
+        }
+      }
+    }
+  }
+
+  template <bool kTransposed>
+  static __device__ void load_four(float (&to)[4], const Element* from, int stride, int i, int k) {
+    if constexpr (kTransposed) {
+#pragma unroll
+      for (int step = 0; step < 4; ++step) to[step] = from[(k + step) * stride + i];
+    } else {
+      const float4 four = *reinterpret_cast<const float4*>(from + i * stride + k);
+      to[0] = four.x, to[1] = four.y, to[2] = four.z, to[3] = four.w;
+    }
+  }
+};
+
+// Rows of a cell that a block works through.
+struct MlpTask {
+  int64_t begin, end;
+  int cell;
+};
+
+// Rows of a cell, kept inside the batch whatever the offsets say.
+__device__ inline int64_t mlp_cell_begin(const MlpCudaData& data, int64_t cell) {
+  const int64_t first = data.offsets[cell];
+  return first < 0 ? 0 : first > data.n ? data.n : first;
+}
+__device__ inline int64_t mlp_cell_rows(const MlpCudaData& data, int64_t cell) {
+  const int64_t end = data.offsets[cell + 1] > data.n ? data.n : data.offsets[cell + 1];
+  const int64_t rows = end - mlp_cell_begin(data, cell);
+  return rows < 0 ? 0 : rows;
+}
+
+// Task number `task`, found in the map that the device made; false where there are fewer.
+__device__ inline bool mlp_find_task(const MlpCudaPlan& plan, const MlpCudaData& data, int64_t task, MlpTask& found) {
+  int64_t low = 0, high = data.k;  // the last cell whose first task is not after this one
+  if (task >= data.first_task[data.k]) return false;
+  while (high - low > 1) {
+    const int64_t middle = (low + high) / 2;
+    if (data.first_task[middle] <= task) {
+      low = middle;
+    } else {
+      high = middle;
+    }
+  }
+  const int64_t begin = mlp_cell_begin(data, low), end = begin + mlp_cell_rows(data, low);
+  found.cell = static_cast<int>(low);
+  found.begin = begin + (task - data.first_task[low]) * plan.task_rows;
+  found.end = found.begin + plan.task_rows < end ? found.begin + plan.task_rows : end;
+  return true;
+}
+
+__device__ inline int64_t mlp_source_row(const MlpCudaData& data, int64_t row) {
+  return data.order == nullptr ? row : data.order[row];
+}
+
+// Raw features of a row.
+__device__ inline const float* mlp_positions(const MlpCudaPlan& plan, const MlpCudaData& data, int64_t row) {
+  return data.positions + mlp_source_row(data, row) * plan.positions.raw;
+}
+__device__ inline const float* mlp_directions(const MlpCudaPlan& plan, const MlpCudaData& data, int64_t row) {
+  const int64_t source = mlp_source_row(data, row);
+  return data.directions +
+         (data.direction_index == nullptr ? source : data.direction_index[source]) * plan.directions.raw;
+}
+
+// One column of an encoding.
+__device__ inline float mlp_encoded(const MlpCudaInput& input, const float* raw, int column) {
+  if (column >= input.width) return 0.0f;
+  if (input.octaves < 0) return raw[column];
+  const int features = input.integrated ? input.raw / 2 : input.raw;
+  if (!input.integrated) {
+    if (column < features) return raw[column];
+    column -= features;
+  }
+  const int part = column / features, feature = column - part * features;
+  const float scale = octave_scale(part / 2);
+  const float value = sine_of_octave(raw[feature] * scale, part % 2 == 0 ? 0.0f : 0.5f);
+  return input.integrated ? value * octave_blur(scale, raw[features + feature]) : value;
+}
+
+// Encodes a warp's rows into its region; rows past the end are zero.
+template <typename Products, typename Raw>
+__device__ void mlp_encode(const MlpCudaInput& input, typename Products::Element* region, int rows, int64_t first,
+                           int64_t end, const Raw& raw_of) {
+  if (!input.used) return;
+  const int lane = threadIdx.x % 32, pairs = input.padded / 2;
+  for (int i = lane; i < rows * pairs; i += 32) {
+    const int row = i / pairs, column = 2 * (i - row * pairs);
+    float x = 0.0f, y = 0.0f;
+    if (first + row < end) {
+      const float* raw = raw_of(first + row);
+      x = mlp_encoded(input, raw, column);
+      y = mlp_encoded(input, raw, column + 1);
+    }
+    Products::store(region + input.value + row * input.stride + column, x, y);
+  }
+}
+
+__device__ inline float mlp_activate(int activation, float x) {
+  switch (static_cast<Activation>(activation)) {
+    case Activation::relu:
+      return x < 0.0f ? 0.0f : x;
+    case Activation::softplus:
+      return (x < 0.0f ? 0.0f : x) + log1pf(expf(-fabsf(x)));
+    case Activation::sigmoid:
+      return 1.0f / (1.0f + expf(-x));
+    case Activation::sine:
+      return sinf(x);
+    default:
+      return x;
+  }
+}
+
+// A source of a layer in the warp's region.
+struct MlpPlace {
+  int value, stride;
+};
+__device__ inline MlpPlace mlp_place(const MlpCudaPlan& plan, int from) {
+  if (from == kFromPositions) return {plan.positions.value, plan.positions.stride};
+  if (from == kFromDirections) return {plan.directions.value, plan.directions.stride};
+  return {plan.layers[from].value, plan.layers[from].stride};
+}
+
+// Copies a piece of packed weights to shared memory: `rows` rows of `bytes` bytes, both strides in bytes, all multiples
+// of 16.
+__device__ inline void mlp_copy(unsigned char* to, int to_stride, const unsigned char* from, int from_stride, int rows,
+                                int bytes) {
+  const int words = bytes / 16;
+  for (int i = threadIdx.x; i < rows * words; i += blockDim.x) {
+    const int row = i / words, word = i - row * words;
+    *reinterpret_cast<float4*>(to + row * to_stride + 16 * word) =
+        *reinterpret_cast<const float4*>(from + static_cast<int64_t>(row) * from_stride + 16 * word);
+  }
+}
+
+// Rows of a warp through the network. `slot` is where weights are in shared memory, `packed` where in global memory.
+// visit(layer, chunk, sums) sees every layer's results before they are rounded.
+template <typename Products, int kRowTiles, typename Visit>
+__device__ void mlp_run(const MlpCudaPlan& plan, typename Products::Element* region, typename Products::Element* slot,
+                        const unsigned char* packed, const Visit& visit) {
+  using Element = typename Products::Element;
+  const int lane = threadIdx.x % 32, group = lane / 4, member = lane % 4;
+  const float* biases = reinterpret_cast<const float*>(packed + sizeof(Element) * plan.packed_weights);
+  for (int l = 0; l < plan.layer_count; ++l) {
+    const MlpCudaLayer& layer = plan.layers[l];
+    if (!layer.live) continue;
+    for (int chunk = 0; chunk < layer.padded; chunk += kMlpChunk) {
+      const int columns = layer.padded - chunk < kMlpChunk ? layer.padded - chunk : kMlpChunk;
+      const Element* weights = slot + layer.weight + chunk * layer.weight_stride;
+      if (!plan.resident) {
+        __syncthreads();  // the piece before is read by all
+        const int bytes = static_cast<int>(sizeof(Element)) * columns * layer.weight_stride;
+        mlp_copy(reinterpret_cast<unsigned char*>(slot), 0,
+                 packed + sizeof(Element) * (layer.weight + chunk * layer.weight_stride), 0, 1, bytes);
+        __syncthreads();
+        weights = slot;
+      }
+      MlpSums<kRowTiles, kMlpTiles> sums;
+#pragma unroll
+      for (int tile = 0; tile < kMlpTiles; ++tile) {
+        const int column = 8 * tile + 2 * member;
+        const bool there = column < columns;
+        const float x = there ? biases[layer.bias + chunk + column] : 0.0f;
+        const float y = there ? biases[layer.bias + chunk + column + 1] : 0.0f;
+#pragma unroll
+        for (int r = 0; r < kRowTiles; ++r) {
+          sums[r][tile][0] = sums[r][tile][2] = x;
+          sums[r][tile][1] = sums[r][tile][3] = y;
+        }
+      }
+      for (int s = 0; s < layer.source_count; ++s) {
+        const MlpCudaSource& source = layer.sources[s];
+        const MlpPlace place = mlp_place(plan, source.from);
+        Products::template multiply<false, false>(sums, region + place.value, place.stride, weights + source.packed,
+                                                  layer.weight_stride, source.padded, columns / 8);
+      }
+      __syncwarp();  // the result may lie where a source was
+#pragma unroll
+      for (int r = 0; r < kRowTiles; ++r) {
+#pragma unroll
+        for (int tile = 0; tile < kMlpTiles; ++tile) {
+          if (8 * tile < columns) {
+            const int row = 16 * r + group, column = chunk + 8 * tile + 2 * member;
+#pragma unroll
+            for (int half = 0; half < 2; ++half) {
+              float* pair = sums[r][tile] + 2 * half;
+              const int at = (row + 8 * half) * layer.stride + column;
+              if (layer.slope >= 0) Products::store(region + layer.slope + at, cosf(pair[0]), cosf(pair[1]));
+              pair[0] = mlp_activate(layer.activation, pair[0]);
+              pair[1] = mlp_activate(layer.activation, pair[1]);
+              Products::store(region + layer.value + at, pair[0], pair[1]);
+            }
+          }
+        }
+      }
+      visit(l, chunk, sums);
+      __syncwarp();
+    }
+  }
+}
+
+}  // namespace voronerf
