@@ -14,7 +14,7 @@ CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
 
 SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
 
-.PHONY: demo test bench check cuda-check emulate-cuda sanitize clean
+.PHONY: demo test bench check cuda-check gpu-check emulate-cuda sanitize clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -37,6 +37,11 @@ check: $(VENV)/.built
 
 cuda-check:
 	@$(PYTHON) .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
+
+# Everything to be learnt from a machine with a GPU, in eight minutes; OUT is a folder for what it says.
+OUT ?= build/gpu-check
+gpu-check:
+	@$(PYTHON) .ci/gpu_check.py --out $(OUT) $(GPU_CHECK_ARGS)
 
 # The tests of the operations on CUDA kernels that run on the CPU, threads in several orders.
 emulate-cuda: $(VENV)/.built

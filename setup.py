@@ -137,12 +137,10 @@ def build_info(cuda: Cuda) -> str:
 
 def ninja_file(module: Path, cuda: Cuda) -> str:
     """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder."""
-    import pybind11
-
     common = ["-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
     # Without OpenMP its pragmas mean nothing, nor do the numbers of threads that stand in them.
     openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
-    includes = [f"-I{SOURCES}", f"-isystem{pybind11.get_include()}", f"-isystem{sysconfig.get_path('include')}"]
+    includes = [f"-I{SOURCES}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
     # After CXXFLAGS: results are defined by separate roundings (csrc/nearest_centre_math.h), fused ones are named, and
     # NaN and infinity are told apart from numbers.
     extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off"]
@@ -189,6 +187,20 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
             lines.append(f"build {objects[-1]}: nvcc {quote(str(source))}")
     lines.append(f"build {quote(module.name)}: link {' '.join(objects)}")
     return "\n".join([*lines, f"default {quote(module.name)}", ""])
+
+
+def pybind11_headers() -> str:
+    """Those of the package, or the ones that torch brings: a machine without a network may have no others."""
+    try:
+        import pybind11
+    except ImportError:
+        import importlib.util
+
+        torch = importlib.util.find_spec("torch")
+        if torch is None or torch.origin is None:
+            raise SystemExit("voronerf: pybind11 is missing; pip install pybind11") from None
+        return str(Path(torch.origin).parent / "include")
+    return str(pybind11.get_include())
 
 
 def quote(path: str) -> str:

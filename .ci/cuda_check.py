@@ -1,9 +1,10 @@
 """Compile every .cu for every architecture, warnings as errors, without a GPU: ``cuda_check.py 80 90a ...``.
 
-Registers, spills and shared memory of every kernel are printed and kept in build/cuda-check/resources.json, so that a
-regression shows in a diff of two runs. The last architecture is compiled to PTX as well. A kernel whose resources are
-not reported for every architecture is a failure, and so is no kernel at all: nothing was checked then. The last line
-says in one sentence what was compiled and whether it held.
+Registers, spills, shared memory, and the warps that registers let a multiprocessor hold, are printed for every kernel
+and compared with the table that is kept, .ci/cuda_resources.json: a spill that is not in it is a failure, and with the
+nvcc that it was made by so are registers or shared memory above it. ``--update`` writes it anew. The last architecture
+is compiled to PTX as well. A kernel whose resources are not reported for every architecture is a failure, and so is no
+kernel at all: nothing was checked then. The last line says in one sentence what was compiled and whether it held.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "build" / "cuda-check"
+TABLE = ROOT / ".ci" / "cuda_resources.json"
+REGISTERS = 65536
+"""Of a multiprocessor."""
 FLAGS = ["-std=c++17", "-O3", "-Werror", "all-warnings", "-Xcompiler", "-Wall,-Wextra,-Werror", "-Xptxas", "-v"]
 KERNEL = re.compile(
     r"Compiling entry function '(?P<name>\w+)' for '(?P<arch>\w+)'.*?"
@@ -29,7 +33,9 @@ KERNEL = re.compile(
 
 
 def main(architectures: list[str]) -> int:
-    """Compile, print, and return the exit status."""
+    """Compile, print, compare, and return the exit status."""
+    update = "--update" in architectures
+    architectures = [architecture for architecture in architectures if architecture != "--update"]
     nvcc = shutil.which("nvcc") or shutil.which("nvcc", path="/usr/local/cuda/bin")
     sources = sorted((ROOT / "csrc").glob("*.cu"))
     if nvcc is None:
@@ -46,7 +52,7 @@ def main(architectures: list[str]) -> int:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = list(pool.map(compile_one, sources))
     failed = [source.name for source, result in zip(sources, results) if result.returncode != 0]
-    kernels: dict[str, dict[str, dict[str, int]]] = {}
+    kernels: Kernels = {}
     for source, result in zip(sources, results):
         if result.returncode != 0:
             print(f"{source.name}:\n{result.stdout}{result.stderr}")
@@ -56,11 +62,13 @@ def main(architectures: list[str]) -> int:
                 "registers": int(match["registers"]),
                 "spilled_bytes": int(match["stores"]) + int(match["loads"]),
                 "shared_bytes": int(shared[1]) if shared else 0,
+                "warps": warps(int(match["registers"])),
             }
     for kernel, by_architecture in sorted(kernels.items()):
         columns = {key: [row[key] for row in by_architecture.values()] for key in next(iter(by_architecture.values()))}
         print(f"{kernel}: " + ", ".join(f"{key} {span(values)}" for key, values in columns.items()))
-    (OUT / "resources.json").write_text(json.dumps(kernels, indent=1, sort_keys=True) + "\n")
+    version = nvcc_version(nvcc)
+    (OUT / "resources.json").write_text(as_text(version, kernels))
     spilling = sum(row["spilled_bytes"] > 0 for rows in kernels.values() for row in rows.values())
     targets = f"{', '.join(f'sm_{arch}' for arch in architectures)} and PTX of {architectures[-1]}"
     # What did not compile lacks architectures for that reason.
@@ -71,16 +79,71 @@ def main(architectures: list[str]) -> int:
         for arch in architectures
         if f"sm_{arch}" not in found
     ]
+    worse = [] if update else regressions(version, kernels)
+    for line in worse:
+        print(line)
     if failed:
         outcome = f"failed in {', '.join(failed)}"
     elif lacking:
         outcome = f"failed: no resources were reported of {', '.join(lacking)}"
     elif not kernels:
         outcome = "failed: no kernel was reported"
+    elif worse:
+        outcome = f"failed: {len(worse)} regressions against {TABLE.relative_to(ROOT)}, listed above"
     else:
         outcome = f"held without a warning, {spilling} spilling"
+        if update:
+            TABLE.write_text(as_text(version, kernels))
     print(f"cuda-check: {len(sources)} files, {len(kernels)} kernels compiled for {targets} {outcome}.")
-    return 1 if failed or lacking or not kernels else 0
+    return 1 if failed or lacking or worse or not kernels else 0
+
+
+Kernels = dict[str, dict[str, dict[str, int]]]
+
+
+def regressions(version: str, kernels: Kernels) -> list[str]:
+    """What is worse than in the table, a line each; kernels and architectures that are not in it may not spill."""
+    kept = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": "", "kernels": {}}
+    compared = ("spilled_bytes", "registers", "shared_bytes") if kept["nvcc"] == version else ("spilled_bytes",)
+    worse = []
+    for kernel, by_architecture in sorted(kernels.items()):
+        for architecture, row in by_architecture.items():
+            known = unpack(kept["kernels"].get(kernel, {})).get(architecture, {"spilled_bytes": 0})
+            for key in compared:
+                if row[key] > known.get(key, row[key]):
+                    worse.append(f"{kernel} ({architecture}): {key} {row[key]}, above {known[key]}")
+    return worse
+
+
+COLUMNS = ("registers", "spilled_bytes", "shared_bytes", "warps")
+
+
+def as_text(version: str, kernels: Kernels) -> str:
+    """The table as JSON, a line for each kernel and architecture."""
+    rows = {
+        kernel: {architecture: [row[key] for key in COLUMNS] for architecture, row in by_architecture.items()}
+        for kernel, by_architecture in sorted(kernels.items())
+    }
+    text = json.dumps({"nvcc": version, "columns": COLUMNS, "kernels": rows}, indent=1)
+    return re.sub(r"\[\s+([^\[\]]*?)\s+\]", lambda found: "[" + re.sub(r"\s+", " ", found[1]) + "]", text) + "\n"
+
+
+def unpack(rows: dict[str, list[int]]) -> dict[str, dict[str, int]]:
+    """Rows of one kernel in the table, by architecture."""
+    return {architecture: dict(zip(COLUMNS, row)) for architecture, row in rows.items()}
+
+
+def warps(registers: int) -> int:
+    """Warps of which the registers fit a multiprocessor; 64 at most, on some 32 or 48."""
+    return min(64, REGISTERS // (32 * -(-max(registers, 1) // 8) * 8))
+
+
+def nvcc_version(nvcc: str) -> str:
+    """Such as "V13.0.88"."""
+    found = re.search(
+        r"V[\d.]+", subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True).stdout
+    )
+    return found[0] if found else ""
 
 
 def demangled(name: str) -> str:

@@ -25,7 +25,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 9;
+constexpr int INTERFACE = 10;
 
 using Address = std::uintptr_t;
 

@@ -11,16 +11,19 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
+constexpr int kRows = 64;             // of a block, forward
 constexpr int64_t kBlocks = 1 << 16;  // of a grid, whose threads then take several elements
 
 __global__ void __launch_bounds__(kThreads)
     encode_kernel(const float* __restrict__ x, const float* __restrict__ variances, float* __restrict__ out, int64_t n,
                   int d, int octaves, int include_input) {
   const int width = d * (2 * octaves + include_input);
-  const int64_t size = n * width, step = static_cast<int64_t>(gridDim.x) * kThreads;
-  for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < size; i += step) {
-    const int64_t row = i / width;
-    int column = static_cast<int>(i - row * width);
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kRows;
+  const int rows = n - first < kRows ? static_cast<int>(n - first) : kRows;
+  // Rows of a block are numbered in 32 bits, in which division is cheap.
+  for (int j = threadIdx.x; j < rows * width; j += kThreads) {
+    const int64_t row = first + j / width, i = first * width + j;
+    int column = j % width;
     if (include_input != 0 && column < d) {
       out[i] = x[row * d + column];
       continue;
@@ -66,10 +69,9 @@ unsigned blocks_of(int64_t size) {
 
 void encode_cuda(const float* x, const float* variances, float* out, int64_t n, int64_t d, int64_t octaves,
                  bool include_input, void* stream) {
-  const int64_t size = n * d * (2 * octaves + (include_input ? 1 : 0));
-  if (size == 0) return;
-  VN_LAUNCH(encode_kernel, blocks_of(size), kThreads, 0, stream, x, variances, out, n, static_cast<int>(d),
-            static_cast<int>(octaves), include_input ? 1 : 0);
+  if (n * d * (2 * octaves + (include_input ? 1 : 0)) == 0) return;
+  VN_LAUNCH(encode_kernel, static_cast<unsigned>(ceil_div<int64_t>(n, kRows)), kThreads, 0, stream, x, variances, out,
+            n, static_cast<int>(d), static_cast<int>(octaves), include_input ? 1 : 0);
 }
 
 void encode_backward_cuda(const float* gradient, const float* x, const float* variances, float* grad_x,

@@ -132,40 +132,18 @@ __device__ void mlp_parameter_gradients(const MlpCudaPlan& plan, const typename 
   }
 }
 
-// Gradients of raw features from those of their encoding, which replace it in the region.
-template <typename Products, int kRowTiles, typename Raw, typename Result>
-__device__ void mlp_encode_backward(const MlpCudaPlan& plan, const MlpCudaInput& input, int from,
-                                    typename Products::Element* region, typename Products::Element* slot,
-                                    const unsigned char* packed, int64_t first, int64_t end, const Raw& raw_of,
-                                    const Result& result_of) {
-  const int lane = threadIdx.x % 32;
-  for (int chunk = 0; chunk < input.padded; chunk += kMlpChunk) {
-    const int columns = input.padded - chunk < kMlpChunk ? input.padded - chunk : kMlpChunk;
-    MlpSums<kRowTiles, kMlpTiles> sums;
-    mlp_clear<kRowTiles, kMlpTiles>(sums);
-    mlp_gather<Products, kRowTiles>(plan, region, slot, packed, from, chunk, columns, sums);
-#pragma unroll
-    for (int r = 0; r < kRowTiles; ++r) {
-#pragma unroll
-      for (int t = 0; t < kMlpTiles; ++t) {
-        if (8 * t >= columns) continue;
-#pragma unroll
-        for (int half = 0; half < 2; ++half) {
-          const int row = 16 * r + lane / 4 + 8 * half, column = chunk + 8 * t + 2 * (lane % 4);
-          Products::store(region + input.value + row * input.stride + column, sums[r][t][2 * half],
-                          sums[r][t][2 * half + 1]);
-        }
-      }
-    }
-  }
-  __syncwarp();
-  const int features = input.integrated ? input.raw / 2 : input.raw;
-  for (int i = lane; i < 16 * kRowTiles * features; i += 32) {
+// Gradients of a warp's raw features from those of their encoding, which lie where it was.
+template <typename Products, typename Raw>
+__device__ void mlp_encode_backward(const MlpCudaInput& input, const typename Products::Element* region, int rows,
+                                    int64_t first, int64_t end, const Raw& raw_of, const MlpCudaData& data,
+                                    float* results) {
+  const int lane = threadIdx.x % 32, features = input.integrated ? input.raw / 2 : input.raw;
+  for (int i = lane; i < rows * features; i += 32) {
     const int row = i / features, feature = i - row * features;
     if (first + row >= end) continue;
     const auto* gradient = region + input.value + row * input.stride + feature;
     const float* raw = raw_of(first + row);
-    float* result = result_of(first + row);
+    float* result = results + mlp_source_row(data, first + row) * input.raw;
     float sum = 0.0f, of_variance = 0.0f;
     if (!input.integrated) {
       sum = Products::load(gradient);
@@ -182,11 +160,10 @@ __device__ void mlp_encode_backward(const MlpCudaPlan& plan, const MlpCudaInput&
     result[feature] = sum;
     if (input.integrated) result[features + feature] = of_variance;
   }
-  __syncwarp();
 }
 
 template <typename Products, int kRowTiles>
-__global__ void __launch_bounds__(128, 3) mlp_backward_kernel(const MlpCudaPlan plan, const MlpCudaData data) {
+__global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan plan, const MlpCudaData data) {
   using Element = typename Products::Element;
   MlpTask task;
   if (!mlp_find_task(plan, data, blockIdx.x, task)) return;  // the whole block
@@ -210,11 +187,17 @@ __global__ void __launch_bounds__(128, 3) mlp_backward_kernel(const MlpCudaPlan 
     mlp_encode<Products>(plan.directions, region, kRows, first, task.end, directions);
     __syncwarp();
     mlp_run<Products, kRowTiles>(plan, region, slot, packed, [](int, int, const MlpSums<kRowTiles, kMlpTiles>&) {});
-    for (int l = plan.layer_count - 1; l >= 0; --l) {
-      const MlpCudaLayer& layer = plan.layers[l];
-      if (!layer.live) continue;
-      for (int chunk = 0; chunk < layer.padded; chunk += kMlpChunk) {
-        const int columns = layer.padded - chunk < kMlpChunk ? layer.padded - chunk : kMlpChunk;
+    // Every layer, then positions and directions, which are layers without a product of their own.
+    for (int l = plan.layer_count - 1; l >= kFromDirections; --l) {
+      const MlpCudaInput& input = l == kFromDirections ? plan.directions : plan.positions;
+      float* results = l == kFromDirections ? data.grad_directions : data.grad_positions;
+      if (l >= 0 ? !plan.layers[l].live : results == nullptr || !input.used) continue;
+      const MlpPlace place = mlp_place(plan, l);
+      const int padded = l >= 0 ? plan.layers[l].padded : input.padded;
+      const int activation = l >= 0 ? plan.layers[l].activation : static_cast<int>(Activation::none);
+      const int slope = l >= 0 && plan.layers[l].slope >= 0 ? plan.layers[l].slope : place.value;
+      for (int chunk = 0; chunk < padded; chunk += kMlpChunk) {
+        const int columns = padded - chunk < kMlpChunk ? padded - chunk : kMlpChunk;
         MlpSums<kRowTiles, kMlpTiles> sums;
         mlp_clear<kRowTiles, kMlpTiles>(sums);
         for (int o = 0; o < plan.output_count; ++o) {
@@ -227,7 +210,7 @@ __global__ void __launch_bounds__(128, 3) mlp_backward_kernel(const MlpCudaPlan 
               for (int i = 0; i < 4; ++i) {
                 const int64_t row = first + 16 * r + lane / 4 + 8 * (i / 2);
                 const int column = chunk + 8 * t + 2 * (lane % 4) + i % 2;
-                if (row < task.end && column < layer.width) {
+                if (row < task.end && column < plan.layers[l].width) {
                   sums[r][t][i] +=
                       data.grad_out[mlp_source_row(data, row) * plan.out_features + plan.output_columns[o] + column];
                 }
@@ -244,30 +227,29 @@ __global__ void __launch_bounds__(128, 3) mlp_backward_kernel(const MlpCudaPlan 
 #pragma unroll
             for (int half = 0; half < 2; ++half) {
               const int row = 16 * r + lane / 4 + 8 * half, column = chunk + 8 * t + 2 * (lane % 4);
-              Element* to = region + layer.value + row * layer.stride + column;
-              const Element* slope = layer.slope < 0 ? to : region + layer.slope + row * layer.stride + column;
-              const float x = mlp_times_slope(layer.activation, sums[r][t][2 * half], Products::load(slope));
-              const float y = mlp_times_slope(layer.activation, sums[r][t][2 * half + 1], Products::load(slope + 1));
-              Products::store(to, x, y);
+              const int at = row * place.stride + column;
+              const float x = mlp_times_slope(activation, sums[r][t][2 * half], Products::load(region + slope + at));
+              const float y =
+                  mlp_times_slope(activation, sums[r][t][2 * half + 1], Products::load(region + slope + at + 1));
+              Products::store(region + place.value + at, x, y);
             }
           }
         }
       }
+      if (l < 0) {
+        __syncwarp();
+        if (l == kFromPositions) {
+          mlp_encode_backward<Products>(input, region, kRows, first, task.end, positions, data, results);
+        } else {
+          mlp_encode_backward<Products>(input, region, kRows, first, task.end, directions, data, results);
+        }
+        continue;
+      }
       __syncthreads();  // the gradients of all rows are there
       if (partial != nullptr) {
-        mlp_parameter_gradients<Products>(plan, shared, layer, kRows, partial, tile == task.begin);
+        mlp_parameter_gradients<Products>(plan, shared, plan.layers[l], kRows, partial, tile == task.begin);
       }
       __syncthreads();  // the values of this layer's sources may be replaced
-    }
-    if (data.grad_positions != nullptr && plan.positions.used) {
-      mlp_encode_backward<Products, kRowTiles>(
-          plan, plan.positions, kFromPositions, region, slot, packed, first, task.end, positions,
-          [&](int64_t row) { return data.grad_positions + mlp_source_row(data, row) * plan.positions.raw; });
-    }
-    if (data.grad_directions != nullptr && plan.directions.used) {
-      mlp_encode_backward<Products, kRowTiles>(
-          plan, plan.directions, kFromDirections, region, slot, packed, first, task.end, directions,
-          [&](int64_t row) { return data.grad_directions + mlp_source_row(data, row) * plan.directions.raw; });
     }
     __syncwarp();
   }

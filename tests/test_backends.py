@@ -179,3 +179,12 @@ def test_require_turns_skips_into_failures(pytester: pytest.Pytester, monkeypatc
     required.stdout.fnmatch_lines("*--require native: it is not here*")
     unknown = pytester.runpytest_inprocess("--require", "metal")
     unknown.stderr.fnmatch_lines("*--require takes native,cuda,warp, got metal*")
+
+
+def test_auto_passes_over_what_runs_by_name_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backends, "missing", lambda backend, device: None)
+    choose = backends._choose_once.__wrapped__
+    for op in ("grouped_mlp", "grouped_linear"):
+        assert choose(op, "auto", "cuda", None, torch.float32) == "reference"
+        assert choose(op, "native", "cuda", None, torch.float32) == "native"
+        assert choose(op, "auto", "cpu", None, torch.float32) == "native"

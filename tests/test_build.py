@@ -6,6 +6,7 @@ import importlib.util
 import os
 import runpy
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -78,6 +79,17 @@ ptxas info    : Used 8 registers, used 0 barriers
 """
 
 
+def cuda_check() -> ModuleType:
+    path = ROOT / ".ci" / "cuda_check.py"
+    if not path.is_file():
+        pytest.skip(".ci/cuda_check.py is not there: the tests are not in the source tree")
+    spec = importlib.util.spec_from_file_location("cuda_check", path)
+    assert spec is not None and spec.loader is not None
+    check = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(check)
+    return check
+
+
 @pytest.mark.parametrize(
     ("reported", "status", "outcome"),
     [
@@ -94,13 +106,7 @@ def test_cuda_check_fails_where_nothing_was_checked(
     status: int,
     outcome: str,
 ) -> None:
-    path = ROOT / ".ci" / "cuda_check.py"
-    if not path.is_file():
-        pytest.skip(".ci/cuda_check.py is not there: the tests are not in the source tree")
-    spec = importlib.util.spec_from_file_location("cuda_check", path)
-    assert spec is not None and spec.loader is not None
-    check = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(check)
+    check = cuda_check()
     # An nvcc that compiles nothing and reports what it is told to.
     (tmp_path / "report").write_text("".join(REPORT.format(arch) for arch in reported))
     nvcc = tmp_path / "nvcc"
@@ -110,3 +116,21 @@ def test_cuda_check_fails_where_nothing_was_checked(
     monkeypatch.setattr(check, "OUT", tmp_path / "out")
     assert check.main(["80", "90a"]) == status
     assert capsys.readouterr().out.rstrip().endswith(outcome)
+
+
+def test_cuda_check_compares_with_the_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    check = cuda_check()
+    row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}
+    monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
+    assert (
+        len(check.regressions("V13", {"kernel": {"sm_80": row}})) == 1
+    )  # not in the table, which is not there: no spills
+    check.TABLE.write_text(check.as_text("V13", {"kernel": {"sm_80": row}}))
+    assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []
+    more = {"kernel": {"sm_80": {**row, "registers": 41, "spilled_bytes": 12}}}
+    assert check.regressions("V13", more) == [
+        "kernel (sm_80): spilled_bytes 12, above 8",
+        "kernel (sm_80): registers 41, above 40",
+    ]
+    assert check.regressions("V14", more) == ["kernel (sm_80): spilled_bytes 12, above 8"]
+    assert [check.warps(registers) for registers in (8, 32, 33, 255)] == [64, 64, 51, 8]
