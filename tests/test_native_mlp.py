@@ -519,8 +519,9 @@ def test_errors() -> None:
     for bad_index in (4, -1):
         index = given["direction_index"].clone()
         index[3] = bad_index
-        with pytest.raises(ValueError, match=r"^grouped_mlp: direction_index must be 0 to 3, got"):
-            grouped_mlp(**{**given, "direction_index": index}, backend="native")
+        for backend in ("native", "reference"):
+            with pytest.raises(ValueError, match=rf"^grouped_mlp: direction_index must be 0 to 3, got {bad_index}$"):
+                grouped_mlp(**{**given, "direction_index": index}, backend=backend)
 
 
 def test_a_plan_without_features_is_refused() -> None:

@@ -185,14 +185,16 @@ class VoronoiDiagram(nn.Module):
             return None
         if backends.why_not("nearest_centre_grid", "native", self.centres.device) is not None:
             return None
+        # One reading of the attribute, which another thread may set at any time.
+        grid = self._grid
         # Buffers may be written to from outside, as by DistributedDataParallel.
-        if self._grid is not None and not self._grid.belongs_to(self.centres, self.power):
-            self._grid = None
+        if grid is not None and not grid.belongs_to(self.centres, self.power):
+            grid = self._grid = None
         self._points_located += n
-        if self._grid is None and self._points_located >= _GRID_POINTS:
-            self._grid = ops.centre_grid(self.centres, weights=self.power)
+        if grid is None and self._points_located >= _GRID_POINTS:
+            grid = self._grid = ops.centre_grid(self.centres, weights=self.power)
             self._points_located = 0
-        return self._grid
+        return grid
 
     def __getstate__(self) -> dict[str, Any]:
         """What is copied and pickled: all but the grid, which can be made again."""

@@ -206,6 +206,32 @@ def test_grid_keeps_its_own_centres() -> None:
 
 
 @native
+def test_a_grid_is_not_that_of_rounded_centres() -> None:
+    centres = torch.rand(100, 3, dtype=torch.float64) + 1e6
+    weights = torch.rand(100, dtype=torch.float64) * 1e-3
+    points, of_others = torch.rand(50, 3) + 1e6, "grid must be made from these centres and weights"
+    with pytest.raises(ValueError, match=of_others):
+        nearest_centre(points, centres.float(), grid=centre_grid(centres))
+    exact = centres.float().double()
+    with pytest.raises(ValueError, match=of_others):
+        nearest_centre(points, exact.float(), weights=weights.float(), grid=centre_grid(exact, weights=weights))
+    found = nearest_centre(points, exact.float(), grid=centre_grid(exact))
+    assert torch.equal(found, nearest_centre(points, exact.float(), backend="reference"))
+
+
+@native
+def test_compiled_graphs_refuse_grids_of_another_size() -> None:
+    # Such a grid names centres behind the end of those that are given.
+    points, grid = torch.rand(5, 3), centre_grid(torch.rand(70, 3))
+    for centres, weights in ((torch.rand(2, 3), None), (grid.centres, torch.rand(70))):
+        compiled = torch.compile(
+            lambda p, c, w: nearest_centre(p, c, weights=w, grid=grid), fullgraph=True, backend="eager"
+        )
+        with pytest.raises(Exception, match="grid must be made from these centres and weights"):
+            compiled(points, centres, weights)
+
+
+@native
 def test_ops_pass_opcheck_and_compile_whole() -> None:
     from voronerf import _native_grid
 

@@ -378,6 +378,15 @@ def test_errors_of_the_kernel() -> None:
         call(direction_index=tree.options["direction_index"] + 1 + (tree.options["direction_index"] == 3).int())
 
 
+def test_an_index_of_no_ray_is_refused_where_the_operations_are_separate() -> None:
+    case = Case.make("nerf", "tree")
+    for bad in (-1, 5):
+        index = case.options["direction_index"].clone()
+        index[-1] = bad
+        with refused(ValueError, f"routed_mlp: direction_index must be 0 to 4, got {bad}"):
+            case.run(case.leaves, backend="reference", direction_index=index)
+
+
 @pytest.mark.native
 @pytest.mark.parametrize("name", ["wide", "nerf", "integrated", "raw"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

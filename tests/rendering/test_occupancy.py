@@ -188,5 +188,9 @@ def test_refuses_what_is_no_grid() -> None:
         OccupancyGrid(BOX, (3, 0, 3), threshold=1)
     with pytest.raises(ValueError, match="threshold must be positive and finite, got 0"):
         OccupancyGrid(BOX, threshold=0)
+    # 2**32 would be cell 0 in the lowest 32 bits.
+    for cell in (-1, 64, 2**32):
+        with pytest.raises(ValueError, match="cells must lie in 0 to 63, got"):
+            OccupancyGrid(BOX, 4, threshold=0.1).update(Ball(), torch.tensor([cell]))
     with pytest.raises(ValueError, match=r"decay must lie in 0..1, got 2"):
         OccupancyGrid(BOX, 4, threshold=1).update(Ball(), decay=2)

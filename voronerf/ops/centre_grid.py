@@ -33,13 +33,18 @@ class CentreGrid:
         """Memory of the tables."""
         return sum(tensor.nbytes for tensor in self.tables[:4])
 
+    def fits(self, centres: Tensor, weights: Tensor | None) -> bool:
+        """Whether as many centres have a place in the tables, and weights as well; reads shapes alone."""
+        return centres.shape == self.centres.shape and (weights is None) == (self.weights is None)
+
     def belongs_to(self, centres: Tensor, weights: Tensor | None) -> bool:
         """Whether the grid was made from these very centres and weights. Reads them, on CUDA from the host."""
-        if centres.shape != self.centres.shape or (weights is None) != (self.weights is None):
+        if not self.fits(centres, weights):
             return False
-        if not torch.equal(centres, self.centres.to(centres.dtype)):
+        # In float64, which holds all of them: centres that were rounded since have other borders.
+        if not torch.equal(centres.double(), self.centres.double()):
             return False
-        return weights is None or self.weights is None or torch.equal(weights, self.weights.to(weights.dtype))
+        return weights is None or self.weights is None or torch.equal(weights.double(), self.weights.double())
 
 
 def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str = "auto") -> CentreGrid:

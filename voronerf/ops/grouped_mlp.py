@@ -51,7 +51,7 @@ def grouped_mlp(
 
     Raises:
         ValueError: shapes, devices, directions that are missing, an unknown backend; on the CPU also offsets that fall
-            or exceed n.
+            or exceed n, and a direction_index outside 0 to r - 1.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
     """

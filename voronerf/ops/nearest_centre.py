@@ -69,8 +69,9 @@ def nearest_centre(
 def _by_grid(points: Tensor, centres: Tensor, weights: Tensor | None, grid: CentreGrid, backend: str) -> Tensor:
     if not isinstance(grid, CentreGrid):
         raise TypeError(f"{_OP}: grid must be a CentreGrid, got {type(grid).__name__}")
-    # A compiled graph cannot compare; it takes the caller's word.
-    if not torch.compiler.is_compiling() and not grid.belongs_to(centres, weights):
+    # A compiled graph cannot compare values; for those it takes the caller's word.
+    belongs = grid.fits if torch.compiler.is_compiling() else grid.belongs_to
+    if not belongs(centres, weights):
         raise ValueError(f"{_OP}: grid must be made from these centres and weights, got that of others")
     run = backends.resolve("nearest_centre_grid", backend=backend, device=points.device, dtype=points.dtype)
     cells: Tensor = run(points, centres, grid.tables, weights=weights)

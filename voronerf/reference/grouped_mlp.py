@@ -48,6 +48,18 @@ def grouped_mlp(
     return out
 
 
+def check_direction_index(op: str, directions: Tensor | None, direction_index: Tensor | None) -> None:
+    """Raises ValueError for an index that names no ray; on the CPU, as it reads the index."""
+    if directions is None or direction_index is None or direction_index.numel() == 0:
+        return
+    if direction_index.device.type != "cpu" or torch.compiler.is_compiling():
+        return
+    low, high = (int(bound) for bound in direction_index.aminmax())
+    if low < 0 or high >= directions.shape[0]:
+        last = directions.shape[0] - 1
+        raise ValueError(f"{op}: direction_index must be 0 to {last}, got {low if low < 0 else high}")
+
+
 @torch.library.custom_op("voronerf::grouped_mlp", mutates_args=())
 def _mlp(
     positions: Tensor,
@@ -59,6 +71,7 @@ def _mlp(
     layers: str,
     keep: bool,
 ) -> tuple[Tensor, list[Tensor]]:
+    check_direction_index("grouped_mlp", directions, direction_index)
     network = Network(MLP.parse(layers), positions, directions, direction_index, offsets, parameters, has_bias)
     return forward(network, keep)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from voronerf.layers import MLP
 from voronerf.reference.cell_sort import cell_sort
-from voronerf.reference.grouped_mlp import grouped_mlp
+from voronerf.reference.grouped_mlp import check_direction_index, grouped_mlp
 from voronerf.reference.locate_cell import locate_cell
 from voronerf.reference.nearest_centre import nearest_centre
 
@@ -52,6 +52,7 @@ def routed_mlp(
 ) -> tuple[Tensor, Tensor]:
     """Output [n, out] in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
     k, n = weights[0].shape[0], positions.shape[0]
+    check_direction_index("routed_mlp", directions, direction_index)
     if cells is None and k == 1:
         offsets = torch.tensor([0, n], dtype=torch.int32, device=positions.device)
         out = operations.grouped_mlp(

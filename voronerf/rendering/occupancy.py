@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from voronerf.checks import MAX_COUNT
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.update_occupancy import update_occupancy
 from voronerf.rendering.cameras import Rays
@@ -118,8 +119,10 @@ class OccupancyGrid:
             uniforms = torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device)
             found.append(density_of(field, self.points(part, uniforms)))
         values = torch.cat(found) if found else self.density.new_empty(0)
+        # What int32 does not hold must stay out of range, not wrap into it.
+        cells = cells.clamp(-1, MAX_COUNT).to(torch.int32)
         self.density, self.occupied = update_occupancy(
-            self.density, cells.to(torch.int32), values, decay=decay, threshold=self.threshold, backend=backend
+            self.density, cells, values, decay=decay, threshold=self.threshold, backend=backend
         )
 
     def march(
