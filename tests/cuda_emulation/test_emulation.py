@@ -20,6 +20,7 @@ OPERATIONS = [
         "frequency_encode",
         "integrated_encode",
         "resample",
+        "grouped_linear",
         "grouped_mlp",
     )
 ]
