@@ -12,6 +12,9 @@ THREADS ?= 1
 # Every architecture nvcc 13 knows that a user may have; the last also as PTX.
 CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
 
+# The CUDA code takes minutes to compile, and nothing here would run it without a GPU: `make cuda-check` compiles all of it.
+export VORONERF_CUDA ?= $(if $(wildcard /dev/nvidiactl /dev/dxg),auto,0)
+
 SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
 
 .PHONY: demo test bench check cuda-check gpu-check emulate-cuda sanitize clean
