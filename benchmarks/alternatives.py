@@ -1,7 +1,8 @@
 """What a user would otherwise run in place of grouped_mlp and grouped_linear, each at its best setting.
 
 Samples are sorted by cell, and encoded inputs are given to the alternatives for nothing, while grouped_mlp encodes
-inside. n samples, k cells, i inputs and o outputs of a layer.
+inside. Every call of each returns its output as one new tensor, through which training goes. n samples, k cells, i
+inputs and o outputs of a layer.
 """
 
 from __future__ import annotations
@@ -103,25 +104,23 @@ def loop(
             rows, own = slice(first, last), cells[cell]
             yield rows, step(x[rows], None if d is None else d[rows], own[:count], own[count:])
 
-    out = torch.empty(batch.n, net.out_features, dtype=dtype, device=parts[0].device)
-
     def forward(call: int) -> Tensor:
+        out = torch.empty(batch.n, net.out_features, dtype=dtype, device=parts[0].device)
         with torch.no_grad():
             for rows, result in outputs(call):
                 out[rows] = result
         return out
 
-    def both(call: int) -> tuple[list[Tensor], tuple[Tensor | None, ...]]:
-        results, gradient = list(outputs(call)), batch.gradient(call).to(dtype)
-        parts = [result for _, result in results]
-        return parts, torch.autograd.grad(parts, leaves, [gradient[rows] for rows, _ in results], allow_unused=True)
+    def both(call: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
+        out = torch.cat([result for _, result in outputs(call)])
+        return out, torch.autograd.grad(out, leaves, batch.gradient(call).to(dtype), allow_unused=True)
 
-    def adapt(result: tuple[list[Tensor], tuple[Tensor | None, ...]]) -> tuple[Tensor, list[Tensor]]:
-        parts, found = result
+    def adapt(result: tuple[Tensor, tuple[Tensor | None, ...]]) -> tuple[Tensor, list[Tensor]]:
+        out, found = result
         full = [torch.zeros_like(leaf) if one is None else one for leaf, one in zip(leaves, found)]
         if not stacked:
             full = [torch.stack(full[at : at + batch.k]) for at in range(0, len(full), batch.k)]
-        return torch.cat(parts), full
+        return out, full
 
     if compiled:
         compile_now(lambda: (both if training else forward)(1))
@@ -248,7 +247,6 @@ def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Conte
     rows = piece or max(max(b - a for a, b in itertools.pairwise(batch.bounds)), 1)
     packed = [[pack(own.to(dtype), rows) for own in weight.detach()] for weight in batch.weights]
     cells = list(zip(*packed)), list(zip(*[bias.detach().to(dtype).unbind() for bias in batch.biases]))
-    out = torch.empty(batch.n, net.out_features, dtype=dtype)
     pieces = list(row_pieces(batch.bounds, piece))
 
     def product(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
@@ -256,6 +254,7 @@ def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Conte
 
     def forward(call: int) -> Tensor:
         x, d = encoded.positions[call % 2], encoded.directions
+        out = torch.empty(batch.n, net.out_features, dtype=dtype)
         for cell, first, last in pieces:
             own = slice(first, last)
             columns = None if d is None else d[own]

@@ -200,9 +200,12 @@ def _contender(
     batch: Batch, parts: Callable[[int], Iterator[tuple[Tensor, Tensor]]], own: Parameters, dtype: torch.dtype
 ) -> Contender:
     """Puts the parts where they belong; with gradients, the whole output is there before they are taken."""
-    out = torch.empty(batch.n, batch.net.out_features, dtype=dtype, device=batch.positions[0].device)
+
+    def empty() -> Tensor:
+        return torch.empty(batch.n, batch.net.out_features, dtype=dtype, device=batch.positions[0].device)
 
     def forward(call: int) -> Tensor:
+        out = empty()
         with torch.no_grad():
             for rows, result in parts(call):
                 out[rows] = result
@@ -210,6 +213,7 @@ def _contender(
 
     def both(call: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
         results, gradient = list(parts(call)), batch.gradient(call).to(dtype)
+        out = empty()
         with torch.no_grad():
             for rows, result in results:
                 out[rows] = result

@@ -14,6 +14,7 @@
 #include "build_info.h"
 #include "cell_sort.h"
 #include "common.h"
+#include "huge_pages.h"
 #include "isa.h"
 #include "locate_cell.h"
 #include "measure_peak.h"
@@ -25,7 +26,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 10;
+constexpr int INTERFACE = 11;
 
 using Address = std::uintptr_t;
 
@@ -71,6 +72,8 @@ PYBIND11_MODULE(_C, module) {
   module.attr("cuda_architectures") = VN_CUDA_ARCHITECTURES;
   module.def("isa_supported", [](int isa) { return voronerf::isa_supported(static_cast<voronerf::Isa>(isa)); });
   module.def("measure_peak", &measure_peak, no_gil);
+  module.def("advise_huge_pages",
+             [](Address memory, int64_t bytes) { voronerf::advise_huge_pages(at<void>(memory), bytes); });
 
   module.def("nearest_centre_float32", &nearest_centre<float>, no_gil);
   module.def("nearest_centre_float64", &nearest_centre<double>, no_gil);

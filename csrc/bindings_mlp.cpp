@@ -9,6 +9,7 @@
 
 #include "bindings_mlp_table.h"
 #include "common.h"
+#include "grouped_linear.h"
 #include "grouped_mlp.h"
 
 namespace py = pybind11;
@@ -47,10 +48,42 @@ void grouped_mlp_backward(const std::vector<int64_t>& flat, const std::vector<Ad
                                      static_cast<voronerf::Isa>(isa), threads);
 }
 
+voronerf::LinearInputs linear(Address x, Address offsets, Address weight, Address bias, int64_t n, int64_t k, int64_t i,
+                              int64_t o, int activation, bool bfloat16) {
+  return {at<const void>(x),
+          at<const int32_t>(offsets),
+          at<const void>(weight),
+          at<const void>(bias),
+          n,
+          k,
+          i,
+          o,
+          static_cast<voronerf::Activation>(activation),
+          bfloat16};
+}
+
+void grouped_linear(Address x, Address offsets, Address weight, Address bias, int64_t n, int64_t k, int64_t i,
+                    int64_t o, int activation, bool bfloat16, Address out, int isa, int threads) {
+  voronerf::grouped_linear_cpu(linear(x, offsets, weight, bias, n, k, i, o, activation, bfloat16), at<void>(out),
+                               static_cast<voronerf::Isa>(isa), threads);
+}
+
+// Gradients: 0 where not wanted.
+void grouped_linear_backward(Address x, Address offsets, Address weight, Address bias, int64_t n, int64_t k, int64_t i,
+                             int64_t o, int activation, bool bfloat16, Address grad_out, Address grad_x,
+                             Address grad_weight, Address grad_bias, int isa, int threads) {
+  voronerf::grouped_linear_backward_cpu(
+      linear(x, offsets, weight, bias, n, k, i, o, activation, bfloat16),
+      {at<const void>(grad_out), at<void>(grad_x), at<void>(grad_weight), at<void>(grad_bias)},
+      static_cast<voronerf::Isa>(isa), threads);
+}
+
 }  // namespace
 
 void bind_mlp(py::module_& module) {
   const auto no_gil = py::call_guard<py::gil_scoped_release>();
   module.def("grouped_mlp", &grouped_mlp, no_gil);
   module.def("grouped_mlp_backward", &grouped_mlp_backward, no_gil);
+  module.def("grouped_linear", &grouped_linear, no_gil);
+  module.def("grouped_linear_backward", &grouped_linear_backward, no_gil);
 }

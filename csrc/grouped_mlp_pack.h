@@ -38,7 +38,7 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
 }
 
 // Weights [o][depth] -> [dots][depth], in pairs with bfloat16 operands, filled up with 0.
-void pack_dots(const float* weights, const MlpPlanLayer& layer, float* packed) {
+[[maybe_unused]] void pack_dots(const float* weights, const MlpPlanLayer& layer, float* packed) {
   for (int64_t o = 0; o < layer.dots; ++o, packed += layer.packed_depth) {
     for (int64_t i = 0; i < layer.packed_depth; i += kLanes) {
       if (o >= layer.width) {

@@ -19,6 +19,7 @@ LAYERS = (
         "_native_composite",
         "_native_grid",
         "_native_march",
+        "_native_linear",
         "_native_mlp",
         "_native_route",
         "_native_sampling",

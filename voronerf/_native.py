@@ -27,7 +27,7 @@ from voronerf.backends import BackendUnavailable
 
 ISAS = ("portable", "avx2", "avx512")
 # Number of csrc/bindings.cpp that this file and its companions are written for.
-INTERFACE = 10
+INTERFACE = 11
 
 # In the order of csrc/measure_peak.h.
 _PEAKS = ("float32", "bfloat16", "copy")
@@ -58,6 +58,17 @@ if getattr(_C, "interface", None) != INTERFACE:
     raise BackendUnavailable(
         "the compiled module is of another version of voronerf; build it again with `pip install -e .`"
     )
+
+
+# Bytes from which a result is asked to lie on huge pages; below, the allocator has warm memory as a rule.
+_LARGE = 1 << 22
+
+
+def fresh(result: Tensor) -> Tensor:
+    """A result as it was allocated, on huge pages where it is large and the system gives them."""
+    if result.nbytes >= _LARGE and result.device.type == "cpu":
+        _C.advise_huge_pages(result.data_ptr(), result.nbytes)
+    return result
 
 
 def _choose_isa() -> int:

@@ -1,4 +1,4 @@
-"""Whole per-cell networks of the compiled module as PyTorch ops: ``grouped_mlp``, and ``grouped_linear`` as one layer.
+"""Whole per-cell networks of the compiled module as PyTorch ops: ``grouped_mlp``, and ``grouped_linear`` on CUDA.
 
 n samples, r rays, k cells, p and q features of a raw position and direction, i inputs and o outputs of a layer. Two
 custom ops, forward and backward, functional both: they make inputs contiguous, allocate outputs, and pass addresses.
@@ -57,7 +57,10 @@ def grouped_mlp(
 def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
 ) -> Tensor:
-    """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer."""
+    """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer.
+
+    For CUDA; the CPU has kernels of one layer (``voronerf/_native_linear.py``).
+    """
     given = _cast(x, [weight], [bias], "grouped_linear", [], _LINEAR[activation], None)
     out: Tensor = _forward(given.positions, offsets, given.weights, given.biases, given.table, None, None)
     return out.to(given.dtype)
@@ -197,7 +200,7 @@ def run(
 ) -> Tensor:
     """The forward pass on sorted rows, or on those that ``order`` int32 [n] sorts."""
     kept = _Arguments(positions, offsets, weights, biases, directions, direction_index, order)
-    out = _allocate(positions, table, weights)
+    out = _native.fresh(_allocate(positions, table, weights))
     numbers = _numbers(table, positions, weights, directions)
     given = numbers, kept.inputs, kept.weights, kept.biases, out.data_ptr()
     if _native.on_cuda(positions):
@@ -222,7 +225,7 @@ def _backward(
     wanted: Sequence[bool],
 ) -> list[Tensor]:
     kept = _Arguments(positions, offsets, weights, biases, directions, direction_index, order)
-    results = _allocate_gradients(positions, weights, biases, directions, wanted)
+    results = [_native.fresh(each) for each in _allocate_gradients(positions, weights, biases, directions, wanted)]
     count, gradient = len(weights), gradient.contiguous()
     addresses = [_address(result) for result in results]
     numbers = _numbers(table, positions, weights, directions)

@@ -43,7 +43,7 @@ def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | N
 @torch.library.custom_op("voronerf::encode_native", mutates_args=(), device_types=("cpu", "cuda"))
 def _encode(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Tensor:
     """The frequency encoding or, with variances, the integrated one."""
-    out = _allocate(x, octaves, include_input)
+    out = _native.fresh(_allocate(x, octaves, include_input))
     kept = [x.contiguous(), None if variances is None else variances.contiguous()]
     addresses = [_address(tensor) for tensor in (*kept, out)]
     if _native.on_cuda(x):

@@ -111,7 +111,7 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
     # On CUDA they have no kernel for layers of more than 256 features, which "auto" must take as well.
     ("grouped_linear", "native"): Implementation(
-        "voronerf._native_mlp:grouped_linear", ("cpu", "cuda"), _FLOATS, by_name=("cuda",)
+        "voronerf._native_linear:grouped_linear", ("cpu", "cuda"), _FLOATS, by_name=("cuda",)
     ),
     ("grouped_mlp", "native"): Implementation(
         "voronerf._native_mlp:grouped_mlp", ("cpu", "cuda"), _FLOATS, by_name=("cuda",)
