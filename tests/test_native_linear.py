@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from voronerf.ops import grouped_linear
 from voronerf.reference import specification
 
 native = pytest.importorskip("voronerf._native_linear")
