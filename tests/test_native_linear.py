@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -154,8 +154,8 @@ def test_large_results_ask_for_huge_pages() -> None:
     """Of a fresh process, whose allocator has nothing to give again."""
     if not sys.platform.startswith("linux"):
         pytest.skip("Linux alone has transparent huge pages")
-    path = "/sys/kernel/mm/transparent_hugepage/enabled"
-    if not os.path.exists(path) or "[never]" in open(path).read():
+    path = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+    if not path.exists() or "[never]" in path.read_text():
         pytest.skip("huge pages are switched off here")
     program = """
 import resource, torch

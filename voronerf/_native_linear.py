@@ -125,10 +125,9 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | Non
     """Derivative of the gradients, through the reference formula."""
     gradient, x, offsets, weight, bias = ctx.saved_tensors
     with torch.enable_grad():
-        leaves = [
-            None if tensor is None else tensor.detach().requires_grad_() for tensor in (x, weight, bias, gradient)
-        ]
-        x, weight, bias, gradient = leaves
+        x, weight, gradient = (tensor.detach().requires_grad_() for tensor in (x, weight, gradient))
+        bias = None if bias is None else bias.detach().requires_grad_()
+        leaves = (x, weight, bias, gradient)
         with torch.autocast(x.device.type, enabled=False):
             out = _reference(x, offsets, weight, bias, activation=ctx.activation)
         chosen = (ctx.wanted[0], ctx.wanted[1], ctx.wanted[1])
