@@ -1,9 +1,10 @@
-"""``grouped_linear`` of the compiled module as PyTorch ops of the CPU; on CUDA it is a network of one layer. n samples, k cells, i inputs, o outputs.
+"""``grouped_linear`` of the compiled module as PyTorch ops of the CPU. n samples, k cells, i inputs, o outputs.
 
-Forward and backward, functional both. float32 and bfloat16 are read and written as they are stored; float16 and float64
-are cast to float32 on the way in and back on the way out. With bfloat16 storage products take bfloat16 operands where
-the processor multiplies them faster (AVX512-BF16), and float32 ones elsewhere; sums are float32 always. Second
-derivatives come from the reference formula. Shapes and dtypes have been validated by ``voronerf.ops``.
+On CUDA it is a network of one layer (``voronerf/_native_mlp.py``). Forward and backward, functional both. float32 and
+bfloat16 are read and written as they are stored; float16 and float64 are cast to float32 on the way in and back on the
+way out. With bfloat16 storage products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16),
+and float32 ones elsewhere; sums are float32 always. Second derivatives come from the reference formula. Shapes and
+dtypes have been validated by ``voronerf.ops``.
 """
 
 from __future__ import annotations

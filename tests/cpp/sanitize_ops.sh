@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
-# Builds the C++ tests of every operation but the networks' twice, with AddressSanitizer and UndefinedBehaviorSanitizer
+# Builds the C++ tests of every operation but the whole networks' twice, with AddressSanitizer and UndefinedBehaviorSanitizer
 # and with ThreadSanitizer (teams on std::thread, csrc/parallel.h), and runs them: sanitize_ops.sh [cases].
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 build=$(mktemp -d)
 trap 'rm -rf "$build"' EXIT
 common=(-std=c++17 -O1 -g -ffp-contract=off -Wall -Wextra -Icsrc)
-plain=(nearest_centre centre_grid locate_cell cell_sort composite encode resample isa)
-per_isa=(nearest_centre_isa centre_grid_isa composite_isa encode_isa)
+plain=(nearest_centre centre_grid locate_cell cell_sort composite encode resample grouped_linear isa)
+per_isa=(nearest_centre_isa centre_grid_isa composite_isa encode_isa
+  grouped_linear_isa grouped_linear_half_isa)
 isas=("portable -DVN_ISA=0")
 if [ "$(uname -m)" = x86_64 ]; then
   isas+=("avx2 -DVN_ISA=1 -mavx2 -mfma" "avx512 -DVN_ISA=2 -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma")
