@@ -51,11 +51,11 @@ class Options:
     """Factor by which the images are made smaller on load."""
     cells: int = 16
     """Cells; 1 is one network."""
-    width: int = TrainConfig.width
+    width: int = 64
     """Channels of the networks' hidden layers."""
     rays: int = TrainConfig.rays
     """Rays per step."""
-    samples: int = TrainConfig.samples
+    samples: int = 64
     """Samples per ray."""
     bfloat16: bool = False
     """Networks under autocast to bfloat16."""

@@ -53,7 +53,7 @@ class Options:
     """Test views of each evaluation, the last one included."""
     rays: int = TrainConfig.rays
     """Rays per step."""
-    samples: int = TrainConfig.samples
+    samples: int = 64
     """Samples per ray."""
     lr: float | None = None
     """Learning rate at the start; default: that of `voronerf train`, which depends on the width."""

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from voronerf.fields import NeRF
+from voronerf.fields import KiloNeRF, NeRF
 from voronerf.fields.nerf import INITIAL_DENSITY
 from voronerf.ops import frequency_encode
 
@@ -100,3 +100,13 @@ def test_bad_settings(settings: dict[str, object], message: str) -> None:
 def test_missing_directions(inputs: tuple[torch.Tensor, torch.Tensor]) -> None:
     with pytest.raises(ValueError, match="directions must be given"):
         NeRF()(inputs[0])
+
+
+def test_kilonerf_has_the_published_size() -> None:
+    """Two layers of 32, density, feature, and 32 channels that see the direction: 63 and 27 encoded inputs."""
+    field = KiloNeRF()
+    shapes = [tuple(layer.weight.shape) for layer in field.linears()]
+    assert shapes == [(32, 63), (32, 32), (1, 32), (32, 32), (32, 59), (3, 32)]
+    colour, density = field(torch.rand(7, 3), torch.nn.functional.normalize(torch.randn(7, 3), dim=1))
+    assert colour.shape == (7, 3) and density.shape == (7,)
+    assert KiloNeRF(width=16, depth=3, view_directions=False).width == 16

@@ -26,6 +26,8 @@ def test_default_splits(cells: tuple[int, ...], expected: tuple[float, ...]) -> 
 def test_json_round_trip(tmp_path: Path) -> None:
     config = TrainConfig(data="x", out=tmp_path, steps=3, cells=(4, 4), split_at=(0.2, 0.7), skips=(1, 2))
     assert TrainConfig.from_json(config.to_json()) == config
+    config = dataclasses.replace(config, split_at=None, split_at_steps=(1, 2), lpips=tmp_path, parameters=5000)
+    assert TrainConfig.from_json(config.to_json()) == config
     assert TrainConfig.from_json(TrainConfig().to_json()) == TrainConfig()
 
 
@@ -52,6 +54,21 @@ def test_json_of_something_else(text: str) -> None:
         ({"cells": (4,), "split_at": (0.2, 0.4)}, "--split-at must have one fraction for each of the 1 levels"),
         ({"cells": (4, 4), "split_at": (0.4, 0.2)}, "--split-at must be rising fractions between 0 and 1"),
         ({"split_at": (1.0,)}, "--split-at must be rising fractions between 0 and 1"),
+        ({"split_at_steps": (7,), "steps": 7}, r"--split-at-steps must be rising numbers between 0 and 7, got \(7,\)"),
+        ({"split_at_seconds": (480.0,)}, "--split-at-seconds must be rising times between 0 and 480"),
+        ({"split_at_seconds": (0.0,), "steps": 9}, r"--split-at-seconds must be rising times above 0, got \(0.0,\)"),
+        ({"split_at_steps": (7, 8)}, "--split-at-steps must have one number for each of the 1 levels of --cells"),
+        ({"split_at": (0.1,), "split_at_steps": (7,)}, "give one of --split-at, --split-at-seconds and --split-at-st"),
+        ({"max_cells": 32}, "--max-cells must come with --split worst, got 32"),
+        ({"max_cells": 16, "split": "worst"}, "--max-cells must exceed the 16 cells of the first split, got 16"),
+        (
+            {"max_cells": 9, "split": "worst", "cells": (2, 2, 2)},
+            "--max-cells must come with one or two numbers of --c",
+        ),
+        ({"max_cells": 9, "split": "worst", "cells": (2,), "split_at": (0.1,)}, "--split-at must have two fractions, "),
+        ({"parameters": 0}, "--parameters must be at least 1, got 0"),
+        ({"blend": -1.0}, "--blend must be a distance of 0 or more, got -1.0"),
+        ({"fine_samples": 0}, "--fine-samples must be at least 1, got 0"),
         ({"backend": "fast"}, "--backend must be auto, .*got 'fast'"),
         ({"eval_views": 0}, "--eval-views must be at least 1, got 0"),
         ({"temperature": -1.0}, "--temperature must be positive and finite, got -1.0"),
@@ -85,3 +102,34 @@ def test_differences_name_what_cannot_change() -> None:
         "--width 64 -> 32",
         "--lr-final 0.05 -> 0.5",
     ]
+
+
+def test_defaults_of_the_architectures() -> None:
+    assert [(c.width, c.depth) for c in (TrainConfig(), TrainConfig(field="kilonerf"))] == [(64, 4), (32, 2)]
+    kilo = TrainConfig(field="kilonerf", width=48, depth=3)
+    assert (kilo.width, kilo.depth) == (48, 3)
+
+
+def test_final_cells() -> None:
+    assert [TrainConfig(cells=cells).final_cells for cells in ((), (12,), (4, 4))] == [1, 12, 16]
+    assert TrainConfig(cells=(4, 3), split="worst").final_cells == 6
+    assert TrainConfig(cells=(4, 3), split="worst", max_cells=15).final_cells == 15
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"cells": (4, 3)}, [(0.15, 4, "all"), (0.5, 3, "all")]),
+        ({"cells": (4, 3), "split_at_steps": (5, 9)}, [(5, 4, "all"), (9, 3, "all")]),
+        ({"cells": (4,), "split": "worst", "split_at_seconds": (2.5,)}, [(2.5, 4, "all")]),
+        (
+            {"cells": (4, 3), "split": "worst", "max_cells": 9, "split_at_seconds": (20.0, 50.0)},
+            [(20, 4, "all"), (30, 3, "worst"), (40, 3, "worst"), (50, 3, "worst")],
+        ),
+        ({"cells": (4,), "split": "worst", "max_cells": 5}, [(0.15, 4, "all"), (0.5, 4, "worst")]),
+    ],
+)
+def test_planned_splits(settings: dict[str, Any], expected: list[tuple[float, int, str]]) -> None:
+    plan = TrainConfig(**settings).planned_splits
+    assert [(round(p.at, 9), p.children, p.cells) for p in plan] == expected
+    assert all(p.most == settings.get("max_cells") for p in plan if p.cells == "worst")

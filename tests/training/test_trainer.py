@@ -19,7 +19,17 @@ from voronerf.training.batches import Batch
 from voronerf.training.checkpoint import CheckpointError, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.evaluation import evaluate, render_view
-from voronerf.training.model import checkpoint_path, load_grid, load_run, make_router, octaves_for, restore_router
+from voronerf.training.model import (
+    checkpoint_path,
+    count_parameters,
+    load_grid,
+    load_run,
+    make_router,
+    octaves_for,
+    resolve_config,
+    restore_router,
+    solve_width,
+)
 from voronerf.training.trainer import Trainer, TrainingError
 
 
@@ -187,6 +197,50 @@ def test_kept_samples_are_weight_times_ray_error(tmp_path: Path, scene: Scene, m
     torch.testing.assert_close(importance.sort(descending=True).values, heaviest.values)
     at = rendered[0].positions.detach().reshape(-1, 3)[heaviest.indices]
     assert {tuple(p) for p in points.tolist()} == {tuple(p) for p in at.tolist()}
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [({"split_at": None, "split_at_steps": (7,)}, [0, 7]), ({"split_at": None, "split_at_seconds": (1e-6,)}, [0, 1])],
+)
+def test_splits_by_steps_and_by_seconds(
+    tmp_path: Path, scene: Scene, settings: dict[str, Any], expected: list[int]
+) -> None:
+    trainer = Trainer(small(tmp_path, **settings), scene)
+    trainer.advance()
+    assert [stage.started_at_step for stage in trainer.stages] == expected
+
+
+def test_worst_cell_first_until_there_are_enough(tmp_path: Path, scene: Scene) -> None:
+    settings = {"cells": (3, 4), "split": "worst", "max_cells": 11, "split_at": (0.2, 0.8), "steps": 50}
+    trainer = Trainer(small(tmp_path, **settings), scene)
+    summary = trainer.run()
+    # The last of them into what is missing: 3, then the worst into 4, 4 and 3.
+    assert [stage.cells for stage in trainer.stages] == [1, 3, 6, 9, 11]
+    assert [stage.started_at_step for stage in trainer.stages] == [0, 10, 20, 30, 40]
+    assert [stage.split_cells for stage in trainer.stages[1:]] == [1, 1, 1, 1]
+    assert summary["cells"] == trainer.config.final_cells == 11
+
+
+@pytest.mark.parametrize("field", ["nerf", "kilonerf"])
+def test_parameters_decide_the_width(tmp_path: Path, scene: Scene, field: str) -> None:
+    trainer = Trainer(small(tmp_path, width=None, depth=None, field=field, parameters=30_000), scene)
+    summary = trainer.run()
+    config = trainer.config
+    width = solve_width(config, 30_000)
+    assert summary["width"] == width == config.width
+    assert summary["parameters"] == count_parameters(config) == sum(p.numel() for p in trainer.router.parameters())
+    assert count_parameters(config) <= 30_000 < count_parameters(config, width + 1)
+    assert config.lr == 0.02
+    assert load_run(tmp_path)[0] == config
+    Trainer(replace(config, width=None, lr=None, resume=True), scene)
+
+
+def test_too_few_parameters(tmp_path: Path, scene: Scene) -> None:
+    with pytest.raises(ConfigError, match=r"--parameters must be at least \d+ for 4 cells, got 7"):
+        resolve_config(small(tmp_path, parameters=7), scene)
+    wide = resolve_config(small(tmp_path, cells=(), parameters=1_000_000), scene)
+    assert wide.width is not None and wide.width > 256 and wide.lr == pytest.approx(0.02 * 64 / wide.width)
 
 
 def test_octaves_follow_the_pixels() -> None:

@@ -17,6 +17,52 @@ from voronerf.ops.grouped_mlp import grouped_mlp
 INITIAL_DENSITY = 0.1
 
 
+def nerf_table(
+    width: int,
+    depth: int,
+    *,
+    skips: tuple[int, ...] | None = None,
+    position_octaves: int = 10,
+    direction_octaves: int = 4,
+    view_directions: bool = True,
+    view_width: int | None = None,
+    position_encoding: str = "frequency",
+) -> MLP:
+    """The layer table of :class:`NeRF`, whose arguments these are.
+
+    Raises:
+        ValueError: For a width, depth or skip out of range.
+    """
+    if width < 2:
+        raise ValueError(f"NeRF: width must be at least 2, got {width}")
+    if depth < 1:
+        raise ValueError(f"NeRF: depth must be at least 1, got {depth}")
+    if min(position_octaves, direction_octaves) < 0:
+        raise ValueError(f"NeRF: octaves must not be negative, got {position_octaves} and {direction_octaves}")
+    if skips is None:
+        skips = (4,) if depth > 5 else ()
+    if any(not 0 <= s < depth - 1 for s in skips):
+        raise ValueError(f"NeRF: skips must be trunk layers with another behind, 0..{depth - 2}, got {skips}")
+    table = [Layer(("positions",), width, "relu")]
+    for i in range(1, depth):
+        table.append(Layer(("positions", i - 1) if i - 1 in skips else (i - 1,), width, "relu"))
+    trunk = depth - 1
+    table.append(Layer((trunk,), 1))
+    if view_directions:
+        table.append(Layer((trunk,), width))
+        table.append(Layer((depth + 1, "directions"), view_width or max(width // 2, 1), "relu"))
+        table.append(Layer((depth + 2,), 3))
+    else:
+        table.append(Layer((trunk,), 3))
+    return MLP(
+        layers=tuple(table),
+        outputs=(len(table) - 1, depth),
+        position_octaves=position_octaves,
+        direction_octaves=direction_octaves if view_directions else None,
+        position_encoding=position_encoding,
+    )
+
+
 class NeRF(nn.Module):
     """The architecture of NeRF (Mildenhall et al. 2020, figure 7), of any width and depth.
 
@@ -42,6 +88,8 @@ class NeRF(nn.Module):
         direction_octaves: The same for the view direction.
         view_directions: Whether colour depends on the view direction.
         density_scale: Factor on the density, per scene unit, > 0.
+        view_width: Channels of the layer that sees the view direction; None is half the width.
+        position_encoding: "frequency", or "integrated" for Gaussians [n, 6] in the place of positions (mip-NeRF).
 
     Raises:
         ValueError: For a width, depth, skip or scale out of range.
@@ -56,44 +104,27 @@ class NeRF(nn.Module):
         direction_octaves: int = 4,
         view_directions: bool = True,
         density_scale: float = 10.0,
+        view_width: int | None = None,
+        position_encoding: str = "frequency",
     ) -> None:
         super().__init__()
-        if width < 2:
-            raise ValueError(f"NeRF: width must be at least 2, got {width}")
-        if depth < 1:
-            raise ValueError(f"NeRF: depth must be at least 1, got {depth}")
         if not density_scale > 0:
             raise ValueError(f"NeRF: density_scale must be positive, got {density_scale}")
-        if min(position_octaves, direction_octaves) < 0:
-            raise ValueError(f"NeRF: octaves must not be negative, got {position_octaves} and {direction_octaves}")
-        if skips is None:
-            skips = (4,) if depth > 5 else ()
-        if any(not 0 <= s < depth - 1 for s in skips):
-            raise ValueError(f"NeRF: skips must be trunk layers with another behind, 0..{depth - 2}, got {skips}")
-
         self.width = width
         self.view_directions = view_directions
         self.density_scale = density_scale
-
-        table = [Layer(("positions",), width, "relu")]
-        for i in range(1, depth):
-            table.append(Layer(("positions", i - 1) if i - 1 in skips else (i - 1,), width, "relu"))
-        trunk = depth - 1
-        table.append(Layer((trunk,), 1))
-        if view_directions:
-            table.append(Layer((trunk,), width))
-            table.append(Layer((depth + 1, "directions"), max(width // 2, 1), "relu"))
-            table.append(Layer((depth + 2,), 3))
-        else:
-            table.append(Layer((trunk,), 3))
-        self.layers = MLP(
-            layers=tuple(table),
-            outputs=(len(table) - 1, depth),
+        self.layers = nerf_table(
+            width,
+            depth,
+            skips=skips,
             position_octaves=position_octaves,
-            direction_octaves=direction_octaves if view_directions else None,
+            direction_octaves=direction_octaves,
+            view_directions=view_directions,
+            view_width=view_width,
+            position_encoding=position_encoding,
         )
 
-        shapes = self.layers.weight_shapes(3, 3)
+        shapes = self.layers.weight_shapes(6 if self.layers.integrated else 3, 3)
         linears = [nn.Linear(i, o) for o, i in shapes]
         self.trunk = nn.ModuleList(linears[:depth])
         self.density = linears[depth]

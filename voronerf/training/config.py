@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -11,8 +13,10 @@ from typing import Any, Literal
 import torch
 
 from voronerf.backends import BACKENDS
+from voronerf.training.schedule import PlannedSplit, TimeUnit, default_times, final_cells, plan_splits
 
-FieldName = Literal["nerf"]
+FieldName = Literal["nerf", "mipnerf", "kilonerf"]
+SamplingName = Literal["stratified", "hierarchical", "proposal"]
 
 
 class ConfigError(Exception):
@@ -47,16 +51,19 @@ class TrainConfig:
     """Training steps, instead of a time."""
 
     field: FieldName = "nerf"
-    """Architecture of the networks."""
-    width: int = 64
-    """Channels of the networks' hidden layers."""
-    depth: int = 4
-    """Hidden layers before the heads."""
+    """The networks: nerf, mipnerf (cones in the place of rays) or kilonerf (nerf in KiloNeRF's size)."""
+    width: int | None = None
+    """Channels of the networks' hidden layers; default 64, kilonerf 32."""
+    depth: int | None = None
+    """Hidden layers before the heads; default 4, kilonerf 2."""
+    parameters: int | None = None
+    """Parameters of all final cells' networks together: decides --width, the largest that stays below."""
     skips: tuple[int, ...] | None = None
     """Trunk layers whose output is joined with the encoded position again; default: 4, as published, where there are
     more than five layers, else none."""
     position_octaves: int | None = None
-    """Frequencies of the position's encoding; default: until the finest wave spans two pixels of the training views."""
+    """Frequencies of the position's encoding; default: until the finest wave spans two pixels of the training views,
+    mipnerf 16 as published."""
     direction_octaves: int = 4
     """Frequencies of the view direction's encoding."""
     view_directions: bool = True
@@ -66,8 +73,15 @@ class TrainConfig:
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, nothing is one network."""
     split_at: tuple[float, ...] | None = None
     """When to split, as fractions of the run, one per level; default: 0.2, or evenly spaced from 0.15 to 0.5."""
+    split_at_seconds: tuple[float, ...] | None = None
+    """The same in seconds of training, in the place of fractions."""
+    split_at_steps: tuple[int, ...] | None = None
+    """The same in training steps."""
     split: Literal["all", "worst"] = "all"
     """On the levels below the first: split every cell, or only the one with the largest accumulated error."""
+    max_cells: int | None = None
+    """With --split worst: go on splitting the worst cell until there are this many, evenly spaced between two times,
+    the first split (into the first number of --cells) and the last (the worst cell each time into the last number)."""
     centres: Literal["balanced", "random", "uniform"] = "balanced"
     """Centres of the new cells: balanced by importance, drawn from the samples, or a regular grid."""
     balance: Literal["published", "transport"] = "published"
@@ -78,6 +92,8 @@ class TrainConfig:
     """Samples go to the nearest cell, or while training to one drawn from the distances."""
     temperature: float = 0.05
     """Temperature of the stochastic assignment, in scene units."""
+    blend: float = 0.0
+    """Margin in scene units within which neighbouring cells are blended in pictures made after training; 0 is off."""
     reservoir: int = 10_000
     """Importance samples kept for the next split."""
     reservoir_batches: int = 500
@@ -87,8 +103,15 @@ class TrainConfig:
 
     rays: int = 1024
     """Rays per training step."""
-    samples: int = 64
-    """Samples per ray, one in each of as many strata."""
+    sampling: SamplingName = "stratified"
+    """Samples along a ray: stratified, or a second pass where the first found something: hierarchical, with the field
+    itself asked twice (nerf: a coarse and a fine network), or proposal, with a small density network asked first."""
+    samples: int | None = None
+    """Samples per ray, one in each of as many strata; default 64, of the first of two passes 32."""
+    fine_samples: int = 32
+    """Samples per ray of the second pass; nerf's fine network is asked about those of the first as well."""
+    contraction: Literal["none", "sphere"] = "none"
+    """Space as the networks see it: as it is, or all that is outside of a sphere drawn into one of twice its radius."""
     occupancy: bool = False
     """Skip the samples in cells of space found empty, in training and in its pictures; needs a scene with a box."""
     occupancy_resolution: int = 64
@@ -112,29 +135,52 @@ class TrainConfig:
     """Seconds between checkpoints."""
     panels: int = 4
     """Test views drawn as picture panels at the end."""
+    lpips: Path | None = None
+    """Folder with LPIPS weights for the final evaluation; default: VORONERF_LPIPS, else lpips in the data folder."""
 
     def __post_init__(self) -> None:
         if self.budget is None and self.steps is None:
             object.__setattr__(self, "budget", 480.0)
-        if self.lr is None:
-            # Hidden layers under Adam want steps in inverse proportion to their width (Yang et al. 2021, table 3).
-            object.__setattr__(self, "lr", 0.02 * 64 / max(self.width, 64))
+        small = self.field == "kilonerf"
+        if self.width is None:
+            object.__setattr__(self, "width", 32 if small else 64)
+        if self.depth is None:
+            object.__setattr__(self, "depth", 2 if small else 4)
+        if self.samples is None:
+            object.__setattr__(self, "samples", 64 if self.sampling == "stratified" else 32)
+        if self.lr is None and self.parameters is None:
+            object.__setattr__(self, "lr", default_learning_rate(int(self.width or 0)))
         check_config(self)
 
     @property
+    def split_unit(self) -> TimeUnit:
+        """What the times of the splits count."""
+        if self.split_at_steps is not None:
+            return "steps"
+        return "fraction" if self.split_at_seconds is None else "seconds"
+
+    @property
     def splits(self) -> tuple[float, ...]:
-        """When each level is split, as fractions of the run."""
-        if self.split_at is not None:
-            return self.split_at
-        levels = len(self.cells)
-        if levels < 2:
-            return (0.2,) * levels
-        return tuple(0.15 + 0.35 * i / (levels - 1) for i in range(levels))
+        """When each level is split, in ``split_unit``; with ``max_cells`` the times of the first and the last split."""
+        for times in (self.split_at, self.split_at_seconds, self.split_at_steps):
+            if times is not None:
+                return times
+        return default_times(len(self.cells) if self.max_cells is None else 2)
+
+    @property
+    def planned_splits(self) -> tuple[PlannedSplit, ...]:
+        """All splits of the run, in order."""
+        return plan_splits(self.cells, self.splits, self.split, self.max_cells)
+
+    @property
+    def final_cells(self) -> int:
+        """Cells at the end, where every cell holds enough samples to be split."""
+        return final_cells(self.planned_splits)
 
     def to_json(self) -> str:
         """The settings as JSON text, which :meth:`from_json` reads."""
         values = dataclasses.asdict(self)
-        values["out"] = None if self.out is None else str(self.out)
+        values |= {name: None if values[name] is None else str(values[name]) for name in PATHS}
         return json.dumps(values, indent=2) + "\n"
 
     @staticmethod
@@ -150,18 +196,20 @@ class TrainConfig:
             unknown = sorted(set(values) - known)
             if unknown:
                 raise ConfigError(f"unknown settings {', '.join(unknown)}")
-            lists = ("cells", "split_at", "skips")
-            values = {key: tuple(v) if key in lists and v is not None else v for key, v in values.items()}
-            values["out"] = None if values["out"] is None else Path(values["out"])
+            values = {key: tuple(v) if key in LISTS and v is not None else v for key, v in values.items()}
+            values |= {name: Path(values[name]) for name in PATHS if values[name] is not None}
             return TrainConfig(**values)
         except (json.JSONDecodeError, TypeError, AttributeError, KeyError, ConfigError) as error:
             raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
 
 
+#: Settings that JSON has as lists and as text.
+LISTS = frozenset({"cells", "split_at", "split_at_seconds", "split_at_steps", "skips"})
+PATHS = ("out", "lpips")
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
     {"data", "out", "resume", "device", "backend", "budget", "steps", "evaluations", "eval_views", "final_views"}
-    | {"checkpoint_every", "panels"}
+    | {"checkpoint_every", "panels", "blend", "lpips"}
 )
 
 
@@ -180,6 +228,7 @@ def check_config(config: TrainConfig) -> None:
         "downscale",
         "rays",
         "samples",
+        "fine_samples",
         "depth",
         "reservoir",
         "reservoir_batches",
@@ -189,12 +238,14 @@ def check_config(config: TrainConfig) -> None:
         need(getattr(config, name) >= 1, name, "be at least 1")
     need(config.occupancy_resolution <= 512, "occupancy_resolution", "be at most 512")
     need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
-    need(config.width >= 2, "width", "be at least 2")
+    need((config.width or 0) >= 2, "width", "be at least 2")
+    need(config.parameters is None or config.parameters >= 1, "parameters", "be at least 1")
+    need(0 <= config.blend < float("inf"), "blend", "be a distance of 0 or more")
     for name in ("position_octaves", "direction_octaves", "panels", "min_cell_samples"):
         need((getattr(config, name) or 0) >= 0, name, "not be negative")
     need(config.eval_views >= 1, "eval_views", "be at least 1")
     need(config.final_views is None or config.final_views >= 1, "final_views", "be at least 1")
-    need(0 < (config.lr or 0.0) < float("inf"), "lr", "be positive")
+    need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
     need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
     need(0 <= config.warmup < 1, "warmup", "lie in [0, 1)")
     need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
@@ -203,12 +254,38 @@ def check_config(config: TrainConfig) -> None:
     need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
     need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
     need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
-    if config.split_at is not None:
-        fits = len(config.split_at) == len(config.cells)
-        need(fits, "split_at", f"have one fraction for each of the {len(config.cells)} levels of --cells")
-        rising = all(a < b for a, b in zip(config.split_at, config.split_at[1:], strict=False))
-        inside = all(0 < at < 1 for at in config.split_at)
-        need(rising and inside, "split_at", "be rising fractions between 0 and 1")
+    _check_splits(config, need)
+    for name, usable in (("field", ("nerf", "kilonerf")), ("sampling", ("stratified",)), ("contraction", ("none",))):
+        need(getattr(config, name) in usable, name, f"be {' or '.join(usable)} in this version")
+    need(config.blend == 0, "blend", "be 0 in this version")
+
+
+def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -> None:
+    if config.max_cells is not None:
+        need(config.split == "worst", "max_cells", "come with --split worst")
+        need(len(config.cells) in (1, 2), "max_cells", "come with one or two numbers of --cells")
+        need(config.max_cells > config.cells[0], "max_cells", f"exceed the {config.cells[0]} cells of the first split")
+    given = [name for name in ("split_at", "split_at_seconds", "split_at_steps") if getattr(config, name) is not None]
+    if len(given) > 1:
+        raise ConfigError("give one of --split-at, --split-at-seconds and --split-at-steps, not several")
+    for name in given:
+        times, unit = getattr(config, name), {"split_at": "fraction", "split_at_seconds": "time"}.get(name, "number")
+        if config.max_cells is None:
+            rule = f"have one {unit} for each of the {len(config.cells)} levels of --cells"
+            need(len(times) == len(config.cells), name, rule)
+        else:
+            need(len(times) == 2, name, f"have two {unit}s, of the first and the last split, with --max-cells")
+        rising = all(a < b for a, b in itertools.pairwise(times))
+        end = 1.0 if name == "split_at" else config.budget if name == "split_at_seconds" else config.steps
+        inside = all(0 < at < (float("inf") if end is None else end) for at in times)
+        kind = "fractions" if name == "split_at" else "times" if name == "split_at_seconds" else "numbers"
+        bound = "above 0" if end is None else f"between 0 and {end:g}"
+        need(rising and inside, name, f"be rising {kind} {bound}")
+
+
+def default_learning_rate(width: int) -> float:
+    """Adam's at the start: hidden layers want steps in inverse proportion to width (Yang et al. 2021, table 3)."""
+    return 0.02 * 64 / max(width, 64)
 
 
 def check_device(name: str) -> None:

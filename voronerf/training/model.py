@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
-from voronerf.fields import NeRF
+from voronerf.fields import KiloNeRF, NeRF, nerf_table
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint
-from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.config import ConfigError, TrainConfig, default_learning_rate
 
 #: A sample that takes less of the light than this, were its cell that dense throughout, is not worth asking for.
 LEAST_OPACITY = 0.01
@@ -36,18 +38,62 @@ def octaves_for(scene: Scene) -> int:
     return min(max(1 + math.ceil(math.log2(math.pi / pixel)), 4), 14)
 
 
-def make_field(config: TrainConfig) -> NeRF:
-    """The field that a configuration describes, freshly initialised from torch's global generator."""
+def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
+    """The configuration with what depends on the scene filled in: octaves, and with ``parameters`` width and rate.
+
+    Raises:
+        ConfigError: When the smallest networks have more parameters than asked for.
+    """
+    if config.position_octaves is None:
+        config = replace(config, position_octaves=octaves_for(scene))
+    if config.parameters is None:
+        return config
+    width = solve_width(config, config.parameters)
+    return replace(config, width=width, lr=default_learning_rate(width) if config.lr is None else config.lr)
+
+
+def _table_options(config: TrainConfig) -> dict[str, Any]:
     if config.position_octaves is None:
         raise ValueError("make_field: config.position_octaves must be a number, got None (octaves_for gives one)")
-    return NeRF(
-        width=config.width,
-        depth=config.depth,
-        skips=config.skips,
-        position_octaves=config.position_octaves,
-        direction_octaves=config.direction_octaves,
-        view_directions=config.view_directions,
-    )
+    return {
+        "depth": config.depth,
+        "skips": config.skips,
+        "position_octaves": config.position_octaves,
+        "direction_octaves": config.direction_octaves,
+        "view_directions": config.view_directions,
+    }
+
+
+def make_field(config: TrainConfig) -> NeRF:
+    """The field that a configuration describes, freshly initialised from torch's global generator."""
+    kind = KiloNeRF if config.field == "kilonerf" else NeRF
+    return kind(int(config.width or 0), **_table_options(config))
+
+
+def count_parameters(config: TrainConfig, width: int | None = None) -> int:
+    """Parameters of all networks of all final cells, with another width than the configured one where given."""
+    width = int(config.width or 0) if width is None else width
+    view = width if config.field == "kilonerf" else None
+    table = nerf_table(width, view_width=view, **_table_options(config))
+    return config.final_cells * sum(o * i + o for o, i in table.weight_shapes(3, 3))
+
+
+def solve_width(config: TrainConfig, total: int) -> int:
+    """The largest width with which all networks of all final cells have at most ``total`` parameters together.
+
+    Raises:
+        ConfigError: When a width of 2 has more.
+    """
+    low, high = 2, 4
+    if count_parameters(config, low) > total:
+        least = count_parameters(config, low)
+        raise ConfigError(f"--parameters must be at least {least} for {config.final_cells} cells, got {total}")
+    while count_parameters(config, high) <= total:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if count_parameters(config, middle) <= total else (low, middle)
+    return low
 
 
 def make_router(config: TrainConfig, device: torch.device | str) -> VoronoiRouter:
@@ -79,7 +125,7 @@ def make_grid(
     if scene.box is None:
         raise ConfigError(f"--occupancy needs a scene with a box around everything, {scene.name} has none")
     diagonal = float((scene.box[1] - scene.box[0]).norm())
-    threshold = -math.log1p(-LEAST_OPACITY) * config.samples / diagonal
+    threshold = -math.log1p(-LEAST_OPACITY) * int(config.samples or 0) / diagonal
     return OccupancyGrid(scene.box, resolution or config.occupancy_resolution, threshold=threshold, device=device)
 
 

@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ from voronerf.training.model import (
     make_grid,
     make_optimizer,
     make_router,
-    octaves_for,
+    resolve_config,
     restore_router,
 )
 from voronerf.training.reservoir import SampleReservoir
@@ -111,9 +111,9 @@ class Trainer:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
         self.out = config.out
-        if config.position_octaves is None:
-            config = replace(config, position_octaves=octaves_for(scene))
+        config = resolve_config(config, scene)
         self.config = config
+        self.plan = config.planned_splits
         self.scene = scene
         self.on_step = on_step
         self.on_event = on_event
@@ -149,6 +149,10 @@ class Trainer:
         if self.config.steps is not None:
             return min(1.0, self.step / self.config.steps)
         return min(1.0, self.seconds / float(self.config.budget or 1.0))
+
+    def _now(self) -> float:
+        """The time in the unit of the planned splits."""
+        return {"fraction": self.fraction, "seconds": self.seconds, "steps": float(self.step)}[self.config.split_unit]
 
     @property
     def level(self) -> int:
@@ -198,7 +202,7 @@ class Trainer:
         saved_at = self.seconds
         while self.fraction < 1 and self.seconds < until and not self.stopped:
             started = time.perf_counter()
-            if self.level < len(self.config.cells) and self.fraction >= self.config.splits[self.level]:
+            if self.level < len(self.plan) and self._now() >= self.plan[self.level].at - 1e-9:
                 self._split()
             loss = self._step()
             self.step += 1
@@ -232,7 +236,7 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
-        if self.level < len(config.cells):
+        if self.level < len(self.plan):
             # Importance of a sample: its weight in the image times its ray's error (section 3.1 of the paper).
             wrong = error.detach().sum(-1)
             wrong = wrong[:, None] if isinstance(rendered, Rendered) else wrong[rendered.ray_index]
@@ -268,7 +272,10 @@ class Trainer:
 
     def _split(self) -> None:
         """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
-        config, level, k = self.config, self.level, self.config.cells[self.level]
+        config, level, planned = self.config, self.level, self.plan[self.level]
+        k = planned.children
+        if planned.most is not None:
+            k = min(k, planned.most - self.router.num_cells + 1)
         points, importance = self.reservoir.samples()
         if level == 0 and points.shape[0] < k:
             self.save()
@@ -284,7 +291,7 @@ class Trainer:
                 points,
                 importance,
                 k,
-                cells="all" if level == 0 else config.split,
+                cells=planned.cells,
                 centres=config.centres,
                 method=config.balance,
                 min_samples=0 if level == 0 else config.min_cell_samples,
@@ -318,7 +325,7 @@ class Trainer:
         scores = evaluate(
             self.router,
             self.scene,
-            samples=self.config.samples,
+            samples=int(self.config.samples or 0),
             views=views,
             backend=self.config.backend,
             occupancy=self.looked_at,
@@ -348,6 +355,7 @@ class Trainer:
             "rays_per_second": self.step * self.config.rays / max(self.seconds, 1e-9),
             "parameters": sum(p.numel() for p in self.router.parameters()),
             "cells": self.router.num_cells,
+            "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
         }
         write_text(self.out / "summary.json", json.dumps(summary, indent=2) + "\n")

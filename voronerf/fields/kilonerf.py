@@ -1,0 +1,22 @@
+"""A field of KiloNeRF's size, for hundreds of cells. Units as in `voronerf.fields.nerf`."""
+
+from __future__ import annotations
+
+from voronerf.fields.nerf import NeRF
+
+#: Channels and trunk layers of KiloNeRF's networks.
+WIDTH, DEPTH = 32, 2
+
+
+class KiloNeRF(NeRF):
+    """The network of one cell in KiloNeRF (Reiser et al. 2021, figure 3): two trunk layers of 32 channels, a feature
+    layer, and a layer of the same 32 channels that also sees the view direction.
+
+    Args:
+        width: Channels of every hidden layer.
+        depth: Trunk layers.
+        **options: The further arguments of :class:`NeRF`.
+    """
+
+    def __init__(self, width: int = WIDTH, depth: int = DEPTH, **options: object) -> None:
+        super().__init__(width, depth, **{"view_width": width, **options})  # type: ignore[arg-type]
