@@ -1,4 +1,4 @@
-"""Scenes: the files of Blender synthetic scenes and of real captures, and one computed from formulas."""
+"""Scenes: the files of Blender synthetic scenes and of real captures, and two computed from formulas."""
 
 from __future__ import annotations
 
@@ -8,28 +8,31 @@ from voronerf.data.blender import load_blender
 from voronerf.data.builtin import builtin_scene
 from voronerf.data.capture import load_capture
 from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.translucent import translucent_scene
 
-__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "load_scene"]
+__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "load_scene", "translucent_scene"]
 
 BUILTIN_SIZE = 100
+BUILTIN = {"builtin": builtin_scene, "builtin-translucent": translucent_scene}
 
 
 def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
     """Loads a scene.
 
     Args:
-        source: "builtin", or a folder with `transforms_train.json` (Blender synthetic) or `transforms.json` (capture).
-        downscale: factor by which images are made smaller, >= 1. Divides the built-in scene's 100 pixels too.
+        source: "builtin" or "builtin-translucent", or a folder with `transforms_train.json` (Blender synthetic) or
+            `transforms.json` (capture).
+        downscale: factor by which images are made smaller, >= 1. Divides the built-in scenes' 100 pixels too.
 
     Raises:
         SceneError: one line that names what is wrong with which file.
     """
     if downscale < 1:
         raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")
-    if str(source) == "builtin":
+    if str(source) in BUILTIN:
         if downscale > BUILTIN_SIZE:
-            raise SceneError(f"builtin: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
-        return builtin_scene(BUILTIN_SIZE // downscale)
+            raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
+        return BUILTIN[str(source)](BUILTIN_SIZE // downscale)
     folder = Path(source)
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")

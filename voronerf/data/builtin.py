@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -29,6 +30,8 @@ SUPERSAMPLES = 3  # on each side of a pixel
 LIGHT = normalised(np.array(((0.45, -0.55, 0.70),), dtype=np.float32))
 AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.46, 0.64, 0.50
 BAND = 1 << 15  # rays at a time, so that their arrays stay in the cache
+# from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity, [r, 4]
+See = Callable[[Array, Array], Array]
 LIFT = 2e-3  # a shadow's ray starts this far above the surface
 
 
@@ -40,17 +43,28 @@ def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views
         train_views: spread over the upper hemisphere on a spherical Fibonacci lattice.
         test_views: on an orbit that rises and falls twice, apart from the training views.
     """
+    train, test = builtin_cameras("builtin_scene", size, train_views, test_views)
+    box = bounds()
+    train_split = render_views(train, "train", _see, box=box, supersamples=SUPERSAMPLES)
+    test_split = render_views(test, "test", _see, box=box, supersamples=SUPERSAMPLES)
+    return Scene("builtin", train_split, test_split, NEAR, FAR, torch.from_numpy(box), "linear", "white")
+
+
+def builtin_cameras(caller: str, size: int, train_views: int, test_views: int) -> tuple[Cameras, Cameras]:
+    """The cameras of the training and of the test views of a built-in scene.
+
+    Raises:
+        ValueError: a size or number of views below 1; names ``caller``.
+    """
     if size < 1:
-        raise ValueError(f"builtin_scene: size must be >= 1, got {size}")
+        raise ValueError(f"{caller}: size must be >= 1, got {size}")
     if train_views < 1 or test_views < 1:
-        raise ValueError(f"builtin_scene: there must be at least one view, got {train_views} and {test_views}")
+        raise ValueError(f"{caller}: there must be at least one view, got {train_views} and {test_views}")
     height = (torch.arange(train_views) + 0.5) / train_views
     golden = math.pi * (3 - math.sqrt(5))
     train = _cameras(torch.asin(0.02 + 0.96 * height), golden * torch.arange(train_views), size)
     turn = 2 * math.pi * torch.arange(test_views) / test_views
-    test = _cameras(torch.deg2rad(28 + 16 * torch.sin(2 * turn)), turn + 0.05, size)
-    box = torch.from_numpy(bounds())
-    return Scene("builtin", _render(train, "train"), _render(test, "test"), NEAR, FAR, box, "linear", "white")
+    return train, _cameras(torch.deg2rad(28 + 16 * torch.sin(2 * turn)), turn + 0.05, size)
 
 
 def bounds() -> Array:
@@ -111,21 +125,35 @@ def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
     return Cameras(poses, torch.tensor((focal, focal, size / 2, size / 2)).repeat(len(poses), 1), size, size)
 
 
-def _render(cameras: Cameras, name: str) -> Split:
-    """All images, a view a thread."""
+def _see(origin: Array, directions: Array) -> Array:
+    """First hits of rays from one point as premultiplied colour and coverage, [r, 4]."""
+    colour, depth = cast(origin, directions)
+    return np.concatenate((colour, np.isfinite(depth)[:, None]), axis=-1, dtype=np.float32)
+
+
+def render_views(cameras: Cameras, name: str, see: See, *, box: Array, supersamples: int) -> Split:
+    """All images, a view a thread, each with an alpha channel.
+
+    Args:
+        cameras: their poses, all with one focal length and the principal point in the middle.
+        name: of the split, which its images are named after.
+        see: from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity [r, 4] in 0..1.
+        box: [2, 3] that holds everything; ``see`` is asked about the rays that meet it.
+        supersamples: rays on each side of a pixel, which is their average.
+    """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        images = list(pool.map(lambda index: _image(cameras, index), range(len(cameras))))
+        numbers = range(len(cameras))
+        images = list(pool.map(lambda index: _image(cameras, index, see, box, supersamples), numbers))
     names = tuple(f"{name}_{index:03d}" for index in range(len(cameras)))
     return Split(cameras, torch.from_numpy(np.stack(images)), names)
 
 
-def _image(cameras: Cameras, index: int) -> NDArray[np.uint8]:
-    """One image: SUPERSAMPLES^2 rays a pixel, a band of rows at a time; averages premultiplied colour and coverage."""
-    size, fine = cameras.width, SUPERSAMPLES
+def _image(cameras: Cameras, index: int, see: See, box: Array, fine: int) -> NDArray[np.uint8]:
+    """One image: fine^2 rays a pixel, a band of rows at a time; averages premultiplied colour and opacity."""
+    size = cameras.width
     pose: Array = cameras.poses[index].numpy()
     focal = float(cameras.intrinsics[index, 0])
     steps = ((np.arange(size * fine, dtype=np.float32) + np.float32(0.5)) / fine - size / 2) / np.float32(focal)
-    box = bounds()
     middle, half = (box[0] + box[1]) / 2, tuple((box[1] - box[0]).tolist())
     image = np.zeros((size, size, 4), dtype=np.uint8)
     band = max(1, BAND // (size * fine * fine))
@@ -138,9 +166,8 @@ def _image(cameras: Cameras, index: int) -> NDArray[np.uint8]:
         start = np.broadcast_to(origin - middle, directions.shape)
         inside = slab(start, directions, (half[0] / 2, half[1] / 2, half[2] / 2))[2].nonzero()[0]
         rgba = np.zeros((u.size, 4), dtype=np.float32)
-        colour, depth = cast(origin, directions[inside])
-        rgba[inside] = np.concatenate((colour, np.isfinite(depth)[:, None]), axis=-1)
+        rgba[inside] = see(origin, directions[inside])
         pixels = rgba.reshape(len(rows) // fine, fine, size, fine, 4).mean(axis=(1, 3))
         pixels[..., :3] /= np.maximum(pixels[..., 3:], np.float32(1e-6))
-        image[first : first + band] = np.rint(pixels * 255).astype(np.uint8)
+        image[first : first + band] = np.rint(pixels * 255).clip(0, 255).astype(np.uint8)
     return image

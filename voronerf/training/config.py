@@ -31,7 +31,8 @@ class TrainConfig:
     """Settings of a training run."""
 
     data: str = "builtin"
-    """Scene folder (Blender synthetic or transforms.json), or "builtin" for the scene computed from formulas."""
+    """Scene folder (Blender synthetic or transforms.json), or a scene computed from formulas: "builtin", or
+    "builtin-translucent" with fog and glass."""
     downscale: int = 1
     """Factor by which the images are made smaller on load."""
     out: Path | None = None
