@@ -56,6 +56,10 @@ def test_eval_scores_every_view(run: Path, capsys: pytest.CaptureFixture[str]) -
     assert result["psnr"] == pytest.approx(sum(v["psnr"] for v in result["views"]) / 3)
     output = capsys.readouterr().out
     assert all(v["name"] in output for v in result["views"])
+    assert result["lpips"] is None and result["psnr_of_mean_error"] <= result["psnr"]
+    assert "LPIPS is not computed, images of 16 x 16 are below AlexNet's smallest, 31 x 31" in " ".join(output.split())
+    assert "--lpips must be off or come with larger images" in error_of(capsys, "eval", str(run), "--lpips", str(run))
+    assert "nowhere: there is no such file or folder" in error_of(capsys, "eval", str(run), "--lpips", "nowhere")
 
 
 def test_render_makes_a_video(run: Path, tmp_path: Path) -> None:

@@ -1,12 +1,16 @@
-"""PSNR and SSIM against slow loops written from their definitions."""
+"""PSNR and SSIM against slow loops written from their definitions, scipy, and figures of other programs."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from pictures_by_formula import FIGURES, pictures_by_formula
+from scipy.ndimage import gaussian_filter
 
+from voronerf.training.evaluation import ViewScore, mean_scores
 from voronerf.training.metrics import psnr, ssim
 
 
@@ -78,3 +82,35 @@ def test_shapes(score) -> None:
         score(torch.zeros(2, 2, 3), torch.zeros(2, 3, 3))
     with pytest.raises(ValueError, match="same shape"):
         score(torch.zeros(0, 2, 3), torch.zeros(0, 2, 3))
+
+
+def scipy_ssim(image: np.ndarray, truth: np.ndarray) -> float:
+    """The same by scipy's filter, which cuts a Gaussian of 1.5 off at 5 pixels too."""
+    scores = []
+    for a, b in zip(np.moveaxis(image.astype(np.float64), -1, 0), np.moveaxis(truth.astype(np.float64), -1, 0)):
+        mean_a, mean_b, aa, bb, ab = (
+            gaussian_filter(plane, 1.5, truncate=3.5)[5:-5, 5:-5] for plane in (a, b, a * a, b * b, a * b)
+        )
+        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+        contrast = (2 * (ab - mean_a * mean_b) + 9e-4) / (aa - mean_a**2 + bb - mean_b**2 + 9e-4)
+        scores.append((luminance * contrast).mean())
+    return float(np.mean(scores))
+
+
+@pytest.mark.parametrize("figures", FIGURES, ids=lambda figures: f"{figures.height}x{figures.width}")
+def test_against_other_programs(figures) -> None:
+    image, truth = pictures_by_formula(figures.height, figures.width)
+    found = [float(score(torch.from_numpy(image), torch.from_numpy(truth))) for score in (psnr, ssim)]
+    assert found[0] == pytest.approx(figures.psnr, abs=1e-5)
+    assert found[1] == pytest.approx(figures.ssim, abs=1e-7)
+    assert found[1] == pytest.approx(scipy_ssim(image, truth), abs=1e-9)
+
+
+def test_means_and_the_psnr_of_the_mean_error() -> None:
+    scores = [ViewScore("a", 20.0, 0.5, 0.1), ViewScore("b", 30.0, 0.7, 0.3)]
+    means = mean_scores(scores)
+    assert means["psnr"] == pytest.approx(25) and means["ssim"] == pytest.approx(0.6)
+    assert means["lpips"] == pytest.approx(0.2)
+    assert means["psnr_of_mean_error"] == pytest.approx(-10 * math.log10((0.01 + 0.001) / 2))
+    assert mean_scores([*scores, ViewScore("c", 25.0, 0.5)])["lpips"] is None
+    assert mean_scores([ViewScore("perfect", math.inf, 1.0)])["psnr_of_mean_error"] == math.inf

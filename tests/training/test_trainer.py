@@ -81,6 +81,17 @@ def test_a_run_and_its_directory(tmp_path: Path, scene: Scene) -> None:
     assert len(lines) == 3
 
 
+def test_lpips_is_of_the_final_evaluation(tmp_path: Path, scene: Scene) -> None:
+    trainer = Trainer(small(tmp_path), scene)
+    assert trainer.lpips is None
+    trainer.lpips = lambda image, truth: torch.tensor(0.25)
+    summary = trainer.run()
+    assert summary["lpips"] == 0.25 and summary["psnr_of_mean_error"] <= summary["psnr"]
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["lpips"] for line in lines] == [None, 0.25]
+    assert lines[-1]["psnr_of_mean_error"] == summary["psnr_of_mean_error"]
+
+
 def test_training_learns(tmp_path: Path, scene: Scene) -> None:
     config = small(tmp_path, steps=150, rays=256, samples=24, width=32, evaluations=1)
     white = -10 * (scene.test.truth(0, torch.ones(3)) - 1).square().mean().log10()

@@ -21,6 +21,7 @@ from voronerf.data import Scene, load_scene
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.volume import render_image
 from voronerf.training.config import ConfigError, TrainConfig, check_device
+from voronerf.training.lpips import find_lpips
 from voronerf.training.model import load_grid, load_run
 from voronerf.training.runs import choose_directory, score_views, write_curve, write_panels
 from voronerf.training.trainer import Trainer
@@ -49,6 +50,8 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
     assert config.out is not None
     with TrainingDisplay(console, scene.name) as display:
         trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
+        if trainer.lpips is None:
+            display.on_event(trainer.lpips_source)
         before = signal.getsignal(signal.SIGINT)
 
         def stop(number: int, frame: FrameType | None) -> None:
@@ -87,6 +90,7 @@ def evaluate_run(
     panels: int = 4,
     samples: int | None = None,
     occupancy: bool = False,
+    lpips: Path | None = None,
     device: str = "cpu",
     backend: str = "auto",
 ) -> int:
@@ -101,6 +105,8 @@ def evaluate_run(
         samples: Samples per ray; default as in training.
         occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
             grid.
+        lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
+            of VORONERF_DATA or beside the scene, the installed lpips package.
         device: Torch device.
         backend: Backend of the operations.
     """
@@ -111,13 +117,18 @@ def evaluate_run(
     samples = config.samples if samples is None else samples
     grid = load_grid(run, config, router, scene, wanted=occupancy, backend=backend)
     options: dict[str, Any] = {"samples": samples, "backend": backend, "occupancy": grid}
-    result = score_views(router, scene, views=views, path=run / "eval.json", **options)
-    table = Table("view", "psnr [dB]", "ssim")
+    size = (scene.test.cameras.height, scene.test.cameras.width)
+    perceived, source = find_lpips(lpips or config.lpips, config.data, size)
+    if perceived is None:
+        console.print(source, highlight=False, markup=False)
+    result = score_views(router, scene, views=views, path=run / "eval.json", lpips=perceived, **options)
+    table = Table("view", "psnr [dB]", "ssim", "lpips")
     for view in result["views"]:
-        table.add_row(view["name"], f"{view['psnr']:.2f}", f"{view['ssim']:.4f}")
+        table.add_row(view["name"], *_figures(view))
     table.add_section()
-    table.add_row("mean", f"{result['psnr']:.2f}", f"{result['ssim']:.4f}")
+    table.add_row("mean", *_figures(result))
     console.print(table)
+    console.print(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB", highlight=False)
     if panels:
         write_panels(router, scene, run / "images", views=panels, **options)
     console.print(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""), highlight=False)
@@ -231,6 +242,12 @@ def check_counts(**counts: int | None) -> None:
     for name, value in counts.items():
         if value is not None and value < 1:
             raise ConfigError(f"--{name} must be at least 1, got {value}")
+
+
+def _figures(score: dict[str, Any]) -> list[str]:
+    """What a table shows of a score; a dash for what was not computed."""
+    places = {"psnr": 2, "ssim": 4, "lpips": 4}
+    return ["-" if score[name] is None else f"{score[name]:.{digits}f}" for name, digits in places.items()]
 
 
 def _load(

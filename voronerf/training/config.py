@@ -137,7 +137,8 @@ class TrainConfig:
     panels: int = 4
     """Test views drawn as picture panels at the end."""
     lpips: Path | None = None
-    """Folder with LPIPS weights for the final evaluation; default: VORONERF_LPIPS, else lpips in the data folder."""
+    """LPIPS weights for the final evaluation, a file or folder, or "off"; default: VORONERF_LPIPS, the folder lpips of
+    VORONERF_DATA or beside the scene, the installed lpips package."""
 
     def __post_init__(self) -> None:
         if self.budget is None and self.steps is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -10,16 +11,18 @@ from voronerf.data import Scene
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.volume import RenderedImage, render_image
 from voronerf.router import VoronoiRouter
+from voronerf.training.lpips import Lpips
 from voronerf.training.metrics import psnr, ssim
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """PSNR in dB and SSIM of one view, colours in 0..1 on the scene's background."""
+    """PSNR in dB, SSIM and LPIPS (None without its weights) of one view, on the scene's background (white)."""
 
     name: str
     psnr: float
     ssim: float
+    lpips: float | None = None
 
 
 def view_numbers(count: int, views: int | None) -> list[int]:
@@ -67,21 +70,32 @@ def evaluate(
     views: int | None = None,
     backend: str = "auto",
     occupancy: OccupancyGrid | None = None,
+    lpips: Lpips | None = None,
 ) -> list[ViewScore]:
-    """PSNR and SSIM of ``views`` evenly spread test views (None: all)."""
+    """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all)."""
     device = next(router.parameters()).device
     scores = []
     for view in view_numbers(len(scene.test.names), views):
         image = render_view(router, scene, view, samples=samples, backend=backend, occupancy=occupancy, heaviest=False)
         target = scene.test.truth(view, scene.background_colour()).to(device)
         colour = image.colour.clamp(0, 1)
-        scores.append(ViewScore(scene.test.names[view], float(psnr(colour, target)), float(ssim(colour, target))))
+        perceived = None if lpips is None else float(lpips(colour, target))
+        name = scene.test.names[view]
+        scores.append(ViewScore(name, float(psnr(colour, target)), float(ssim(colour, target)), perceived))
     return scores
 
 
-def mean_scores(scores: list[ViewScore]) -> dict[str, float]:
-    """Means per image, as the literature reports them."""
+def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
+    """Means per image, as the literature's tables have them, and the PSNR of the mean squared error over all views.
+
+    The latter, "psnr_of_mean_error", is what the paper's curves show; it is never above the mean of the PSNRs. "lpips"
+    is None unless every view has one.
+    """
+    perceived = [s.lpips for s in scores if s.lpips is not None]
+    error = sum(10 ** (-s.psnr / 10) for s in scores) / len(scores)
     return {
         "psnr": sum(s.psnr for s in scores) / len(scores),
         "ssim": sum(s.ssim for s in scores) / len(scores),
+        "lpips": sum(perceived) / len(scores) if len(perceived) == len(scores) else None,
+        "psnr_of_mean_error": -10 * math.log10(error) if error > 0 else math.inf,
     }

@@ -13,6 +13,7 @@ from voronerf.router import VoronoiRouter
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.evaluation import evaluate, mean_scores, render_view, view_numbers
 from voronerf.training.files import read_json_lines, write_text
+from voronerf.training.lpips import Lpips
 from voronerf.training.model import checkpoint_path
 from voronerf.training.panels import save_panel
 from voronerf.training.plots import plot_curves
@@ -104,9 +105,10 @@ def score_views(
     backend: str,
     path: Path | None = None,
     occupancy: OccupancyGrid | None = None,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """Scores of test views, one by one and in the mean; written to ``path`` as JSON when given."""
-    scores = evaluate(router, scene, samples=samples, views=views, backend=backend, occupancy=occupancy)
+    scores = evaluate(router, scene, samples=samples, views=views, backend=backend, occupancy=occupancy, lpips=lpips)
     result = {**mean_scores(scores), "views": [asdict(score) for score in scores]}
     if path is not None:
         write_text(path, json.dumps(result, indent=2) + "\n")

@@ -36,6 +36,7 @@ from voronerf.training.checkpoint import (
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.evaluation import ViewScore, evaluate, mean_scores
 from voronerf.training.files import read_json_lines, write_bytes, write_text
+from voronerf.training.lpips import Lpips, find_lpips
 from voronerf.training.model import (
     checkpoint_path,
     make_grid,
@@ -52,6 +53,10 @@ OCCUPANCY_WARMUP = 256
 OCCUPANCY_EVERY, OCCUPANCY_PARTS = 16, 4
 #: What a cell remembers at each look at it: a density of 100 is forgotten after some twelve.
 OCCUPANCY_DECAY = 0.6
+
+
+#: What summary.json repeats of the last evaluation.
+FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views")
 
 
 class TrainingError(RuntimeError):
@@ -124,6 +129,8 @@ class Trainer:
             backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
         backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
         self.generator = torch.Generator().manual_seed(config.seed)
+        size = (scene.test.cameras.height, scene.test.cameras.width)
+        self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, size)
         self.batches = RayBatches(scene, self.device)
         self.background = scene.background_colour(self.device)
         self.router = make_router(config, self.device)
@@ -187,7 +194,7 @@ class Trainer:
         self.advance()
         self.save()
         if not self.stopped:
-            self._evaluate(self.config.final_views)
+            self._evaluate(self.config.final_views, self.lpips)
         return self._summarise()
 
     def advance(self, until: float = math.inf) -> None:
@@ -320,7 +327,7 @@ class Trainer:
         """Evaluations that should have been made by now."""
         return int(self.fraction * self.config.evaluations + 1e-9)
 
-    def _evaluate(self, views: int | None) -> list[ViewScore]:
+    def _evaluate(self, views: int | None, lpips: Lpips | None = None) -> list[ViewScore]:
         self.evaluated = self._due()
         scores = evaluate(
             self.router,
@@ -329,6 +336,7 @@ class Trainer:
             views=views,
             backend=self.config.backend,
             occupancy=self.looked_at,
+            lpips=lpips,
         )
         now = {
             "step": self.step,
@@ -348,7 +356,7 @@ class Trainer:
 
     def _summarise(self) -> dict[str, Any]:
         summary = {
-            **{key: self.metrics[-1][key] if self.metrics else None for key in ("psnr", "ssim", "views")},
+            **{key: self.metrics[-1][key] if self.metrics else None for key in FIGURES},
             "complete": self.fraction >= 1,
             "seconds": self.seconds,
             "steps": self.step,
