@@ -21,12 +21,11 @@ README = (
     r"^locate_cell/16x16 n=262144/",
     r"^cell_sort/n=262144 k=256/",
     r"^grouped_linear/64-64 .*/float32/",
-    r"^grouped_mlp/(w64d4|nerf64) n=262144 k=16/",
-    r"^grouped_mlp/mlp32 n=262144 k=(256|4096)/",
-    r"^grouped_mlp/nerf256 n=262144 k=1/",
-    r"^(frequency|integrated)_encode/L=10 n=262144/float32/",
+    r"^grouped_mlp/w64d4 n=262144 k=16/float32/",
+    r"^grouped_mlp/nerf64 n=262144 k=16/",
+    r"^grouped_mlp/mlp32 n=262144 k=256/float32",
+    r"^frequency_encode/L=10 n=262144/float32/",
     r"^composite/dense n=262144/",
-    r"^resample/.* n=262144/",
     r"^routed_mlp/(w64d4|mlp32) n=262144 k=(16|256)/",
 )
 """Rows of the README's table, by op/case/dtype/direction."""
