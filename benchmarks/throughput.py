@@ -12,12 +12,15 @@ docs/performance.md says how to read the table. Rows appear as they are measured
 from __future__ import annotations
 
 import argparse
+import atexit
 import functools
 import importlib.metadata
 import json
 import os
 import re
+import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +30,7 @@ from typing import Any, NoReturn
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 
 import cases_lookup
+import cases_marching
 import cases_network
 import cases_sampling
 import torch
@@ -86,7 +90,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """The cases that the options leave."""
-    every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases()]
+    every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases(), *cases_marching.cases()]
     if options.filter is not None:
         try:
             pattern = re.compile(options.filter)
@@ -143,11 +147,12 @@ class Bench:
     def _measure(self, case: Case, names: list[str], work: Work) -> list[dict[str, Any]]:
         notes: dict[str, str] = {}
         errors: dict[str, float] = {}
+        first: dict[str, float] = {}
         warm: dict[str, float] = {}
         contenders: dict[str, Contender] = {}
         for name in names:
             contenders[name] = work.ours(name)
-            errors[name], _ = self._check(contenders[name], work)
+            errors[name], first[name] = self._check(contenders[name], work)
         for name, set_up in work.alternatives.items():
             if self.quick and any(part in name for part in SLOW):
                 continue
@@ -168,7 +173,7 @@ class Bench:
         }
         notes.update({name: "capped" for name, timing in timings.items() if timing.capped})
         rows = [self._row(case, work, name, timings[name], alternatives, errors[name], peak, notes) for name in names]
-        return [{**row, "other_load": disturbed} for row in rows]
+        return [{**row, "other_load": disturbed, "first_call_ms": first[row["backend"]] * 1e3} for row in rows]
 
     def _check(self, contender: Contender, work: Work) -> tuple[float, float]:
         """Calls a contender for the first time: error, seconds."""
@@ -232,6 +237,16 @@ def _milliseconds(timing: Timing | None) -> float | None:
     return None if timing is None else timing.median_ms
 
 
+def cold_starts(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """For each op the seconds that its first call on Warp took beyond an ordinary one: compiling, or loading."""
+    found: dict[str, float] = {}
+    for row in rows:
+        if row["backend"] == "warp":
+            extra = (row["first_call_ms"] - row["median_ms"]) * 1e-3
+            found[row["op"]] = max(extra, found.get(row["op"], 0.0))
+    return {op: round(seconds, 2) for op, seconds in found.items()}
+
+
 HEADER = (
     f"{'op':17} {'case':28} {'dtype':8} {'direction':16} {'backend':9} {'median':>10} {'iqr':>8} {'ns/sample':>10}"
     f" {'throughput':>15} {'of peak':>8} {'x best':>7} {'error':>8}"
@@ -268,6 +283,11 @@ def main(arguments: list[str] | None = None) -> None:
             options.json.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             fail(f"--json: {error}")
+    if not options.quick:
+        # Compilation is part of what a first call costs; a cache that is there would hide it.
+        folder = tempfile.mkdtemp(prefix="voronerf-warp-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ["WARP_CACHE_PATH"] = folder
     start, load = time.perf_counter(), os.getloadavg()
     torch.manual_seed(0)
     bench = Bench(torch.device(options.device), quick=options.quick, wanted=options.backends)
@@ -285,6 +305,11 @@ def main(arguments: list[str] | None = None) -> None:
             print("\n".join(lines(row, last=row is rows[-1])), flush=True)
         if rows and (rows[0]["other_load"] or 0.0) > DISTURBED:
             progress(f"    disturbed: other processes kept {rows[0]['other_load']:.1f} cores busy during this row")
+    cold = cold_starts(bench.rows)
+    if cold:
+        listed = ", ".join(f"{op} {seconds:.1f}" for op, seconds in cold.items())
+        where = "the cache that is there" if options.quick else "an empty cache"
+        print(f"\nfirst calls on Warp, seconds, with {where}: {listed}")
     if options.targets:
         print("\n".join(["", *target_lines(bench.rows), "", *architecture_lines(bench.rows)]))
     if options.json is not None:
@@ -298,6 +323,8 @@ def main(arguments: list[str] | None = None) -> None:
             peaks={name: round(value * 1e-9, 1) for name, value in bench.peaks.found.items()},
             installed=found,
             missing=missing,
+            warp_cache="as it was" if options.quick else "empty",
+            warp_cold_start=cold,
         )
         write_text(options.json, json.dumps({"metadata": description, "results": bench.rows}, indent=1) + "\n")
 

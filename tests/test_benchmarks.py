@@ -31,6 +31,8 @@ OPS = {
     "resample",
     "routed_mlp",
 }
+NOT_DIFFERENTIABLE = {"march_rays", "update_occupancy", "camera_rays", "balance_centres", "select_heaviest"}
+OPS |= NOT_DIFFERENTIABLE
 COLUMNS = [
     *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "median_ms", "iqr_ms", "throughput", "unit"),
     *("percent_of_peak", "alternatives", "speedup_over_best", "max_error"),
@@ -152,7 +154,7 @@ def test_every_operation_has_rows_in_both_modes(load: Callable[[str], Any]) -> N
         keys = [case.key for case in cases]
         assert len(set(keys)) == len(keys)
     both = {(case.op, case.direction) for case in throughput.chosen_cases(throughput.parse([]))}
-    differentiable = OPS - {"nearest_centre", "locate_cell", "cell_sort", "resample"}
+    differentiable = OPS - NOT_DIFFERENTIABLE - {"nearest_centre", "locate_cell", "cell_sort", "resample"}
     assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 
@@ -214,11 +216,19 @@ def test_routes_compute_the_same(load: Callable[[str], Any], direction: str) -> 
 
 def test_what_is_compared_is_right_in_every_small_case(load: Callable[[str], Any]) -> None:
     lookup, sampling, case = load("cases_lookup"), load("cases_sampling"), load("case")
+    marching = load("cases_marching")
     works = {
         "nearest_centre": lookup._nearest_work(500, 7, torch.float32, False, CPU),
         "locate_cell": lookup._locate_work(500, (4, 3), CPU),
         "cell_sort": lookup._sort_work(500, 7, CPU),
         "resample": sampling._resample_work(512, CPU),
+        "march_rays": marching._march_work(1 << 13, False, CPU),
+        "march_rays, jittered": marching._march_work(1 << 13, True, CPU),
+        "update_occupancy": marching._update_work(250, CPU),
+        "camera_rays": marching._camera_work(300, False, CPU),
+        "camera_rays, lens": marching._camera_work(300, True, CPU),
+        "balance_centres": marching._balance_work(600, 5, CPU),
+        "select_heaviest": marching._heaviest_work(2000, CPU),
     }
     for direction in ("forward", "forward+backward"):
         for op in ("frequency_encode", "integrated_encode"):
@@ -248,6 +258,19 @@ def test_wrong_answers_are_found(load: Callable[[str], Any]) -> None:
     work = lookup._sort_work(500, 7, CPU)
     order, offsets = work.ours("reference").run(0)
     assert work.error((order, offsets)) == 0 and work.error((order.flip(0), offsets)) > 0
+    marching = load("cases_marching")
+    work = marching._march_work(1 << 13, True, CPU)
+    right = work.ours("reference").run(0)
+    assert work.error(right) < 1e-6 and work.error(right._replace(depths=right.depths * 1.1)) > 0.05
+    assert work.error(work.ours("reference").run(1)) > 0.1, "other rays"
+    work = marching._update_work(250, CPU)
+    density, occupied = work.ours("reference").run(0)
+    assert work.error((density, occupied)) < 1e-6 and work.error((density, ~occupied)) == float("inf")
+    work = marching._balance_work(600, 5, CPU)
+    assert work.error((marching._balance_work(600, 5, CPU).ours("reference").run(1)[0], None)) > work.tolerance
+    work = marching._heaviest_work(2000, CPU)
+    points, kept = work.ours("reference").run(0)
+    assert work.error((points, kept)) == 0 and work.error((points.flip(0), kept)) == float("inf")
     batch = networks.make_batch(networks.NETS["mlp32"], 200, 3, torch.float32, "forward+backward", CPU)
     error = networks.network_error(batch)
     out, gradients = load("alternatives").ours(batch, "reference").run(0)
@@ -295,7 +318,10 @@ def test_rows_report_failures_losses_and_caps(load: Callable[[str], Any]) -> Non
     assert row["alternatives"]["absent"] is None and row["notes"]["absent"] == "n/a: not installed"
     assert row["notes"]["broken"] == "n/a: RuntimeError: first line"
     assert row["alternatives"]["wrong"] is None and "error of 1 is above" in row["notes"]["wrong"]
-    assert row["percent_of_peak"] is None and row["max_error"] == 0
+    assert row["percent_of_peak"] is None and row["max_error"] == 0 and row["first_call_ms"] >= 6
+    assert throughput.cold_starts([row]) == {}
+    rows = [{**row, "backend": "warp", "first_call_ms": row["median_ms"] + extra} for extra in (0, 3000)]
+    assert throughput.cold_starts(rows) == {"cell_sort": 3.0}
     text = "\n".join(throughput.lines(row, last=True))
     assert "n/a: not installed" in text and "capped" in text
 
