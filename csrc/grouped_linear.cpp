@@ -1,91 +1,23 @@
-// Tasks of grouped_linear over threads, as those of grouped_mlp: a task is a cell and a range of its rows, which tasks
-// there are depends on the sizes alone, and partial gradients are summed in the order of the rows.
+// grouped_linear over threads, task by task (row_tasks.h).
 #include "grouped_linear.h"
 
 #include <algorithm>
-#include <cstdlib>
-#include <memory>
-#include <new>
-#include <stdexcept>
-#include <string>
-#include <vector>
 
 #include "common.h"
 #include "grouped_linear_isa.h"
 #include "parallel.h"
+#include "row_tasks.h"
 
 namespace voronerf {
 
 namespace {
 
-// Rows of a task, in whole tiles: enough to pay for packing the weights, few enough to keep every thread busy.
-constexpr int64_t kFewestRows = 96, kMostRows = 2048, kFewestGradientRows = 384, kMostGradientRows = 4096;
-constexpr int64_t kTasks = 64;
-// Partial gradients of one call, in floats: wide layers get longer tasks instead of more memory.
-constexpr int64_t kPartialFloats = int64_t{1} << 24;
-constexpr int64_t kAlign = 64;
-
-struct Task {
-  int64_t cell, begin, end;
-  int64_t partial;  // index of its partial; -1: the cell's only task
-};
-
-struct Tasks {
-  std::vector<Task> tasks;
-  std::vector<int64_t> first_partial;  // [k+1] for each cell
-};
-
-struct Free {
-  void operator()(float* memory) const { std::free(memory); }
-};
-
-// Kept by a thread that has made a call until it ends, since fresh pages are slow; one that large partials have made
-// large is given back.
-struct Workspace {
-  std::unique_ptr<float, Free> memory;
-  int64_t size = 0;
-
-  float* grow(int64_t floats) {
-    if (floats > size) {
-      size = 0;
-      memory.reset();
-      memory.reset(static_cast<float*>(std::aligned_alloc(kAlign, ceil_div(floats * 4, kAlign) * kAlign)));
-      if (memory == nullptr) throw std::bad_alloc();
-      size = floats;
-    }
-    return memory.get();
-  }
-};
-thread_local Workspace kept;
+constexpr RowLimits kRows{96, 2048}, kGradientRows{384, 4096};
 
 void check(const LinearInputs& in) {
   // The products walk their operands with loops that test at the end.
   VN_CHECK(in.i > 0 && in.o > 0, "grouped_linear: a layer must have inputs and outputs");
-  int64_t before = 0;
-  for (int64_t c = 0; c <= in.k; ++c) {
-    if (in.offsets[c] < before || in.offsets[c] > in.n) {
-      throw std::invalid_argument("grouped_linear: offsets must rise from 0 or more to at most the number of rows, " +
-                                  std::to_string(in.n) + ", got " + std::to_string(in.offsets[c]) + " for cell " +
-                                  std::to_string(c));
-    }
-    before = in.offsets[c];
-  }
-}
-
-Tasks split(const LinearInputs& in, int64_t target) {
-  Tasks result;
-  result.first_partial.assign(in.k + 1, 0);
-  int64_t partials = 0;
-  for (int64_t c = 0; c < in.k; ++c) {
-    const int64_t begin = in.offsets[c], rows = in.offsets[c + 1] - begin;
-    const int64_t count = ceil_div(rows, target);
-    const int64_t size = count > 1 ? ceil_div(ceil_div(rows, count), kLinearTile) * kLinearTile : rows;
-    for (int64_t start = 0; start < rows; start += size) {
-      result.tasks.push_back({c, begin + start, begin + std::min(rows, start + size), count > 1 ? partials++ : -1});
-    }
-    result.first_partial[c + 1] = partials;
-  }
-  return result;
+  check_offsets("grouped_linear", in.offsets, in.k, in.n);
 }
 
 int64_t pad(int64_t width, int64_t to) {
@@ -157,13 +89,13 @@ void pack(Isa isa, const LinearCall& call, int64_t cell, float* own) {
 #endif
   VN_FOR_ISA(isa, linear_pack(call, cell, own))
 }
-void forward(Isa isa, const LinearCall& call, const Task& task, float* own) {
+void forward(Isa isa, const LinearCall& call, const RowTask& task, float* own) {
 #if VN_HAS_HALF
   if (call.half) return avx512::linear_half_forward(call, task.begin, task.end, own);
 #endif
   VN_FOR_ISA(isa, linear_forward(call, task.begin, task.end, own))
 }
-void backward(Isa isa, const LinearCall& call, const Task& task, float* own, float* partial) {
+void backward(Isa isa, const LinearCall& call, const RowTask& task, float* own, float* partial) {
 #if VN_HAS_HALF
   if (call.half) return avx512::linear_half_backward(call, task.begin, task.end, own, partial);
 #endif
@@ -173,21 +105,10 @@ void reduce(Isa isa, const LinearCall& call, int64_t cell, float* partials, int6
   VN_FOR_ISA(isa, linear_reduce(call, cell, partials, count, own))
 }
 
-// run(task, own workspace) for every task, a cell's weights packed.
 template <typename Run>
-void for_each_task(const Tasks& tasks, const LinearCall& call, float* memory, Isa isa, int threads, const Run& run) {
-  const int64_t count = static_cast<int64_t>(tasks.tasks.size());
-  Items items(count);
-  parallel(static_cast<int>(std::min<int64_t>(threads, count)), [&](int thread) {
-    float* own = memory + thread * call.workspace;
-    int64_t packed = -1;
-    for (int64_t i, end; items.take(i, end);) {
-      const Task& task = tasks.tasks[i];
-      if (task.cell != packed) pack(isa, call, task.cell, own);
-      packed = task.cell;
-      run(task, own);
-    }
-  });
+void run_tasks(const RowTasks& tasks, const LinearCall& call, float* memory, Isa isa, int threads, const Run& run) {
+  const auto pack_cell = [&](int64_t cell, float* own, bool) { pack(isa, call, cell, own); };
+  for_each_task(tasks, memory, call.workspace, threads, pack_cell, [](int64_t) {}, run);
 }
 
 }  // namespace
@@ -197,11 +118,11 @@ void grouped_linear_cpu(const LinearInputs& in, void* out, Isa isa, int threads)
   LinearCall call = describe(in, nullptr, isa);
   call.out = out;
   zero_strays(in, in.o, out);
-  const Tasks tasks = split(in, std::clamp(in.n / kTasks, kFewestRows, kMostRows));
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kRows, kLinearTile, 0);
   if (tasks.tasks.empty()) return;
-  float* memory = kept.grow(call.workspace * std::max(threads, 1));
-  for_each_task(tasks, call, memory, isa, threads,
-                [&](const Task& task, float* own) { forward(isa, call, task, own); });
+  const Workspace workspace(call.workspace * std::max(threads, 1));
+  run_tasks(tasks, call, workspace.data(), isa, threads,
+            [&](const RowTask& task, float* own) { forward(isa, call, task, own); });
 }
 
 void grouped_linear_backward_cpu(const LinearInputs& in, const LinearGradients& gradients, Isa isa, int threads) {
@@ -209,14 +130,13 @@ void grouped_linear_backward_cpu(const LinearInputs& in, const LinearGradients& 
   const LinearCall call = describe(in, &gradients, isa);
   if (gradients.x != nullptr) zero_strays(in, in.i, gradients.x);
   const bool parameters = gradients.weight != nullptr;
-  const int64_t room = std::max<int64_t>(kPartialFloats / call.partial, 1);
-  const int64_t target = std::max(std::clamp(in.n / kTasks, kFewestGradientRows, kMostGradientRows), in.n / room);
-  const Tasks tasks = split(in, target);
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kGradientRows, kLinearTile, call.partial);
   const int64_t partials = parameters ? tasks.first_partial[in.k] : 0, team = std::max(threads, 1);
-  float* memory = kept.grow(call.workspace * team + partials * call.partial);
+  const Workspace workspace(call.workspace * team + partials * call.partial);
+  float* memory = workspace.data();
   float* partial = memory + call.workspace * team;
   if (!tasks.tasks.empty()) {
-    for_each_task(tasks, call, memory, isa, threads, [&](const Task& task, float* own) {
+    run_tasks(tasks, call, memory, isa, threads, [&](const RowTask& task, float* own) {
       float* to = task.partial < 0 ? own + call.own_partial : partial + task.partial * call.partial;
       backward(isa, call, task, own, to);
       if (task.partial < 0 && parameters) reduce(isa, call, task.cell, to, 1, own);
@@ -226,7 +146,7 @@ void grouped_linear_backward_cpu(const LinearInputs& in, const LinearGradients& 
     Items items(in.k);
     parallel(static_cast<int>(std::min<int64_t>(threads, in.k)), [&](int thread) {
       for (int64_t cell, end; items.take(cell, end);) {
-        const int64_t first = tasks.first_partial[cell], count = tasks.first_partial[cell + 1] - first;
+        const int64_t first = tasks.first_partial[cell], count = tasks.partials(cell);
         const bool empty = in.offsets[cell + 1] == in.offsets[cell];
         if (count > 0 || empty) {
           reduce(isa, call, cell, partial + first * call.partial, count, memory + thread * call.workspace);
@@ -234,7 +154,6 @@ void grouped_linear_backward_cpu(const LinearInputs& in, const LinearGradients& 
       }
     });
   }
-  if (kept.size > 2 * kPartialFloats) kept = Workspace{};
 }
 
 }  // namespace voronerf

@@ -1,12 +1,7 @@
-// Tasks of grouped_mlp over threads. A task is a cell and a range of its rows; which tasks there are depends on the
-// sizes alone, and partial weight gradients are summed in the order of the rows, so results do not depend on the number
-// of threads or on which thread took what.
+// grouped_mlp over threads, task by task (row_tasks.h).
 #include "grouped_mlp.h"
 
 #include <algorithm>
-#include <cstdlib>
-#include <memory>
-#include <new>
 #include <stdexcept>
 #include <string>
 
@@ -14,75 +9,20 @@
 #include "grouped_mlp_isa.h"
 #include "grouped_mlp_planner.h"
 #include "parallel.h"
+#include "row_tasks.h"
 
 namespace voronerf {
 
 namespace {
 
-// Rows of a task: enough to pay for packing the weights, few enough to keep every thread busy to the end.
-constexpr int64_t kFewestRows = 96, kMostRows = 1024, kFewestGradientRows = 384, kMostGradientRows = 4096;
-constexpr int64_t kTasks = 64;
-// ... in whole tiles or halves of one.
+constexpr RowLimits kRows{96, 1024}, kGradientRows{384, 4096};
+// Tasks are whole tiles or halves of one.
 constexpr int64_t kTaskUnit = 48;
-// Partial weight gradients of one call, in floats: wide networks get longer tasks instead of more memory.
-constexpr int64_t kPartialFloats = int64_t{1} << 24;
-// What a thread keeps from one call to the next, in floats: the partials of a wide network, and as much again.
-constexpr int64_t kKeptFloats = 2 * kPartialFloats;
-constexpr int64_t kAlign = 64;
-
-struct Task {
-  int64_t cell, begin, end;
-  int64_t partial;  // index of its partial; -1: the cell's only task
-};
-
-struct Tasks {
-  std::vector<Task> tasks;
-  std::vector<int64_t> first_partial;  // [k+1] for each cell
-};
-
-struct Free {
-  void operator()(float* memory) const { std::free(memory); }
-};
-
-struct Block {
-  std::unique_ptr<float, Free> memory;
-  int64_t size = 0;
-};
-
-// Kept by a thread that has made a call until it ends: a fresh page costs a microsecond at its first touch.
-thread_local Block kept;
-
-// Memory for one call. It is the thread's block, and where that is too small replaces it; a block of more than
-// kKeptFloats goes back at the end of the call.
-class Workspace {
- public:
-  explicit Workspace(int64_t floats) {
-    if (floats <= kept.size) return;
-    kept = Block{};
-    kept.memory.reset(static_cast<float*>(std::aligned_alloc(kAlign, ceil_div(floats * 4, kAlign) * kAlign)));
-    if (kept.memory == nullptr) throw std::bad_alloc();
-    kept.size = floats;
-  }
-  ~Workspace() {
-    if (kept.size > kKeptFloats) kept = Block{};
-  }
-  Workspace(const Workspace&) = delete;
-  Workspace& operator=(const Workspace&) = delete;
-  float* data() const { return kept.memory.get(); }
-};
 
 void check(const MlpTable& table, const MlpInputs& in) {
-  constexpr const char* kNames[] = {"grouped_mlp: ", "grouped_linear: ", "routed_mlp: "};
+  constexpr const char* kNames[] = {"grouped_mlp", "grouped_linear", "routed_mlp"};
   const std::string op = kNames[static_cast<int>(table.caller)];
-  int64_t before = 0;
-  for (int64_t c = 0; c <= in.k; ++c) {
-    if (in.offsets[c] < before || in.offsets[c] > in.n) {
-      throw std::invalid_argument(op + "offsets must rise from 0 or more to at most the number of rows, " +
-                                  std::to_string(in.n) + ", got " + std::to_string(in.offsets[c]) + " for cell " +
-                                  std::to_string(c));
-    }
-    before = in.offsets[c];
-  }
+  check_offsets(op, in.offsets, in.k, in.n);
   if (in.direction_index == nullptr) return;
   int32_t low = 0, high = -1;
   for (int64_t i = 0; i < in.n; ++i) {
@@ -90,25 +30,9 @@ void check(const MlpTable& table, const MlpInputs& in) {
     high = std::max(high, in.direction_index[i]);
   }
   if (low < 0 || high >= in.r) {
-    throw std::invalid_argument(op + "direction_index must be 0 to " + std::to_string(in.r - 1) + ", got " +
+    throw std::invalid_argument(op + ": direction_index must be 0 to " + std::to_string(in.r - 1) + ", got " +
                                 std::to_string(low < 0 ? low : high));
   }
-}
-
-Tasks split(const MlpInputs& in, int64_t target) {
-  Tasks result;
-  result.first_partial.assign(in.k + 1, 0);
-  int64_t partials = 0;
-  for (int64_t c = 0; c < in.k; ++c) {
-    const int64_t begin = in.offsets[c], rows = in.offsets[c + 1] - begin;
-    const int64_t count = ceil_div(rows, target);
-    const int64_t size = count > 1 ? ceil_div(ceil_div(rows, count), kTaskUnit) * kTaskUnit : rows;
-    for (int64_t start = 0; start < rows; start += size) {
-      result.tasks.push_back({c, begin + start, begin + std::min(rows, start + size), count > 1 ? partials++ : -1});
-    }
-    result.first_partial[c + 1] = partials;
-  }
-  return result;
 }
 
 // Rows of no cell.
@@ -137,13 +61,13 @@ void pack(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, float
 #endif
   VN_FOR_ISA(isa, mlp_pack(plan, data, cell, own))
 }
-void forward(Isa isa, const MlpPlan& plan, const MlpData& data, const Task& task, float* own) {
+void forward(Isa isa, const MlpPlan& plan, const MlpData& data, const RowTask& task, float* own) {
 #if VN_HAS_HALF
   if (plan.half) return avx512::mlp_half_forward(plan, data, task.begin, task.end, own);
 #endif
   VN_FOR_ISA(isa, mlp_forward(plan, data, task.begin, task.end, own))
 }
-void backward(Isa isa, const MlpPlan& plan, const MlpData& data, const Task& task, float* own, float* partial) {
+void backward(Isa isa, const MlpPlan& plan, const MlpData& data, const RowTask& task, float* own, float* partial) {
 #if VN_HAS_HALF
   if (plan.half) return avx512::mlp_half_backward(plan, data, task.begin, task.end, own, partial);
 #endif
@@ -168,27 +92,20 @@ void fetch(const MlpPlan& plan, const MlpData& data, int64_t cell) {
   }
 }
 
-// run(task, own workspace) for every task, a cell's weights packed.
+// Floats of a thread's workspace.
+int64_t stride(const MlpPlan& plan) {
+  return ceil_div(plan.workspace, kGranule) * kGranule;
+}
+
 template <typename Run>
-void for_each_task(const Tasks& tasks, const MlpPlan& plan, const MlpData& data, float* memory, Isa isa, int threads,
-                   const Run& run) {
-  const int64_t count = static_cast<int64_t>(tasks.tasks.size());
-  const int64_t stride = ceil_div(plan.workspace, kGranule) * kGranule;
-  Items items(count);
-  parallel(static_cast<int>(std::min<int64_t>(threads, count)), [&](int thread) {
-    float* own = memory + thread * stride;
-    int64_t packed = -1;
-    prepare(isa, plan, own);
-    for (int64_t i, end; items.take(i, end);) {
-      const Task& task = tasks.tasks[i];
-      if (task.cell != packed) pack(isa, plan, data, task.cell, own);
-      packed = task.cell;
-      // Most likely this thread's next: the others take as many in the same time.
-      const int64_t next = i + threads;
-      if (next < count && tasks.tasks[next].cell != packed) fetch(plan, data, tasks.tasks[next].cell);
-      run(task, own);
-    }
-  });
+void run_tasks(const RowTasks& tasks, const MlpPlan& plan, const MlpData& data, float* memory, Isa isa, int threads,
+               const Run& run) {
+  const auto pack_cell = [&](int64_t cell, float* own, bool first) {
+    if (first) prepare(isa, plan, own);
+    pack(isa, plan, data, cell, own);
+  };
+  const auto ahead = [&](int64_t cell) { fetch(plan, data, cell); };
+  for_each_task(tasks, memory, stride(plan), threads, pack_cell, ahead, run);
 }
 
 MlpData pointers(const MlpInputs& in) {
@@ -215,11 +132,6 @@ void sum_by_ray(const MlpInputs& in, int64_t q, const float* samples, float* out
   }
 }
 
-// Floats of the workspaces of all threads.
-int64_t workspaces(const MlpPlan& plan, int threads) {
-  return ceil_div(plan.workspace, kGranule) * kGranule * threads;
-}
-
 }  // namespace
 
 void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa isa, int threads) {
@@ -227,13 +139,13 @@ void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa
   const MlpPlanner planner(table, gathered(in), {false, false, false, use_half(table, isa)});
   const MlpPlan& plan = planner.plan();
   zero_strays(in, plan.out_features, out);
-  const Tasks tasks = split(in, std::clamp(in.n / kTasks, kFewestRows, kMostRows));
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kRows, kTaskUnit, 0);
   if (tasks.tasks.empty()) return;
   MlpData data = pointers(in);
   data.out = out;
-  const Workspace workspace(workspaces(plan, threads));
-  for_each_task(tasks, plan, data, workspace.data(), isa, threads,
-                [&](const Task& task, float* own) { forward(isa, plan, data, task, own); });
+  const Workspace workspace(stride(plan) * threads);
+  run_tasks(tasks, plan, data, workspace.data(), isa, threads,
+            [&](const RowTask& task, float* own) { forward(isa, plan, data, task, own); });
 }
 
 void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const MlpGradients& gradients, Isa isa,
@@ -244,17 +156,14 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
                          use_half(table, isa)};
   const MlpPlanner planner(table, gathered(in), wanted);
   const MlpPlan& plan = planner.plan();
-  const int64_t room = std::max<int64_t>(kPartialFloats / std::max<int64_t>(plan.partial, 1), 1);
-  const int64_t target = std::max(std::clamp(in.n / kTasks, kFewestGradientRows, kMostGradientRows), in.n / room);
-  const Tasks tasks = split(in, target);
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kGradientRows, kTaskUnit, plan.partial);
   const int64_t partials = wanted.parameters ? tasks.first_partial[in.k] : 0;
   // Gradients of the samples' directions, before they are summed over each ray's samples.
   const bool by_ray = wanted.directions && indexed && plan.directions.used;
   const int64_t samples = by_ray ? in.n * table.directions : 0;
-  const Workspace workspace(workspaces(plan, threads) + partials * plan.partial +
-                            ceil_div(samples, kGranule) * kGranule);
+  const Workspace workspace(stride(plan) * threads + partials * plan.partial + ceil_div(samples, kGranule) * kGranule);
   float* memory = workspace.data();
-  float* partial = memory + workspaces(plan, threads);
+  float* partial = memory + stride(plan) * threads;
   float* sample_directions = partial + partials * plan.partial;
 
   MlpData data = pointers(in);
@@ -274,7 +183,7 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   if (wanted.directions && !indexed) clear(data.grad_directions, table.directions, plan.directions.used);
 
   if (!tasks.tasks.empty()) {
-    for_each_task(tasks, plan, data, memory, isa, threads, [&](const Task& task, float* own) {
+    run_tasks(tasks, plan, data, memory, isa, threads, [&](const RowTask& task, float* own) {
       float* to = task.partial < 0 ? own + plan.own_partial : partial + task.partial * plan.partial;
       backward(isa, plan, data, task, own, to);
       if (task.partial >= 0 || !wanted.parameters) return;
@@ -284,7 +193,7 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   if (wanted.parameters) {
     parallel_for(in.k * plan.layer_count, 1, threads, [&](int64_t item) {
       const int64_t cell = item / plan.layer_count, l = item % plan.layer_count;
-      const int64_t first = tasks.first_partial[cell], count = tasks.first_partial[cell + 1] - first;
+      const int64_t first = tasks.first_partial[cell], count = tasks.partials(cell);
       const bool empty = in.offsets[cell + 1] == in.offsets[cell];
       if (count > 0 || empty) reduce(isa, plan, data, cell, l, partial + first * plan.partial, count);
     });

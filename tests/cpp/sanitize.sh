@@ -38,7 +38,7 @@ check() {
   setarch -R "$build/$name/run" "$count"
 }
 
-mlp="csrc/grouped_mlp_isa csrc/grouped_mlp_half_isa csrc/grouped_mlp csrc/grouped_mlp_plan csrc/isa
+mlp="csrc/grouped_mlp_isa csrc/grouped_mlp_half_isa csrc/grouped_mlp csrc/grouped_mlp_plan csrc/row_tasks csrc/isa
   tests/cpp/grouped_mlp_sanitize"
 check grouped_mlp "-fsanitize=address,undefined -fopenmp" "$mlp" "$cases"
 check grouped_mlp_threads "-fsanitize=thread -DVN_STD_THREADS" "$mlp" "$((cases / 3))"
