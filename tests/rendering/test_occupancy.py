@@ -90,6 +90,49 @@ def test_cells_that_are_looked_at_fade_and_the_others_stay() -> None:
     assert bool((density[1::2] == 8).all())
 
 
+def test_cells_are_those_of_their_points() -> None:
+    grid = OccupancyGrid(torch.tensor([[0.0, 10.0, -4.0], [2.0, 13.0, 0.0]]), (2, 3, 4), threshold=1)
+    every = torch.arange(24)
+    for _ in range(4):
+        assert torch.equal(grid.cells(grid.points(every, torch.rand(24, 3))), every.int())
+    border = torch.tensor([[-1.0, 10.5, -3.5], [2.0, 13.0, 0.0], [9.0, 99.0, torch.nan]])
+    assert grid.cells(border).tolist() == [0, 23, 20] and grid.cells(border).dtype == torch.int32
+
+
+def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden() -> None:
+    """Rays from all around a ball: its shell stays, the air around it and the inside that no light reaches fade."""
+    grid, ball = OccupancyGrid(BOX, 16, threshold=0.1), Ball(200.0)
+    random = torch.Generator().manual_seed(0)
+    for _ in range(60):
+        origins = 3 * torch.nn.functional.normalize(torch.randn(300, 3, generator=random), dim=1)
+        towards = torch.rand(300, 3, generator=random) * 1.6 - 0.8
+        rays = Rays(origins, torch.nn.functional.normalize(towards - origins, dim=1))
+        near, far, hit = intersect_box(rays.origins, rays.directions, BOX, 0.0, 9.0)
+        seen = render_marched(ball, rays[hit], near[hit], far[hit], grid, samples=64, jitter=True, generator=random)
+        grid.observe(seen.positions, seen.density, seen.deltas, seen.weights, decay=0.8)
+    distance = grid.points(torch.arange(16**3)).norm(dim=-1).reshape(16, 16, 16)
+    half = 3**0.5 / 16
+    corners = grid.points(torch.arange(16**3)).abs().amax(-1).reshape(16, 16, 16) > 0.8
+    assert not bool(grid.occupied[(distance > 0.5 + half) & ~corners].any())
+    # A ray that slips through a corner of the shell brings single cells behind it back.
+    assert float(grid.occupied[distance < 0.5 - 2.5 * half].float().mean()) < 0.2
+    options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 64, "background": WHITE}
+    plain, quick = (render_image(ball, cameras(), 0, occupancy=each, **options).colour for each in (None, grid))
+    assert float((plain - quick).abs().mean()) < 2e-3
+    before = ball.asked
+    render_marched(ball, rays[hit], near[hit], far[hit], grid, samples=64)
+    assert (ball.asked - before) * 5 < 64 * int(hit.sum())
+    # A cell comes back when a look finds something there, and fades no further by it.
+    inside = grid.cells(torch.zeros(1, 3))
+    grid.update(ball, inside, decay=1.0)
+    assert float(grid.density.reshape(-1)[inside]) == 200.0
+    # What is not a number counts as dense.
+    grid.observe(torch.full((1, 3), 0.95), torch.tensor([torch.nan]), torch.ones(1), torch.ones(1), decay=0.0)
+    assert bool(grid.occupied[15, 15, 15])
+    with pytest.raises(ValueError, match=r"observe: decay must lie in 0..1, got -1"):
+        grid.observe(*[torch.zeros(1, 3), *[torch.zeros(1)] * 3], decay=-1)
+
+
 def test_images_are_the_same_with_a_fraction_of_the_samples() -> None:
     dense, sparse = Ball(), Ball()
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 96, "background": WHITE}
@@ -188,6 +231,8 @@ def test_refuses_what_is_no_grid() -> None:
         OccupancyGrid(BOX, (3, 0, 3), threshold=1)
     with pytest.raises(ValueError, match="threshold must be positive and finite, got 0"):
         OccupancyGrid(BOX, threshold=0)
+    with pytest.raises(ValueError, match=r"remembered must be at least 1 and finite, got 0.5"):
+        OccupancyGrid(BOX, threshold=1, remembered=0.5)
     # 2**32 would be cell 0 in the lowest 32 bits.
     for cell in (-1, 64, 2**32):
         with pytest.raises(ValueError, match="cells must lie in 0 to 63, got"):

@@ -369,22 +369,22 @@ def test_longer_resumed_runs_are_evaluated(tmp_path: Path, scene: Scene) -> None
 
 
 def test_training_through_an_occupancy_grid(tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, steps in (("WARMUP", 6), ("EVERY", 2)):
-        monkeypatch.setattr(trainer_module, f"OCCUPANCY_{name}", steps)
+    monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
     config = small(tmp_path / "a", split_at=(0.9,), reservoir_batches=5, occupancy=True, occupancy_resolution=8)
     trainer = Trainer(config, scene)
-    assert trainer.looked_at is None
+    assert trainer.occupancy is not None and trainer.occupancy.share == 1
     # What is empty: the upper half of the box, which the field is then never asked about.
     monkeypatch.setattr(trainer_module.OccupancyGrid, "update", _only_below)
+    monkeypatch.setattr(trainer_module.OccupancyGrid, "observe", _only_below)
     summary = trainer.run()
-    assert trainer.looked_at is not None and trainer.looked_at.share == 0.5
-    middle = float(trainer.looked_at.box[:, 2].mean())
+    assert trainer.occupancy.share == 0.5
+    middle = float(trainer.occupancy.box[:, 2].mean())
     points = np.load(tmp_path / "a" / "samples" / "level-1.npz")["points"]
     assert summary["cells"] == 4 and len(points) > 0 and points[:, 2].max() < middle
     _, router = load_run(tmp_path / "a")
     grid = load_grid(tmp_path / "a", config, router, scene, wanted=False)
-    assert grid is not None and torch.equal(grid.occupied, trainer.looked_at.occupied)
-    expected = evaluate(trainer.router, scene, samples=12, views=1, occupancy=trainer.looked_at)
+    assert grid is not None and torch.equal(grid.occupied, trainer.occupancy.occupied)
+    expected = evaluate(trainer.router, scene, samples=12, views=1, occupancy=trainer.occupancy)
     assert evaluate(router, scene, samples=12, views=1, occupancy=grid) == expected
 
 
@@ -393,8 +393,7 @@ def _only_below(self: OccupancyGrid, *_: Any, **__: Any) -> None:
 
 
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, steps in (("WARMUP", 4), ("EVERY", 2)):
-        monkeypatch.setattr(trainer_module, f"OCCUPANCY_{name}", steps)
+    monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
     whole = small(tmp_path / "whole", occupancy=True, occupancy_resolution=8)
     Trainer(whole, scene).run()
     parts = replace(whole, out=tmp_path / "parts")

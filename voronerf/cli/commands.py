@@ -74,7 +74,7 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
             samples=int(config.samples or 0),
             views=config.panels,
             backend=config.backend,
-            occupancy=trainer.looked_at,
+            occupancy=trainer.occupancy,
         )
     write_curve(config.out)
     console.print(f"wrote {config.out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/", highlight=False)

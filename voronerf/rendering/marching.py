@@ -30,6 +30,8 @@ class Marched(NamedTuple):
         positions: [m, 3].
         rgb: [m, 3], each sample's colour.
         ray_index: int32 [m], the ray of each sample.
+        density: [m].
+        deltas: [m], length of each sample's stratum.
     """
 
     colour: Tensor
@@ -39,6 +41,8 @@ class Marched(NamedTuple):
     positions: Tensor
     rgb: Tensor
     ray_index: Tensor
+    density: Tensor
+    deltas: Tensor
 
 
 class Seen(NamedTuple):
@@ -106,6 +110,8 @@ def render_marched(
         march.positions,
         rgb,
         index,
+        sigma,
+        march.deltas,
     )
 
 

@@ -2,7 +2,7 @@
 
 x, y, z cells of the grid along each axis, q cells asked about, r rays, s strata of a ray. Densities are per world unit.
 Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (cells that remember the largest recent
-density, decaying); which cells are visited when is this project's own.
+density, decaying); learning it from the samples of a batch, and forgetting what is hidden, is this project's own.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 
 CHUNK = 1 << 17  # points a field is asked about at a time
+HIDDEN = 1e-3  # of the light: a sample that less of it reaches is hidden
 
 
 class OccupancyGrid:
@@ -39,6 +40,7 @@ class OccupancyGrid:
         resolution: int | Sequence[int] = 64,
         *,
         threshold: float,
+        remembered: float = 2.0,
         device: torch.device | str | None = None,
     ) -> None:
         """Makes a grid that is occupied everywhere.
@@ -47,10 +49,12 @@ class OccupancyGrid:
             box: [2, 3], the second corner above the first.
             resolution: cells along each axis, one number for all or three.
             threshold: density from which a cell is occupied, per world unit, > 0 and finite.
+            remembered: what a new cell remembers, in thresholds, >= 1: it has to be found empty, not to fade away by
+                the first look, and the more it remembers the more often.
             device: of the grid; default that of the box.
 
         Raises:
-            ValueError: a box, resolution or threshold that is none.
+            ValueError: a box, resolution or threshold that is none, or a new cell that would be empty.
         """
         shape = (resolution,) * 3 if isinstance(resolution, int) else tuple(resolution)
         if tuple(box.shape) != (2, 3) or not bool((box[1] > box[0]).all()) or not bool(box.isfinite().all()):
@@ -59,10 +63,11 @@ class OccupancyGrid:
             raise ValueError(f"OccupancyGrid: resolution must be one or three numbers >= 1, got {resolution}")
         if not 0 < threshold < float("inf"):
             raise ValueError(f"OccupancyGrid: threshold must be positive and finite, got {threshold}")
+        if not 1 <= remembered < float("inf"):
+            raise ValueError(f"OccupancyGrid: remembered must be at least 1 and finite, got {remembered}")
         self.box = box.detach().to(device=device, dtype=torch.float32).clone()
         self.threshold = float(threshold)
-        # Twice the threshold: a cell that is met for the first time has to be found empty, not to fade away.
-        self.density = torch.full(shape, 2 * self.threshold, device=self.box.device)
+        self.density = torch.full(shape, remembered * self.threshold, device=self.box.device)
         self.occupied = torch.ones(shape, dtype=torch.bool, device=self.box.device)
 
     @property
@@ -124,6 +129,54 @@ class OccupancyGrid:
         self.density, self.occupied = update_occupancy(
             self.density, cells, values, decay=decay, threshold=self.threshold, backend=backend
         )
+
+    @torch.no_grad()
+    def observe(
+        self,
+        positions: Tensor,
+        density: Tensor,
+        deltas: Tensor,
+        weights: Tensor,
+        *,
+        decay: float,
+        backend: str = "auto",
+    ) -> None:
+        """Learns from samples that have been rendered anyway: their cells keep the densities seen, or fade.
+
+        A sample that less than `HIDDEN` of the light reaches counts as one of density 0, so that the inside of what is
+        opaque becomes empty like the space around it; neither changes a picture.
+
+        Args:
+            positions: float32 [m, 3] in the box; what lies outside counts for the cell at the border.
+            density: [m], found there; NaN counts as endless.
+            deltas: [m], lengths of the samples' strata.
+            weights: [m], what they contributed to their rays, as `composite` gives it.
+            decay: factor on what the cells of these samples remember, 0..1.
+            backend: of the op.
+
+        Raises:
+            ValueError: a decay out of range.
+        """
+        if not 0 <= decay <= 1:
+            raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
+        density = density.float().nan_to_num(nan=float("inf"), posinf=float("inf"))
+        # weight = light that arrives * share of it that is taken
+        seen = weights > HIDDEN * -torch.expm1(-density * deltas)
+        self.density, self.occupied = update_occupancy(
+            self.density,
+            self.cells(positions),
+            torch.where(seen, density, 0),
+            decay=decay,
+            threshold=self.threshold,
+            backend=backend,
+        )
+
+    def cells(self, points: Tensor) -> Tensor:
+        """Flat numbers int32 [n] of the cells that points [n, 3] lie in; outside the box the nearest at its border."""
+        shape = self.occupied.shape
+        places = (points - self.box[0]) / (self.box[1] - self.box[0])
+        x, y, z = ((places[:, i] * size).nan_to_num(0).clamp(0, size - 1).int() for i, size in enumerate(shape))
+        return (x * shape[1] + y) * shape[2] + z
 
     def march(
         self,

@@ -18,8 +18,13 @@ from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig, default_learning_rate
 
-#: A sample that takes less of the light than this, were its cell that dense throughout, is not worth asking for.
-LEAST_OPACITY = 0.01
+#: A sample that takes less of the light than this, were its cell that dense throughout, is not worth asking for: in
+#: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
+#: through empty space lies between the two, and would keep a third of the samples.
+LEAST_OPACITY, TRAINING_OPACITY = 0.01, 0.05
+#: What a cell remembers each time a sample of a training batch lies in it, and how many samples in a row have to find
+#: nothing in a new cell: some thirty steps, until which the field has said nothing about most of them.
+OCCUPANCY_DECAY, OCCUPANCY_PATIENCE = 0.8, 8
 #: Of a grid made for pictures alone: cells along each axis, and points asked for in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 
@@ -112,12 +117,16 @@ def make_router(config: TrainConfig, device: torch.device | str) -> VoronoiRoute
 
 
 def make_grid(
-    config: TrainConfig, scene: Scene, device: torch.device | str, resolution: int | None = None
+    config: TrainConfig,
+    scene: Scene,
+    device: torch.device | str,
+    resolution: int | None = None,
+    least_opacity: float = TRAINING_OPACITY,
 ) -> OccupancyGrid:
     """A grid over the scene's box that is occupied everywhere.
 
     A cell is empty below the density with which an average stratum, the box's diagonal divided by the samples of a ray,
-    takes `LEAST_OPACITY` of the light.
+    takes `least_opacity` of the light.
 
     Raises:
         ConfigError: When the scene has no box.
@@ -125,8 +134,10 @@ def make_grid(
     if scene.box is None:
         raise ConfigError(f"--occupancy needs a scene with a box around everything, {scene.name} has none")
     diagonal = float((scene.box[1] - scene.box[0]).norm())
-    threshold = -math.log1p(-LEAST_OPACITY) * int(config.samples or 0) / diagonal
-    return OccupancyGrid(scene.box, resolution or config.occupancy_resolution, threshold=threshold, device=device)
+    threshold = -math.log1p(-least_opacity) * int(config.samples or 0) / diagonal
+    size = resolution or config.occupancy_resolution
+    remembered = OCCUPANCY_DECAY**-OCCUPANCY_PATIENCE
+    return OccupancyGrid(scene.box, size, threshold=threshold, remembered=remembered, device=device)
 
 
 def make_optimizer(router: VoronoiRouter, config: TrainConfig) -> torch.optim.Adam:
@@ -189,7 +200,7 @@ def load_grid(
         return OccupancyGrid.from_state(state, device=device)
     if not wanted:
         return None
-    grid = make_grid(config, scene, device, PICTURE_RESOLUTION)
+    grid = make_grid(config, scene, device, PICTURE_RESOLUTION, LEAST_OPACITY)
     generator = torch.Generator().manual_seed(0)
     for points in range(PICTURE_POINTS):
         grid.update(router, decay=float(points > 0), generator=generator, backend=backend)

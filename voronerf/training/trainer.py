@@ -38,6 +38,7 @@ from voronerf.training.evaluation import ViewScore, evaluate, mean_scores
 from voronerf.training.files import read_json_lines, write_bytes, write_text
 from voronerf.training.lpips import Lpips, find_lpips
 from voronerf.training.model import (
+    OCCUPANCY_DECAY,
     checkpoint_path,
     make_grid,
     make_optimizer,
@@ -47,12 +48,8 @@ from voronerf.training.model import (
 )
 from voronerf.training.reservoir import SampleReservoir
 
-#: Steps before the first look at which cells are empty: until then the field has said nothing about most of them.
-OCCUPANCY_WARMUP = 256
-#: Steps between looks, and looks over which all cells are spread.
-OCCUPANCY_EVERY, OCCUPANCY_PARTS = 16, 4
-#: What a cell remembers at each look at it: a density of 100 is forgotten after some twelve.
-OCCUPANCY_DECAY = 0.6
+#: Steps between looks at random cells, which bring back those that were thought empty, and the share looked at.
+OCCUPANCY_EVERY, OCCUPANCY_SHARE = 16, 1 / 32
 
 
 #: What summary.json repeats of the last evaluation.
@@ -173,11 +170,6 @@ class Trainer:
         rise = 1.0 if done >= config.warmup else 0.01 + 0.99 * done / config.warmup
         return config.lr * rise * math.exp(math.log(config.lr_final) * done)
 
-    @property
-    def looked_at(self) -> OccupancyGrid | None:
-        """The grid, once it knows what is empty."""
-        return self.occupancy if self.step > OCCUPANCY_WARMUP else None
-
     def request_stop(self) -> None:
         """Ends training after the step in hand, with a checkpoint; what Ctrl-C does."""
         self.stopped = True
@@ -260,21 +252,26 @@ class Trainer:
             "spacing": self.scene.spacing,
             "backend": self.config.backend,
         }
-        if self.occupancy is None or self.step < OCCUPANCY_WARMUP:
+        grid = self.occupancy
+        if grid is None:
             return render_rays(self.router, batch.rays, batch.near, batch.far, **options)
         if self.step % OCCUPANCY_EVERY == 0:
-            self._look(self.occupancy)
-        return render_marched(self.router, batch.rays, batch.near, batch.far, self.occupancy, **options)
+            self._look(grid)
+        # As long as nothing has been found empty these are the samples that render_rays takes.
+        rendered = render_marched(self.router, batch.rays, batch.near, batch.far, grid, **options)
+        found = (rendered.positions, rendered.density, rendered.deltas, rendered.weights)
+        grid.observe(*(tensor.detach() for tensor in found), decay=OCCUPANCY_DECAY, backend=self.config.backend)
+        return rendered
 
     def _look(self, grid: OccupancyGrid) -> None:
-        """Looks which cells are empty: all at first, then a part at a time."""
-        cells = None
-        if self.step > OCCUPANCY_WARMUP:
-            part = self.step // OCCUPANCY_EVERY % OCCUPANCY_PARTS
-            cells = torch.arange(part, grid.occupied.numel(), OCCUPANCY_PARTS, device=self.device)
-        decay = 0.0 if cells is None else OCCUPANCY_DECAY
+        """Looks at random cells, so that one that was wrongly thought empty comes back."""
+        every = grid.occupied.numel()
+        count = max(1, int(every * OCCUPANCY_SHARE))
+        cells = torch.randint(every, (count,), generator=self.generator, device=self.generator.device)
         self.router.eval()
-        grid.update(self.router, cells, decay=decay, generator=self.generator, backend=self.config.backend)
+        grid.update(
+            self.router, cells.to(self.device), decay=1.0, generator=self.generator, backend=self.config.backend
+        )
         self.router.train()
 
     def _split(self) -> None:
@@ -335,7 +332,7 @@ class Trainer:
             samples=int(self.config.samples or 0),
             views=views,
             backend=self.config.backend,
-            occupancy=self.looked_at,
+            occupancy=self.occupancy,
             lpips=lpips,
         )
         now = {
@@ -378,8 +375,8 @@ class Trainer:
             "reservoir": self.reservoir.state_dict(),
             "generator": {"state": self.generator.get_state()},
         }
-        if self.looked_at is not None:
-            parts["occupancy"] = self.looked_at.state_dict()
+        if self.occupancy is not None:
+            parts["occupancy"] = self.occupancy.state_dict()
         for prefix, group in parts.items():
             tensors |= {f"{prefix}.{name}": torch.as_tensor(value) for name, value in group.items()}
         values = {
