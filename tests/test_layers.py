@@ -28,7 +28,7 @@ LAYERS = (
         "reference",
     },
     {"ops"},
-    {"router", "diagram", "balance", "transport", "subdivision"},
+    {"router", "diagram", "balance", "transport", "subdivision", "blending"},
     {"data", "rendering", "fields"},
     {"training"},
     {"cli", "viewer"},

@@ -77,6 +77,19 @@ def test_pictures_through_an_occupancy_grid(run: Path, tmp_path: Path) -> None:
     assert path.stat().st_size > 0
 
 
+def test_pictures_of_blended_cells(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    found = []
+    for blend in ("0", "0.3"):
+        assert main(["eval", str(run), "--views", "1", "--panels", "1", "--blend", blend]) == 0
+        found.append(json.loads((run / "eval.json").read_text())["psnr"])
+    assert found[0] != found[1]
+    path = tmp_path / "turn.mp4"
+    assert main(["render", str(run), "--frames", "2", "--out", str(path), "--blend", "0.3"]) == 0
+    assert path.stat().st_size > 0
+    capsys.readouterr()
+    assert "--blend must be a distance of 0 or more, got -1.0" in error_of(capsys, "eval", str(run), "--blend", "-1")
+
+
 def test_info_names_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info"]) == 0
     output = capsys.readouterr().out

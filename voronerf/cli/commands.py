@@ -67,6 +67,7 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
         console.print(f"stopped; continue with: voronerf train --resume --out {config.out}", highlight=False)
         return summary
     if config.panels:
+        trainer.router.blend = config.blend
         write_panels(
             trainer.router,
             scene,
@@ -90,6 +91,7 @@ def evaluate_run(
     panels: int = 4,
     samples: int | None = None,
     occupancy: bool = False,
+    blend: float | None = None,
     lpips: Path | None = None,
     device: str = "cpu",
     backend: str = "auto",
@@ -105,6 +107,7 @@ def evaluate_run(
         samples: Samples per ray; default as in training.
         occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
             grid.
+        blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
         lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
             of VORONERF_DATA or beside the scene, the installed lpips package.
         device: Torch device.
@@ -113,7 +116,7 @@ def evaluate_run(
     if panels < 0:
         raise ConfigError(f"--panels must not be negative, got {panels}")
     check_counts(views=views, samples=samples, downscale=downscale)
-    config, router, scene = _load(run, data, downscale, device, backend)
+    config, router, scene = _load(run, data, downscale, blend, device, backend)
     samples = config.samples if samples is None else samples
     grid = load_grid(run, config, router, scene, wanted=occupancy, backend=backend)
     options: dict[str, Any] = {"samples": samples, "backend": backend, "occupancy": grid}
@@ -145,6 +148,7 @@ def render(
     downscale: int | None = None,
     samples: int | None = None,
     occupancy: bool = False,
+    blend: float | None = None,
     device: str = "cpu",
     backend: str = "auto",
 ) -> int:
@@ -160,11 +164,12 @@ def render(
         samples: Samples per ray; default as in training.
         occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
             grid.
+        blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
         device: Torch device.
         backend: Backend of the operations.
     """
     check_counts(frames=frames, fps=fps, samples=samples, downscale=downscale)
-    config, router, scene = _load(run, data, downscale, device, backend)
+    config, router, scene = _load(run, data, downscale, blend, device, backend)
     grid = load_grid(run, config, router, scene, wanted=occupancy, backend=backend)
     cameras = turntable_cameras(scene.train.cameras, frames).to(device)
     pictures = []
@@ -251,10 +256,13 @@ def _figures(score: dict[str, Any]) -> list[str]:
 
 
 def _load(
-    run: Path, data: str | None, downscale: int | None, device: str, backend: str
+    run: Path, data: str | None, downscale: int | None, blend: float | None, device: str, backend: str
 ) -> tuple[TrainConfig, Any, Scene]:
     check_device(device)
+    if blend is not None and not 0 <= blend < float("inf"):
+        raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
     config, router = load_run(run, device=device, backend=backend)
+    router.blend = config.blend if blend is None else blend
     config = replace(
         config,
         data=config.data if data is None else data,

@@ -156,8 +156,8 @@ class Reordering:
         """[n, 1, ...] of a tensor per sample or per ray."""
         flat = self.layout.flatten(tensor, kind)
         if self.layout.n < 2:
-            # The module is run on two rows, since sizes of 0 and 1 leave open what is a row.
-            rows = flat[:1].expand(2, *flat.shape[1:]).clone() if flat.shape[0] else _placeholder(flat)
+            # The module is run on two rows or more, since sizes of 0 and 1 leave open what is a row.
+            rows = flat[:1].expand(self.n, *flat.shape[1:]).clone() if flat.shape[0] else _placeholder(flat)
         elif kind == RAY:
             rows = flat.index_select(0, self._ray_of_rows(flat.device))
         else:
@@ -190,7 +190,7 @@ class Reordering:
         if n < 2:
             if n == 0:
                 return self._object("", value)
-            flat = flat[torch.zeros(2, dtype=torch.int64, device=device)]
+            flat = flat[torch.zeros(self.n, dtype=torch.int64, device=device)]
         elif shape != lead:
             flat = flat[self._ray_of_rows(device).long()]
         elif self.grouping is not None:
@@ -277,7 +277,7 @@ def narrow(value: Any, rows: Callable[[Tensor], bool], first: int, last: int) ->
     return part
 
 
-def map_result(value: Any, change: Callable[[Any], Any], leaf: type = Tensor, depth: int = 0) -> Any:
+def map_result(value: Any, change: Callable[[Any], Any], leaf: type | tuple[type, ...] = Tensor, depth: int = 0) -> Any:
     """A result of any structure (tuple, named tuple, list, dict, object) with every tensor, or ``leaf``, changed.
 
     What holds none is passed on as it is.

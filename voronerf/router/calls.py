@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from voronerf.router.arguments import Layout, Reordering, argument_names, map_result
 from voronerf.router.checkpointing import rerun_in
 from voronerf.router.fusion import Plan, Unrecognised, agree
-from voronerf.router.grouping import Grouping, PerCell
+from voronerf.router.grouping import Entries, Grouping, PerCell
 from voronerf.router.loop import run_cells
 from voronerf.router.memory import Memory
 from voronerf.router.parameters import as_per_cell, in_place_of_parameters
@@ -211,6 +211,35 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
     return result
 
 
+def run_entries(
+    module: nn.Module,
+    call: Call,
+    layout: Layout,
+    entries: Entries,
+    memory: Memory,
+    wrap: Callable[[Tensor], Any],
+) -> Any:
+    """Runs a module on chosen samples in chosen cells, after :func:`run_grouped` of the same call.
+
+    Args:
+        module: with stacked parameters.
+        call: of a method of it.
+        layout: of the arguments.
+        entries: m >= 2 samples with their cells.
+        memory: of the router.
+        wrap: makes of a tensor of rows [m, ...] or [m * entries of a sample, ...] what stands for it in the result.
+    """
+
+    def place(rows: Tensor, number: int) -> Any:
+        each = rows.shape[0] // entries.n
+        return wrap(entries.unsort(rows.reshape(entries.n, each, *rows.shape[1:]) if each > 1 else rows))
+
+    kind = call.kind(layout, module.training)
+    if kind in memory.by_cell:
+        return _run_by_cell(module, call, layout, entries, memory, kind, place)
+    return _run_at_once(module, call, layout, entries, memory, None, place)
+
+
 def _next_plan(
     recorded: Program | None, recorder: Recorder, call: Call, layout: Layout, grouping: Grouping, result: Any
 ) -> Plan | Program | str:
@@ -246,8 +275,15 @@ def _run_plan(plan: Plan, call: Call, layout: Layout, grouping: Grouping) -> Any
 
 
 def _run_at_once(
-    module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory, recorder: Recorder | None
+    module: nn.Module,
+    call: Call,
+    layout: Layout,
+    grouping: Grouping,
+    memory: Memory,
+    recorder: Recorder | None,
+    place: Callable[[Tensor, int], Any] | None = None,
 ) -> Any:
+    place = place or (lambda rows, number: _in_original_order(rows, number, layout, grouping))
     parts = grouping.parts(memory.rows_at_once(module)) if grouping.device.type == "cpu" else [grouping]
     results: list[_Result] = []
     for part in parts:
@@ -258,9 +294,7 @@ def _run_at_once(
         rows = [list(pieces) for pieces in zip(*[result.rows for result in results], strict=True)]
     number = itertools.count()
     whole = iter([pieces[0] if len(pieces) == 1 else torch.cat(pieces) for pieces in rows])
-    return map_result(
-        results[0].value, lambda slot: _in_original_order(next(whole), next(number), layout, grouping), leaf=_Slot
-    )
+    return map_result(results[0].value, lambda slot: place(next(whole), next(number)), leaf=_Slot)
 
 
 class _Slot:
@@ -317,7 +351,16 @@ def _run_part(
     return _Result(rows, map_result(result, finish))
 
 
-def _run_by_cell(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory, kind: Any) -> Any:
+def _run_by_cell(
+    module: nn.Module,
+    call: Call,
+    layout: Layout,
+    grouping: Grouping,
+    memory: Memory,
+    kind: Any,
+    place: Callable[[Tensor, int], Any] | None = None,
+) -> Any:
+    place = place or (lambda rows, number: _in_original_order(rows, number, layout, grouping))
     seen: list[Tensor] = []
     args, kwargs = call.arranged(Reordering(layout, grouping, seen.append))
     rows = {id(tensor) for tensor in seen}
@@ -327,7 +370,7 @@ def _run_by_cell(module: nn.Module, call: Call, layout: Layout, grouping: Groupi
     if checked:
         memory.separate.add(kind)
     number = itertools.count()
-    return map_result(result, lambda tensor: _in_original_order(tensor, next(number), layout, grouping))
+    return map_result(result, lambda tensor: place(tensor, next(number)))
 
 
 def _in_original_order(rows: Tensor, number: int, layout: Layout, grouping: Grouping) -> Tensor:

@@ -180,6 +180,36 @@ class Grouping:
         return rows.reshape(self.n * m, *stacked.shape[1:])
 
 
+class Entries(Grouping):
+    """Samples in cells that are not their own: each entry names a sample, any number of times, and a cell.
+
+    ``order`` gives the sample of each sorted entry, and ``unsort`` the order of the entries.
+
+    Args:
+        rows: int64 [m], the samples.
+        cells: int32 [m].
+        k: number of cells.
+        backend: of the operations on the sorted rows.
+    """
+
+    def __init__(self, rows: Tensor, cells: Tensor, k: int, backend: str) -> None:
+        super().__init__(cells, rows.shape[0], k, cells.device, backend)
+        order, offsets = ops.cell_sort(cells, k, backend=backend)
+        self._sorted = rows.to(torch.int32).index_select(0, order), offsets
+        self._sorted_cells = cells.index_select(0, order).long()
+        place = torch.arange(self.n, dtype=torch.int32, device=cells.device)
+        self._place = torch.empty_like(order).scatter_(0, order.long(), place)
+
+    def sort(self, x: Tensor) -> Tensor:
+        """[samples, ...] -> [m, ...], the entries sorted by cell."""
+        assert self.order is not None
+        return x.index_select(0, self.order)
+
+    def unsort(self, x: Tensor) -> Tensor:
+        """[m, ...] sorted by cell -> the order of the entries."""
+        return x.index_select(0, self._place)
+
+
 class _Part(Grouping):
     """Sorted rows ``first`` to ``last`` of a grouping, whose arguments are found in those of all samples."""
 

@@ -26,6 +26,45 @@ class LayeredField(Protocol):
         ...
 
 
+class Mix(Protocol):
+    """Further entries to evaluate, see :class:`voronerf.router.blended.Mixture`."""
+
+    rows: Tensor
+    cells: Tensor
+
+    def mix(self, own: Tensor, others: Tensor) -> Tensor:
+        """The results of the samples' own cells and of the entries, joined."""
+        ...
+
+
+def evaluate_blended(
+    field: LayeredField,
+    where: Callable[[Tensor, Tensor | None], dict[str, Any]],
+    backend: str,
+    mixture_at: Callable[[Tensor], Mix | None],
+    positions: Tensor,
+    directions: Tensor | None = None,
+    ray_index: Tensor | None = None,
+    *,
+    coords: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """:func:`evaluate_table`, and again in other cells the samples for which ``mixture_at`` says so.
+
+    Colours and densities are mixed as ``activate`` gives them.
+    """
+    own = evaluate_table(field, where, backend, positions, directions, ray_index, coords=coords)
+    mixture = mixture_at(positions if coords is None else coords)
+    if mixture is None:
+        return own
+    if ray_index is not None:
+        ray_index = ray_index[mixture.rows]
+    elif directions is not None:
+        directions = directions[mixture.rows]
+    cells = {"cells": mixture.cells}
+    others = evaluate_table(field, lambda *_: cells, backend, positions[mixture.rows], directions, ray_index)
+    return mixture.mix(own[0], others[0]), mixture.mix(own[1], others[1])
+
+
 def evaluate_table(
     field: LayeredField,
     where: Callable[[Tensor, Tensor | None], dict[str, Any]],

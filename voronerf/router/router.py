@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.router.arguments import accepted_names
+from voronerf.router.blended import Mixture, mix_call
 from voronerf.router.calls import Call, run_grouped
 from voronerf.router.grouping import Grouping
-from voronerf.router.layered import LayeredField, evaluate_table
+from voronerf.router.layered import LayeredField, evaluate_blended, evaluate_table
 from voronerf.router.memory import Memory
 from voronerf.router.parameters import (
     check_module,
@@ -81,10 +82,15 @@ class VoronoiRouter(nn.Module):
             distances while training (:meth:`VoronoiDiagram.sample_cell`), and is "nearest" in eval mode.
         temperature: Of the stochastic assignment, in scene units.
         backend: Of every operation, see ``voronerf info``.
+        blend: Margin in scene units, an attribute as well: in eval mode samples this near to a border are evaluated in
+            the cells beyond it too, four cells at most, and the results are averaged by distance, so that nothing
+            jumps across borders (:mod:`voronerf.blending`). Other samples are as without. Not within a full graph of
+            ``torch.compile``.
 
     Raises:
         TypeError: For a module that mixes samples, or that cannot be one network for each cell.
-        ValueError: For bad centres, coords, methods, an unknown assignment or a temperature that is not positive.
+        ValueError: For bad centres, coords, methods, an unknown assignment, a temperature that is not positive or a
+            margin that is negative.
     """
 
     def __init__(
@@ -99,6 +105,7 @@ class VoronoiRouter(nn.Module):
         assignment: Assignment = "nearest",
         temperature: float = 0.05,
         backend: str = "auto",
+        blend: float = 0.0,
     ) -> None:
         super().__init__()
         module = getattr(module, "_orig_mod", module)  # of torch.compile, which would not see the parameters of cells
@@ -107,6 +114,8 @@ class VoronoiRouter(nn.Module):
             raise ValueError(f"VoronoiRouter: assignment must be 'nearest' or 'stochastic', got {assignment!r}")
         if not temperature > 0:
             raise ValueError(f"VoronoiRouter: temperature must be positive, got {temperature}")
+        if not 0 <= blend < float("inf"):
+            raise ValueError(f"VoronoiRouter: blend must be finite and at least 0, got {blend}")
         if not (coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords)):
             raise ValueError(f"VoronoiRouter: coords must be 'first3', a slice or a function, got {coords!r}")
         for name, value in (("per_ray", per_ray), ("shared", shared), ("methods", methods)):
@@ -128,6 +137,7 @@ class VoronoiRouter(nn.Module):
         self.assignment = assignment
         self.temperature = temperature
         self.backend = backend
+        self.blend = blend
         self.generator: torch.Generator | None = None
         self.coords = coords
         self.per_ray = None if per_ray is None else tuple(per_ray)
@@ -202,6 +212,9 @@ class VoronoiRouter(nn.Module):
             TypeError: When the module turns out to mix samples.
         """
         if self._layered:
+            if self._blends:
+                at = self._mixture
+                return evaluate_blended(self.field, self._where, self.backend, at, *args, coords=coords, **kwargs)
             return evaluate_table(self.field, self._where, self.backend, *args, coords=coords, **kwargs)
         return self._route("forward", args, kwargs, coords)
 
@@ -224,7 +237,18 @@ class VoronoiRouter(nn.Module):
         if grouping is None:
             grouping = self._group(positions, layout.n)
             self._memory.assignments.keep(method, source, positions, self._assignment_key(), grouping)
-        return run_grouped(self.module, call, layout, grouping, self._memory)
+        result = run_grouped(self.module, call, layout, grouping, self._memory)
+        mixture = self._mixture(positions) if self._blends else None
+        if mixture is None:
+            return result
+        return mix_call(result, self.module, call, layout, mixture, self.num_cells, self.backend, self._memory)
+
+    @property
+    def _blends(self) -> bool:
+        return self.blend > 0 and not self.training and self.num_cells > 1
+
+    def _mixture(self, positions: Tensor) -> Mixture | None:
+        return Mixture.of(self.diagram, positions, self.blend, self.backend)
 
     def _group(self, positions: Tensor, n: int) -> Grouping:
         flat, k = positions.detach().reshape(-1, 3), self.num_cells

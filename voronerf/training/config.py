@@ -259,7 +259,6 @@ def check_config(config: TrainConfig) -> None:
     _check_splits(config, need)
     for name, usable in (("field", ("nerf", "kilonerf")), ("sampling", ("stratified",)), ("contraction", ("none",))):
         need(getattr(config, name) in usable, name, f"be {' or '.join(usable)} in this version")
-    need(config.blend == 0, "blend", "be 0 in this version")
 
 
 def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -> None:
