@@ -27,7 +27,7 @@ from voronerf.training.config import TrainConfig
 from voronerf.training.evaluation import render_view
 from voronerf.training.files import write_text
 from voronerf.training.metrics import psnr
-from voronerf.training.model import load_grid
+from voronerf.training.model import load_grid, make_renderer
 from voronerf.training.runs import read_metrics
 from voronerf.training.trainer import Trainer
 
@@ -88,7 +88,7 @@ def render(options: Options, trainers: dict[str, Trainer]) -> list[dict[str, Any
     background = scene.background_colour()
     results = []
     for name, trainer in trainers.items():
-        samples = trainer.config.samples
+        renderer = make_renderer(trainer.config, scene, trainer.routers)
         started = time.perf_counter()
         grid = load_grid(trainer.out, trainer.config, trainer.router, scene, wanted=True)
         made_in = time.perf_counter() - started
@@ -101,15 +101,8 @@ def render(options: Options, trainers: dict[str, Trainer]) -> list[dict[str, Any
                 truth = scene.test.truth(view, background)
                 for way, occupancy in ways.items():
                     started = time.perf_counter()
-                    image = render_view(
-                        trainer.router,
-                        scene,
-                        view,
-                        samples=samples,
-                        backend="auto",
-                        occupancy=occupancy,
-                        heaviest=False,
-                    )
+                    renderer.occupancy = occupancy
+                    image = render_view(renderer, scene, view, heaviest=False)
                     took = time.perf_counter() - started
                     if repeat > 0:  # the first warms up
                         seconds[way].append(took)

@@ -116,8 +116,7 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
         lr = trainer.config.lr
         results.append({"variant": name, "seed": seed, "lr": lr, **summary, "curve": read_metrics(trainer.out)})
         if options.panels is not None and seed == 0:
-            pictures, backend = options.panels / name, options.backend
-            write_panels(trainer.router, scene, pictures, samples=options.samples, views=3, backend=backend)
+            write_panels(trainer.renderer, scene, options.panels / name, views=3)
     description = metadata(
         benchmark="time_to_quality",
         scene=scene.name,

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from voronerf.rendering.cameras import Cameras, Rays, orbit_cameras
-from voronerf.rendering.volume import render_image, render_rays
+from voronerf.rendering.renderer import render_image
+from voronerf.rendering.volume import render_rays
 
 BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])
 WHITE = torch.ones(3)

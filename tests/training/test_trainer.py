@@ -15,6 +15,7 @@ import voronerf.training.trainer as trainer_module
 from voronerf.backends import BackendUnavailable
 from voronerf.data import Scene, builtin_scene
 from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.renderer import Renderer
 from voronerf.training.batches import Batch
 from voronerf.training.checkpoint import CheckpointError, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
@@ -24,10 +25,11 @@ from voronerf.training.model import (
     count_parameters,
     load_grid,
     load_run,
-    make_router,
+    make_renderer,
+    make_routers,
     octaves_for,
     resolve_config,
-    restore_router,
+    restore_routers,
     solve_width,
 )
 from voronerf.training.trainer import Trainer, TrainingError
@@ -106,7 +108,7 @@ def test_no_collapse_to_white(tmp_path: Path, scene: Scene, seed: int, backgroun
     config = small(tmp_path, steps=100, seed=seed, rays=256, samples=24, width=32, cells=(), background=background)
     trainer = Trainer(config, scene)
     trainer.advance()
-    image = render_view(trainer.router, scene, 0, samples=24, backend="auto")
+    image = render_view(trainer.renderer, scene, 0)
     alpha = scene.test.images[0][..., 3].float() / 255
     assert image.opacity[alpha > 0.99].mean() > 0.5
 
@@ -195,8 +197,8 @@ def test_the_reference_backend_trains_to_the_same_curve(tmp_path: Path, scene: S
 def test_kept_samples_are_weight_times_ray_error(tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Importance w * E(r), E the squared error of the ray's colour summed over its channels."""
     rendered, targets = [], []
-    whole, target = trainer_module.render_rays, Batch.target
-    monkeypatch.setattr(trainer_module, "render_rays", lambda *a, **k: rendered.append(whole(*a, **k)) or rendered[-1])
+    whole, target = Renderer.render, Batch.target
+    monkeypatch.setattr(Renderer, "render", lambda *a, **k: rendered.extend(whole(*a, **k)) or tuple(rendered[-1:]))
     monkeypatch.setattr(Batch, "target", lambda *a: targets.append(target(*a)) or targets[-1])
     trainer = Trainer(small(tmp_path, reservoir=40, reservoir_batches=1, cells=(4,), split_at=(0.9,)), scene)
     trainer.on_step = lambda p: trainer.request_stop()
@@ -308,9 +310,12 @@ def test_seeds_decide_everything(tmp_path: Path, scene: Scene) -> None:
 def test_a_loaded_run_renders_the_same(tmp_path: Path, scene: Scene) -> None:
     trainer = Trainer(small(tmp_path, cells=(3, 2)), scene)
     trainer.run()
-    config, router = load_run(tmp_path)
+    config, routers = load_run(tmp_path)
     assert config == trainer.config
-    assert evaluate(router, scene, samples=12, views=2) == evaluate(trainer.router, scene, samples=12, views=2)
+    loaded = make_renderer(config, scene, routers)
+    assert evaluate(loaded, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
+    coarser = make_renderer(config, scene, routers, samples=3, backend="reference")
+    assert (coarser.samples, coarser.backend) == (3, "reference")
 
 
 def test_another_configuration_is_refused(tmp_path: Path, scene: Scene) -> None:
@@ -321,7 +326,7 @@ def test_another_configuration_is_refused(tmp_path: Path, scene: Scene) -> None:
     checkpoint = load_checkpoint(checkpoint_path(tmp_path))
     del checkpoint.tensors["router.module.density.weight"]
     with pytest.raises(CheckpointError, match="another architecture"):
-        restore_router(make_router(small(tmp_path, position_octaves=octaves_for(scene)), "cpu"), checkpoint)
+        restore_routers(make_routers(small(tmp_path, position_octaves=octaves_for(scene)), "cpu"), checkpoint)
 
 
 def test_a_loss_that_is_not_finite_stops_training(tmp_path: Path, scene: Scene) -> None:
@@ -381,11 +386,12 @@ def test_training_through_an_occupancy_grid(tmp_path: Path, scene: Scene, monkey
     middle = float(trainer.occupancy.box[:, 2].mean())
     points = np.load(tmp_path / "a" / "samples" / "level-1.npz")["points"]
     assert summary["cells"] == 4 and len(points) > 0 and points[:, 2].max() < middle
-    _, router = load_run(tmp_path / "a")
-    grid = load_grid(tmp_path / "a", config, router, scene, wanted=False)
+    config, routers = load_run(tmp_path / "a")
+    grid = load_grid(tmp_path / "a", config, routers["field"], scene, wanted=False)
     assert grid is not None and torch.equal(grid.occupied, trainer.occupancy.occupied)
-    expected = evaluate(trainer.router, scene, samples=12, views=1, occupancy=trainer.occupancy)
-    assert evaluate(router, scene, samples=12, views=1, occupancy=grid) == expected
+    loaded = make_renderer(config, scene, routers, occupancy=grid)
+    assert trainer.renderer.occupancy is trainer.occupancy
+    assert evaluate(loaded, scene, views=1) == evaluate(trainer.renderer, scene, views=1)
 
 
 def _only_below(self: OccupancyGrid, *_: Any, **__: Any) -> None:
@@ -416,5 +422,5 @@ def test_a_grid_needs_a_box(tmp_path: Path, scene: Scene) -> None:
 def test_training_on_a_gpu(tmp_path: Path, scene: Scene) -> None:
     config = small(tmp_path, device="cuda", assignment="stochastic")
     assert Trainer(config, scene).run()["cells"] == 4
-    _, router = load_run(tmp_path, device="cpu")
-    assert len(evaluate(router, scene, samples=8, views=1)) == 1
+    config, routers = load_run(tmp_path, device="cpu")
+    assert len(evaluate(make_renderer(config, scene, routers), scene, views=1)) == 1

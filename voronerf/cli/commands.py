@@ -19,10 +19,10 @@ from voronerf import backends
 from voronerf.cli.display import TrainingDisplay
 from voronerf.data import Scene, load_scene
 from voronerf.rendering.cameras import turntable_cameras
-from voronerf.rendering.volume import render_image
+from voronerf.rendering.renderer import Renderer
 from voronerf.training.config import ConfigError, TrainConfig, check_device
 from voronerf.training.lpips import find_lpips
-from voronerf.training.model import load_grid, load_run
+from voronerf.training.model import load_grid, load_run, make_renderer
 from voronerf.training.runs import choose_directory, score_views, write_curve, write_panels
 from voronerf.training.trainer import Trainer
 from voronerf.training.video import write_video
@@ -67,16 +67,9 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
         console.print(f"stopped; continue with: voronerf train --resume --out {config.out}", highlight=False)
         return summary
     if config.panels:
-        trainer.router.blend = config.blend
-        write_panels(
-            trainer.router,
-            scene,
-            config.out / "images",
-            samples=int(config.samples or 0),
-            views=config.panels,
-            backend=config.backend,
-            occupancy=trainer.occupancy,
-        )
+        for router in trainer.routers.values():
+            router.blend = config.blend
+        write_panels(trainer.renderer, scene, config.out / "images", views=config.panels)
     write_curve(config.out)
     console.print(f"wrote {config.out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/", highlight=False)
     return summary
@@ -90,6 +83,7 @@ def evaluate_run(
     views: int | None = None,
     panels: int = 4,
     samples: int | None = None,
+    fine_samples: int | None = None,
     occupancy: bool = False,
     blend: float | None = None,
     lpips: Path | None = None,
@@ -104,7 +98,8 @@ def evaluate_run(
         downscale: Factor on the images; default as in training.
         views: Number of test views, evenly spread; default all.
         panels: Number of views drawn.
-        samples: Samples per ray; default as in training.
+        samples: Samples per ray, of the first pass where there are two; default as in training.
+        fine_samples: Samples per ray of the second pass; default as in training.
         occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
             grid.
         blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
@@ -115,16 +110,13 @@ def evaluate_run(
     """
     if panels < 0:
         raise ConfigError(f"--panels must not be negative, got {panels}")
-    check_counts(views=views, samples=samples, downscale=downscale)
-    config, router, scene = _load(run, data, downscale, blend, device, backend)
-    samples = config.samples if samples is None else samples
-    grid = load_grid(run, config, router, scene, wanted=occupancy, backend=backend)
-    options: dict[str, Any] = {"samples": samples, "backend": backend, "occupancy": grid}
+    check_counts(views=views, samples=samples, fine_samples=fine_samples, downscale=downscale)
+    config, renderer, scene = _load(run, data, downscale, samples, fine_samples, occupancy, blend, device, backend)
     size = (scene.test.cameras.height, scene.test.cameras.width)
     perceived, source = find_lpips(lpips or config.lpips, config.data, size)
     if perceived is None:
         console.print(source, highlight=False, markup=False)
-    result = score_views(router, scene, views=views, path=run / "eval.json", lpips=perceived, **options)
+    result = score_views(renderer, scene, views=views, path=run / "eval.json", lpips=perceived)
     table = Table("view", "psnr [dB]", "ssim", "lpips")
     for view in result["views"]:
         table.add_row(view["name"], *_figures(view))
@@ -133,7 +125,7 @@ def evaluate_run(
     console.print(table)
     console.print(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB", highlight=False)
     if panels:
-        write_panels(router, scene, run / "images", views=panels, **options)
+        write_panels(renderer, scene, run / "images", views=panels)
     console.print(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""), highlight=False)
     return 0
 
@@ -147,6 +139,7 @@ def render(
     data: str | None = None,
     downscale: int | None = None,
     samples: int | None = None,
+    fine_samples: int | None = None,
     occupancy: bool = False,
     blend: float | None = None,
     device: str = "cpu",
@@ -161,32 +154,27 @@ def render(
         fps: Frames per second.
         data: Scene folder, where it has moved since training.
         downscale: Factor on the images, which decides the video's size; default as in training.
-        samples: Samples per ray; default as in training.
+        samples: Samples per ray, of the first pass where there are two; default as in training.
+        fine_samples: Samples per ray of the second pass; default as in training.
         occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
             grid.
         blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
         device: Torch device.
         backend: Backend of the operations.
     """
-    check_counts(frames=frames, fps=fps, samples=samples, downscale=downscale)
-    config, router, scene = _load(run, data, downscale, blend, device, backend)
-    grid = load_grid(run, config, router, scene, wanted=occupancy, backend=backend)
+    check_counts(frames=frames, fps=fps, samples=samples, fine_samples=fine_samples, downscale=downscale)
+    _, renderer, scene = _load(run, data, downscale, samples, fine_samples, occupancy, blend, device, backend)
     cameras = turntable_cameras(scene.train.cameras, frames).to(device)
     pictures = []
     for frame in track(range(frames), description="rendering", console=console, disable=not console.is_terminal):
-        image = render_image(
-            router,
+        image = renderer.image(
             cameras,
             frame,
             near=scene.near,
             far=scene.far,
             box=None if scene.box is None else scene.box.to(device),
-            samples=int(config.samples or 0) if samples is None else samples,
             background=scene.background_colour(device),
-            spacing=scene.spacing,
-            occupancy=grid,
             heaviest=False,
-            backend=backend,
         )
         pictures.append((image.colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu())
     path = out or run / "turntable.mp4"
@@ -246,7 +234,7 @@ def check_counts(**counts: int | None) -> None:
     """Raises ConfigError for an option below 1; None stands for its default."""
     for name, value in counts.items():
         if value is not None and value < 1:
-            raise ConfigError(f"--{name} must be at least 1, got {value}")
+            raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
 
 
 def _figures(score: dict[str, Any]) -> list[str]:
@@ -256,16 +244,28 @@ def _figures(score: dict[str, Any]) -> list[str]:
 
 
 def _load(
-    run: Path, data: str | None, downscale: int | None, blend: float | None, device: str, backend: str
-) -> tuple[TrainConfig, Any, Scene]:
+    run: Path,
+    data: str | None,
+    downscale: int | None,
+    samples: int | None,
+    fine_samples: int | None,
+    occupancy: bool,
+    blend: float | None,
+    device: str,
+    backend: str,
+) -> tuple[TrainConfig, Renderer, Scene]:
     check_device(device)
     if blend is not None and not 0 <= blend < float("inf"):
         raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
-    config, router = load_run(run, device=device, backend=backend)
-    router.blend = config.blend if blend is None else blend
+    config, routers = load_run(run, device=device, backend=backend)
+    for router in routers.values():
+        router.blend = config.blend if blend is None else blend
     config = replace(
         config,
         data=config.data if data is None else data,
         downscale=config.downscale if downscale is None else downscale,
     )
-    return config, router, load_scene(config.data, downscale=config.downscale)
+    scene = load_scene(config.data, downscale=config.downscale)
+    grid = load_grid(run, config, routers["field"], scene, wanted=occupancy, backend=backend)
+    options: dict[str, Any] = {"samples": samples, "fine_samples": fine_samples, "occupancy": grid, "backend": backend}
+    return config, make_renderer(config, scene, routers, **options), scene

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from voronerf.training.trainer import Progress as TrainingProgress
+from voronerf.training.progress import Progress as TrainingProgress
 
 
 class _Rate(ProgressColumn):

@@ -16,8 +16,8 @@ from rich.console import Console
 from voronerf.backends import BackendUnavailable
 from voronerf.cli import commands, demo
 from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.progress import TrainingError
 from voronerf.training.runs import stored_config
-from voronerf.training.trainer import TrainingError
 
 #: What a user can cause, told in one line. ValueError includes the project's own SceneError and CheckpointError.
 EXPECTED = (ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError, torch.OutOfMemoryError)

@@ -1,21 +1,25 @@
 """From cameras to rays, from rays to colours. Knows nothing of files."""
 
 from voronerf.rendering.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
+from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.rays import intersect_box
+from voronerf.rendering.renderer import RenderedImage, Renderer, render_image
 from voronerf.rendering.sampling import stratified_depths
-from voronerf.rendering.volume import Rendered, RenderedImage, render_image, render_rays
+from voronerf.rendering.volume import Rendered, render_rays
 
 __all__ = [
     "Cameras",
+    "Contraction",
     "Field",
     "Marched",
     "OccupancyGrid",
     "Rays",
     "Rendered",
     "RenderedImage",
+    "Renderer",
     "focus_point",
     "intersect_box",
     "orbit_cameras",

@@ -39,20 +39,24 @@ class Rays:
     Attributes:
         origins: float32 [r, 3].
         directions: float32 [r, 3], unit length.
+        radii: float32 [r], radius at distance 1 of the cone that a ray stands for, or None.
     """
 
     origins: Tensor
     directions: Tensor
+    radii: Tensor | None = None
 
     def __len__(self) -> int:
         return self.origins.shape[0]
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
-        return Rays(self.origins[index], self.directions[index])
+        radii = None if self.radii is None else self.radii[index]
+        return Rays(self.origins[index], self.directions[index], radii)
 
     def to(self, device: torch.device | str) -> Rays:
         """The same rays on a device."""
-        return Rays(self.origins.to(device), self.directions.to(device))
+        radii = None if self.radii is None else self.radii.to(device)
+        return Rays(self.origins.to(device), self.directions.to(device), radii)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +128,16 @@ class Cameras:
             self, intrinsics=self.intrinsics / factor, width=self.width // factor, height=self.height // factor
         )
 
-    def rays(self, image_index: Tensor | int, x: Tensor, y: Tensor) -> Rays:
+    def rays(self, image_index: Tensor | int, x: Tensor, y: Tensor, *, cones: bool = False) -> Rays:
         """Rays through pixels.
 
         Args:
             image_index: integer [b], the camera of each pixel, or one camera for all.
             x: [b] column. Integers name pixels (the ray goes through their centre), floats are positions in the image.
             y: [b] row, likewise.
+            cones: give the rays radii: a cone's variance across its axis is that of the pixel at each distance, its
+                radius 2 / sqrt(12) of the pixel's width (Barron et al. 2021, section 3.1). A pixel off the axis is
+                farther away and so narrower; lens distortion of its size is not followed.
         """
         if isinstance(image_index, int):
             chosen, camera = self[[image_index]], None
@@ -144,15 +151,21 @@ class Cameras:
             camera=camera,
             distortion=chosen.distortion,
         )
-        return Rays(origins, directions)
+        if not cones:
+            return Rays(origins, directions)
+        widths = chosen.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12))
+        axes = -chosen.poses[:, :3, 2]
+        if camera is not None:
+            widths, axes = widths[camera], axes[camera]
+        return Rays(origins, directions, widths * (directions * axes).sum(-1))
 
-    def image_rays(self, index: int) -> Rays:
+    def image_rays(self, index: int, *, cones: bool = False) -> Rays:
         """Rays through all pixel centres of one camera, row by row: [height * width]."""
         device = self.poses.device
         y, x = torch.meshgrid(
             torch.arange(self.height, device=device), torch.arange(self.width, device=device), indexing="ij"
         )
-        return self.rays(index, x.reshape(-1), y.reshape(-1))
+        return self.rays(index, x.reshape(-1), y.reshape(-1), cones=cones)
 
     def project(self, points: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Where one camera sees points.

@@ -5,7 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from voronerf.ops.resample import resample
+
 SPACINGS = ("linear", "disparity")
+#: What the weights of all intervals are raised by before drawing from them (mip-NeRF, equation 18).
+PADDING = 0.01
 
 
 def stratified_depths(
@@ -59,6 +63,115 @@ def stratified_depths(
     # rounding may put a sample a last bit outside its stratum
     depths = torch.minimum(torch.maximum(depths, edges[:, :-1]), edges[:, 1:])
     return depths, edges.diff(dim=-1), edges
+
+
+def stratified_edges(
+    near: Tensor,
+    far: Tensor,
+    samples: int,
+    *,
+    jitter: bool,
+    spacing: str = "linear",
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Ends of s intervals that cover [near, far], for cones.
+
+    Args:
+        near: [r], as for `stratified_depths`.
+        far: [r].
+        samples: s, >= 1.
+        jitter: every inner edge uniformly random between the middles of its strata, else evenly spaced.
+        spacing: "linear" or "disparity".
+        generator: of the jitter, on any device.
+
+    Returns:
+        [r, s + 1] ascending, the first near and the last far.
+    """
+    edges = stratified_depths(near, far, samples, jitter=False, spacing=spacing)[2]
+    if not jitter:
+        return edges
+    device = near.device if generator is None else generator.device
+    shift = torch.rand(len(near), samples - 1, device=device, dtype=near.dtype, generator=generator).to(near.device)
+    steps = (torch.arange(1, samples, device=near.device, dtype=near.dtype) - 0.5 + shift) / samples
+    inner = _spaced(near[:, None], far[:, None], steps, spacing)
+    return torch.cat((edges[:, :1], inner, edges[:, -1:]), dim=1)
+
+
+def strata_uniforms(
+    rays: int, count: int, like: Tensor, jitter: bool, generator: torch.Generator | None
+) -> Tensor | None:
+    """Numbers [r, count] in 0..1, one in each of as many strata; None, which stands for their middles, without jitter.
+
+    A stratum's own draw spreads them more evenly than independent numbers, with the same distribution.
+    """
+    if not jitter:
+        return None
+    device = like.device if generator is None else generator.device
+    drawn = torch.rand(rays, count, device=device, dtype=like.dtype, generator=generator).to(like.device)
+    return (torch.arange(count, device=like.device, dtype=like.dtype) + drawn) / count
+
+
+def blurred_weights(weights: Tensor) -> Tensor:
+    """Weights [r, s] as drawn from: a maximum over two neighbours, blurred, and raised (mip-NeRF, equation 18).
+
+    The result bounds the weights from above with room at both sides, so that a second pass also looks beside a surface.
+    """
+    wide = torch.nn.functional.pad(weights[:, None, :], (1, 1), mode="replicate")[:, 0]
+    largest = torch.maximum(wide[:, :-1], wide[:, 1:])
+    return (largest[:, :-1] + largest[:, 1:]) / 2 + PADDING
+
+
+def union_depths(
+    depths: Tensor,
+    edges: Tensor,
+    weights: Tensor,
+    count: int,
+    *,
+    jitter: bool,
+    generator: torch.Generator | None = None,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """The samples of a first pass and further ones where it found something (NeRF, section 5.2).
+
+    Args:
+        depths: [r, s], of the first pass.
+        edges: [r, s + 1], of its strata.
+        weights: [r, s].
+        count: f, of the further samples.
+        jitter: draw them, else the middles of strata of equal weight.
+        generator: of the jitter.
+        backend: of the op.
+
+    Returns:
+        (depths [r, s + f] ascending, edges [r, s + f + 1]): a sample stands for the ray
+        up to halfway to its neighbours.
+    """
+    uniforms = strata_uniforms(len(depths), count, depths, jitter, generator)
+    found = resample(weights, edges, count, uniforms=uniforms, backend=backend)
+    every = torch.cat((depths, found), dim=1).sort(dim=1).values
+    return every, torch.cat((edges[:, :1], (every[:, 1:] + every[:, :-1]) / 2, edges[:, -1:]), dim=1)
+
+
+def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tensor) -> Tensor:
+    """What a proposal has missed (Barron et al. 2022, "Mip-NeRF 360", equation 13), the mean over rays.
+
+    A histogram ``weights`` can come from one density together with the proposal only where it does not exceed the sum
+    of all of the proposal's intervals that it touches.
+
+    Args:
+        edges: [r, s + 1], of the field's intervals; no gradient.
+        weights: [r, s]; no gradient.
+        found: [r, t + 1], edges of the proposal's intervals.
+        bounds: [r, t], the proposal's weights.
+    """
+    edges, weights = edges.detach(), weights.detach()
+    total = torch.nn.functional.pad(bounds.cumsum(dim=1), (1, 0))
+    t = bounds.shape[1]
+    first = torch.searchsorted(found, edges[:, :-1].contiguous(), right=True).sub(1).clamp(0, t)
+    last = torch.searchsorted(found, edges[:, 1:].contiguous()).clamp(0, t)
+    bound = total.gather(1, torch.maximum(first, last)) - total.gather(1, first)
+    missed = (weights - bound).clamp_min(0)
+    return (missed.square() / (weights + 1e-7)).sum(dim=1).mean()
 
 
 def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:

@@ -1,6 +1,6 @@
 """Volume rendering: rays to colours through a field.
 
-r rays, s samples a ray, n = r * s samples, h x w pixels. Colours are in 0..1, distances in world units along unit
+r rays, s samples a ray, n = r * s samples. Colours are in 0..1, distances in world units along unit
 directions, densities per unit length.
 """
 
@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from voronerf.ops.composite import composite
-from voronerf.rendering.cameras import Cameras, Rays
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.cones import frustum_gaussians
+from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.field import Field
-from voronerf.rendering.marching import render_until_opaque
-from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.sampling import stratified_depths
 
 
@@ -30,6 +29,8 @@ class Rendered(NamedTuple):
         weights: [r, s], each sample's contribution.
         positions: [r, s, 3].
         rgb: [r, s, 3], each sample's colour.
+        depths: [r, s], distance of each sample.
+        edges: [r, s + 1], where the part of the ray that it stands for begins and ends.
     """
 
     colour: Tensor
@@ -38,23 +39,8 @@ class Rendered(NamedTuple):
     weights: Tensor
     positions: Tensor
     rgb: Tensor
-
-
-class RenderedImage(NamedTuple):
-    """What `render_image` returns.
-
-    Attributes:
-        colour: [h, w, 3], the background included.
-        opacity: [h, w].
-        depth: [h, w], as in `Rendered`.
-        heaviest: [h, w, 3], position of each ray's heaviest sample: whose cell the pixel shows. Rays without samples
-            have the point at their far end (opacity 0).
-    """
-
-    colour: Tensor
-    opacity: Tensor
-    depth: Tensor
-    heaviest: Tensor
+    depths: Tensor
+    edges: Tensor
 
 
 def render_rays(
@@ -84,104 +70,57 @@ def render_rays(
         spacing: of the strata, "linear" or "disparity".
         backend: of the composite op.
     """
-    near, far = _per_ray(near, rays), _per_ray(far, rays)
-    depths, deltas, _ = stratified_depths(near, far, samples, jitter=jitter, spacing=spacing, generator=generator)
-    positions = torch.addcmul(rays.origins[:, None, :], depths[:, :, None], rays.directions[:, None, :])
+    near, far = per_ray(near, rays), per_ray(far, rays)
+    depths, _, edges = stratified_depths(near, far, samples, jitter=jitter, spacing=spacing, generator=generator)
+    return render_samples(field, rays, depths, edges, background=background, backend=backend)
+
+
+def render_samples(
+    field: Field,
+    rays: Rays,
+    depths: Tensor,
+    edges: Tensor,
+    *,
+    cones: bool = False,
+    contraction: Contraction | None = None,
+    background: Tensor | None = None,
+    backend: str = "auto",
+) -> Rendered:
+    """The same for samples that have been chosen.
+
+    Args:
+        field: called once, on all r * s samples, a ray's samples being consecutive: points [n, 3], or with cones their
+            Gaussians [n, 6].
+        rays: r rays, with radii for cones.
+        depths: [r, s].
+        edges: [r, s + 1] around them.
+        cones: ask about the cones' frustums between the edges.
+        contraction: of the space that the field lives in; the positions returned lie there as well.
+        background: [3] or [r, 3].
+        backend: of the composite op.
+    """
+    samples = depths.shape[1]
+    if cones:
+        inputs = frustum_gaussians(rays, edges, contraction)
+    else:
+        inputs = torch.addcmul(rays.origins[:, None, :], depths[:, :, None], rays.directions[:, None, :])
+        inputs = inputs if contraction is None else contraction.points(inputs)
     # A copy of an expanded view: repeat_interleave would gather.
-    index = torch.arange(len(rays), device=positions.device, dtype=torch.int32)[:, None].expand(-1, samples).reshape(-1)
-    rgb, sigma = field(positions.reshape(-1, 3), rays.directions, index)
+    index = torch.arange(len(rays), device=depths.device, dtype=torch.int32)[:, None].expand(-1, samples).reshape(-1)
+    rgb, sigma = field(inputs.reshape(-1, inputs.shape[-1]), rays.directions, index)
     # a field under autocast answers in a half type: the sums along a ray are float32's
     rgb = rgb.reshape(len(rays), samples, 3).to(depths.dtype)
     sigma = sigma.reshape(len(rays), samples).to(depths.dtype)
-    result = composite(sigma, rgb, depths, deltas, background=background, backend=backend)
+    result = composite(sigma, rgb, depths, edges.diff(dim=-1), background=background, backend=backend)
     seen = result.opacity > 0
-    depth = torch.where(seen, result.depth / torch.where(seen, result.opacity, 1), far)
-    return Rendered(result.colour, result.opacity, depth, result.weights, positions, rgb)
+    depth = torch.where(seen, result.depth / torch.where(seen, result.opacity, 1), edges[:, -1])
+    return Rendered(
+        result.colour, result.opacity, depth, result.weights, inputs[..., :3], rgb, depths=depths, edges=edges
+    )
 
 
-@torch.no_grad()
-def render_image(
-    field: Field,
-    cameras: Cameras,
-    index: int,
-    *,
-    near: float,
-    far: float,
-    box: Tensor | None = None,
-    samples: int,
-    background: Tensor | None = None,
-    spacing: str = "linear",
-    occupancy: OccupancyGrid | None = None,
-    heaviest: bool = True,
-    chunk: int | None = None,
-    backend: str = "auto",
-) -> RenderedImage:
-    """One camera's whole image, without gradients and without randomness.
-
-    Args:
-        field: as for `render_rays`.
-        cameras: on the field's device.
-        index: the camera.
-        near: nearest distance of interest.
-        far: farthest.
-        box: [2, 3] outside of which nothing is; rays that miss it show the background without asking the field.
-        samples: s, per ray, inside the box.
-        background: [3], None is black.
-        spacing: of the strata.
-        occupancy: which cells of the box are empty; the field is asked about the others alone, up to where a ray is
-            opaque. None asks about every sample.
-        heaviest: whether to look for each ray's heaviest sample; without it the result has every ray's far end instead.
-        chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples of
-            a ray, 32,768.
-        backend: of the ops.
-    """
-    if chunk is None:
-        chunk = 4096 if occupancy is None else 32_768
-    if chunk < 1:
-        raise ValueError(f"render_image: chunk must be >= 1, got {chunk}")
-    rays = cameras.image_rays(index)
-    first, last, hit = intersect_box(rays.origins, rays.directions, box, near, far)
-    colour = torch.zeros_like(rays.origins) if background is None else background.to(rays.origins).repeat(len(rays), 1)
-    opacity = torch.zeros_like(first)
-    depth = torch.full_like(first, far)
-    places = rays.origins + far * rays.directions
-    for rows in hit.nonzero()[:, 0].split(chunk):
-        if occupancy is not None:
-            seen = render_until_opaque(
-                field,
-                rays[rows],
-                first[rows],
-                last[rows],
-                occupancy,
-                samples=samples,
-                background=background,
-                spacing=spacing,
-                heaviest=heaviest,
-                backend=backend,
-            )
-            colour[rows], opacity[rows], depth[rows], places[rows] = seen
-            continue
-        part = render_rays(
-            field,
-            rays[rows],
-            first[rows],
-            last[rows],
-            samples=samples,
-            background=background,
-            spacing=spacing,
-            backend=backend,
-        )
-        colour[rows] = part.colour.to(colour.dtype)
-        opacity[rows] = part.opacity.to(opacity.dtype)
-        depth[rows] = part.depth.to(depth.dtype)
-        if heaviest:
-            top = part.weights.argmax(-1)
-            places[rows] = part.positions[torch.arange(len(rows), device=rows.device), top]
-    size = (cameras.height, cameras.width)
-    return RenderedImage(colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3))
-
-
-def _per_ray(distance: Tensor | float, rays: Rays) -> Tensor:
+def per_ray(distance: Tensor | float, rays: Rays) -> Tensor:
+    """A distance of each ray, from one for all or theirs."""
     if isinstance(distance, Tensor):
         return distance.expand(len(rays))
     return torch.full_like(rays.origins[:, 0], distance)

@@ -53,7 +53,7 @@ def evaluate_blended(
     Colours and densities are mixed as ``activate`` gives them.
     """
     own = evaluate_table(field, where, backend, positions, directions, ray_index, coords=coords)
-    mixture = mixture_at(positions if coords is None else coords)
+    mixture = mixture_at(positions[:, :3] if coords is None else coords)
     if mixture is None:
         return own
     if ray_index is not None:
@@ -81,10 +81,10 @@ def evaluate_table(
         field: the field.
         where: gives for positions and coords what tells ``routed_mlp`` the cells.
         backend: of the operation.
-        positions: [n, 3] in scene units.
+        positions: [n, 3] in scene units; [n, 6], means and variances, where the table integrates over Gaussians.
         directions: unit vectors, [n, 3], or [r, 3] together with ``ray_index``.
         ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
-        coords: [n, 3] or None, positions that decide the cells in the place of ``positions``.
+        coords: [n, 3] or None, positions that decide the cells in the place of ``positions`` (of Gaussians, the means).
 
     Returns:
         What the field's ``activate`` gives: (colour [n, 3], density [n]).
@@ -92,13 +92,12 @@ def evaluate_table(
     Raises:
         ValueError: for shapes that disagree, or directions that the field needs and did not get.
     """
-    if positions.ndim != 2 or positions.shape[1] != 3:
-        raise ValueError(f"VoronoiRouter: positions must have shape [n, 3], got {list(positions.shape)}")
-    if coords is not None and coords.shape != positions.shape:
-        raise ValueError(
-            f"VoronoiRouter: coords must have the shape of positions, {list(positions.shape)}, got {list(coords.shape)}"
-        )
     table = field.layers
+    features = 6 if table.integrated else 3
+    if positions.ndim != 2 or positions.shape[1] != features:
+        raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
+    if coords is not None and coords.shape != (positions.shape[0], 3):
+        raise ValueError(f"VoronoiRouter: coords must have shape [{positions.shape[0]}, 3], got {list(coords.shape)}")
     needs_directions = table.uses_directions
     if needs_directions and directions is None:
         raise ValueError("VoronoiRouter: directions must be given, since the field's colour depends on them")

@@ -276,7 +276,7 @@ class VoronoiRouter(nn.Module):
         if self.num_cells == 1:
             return {}
         if (self.assignment == "stochastic" and self.training) or (diagram.depth == 1 and self.num_cells > _MANY):
-            return {"cells": self.assign((positions if coords is None else coords).detach())}
+            return {"cells": self.assign((positions[:, :3] if coords is None else coords).detach())}
         tables = {"centres": diagram.centres, "centre_weights": diagram.power, "coords": coords}
         if diagram.depth == 1:
             return tables

@@ -48,10 +48,12 @@ class RayBatches:
     Args:
         scene: The scene; its training views are used.
         device: Where images, cameras and batches live.
+        cones: Whether the rays have radii.
     """
 
-    def __init__(self, scene: Scene, device: torch.device) -> None:
+    def __init__(self, scene: Scene, device: torch.device, *, cones: bool = False) -> None:
         self.scene = scene
+        self.cones = cones
         self.device = device
         self.cameras = scene.train.cameras.to(device)
         images = scene.train.images.to(device)
@@ -84,7 +86,7 @@ class RayBatches:
         width = self.cameras.width
         per_image = width * self.cameras.height
         pixel = index % per_image
-        rays = self.cameras.rays(index // per_image, pixel % width, pixel // width)
+        rays = self.cameras.rays(index // per_image, pixel % width, pixel // width, cones=self.cones)
         near = torch.full((count,), float(self.scene.near), device=self.device)
         far = torch.full((count,), float(self.scene.far), device=self.device)
         if self.box is not None:

@@ -111,6 +111,8 @@ class TrainConfig:
     """Samples per ray, one in each of as many strata; default 64, of the first of two passes 32."""
     fine_samples: int = 32
     """Samples per ray of the second pass; nerf's fine network is asked about those of the first as well."""
+    split_proposal: bool = False
+    """Whether the proposal's density network has cells as well, or stays one for the whole scene."""
     contraction: Literal["none", "sphere"] = "none"
     """Space as the networks see it: as it is, or all that is outside of a sphere drawn into one of twice its radius."""
     occupancy: bool = False
@@ -205,6 +207,8 @@ class TrainConfig:
             raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
 
 
+#: With what the occupancy grid works: it is asked about points of a single pass.
+OCCUPANCY_RULE = "come with --field nerf or kilonerf, --sampling stratified and --contraction none"
 #: Settings that JSON has as lists and as text.
 LISTS = frozenset({"cells", "split_at", "split_at_seconds", "split_at_steps", "skips"})
 PATHS = ("out", "lpips")
@@ -257,8 +261,8 @@ def check_config(config: TrainConfig) -> None:
     need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
     need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
     _check_splits(config, need)
-    for name, usable in (("field", ("nerf", "kilonerf")), ("sampling", ("stratified",)), ("contraction", ("none",))):
-        need(getattr(config, name) in usable, name, f"be {' or '.join(usable)} in this version")
+    plain = config.field != "mipnerf" and config.sampling == "stratified" and config.contraction == "none"
+    need(plain or not config.occupancy, "occupancy", OCCUPANCY_RULE)
 
 
 def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -> None:

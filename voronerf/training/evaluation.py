@@ -5,12 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import torch
-
 from voronerf.data import Scene
-from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.rendering.volume import RenderedImage, render_image
-from voronerf.router import VoronoiRouter
+from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.training.lpips import Lpips
 from voronerf.training.metrics import psnr, ssim
 
@@ -32,52 +28,28 @@ def view_numbers(count: int, views: int | None) -> list[int]:
     return [i * count // views for i in range(views)]
 
 
-@torch.no_grad()
-def render_view(
-    router: VoronoiRouter,
-    scene: Scene,
-    view: int,
-    *,
-    samples: int,
-    backend: str,
-    occupancy: OccupancyGrid | None = None,
-    heaviest: bool = True,
-) -> RenderedImage:
-    """One test view as the router sees it, samples at the middle of their strata, those in empty cells left out."""
-    device = next(router.parameters()).device
-    router.eval()
-    return render_image(
-        router,
+def render_view(renderer: Renderer, scene: Scene, view: int, *, heaviest: bool = True) -> RenderedImage:
+    """One test view as the renderer sees it, samples at the middle of their strata, those in empty cells left out."""
+    device = renderer.device
+    return renderer.train(False).image(
         scene.test.cameras.to(device),
         view,
         near=scene.near,
         far=scene.far,
         box=None if scene.box is None else scene.box.to(device),
-        samples=samples,
         background=scene.background_colour(device),
-        spacing=scene.spacing,
-        occupancy=occupancy,
         heaviest=heaviest,
-        backend=backend,
     )
 
 
 def evaluate(
-    router: VoronoiRouter,
-    scene: Scene,
-    *,
-    samples: int,
-    views: int | None = None,
-    backend: str = "auto",
-    occupancy: OccupancyGrid | None = None,
-    lpips: Lpips | None = None,
+    renderer: Renderer, scene: Scene, *, views: int | None = None, lpips: Lpips | None = None
 ) -> list[ViewScore]:
     """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all)."""
-    device = next(router.parameters()).device
     scores = []
     for view in view_numbers(len(scene.test.names), views):
-        image = render_view(router, scene, view, samples=samples, backend=backend, occupancy=occupancy, heaviest=False)
-        target = scene.test.truth(view, scene.background_colour()).to(device)
+        image = render_view(renderer, scene, view, heaviest=False)
+        target = scene.test.truth(view, scene.background_colour()).to(renderer.device)
         colour = image.colour.clamp(0, 1)
         perceived = None if lpips is None else float(lpips(colour, target))
         name = scene.test.names[view]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,18 @@ import torch
 
 from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
-from voronerf.fields import KiloNeRF, NeRF, nerf_table
+from voronerf.fields import DensityField, KiloNeRF, MipNeRF, NeRF, density_table, nerf_table
+from voronerf.fields.mipnerf import OCTAVES
+from voronerf.layers import MLP
+from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint
-from voronerf.training.config import ConfigError, TrainConfig, default_learning_rate
+from voronerf.training.config import ConfigError, TrainConfig, check_config, default_learning_rate
 
+#: Channels, layers and frequencies of the proposal's density network: small, and asked about coarse intervals alone.
+PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
 #: A sample that takes less of the light than this, were its cell that dense throughout, is not worth asking for: in
 #: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
 #: through empty space lies between the two, and would keep a third of the samples.
@@ -50,7 +57,7 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
         ConfigError: When the smallest networks have more parameters than asked for.
     """
     if config.position_octaves is None:
-        config = replace(config, position_octaves=octaves_for(scene))
+        config = replace(config, position_octaves=OCTAVES if config.field == "mipnerf" else octaves_for(scene))
     if config.parameters is None:
         return config
     width = solve_width(config, config.parameters)
@@ -71,16 +78,38 @@ def _table_options(config: TrainConfig) -> dict[str, Any]:
 
 def make_field(config: TrainConfig) -> NeRF:
     """The field that a configuration describes, freshly initialised from torch's global generator."""
-    kind = KiloNeRF if config.field == "kilonerf" else NeRF
+    kind = {"nerf": NeRF, "mipnerf": MipNeRF, "kilonerf": KiloNeRF}[config.field]
     return kind(int(config.width or 0), **_table_options(config))
+
+
+def network_names(config: TrainConfig) -> tuple[str, ...]:
+    """The networks of a cell, as :class:`voronerf.rendering.Renderer` names them; "field" is the one whose colours
+    count."""
+    if config.sampling == "proposal":
+        return ("field", "proposal")
+    # mip-NeRF asks one network twice.
+    return ("field", "coarse") if config.sampling == "hierarchical" and config.field != "mipnerf" else ("field",)
 
 
 def count_parameters(config: TrainConfig, width: int | None = None) -> int:
     """Parameters of all networks of all final cells, with another width than the configured one where given."""
     width = int(config.width or 0) if width is None else width
+    names, cells, encoding = network_names(config), config.final_cells, _encoding(config)
     view = width if config.field == "kilonerf" else None
-    table = nerf_table(width, view_width=view, **_table_options(config))
-    return config.final_cells * sum(o * i + o for o, i in table.weight_shapes(3, 3))
+    table = nerf_table(width, view_width=view, position_encoding=encoding, **_table_options(config))
+    total = cells * _parameters_of(table) * (2 if "coarse" in names else 1)
+    if "proposal" in names:
+        proposal = density_table(position_encoding=encoding, **PROPOSAL)
+        total += _parameters_of(proposal) * (cells if config.split_proposal else 1)
+    return total
+
+
+def _encoding(config: TrainConfig) -> str:
+    return "integrated" if config.field == "mipnerf" else "frequency"
+
+
+def _parameters_of(table: MLP) -> int:
+    return sum(o * i + o for o, i in table.weight_shapes(6 if table.integrated else 3, 3))
 
 
 def solve_width(config: TrainConfig, total: int) -> int:
@@ -101,19 +130,57 @@ def solve_width(config: TrainConfig, total: int) -> int:
     return low
 
 
-def make_router(config: TrainConfig, device: torch.device | str) -> VoronoiRouter:
-    """A router of one cell around the configured field: the coarse stage. Depends on the seed alone."""
+def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, VoronoiRouter]:
+    """A router of one cell around each of the configured networks: the coarse stage. Depends on the seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        field = make_field(config)
-    router = VoronoiRouter(
-        field,
-        VoronoiDiagram(torch.zeros(1, 3)),
-        assignment=config.assignment,
-        temperature=config.temperature,
-        backend=config.backend,
+        fields: dict[str, torch.nn.Module] = {}
+        for name in network_names(config):
+            proposal = name == "proposal"
+            fields[name] = (
+                DensityField(position_encoding=_encoding(config), **PROPOSAL) if proposal else make_field(config)
+            )
+    return {
+        name: VoronoiRouter(
+            field,
+            VoronoiDiagram(torch.zeros(1, 3)),
+            assignment=config.assignment,
+            temperature=config.temperature,
+            backend=config.backend,
+        ).to(device)
+        for name, field in fields.items()
+    }
+
+
+def make_renderer(
+    config: TrainConfig,
+    scene: Scene,
+    routers: Mapping[str, VoronoiRouter],
+    *,
+    samples: int | None = None,
+    fine_samples: int | None = None,
+    occupancy: OccupancyGrid | None = None,
+    backend: str | None = None,
+) -> Renderer:
+    """How the configured networks become pictures of a scene; samples and backend differ from the configuration's where
+    they are given."""
+    return Renderer(
+        routers,
+        samples=int(config.samples or 0) if samples is None else samples,
+        fine_samples=0 if config.sampling == "stratified" else fine_samples or config.fine_samples,
+        cones=config.field == "mipnerf",
+        contraction=None if config.contraction == "none" else make_contraction(scene),
+        spacing=scene.spacing,
+        occupancy=occupancy,
+        backend=config.backend if backend is None else backend,
     )
-    return router.to(device)
+
+
+def make_contraction(scene: Scene) -> Contraction:
+    """The sphere around a scene's box, or without one around the origin and all cameras."""
+    if scene.box is not None:
+        return Contraction(scene.box.mean(0), float((scene.box[1] - scene.box[0]).norm()) / 2)
+    return Contraction(torch.zeros(3), float(scene.train.cameras.origins.norm(dim=-1).max()))
 
 
 def make_grid(
@@ -140,14 +207,15 @@ def make_grid(
     return OccupancyGrid(scene.box, size, threshold=threshold, remembered=remembered, device=device)
 
 
-def make_optimizer(router: VoronoiRouter, config: TrainConfig) -> torch.optim.Adam:
+def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) -> torch.optim.Adam:
     """Adam with a shorter memory of squared gradients than its default (0.99 for 0.999).
 
     After a split each cell meets fewer samples and other gradients than its parent; moments inherited from the parent
     would otherwise set its step sizes for a thousand steps. Worth 0.7 dB after 800 steps of Lego at 100 x 100.
     """
     assert config.lr is not None
-    return torch.optim.Adam(router.parameters(), lr=config.lr, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    parameters = [parameter for router in routers.values() for parameter in router.parameters()]
+    return torch.optim.Adam(parameters, lr=config.lr, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
 def checkpoint_path(run: Path) -> Path:
@@ -155,21 +223,31 @@ def checkpoint_path(run: Path) -> Path:
     return run / "checkpoints" / "last.safetensors"
 
 
-def restore_router(router: VoronoiRouter, checkpoint: Checkpoint) -> None:
-    """Fills a router with a checkpoint's cells, whatever the number of them.
+def router_states(routers: Mapping[str, VoronoiRouter]) -> dict[str, dict[str, Any]]:
+    """The routers' states, under the names that a checkpoint has for them."""
+    return {_group(name): router.state_dict() for name, router in routers.items()}
+
+
+def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint) -> None:
+    """Fills routers with a checkpoint's cells, whatever the number of them.
 
     Raises:
         CheckpointError: When the checkpoint's parameters are of another architecture.
     """
-    state = checkpoint.group("router")
-    try:
-        router.load_state_dict(state)
-    except RuntimeError as error:
-        raise CheckpointError(f"the checkpoint is of another architecture: {str(error).splitlines()[-1]}") from None
+    for name, router in routers.items():
+        try:
+            router.load_state_dict(checkpoint.group(_group(name)))
+        except RuntimeError as error:
+            line = str(error).splitlines()[-1]
+            raise CheckpointError(f"the checkpoint is of another architecture: {line}") from None
 
 
-def load_run(run: Path, *, device: str = "cpu", backend: str = "auto") -> tuple[TrainConfig, VoronoiRouter]:
-    """The configuration and the trained router of a run directory.
+def _group(name: str) -> str:
+    return "router" if name == "field" else f"router-{name}"
+
+
+def load_run(run: Path, *, device: str = "cpu", backend: str = "auto") -> tuple[TrainConfig, dict[str, VoronoiRouter]]:
+    """The configuration and the trained routers of a run directory, for :func:`make_renderer`.
 
     Raises:
         CheckpointError: When ``run`` holds no usable checkpoint.
@@ -177,10 +255,12 @@ def load_run(run: Path, *, device: str = "cpu", backend: str = "auto") -> tuple[
     path = checkpoint_path(run)
     checkpoint = load_checkpoint(path)
     config = TrainConfig.from_json(json.dumps(checkpoint.values["config"]), str(path))
-    router = make_router(config, device)
-    restore_router(router, checkpoint)
-    router.backend = backend
-    return config, router.eval()
+    routers = make_routers(config, device)
+    restore_routers(routers, checkpoint)
+    for router in routers.values():
+        router.backend = backend
+        router.eval()
+    return config, routers
 
 
 def load_grid(
@@ -192,7 +272,7 @@ def load_grid(
 
     Raises:
         CheckpointError: When ``run`` holds no usable checkpoint.
-        ConfigError: When a grid is to be made and the scene has no box.
+        ConfigError: When a grid is to be made and the scene has no box, or the run's sampling has no use for one.
     """
     device = next(router.parameters()).device
     state = load_checkpoint(checkpoint_path(run)).group("occupancy")
@@ -200,6 +280,7 @@ def load_grid(
         return OccupancyGrid.from_state(state, device=device)
     if not wanted:
         return None
+    check_config(replace(config, occupancy=True))
     grid = make_grid(config, scene, device, PICTURE_RESOLUTION, LEAST_OPACITY)
     generator = torch.Generator().manual_seed(0)
     for points in range(PICTURE_POINTS):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from voronerf.data import Scene
-from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.evaluation import evaluate, mean_scores, render_view, view_numbers
@@ -51,23 +51,17 @@ def stored_config(run: Path) -> TrainConfig | None:
     return replace(TrainConfig.from_json(path.read_text(), str(path)), out=run)
 
 
-def write_panels(
-    router: VoronoiRouter,
-    scene: Scene,
-    folder: Path,
-    *,
-    samples: int,
-    views: int,
-    backend: str = "auto",
-    occupancy: OccupancyGrid | None = None,
-) -> list[Path]:
+def write_panels(renderer: Renderer, scene: Scene, folder: Path, *, views: int) -> list[Path]:
     """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
+    router = renderer.field
+    assert isinstance(router, VoronoiRouter)
     paths = []
     background = scene.background_colour()
     for view in view_numbers(len(scene.test), views):
-        image = render_view(router, scene, view, samples=samples, backend=backend, occupancy=occupancy)
+        image = render_view(renderer, scene, view)
         # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
-        cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=backend).reshape(image.opacity.shape)
+        cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)
+        cells = cells.reshape(image.opacity.shape)
         path = folder / f"{scene.test.names[view]}.png"
         save_panel(
             path,
@@ -97,18 +91,10 @@ def write_curve(run: Path) -> Path | None:
 
 
 def score_views(
-    router: VoronoiRouter,
-    scene: Scene,
-    *,
-    samples: int,
-    views: int | None,
-    backend: str,
-    path: Path | None = None,
-    occupancy: OccupancyGrid | None = None,
-    lpips: Lpips | None = None,
+    renderer: Renderer, scene: Scene, *, views: int | None, path: Path | None = None, lpips: Lpips | None = None
 ) -> dict[str, Any]:
     """Scores of test views, one by one and in the mean; written to ``path`` as JSON when given."""
-    scores = evaluate(router, scene, samples=samples, views=views, backend=backend, occupancy=occupancy, lpips=lpips)
+    scores = evaluate(renderer, scene, views=views, lpips=lpips)
     result = {**mean_scores(scores), "views": [asdict(score) for score in scores]}
     if path is not None:
         write_text(path, json.dumps(result, indent=2) + "\n")

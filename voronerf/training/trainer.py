@@ -5,26 +5,23 @@ Time means training time: steps and splits count, evaluations and checkpoints do
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from voronerf import backends
 from voronerf.data import Scene
-from voronerf.rendering.marching import Marched, render_marched
+from voronerf.rendering.marching import Marched
 from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.rendering.volume import Rendered, render_rays
-from voronerf.subdivision import split_diagram
-from voronerf.training.batches import Batch, RayBatches
+from voronerf.rendering.volume import Rendered
+from voronerf.router import VoronoiRouter
+from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -35,18 +32,22 @@ from voronerf.training.checkpoint import (
 )
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.evaluation import ViewScore, evaluate, mean_scores
-from voronerf.training.files import read_json_lines, write_bytes, write_text
+from voronerf.training.files import read_json_lines, write_text
 from voronerf.training.lpips import Lpips, find_lpips
 from voronerf.training.model import (
     OCCUPANCY_DECAY,
     checkpoint_path,
     make_grid,
     make_optimizer,
-    make_router,
+    make_renderer,
+    make_routers,
     resolve_config,
-    restore_router,
+    restore_routers,
+    router_states,
 )
+from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.reservoir import SampleReservoir
+from voronerf.training.splitting import median, save_samples, split_by_samples
 
 #: Steps between looks at random cells, which bring back those that were thought empty, and the share looked at.
 OCCUPANCY_EVERY, OCCUPANCY_SHARE = 16, 1 / 32
@@ -54,39 +55,6 @@ OCCUPANCY_EVERY, OCCUPANCY_SHARE = 16, 1 / 32
 
 #: What summary.json repeats of the last evaluation.
 FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views")
-
-
-class TrainingError(RuntimeError):
-    """Training cannot go on; the message says why and what is left on disk."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A period of training on one diagram.
-
-    ``balance_before`` and ``balance_after`` are std(W / max W) over the new cells of one parent, the median over the
-    parents that were split; None for the coarse stage.
-    """
-
-    cells: int
-    started_at_second: float
-    started_at_step: int
-    balance_before: float | None
-    balance_after: float | None
-    split_cells: int
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a display shows of a running training; one is passed to the caller's callback after every step."""
-
-    step: int
-    seconds: float
-    fraction: float
-    loss: float
-    rays_per_second: float
-    cells: int
-    psnr: float | None
 
 
 class Trainer:
@@ -122,19 +90,22 @@ class Trainer:
         self.device = torch.device(config.device)
         # Every op of a step is looked up now: a backend that cannot train should say so before anything is written.
         marching = ("march_rays", "update_occupancy") if config.occupancy else ()
-        for op in ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", *marching):
+        drawing = () if config.sampling == "stratified" else ("resample",)
+        for op in ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", *marching, *drawing):
             backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
         backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
         self.generator = torch.Generator().manual_seed(config.seed)
         size = (scene.test.cameras.height, scene.test.cameras.width)
         self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, size)
-        self.batches = RayBatches(scene, self.device)
+        self.batches = RayBatches(scene, self.device, cones=config.field == "mipnerf")
         self.background = scene.background_colour(self.device)
-        self.router = make_router(config, self.device)
-        self.router.generator = self.generator
-        self.optimizer = make_optimizer(self.router, config)
+        self.routers = make_routers(config, self.device)
+        for router in self.routers.values():
+            router.generator = self.generator
+        self.optimizer = make_optimizer(self.routers, config)
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
         self.occupancy = make_grid(config, scene, self.device) if config.occupancy else None
+        self.renderer = make_renderer(config, scene, self.routers, occupancy=self.occupancy)
         self.step = 0
         self.seconds = 0.0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
@@ -144,6 +115,11 @@ class Trainer:
         if config.resume:
             self._load()
         write_text(self.out / "config.json", config.to_json())
+
+    @property
+    def router(self) -> VoronoiRouter:
+        """The router whose colours count; its diagram is that of the run."""
+        return self.routers["field"]
 
     # --- progress ------------------------------------------------------------------------------------------------
 
@@ -228,40 +204,34 @@ class Trainer:
         background = self.background
         if batch.alpha is not None and config.background == "random":
             background = torch.rand(config.rays, 3, generator=self.generator).to(self.device)
-        self.router.train()
-        rendered = self._render(batch, background)
-        error = (rendered.colour - batch.target(background)).square()
-        loss = error.mean()
+        if self.occupancy is not None and self.step % OCCUPANCY_EVERY == 0:
+            self._look(self.occupancy)
+        passes = self.renderer.train().render(
+            batch.rays, batch.near, batch.far, background=background, jitter=True, generator=self.generator
+        )
+        if isinstance(passes[0], Marched):
+            self._observe(passes[0])
+        target = batch.target(background)
+        loss = self.renderer.loss(passes, target)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
         if self.level < len(self.plan):
             # Importance of a sample: its weight in the image times its ray's error (section 3.1 of the paper).
-            wrong = error.detach().sum(-1)
+            rendered = passes[-1]
+            wrong = (rendered.colour.detach() - target).square().sum(-1)
             wrong = wrong[:, None] if isinstance(rendered, Rendered) else wrong[rendered.ray_index]
             importance = rendered.weights.detach() * wrong
             self.reservoir.add(rendered.positions.detach().reshape(-1, 3), importance.reshape(-1))
         return float(loss.detach())
 
-    def _render(self, batch: Batch, background: Tensor | None) -> Rendered | Marched:
-        options: dict[str, Any] = {
-            "samples": self.config.samples,
-            "background": background,
-            "jitter": True,
-            "generator": self.generator,
-            "spacing": self.scene.spacing,
-            "backend": self.config.backend,
-        }
-        grid = self.occupancy
-        if grid is None:
-            return render_rays(self.router, batch.rays, batch.near, batch.far, **options)
-        if self.step % OCCUPANCY_EVERY == 0:
-            self._look(grid)
-        # As long as nothing has been found empty these are the samples that render_rays takes.
-        rendered = render_marched(self.router, batch.rays, batch.near, batch.far, grid, **options)
-        found = (rendered.positions, rendered.density, rendered.deltas, rendered.weights)
-        grid.observe(*(tensor.detach() for tensor in found), decay=OCCUPANCY_DECAY, backend=self.config.backend)
-        return rendered
+    def _observe(self, marched: Marched) -> None:
+        """Lets the grid learn from the samples of a step."""
+        assert self.occupancy is not None
+        found = (marched.positions, marched.density, marched.deltas, marched.weights)
+        self.occupancy.observe(
+            *(tensor.detach() for tensor in found), decay=OCCUPANCY_DECAY, backend=self.config.backend
+        )
 
     def _look(self, grid: OccupancyGrid) -> None:
         """Looks at random cells, so that one that was wrongly thought empty comes back."""
@@ -272,7 +242,6 @@ class Trainer:
         grid.update(
             self.router, cells.to(self.device), decay=1.0, generator=self.generator, backend=self.config.backend
         )
-        self.router.train()
 
     def _split(self) -> None:
         """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
@@ -287,28 +256,16 @@ class Trainer:
                 f"{self.out}: more cells than samples: --cells asks for {k}, {points.shape[0]} samples were kept in "
                 f"{self.step} steps; split later or keep more a batch (--reservoir, --reservoir-batches)"
             )
-        _save_samples(self.out / "samples" / f"level-{level + 1}.npz", points, importance)
-        split = None
-        if points.shape[0] >= k:
-            split = split_diagram(
-                self.router.diagram,
-                points,
-                importance,
-                k,
-                cells=planned.cells,
-                centres=config.centres,
-                method=config.balance,
-                min_samples=0 if level == 0 else config.min_cell_samples,
-                generator=self.generator,
-                backend=config.backend,
-            )
-        balances = list(split.balances.values()) if split is not None else []
-        if split is not None and balances:
-            self.router.subdivide(
-                split.diagram, split.parents, optimizer=self.optimizer, inherit=config.init == "inherit"
-            )
-        before = _median([balance.imbalance_before for balance in balances])
-        after = _median([balance.imbalance_after for balance in balances])
+        save_samples(self.out / "samples" / f"level-{level + 1}.npz", points, importance)
+        split = split_by_samples(config, planned, self.router.diagram, k, points, importance, self.generator)
+        balances = [] if split is None else list(split.balances.values())
+        for name, router in self.routers.items():
+            if split is not None and balances and (name != "proposal" or config.split_proposal):
+                router.subdivide(
+                    split.diagram, split.parents, optimizer=self.optimizer, inherit=config.init == "inherit"
+                )
+        before = median([balance.imbalance_before for balance in balances])
+        after = median([balance.imbalance_after for balance in balances])
         self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
         when = f"at {self.seconds:.0f} s, step {self.step}"
@@ -326,15 +283,7 @@ class Trainer:
 
     def _evaluate(self, views: int | None, lpips: Lpips | None = None) -> list[ViewScore]:
         self.evaluated = self._due()
-        scores = evaluate(
-            self.router,
-            self.scene,
-            samples=int(self.config.samples or 0),
-            views=views,
-            backend=self.config.backend,
-            occupancy=self.occupancy,
-            lpips=lpips,
-        )
+        scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips)
         now = {
             "step": self.step,
             "seconds": round(self.seconds, 3),
@@ -358,7 +307,7 @@ class Trainer:
             "seconds": self.seconds,
             "steps": self.step,
             "rays_per_second": self.step * self.config.rays / max(self.seconds, 1e-9),
-            "parameters": sum(p.numel() for p in self.router.parameters()),
+            "parameters": sum(p.numel() for router in self.routers.values() for p in router.parameters()),
             "cells": self.router.num_cells,
             "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
@@ -370,7 +319,7 @@ class Trainer:
         """Writes ``checkpoints/last.safetensors``."""
         tensors: dict[str, Tensor] = {}
         parts = {
-            "router": self.router.state_dict(),
+            **router_states(self.routers),
             "optimizer": optimizer_tensors(self.optimizer),
             "reservoir": self.reservoir.state_dict(),
             "generator": {"state": self.generator.get_state()},
@@ -394,13 +343,14 @@ class Trainer:
         different = differences(stored, self.config)
         if different:
             raise CheckpointError(f"{path}: a checkpoint of another configuration: {'; '.join(different)}")
-        restore_router(self.router, checkpoint)
-        self.optimizer = make_optimizer(self.router, self.config)
+        restore_routers(self.routers, checkpoint)
+        self.optimizer = make_optimizer(self.routers, self.config)
         load_optimizer_tensors(self.optimizer, checkpoint.group("optimizer"))
         self.reservoir.load_state_dict(checkpoint.group("reservoir"))
         occupancy = checkpoint.group("occupancy")
         if occupancy:
             self.occupancy = OccupancyGrid.from_state(occupancy, device=self.device)
+            self.renderer.occupancy = self.occupancy
         self.generator.set_state(checkpoint.group("generator")["state"])
         self.step = checkpoint.values["step"]
         self.seconds = checkpoint.values["seconds"]
@@ -412,14 +362,3 @@ class Trainer:
     def _say(self, line: str) -> None:
         if self.on_event is not None:
             self.on_event(line)
-
-
-def _median(values: list[float]) -> float | None:
-    return float(torch.tensor(values).median()) if values else None
-
-
-def _save_samples(path: Path, points: Tensor, importance: Tensor) -> None:
-    """The samples that a split was made from, for a later look (and ``benchmarks/balance.py``)."""
-    buffer = io.BytesIO()
-    np.savez(buffer, points=points.cpu().numpy(), importance=importance.cpu().numpy())
-    write_bytes(path, buffer.getvalue())

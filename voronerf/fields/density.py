@@ -1,0 +1,73 @@
+"""A small network for the density alone: where a ray is worth asking about. Units as in `voronerf.fields.nerf`."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from voronerf.fields.nerf import INITIAL_DENSITY
+from voronerf.layers import MLP, Layer
+
+
+def density_table(width: int, depth: int, position_octaves: int = 6, position_encoding: str = "frequency") -> MLP:
+    """The layer table of :class:`DensityField`, whose arguments these are."""
+    trunk = [Layer(("positions",) if i == 0 else (i - 1,), width, "relu") for i in range(depth)]
+    return MLP(
+        (*trunk, Layer((depth - 1,), 1)),
+        (depth,),
+        position_octaves=position_octaves,
+        position_encoding=position_encoding,
+    )
+
+
+class DensityField(nn.Module):
+    """ReLU layers and a density, without colour: a proposal network (Barron et al. 2022, "Mip-NeRF 360", section 3).
+
+    Density is a scaled softplus, as that of :class:`voronerf.fields.NeRF`.
+
+    Args:
+        width: Channels of the hidden layers, at least 1.
+        depth: Hidden layers, at least 1.
+        position_octaves: Frequencies of the position's encoding.
+        position_encoding: "frequency", or "integrated" for Gaussians [n, 6].
+        density_scale: Factor on the density, per scene unit.
+
+    Raises:
+        ValueError: For a width or depth below 1.
+    """
+
+    def __init__(
+        self,
+        width: int = 32,
+        depth: int = 2,
+        position_octaves: int = 6,
+        position_encoding: str = "frequency",
+        density_scale: float = 10.0,
+    ) -> None:
+        super().__init__()
+        if min(width, depth) < 1:
+            raise ValueError(f"DensityField: width and depth must be at least 1, got {width} and {depth}")
+        self.layers = density_table(width, depth, position_octaves, position_encoding)
+        self.density_scale = density_scale
+        shapes = self.layers.weight_shapes(6 if self.layers.integrated else 3)
+        self.trunk = nn.ModuleList(nn.Linear(i, o) for o, i in shapes)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """He initialisation, a small head, and a density that can grow; as in :class:`voronerf.fields.NeRF`."""
+        for layer in self.linears():
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)
+        head = self.linears()[-1]
+        nn.init.xavier_uniform_(head.weight, gain=0.1)
+        nn.init.constant_(head.bias, float(torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale)).log()))
+
+    def linears(self) -> list[nn.Linear]:
+        """The linear layers in the order of ``layers``."""
+        return [layer for layer in self.trunk if isinstance(layer, nn.Linear)]
+
+    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Raw [n, 1] to (black [n, 3], density [n] >= 0 per scene unit), float32 or wider."""
+        raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
+        return raw.new_zeros(raw.shape[0], 3), F.softplus(raw.squeeze(-1)) * self.density_scale

@@ -1,0 +1,26 @@
+"""The mip-NeRF field: a NeRF whose inputs are Gaussians. Units as in `voronerf.fields.nerf`."""
+
+from __future__ import annotations
+
+from voronerf.fields.nerf import NeRF
+
+#: Frequencies of the position's encoding as published: the encoding fades out by itself what a Gaussian cannot resolve.
+OCTAVES = 16
+
+
+class MipNeRF(NeRF):
+    """The architecture of NeRF behind the integrated encoding (Barron et al. 2021, "Mip-NeRF", section 3.1).
+
+    It is called with Gaussians [n, 6], mean and diagonal variance, in the place of positions;
+    `voronerf.rendering.cones.frustum_gaussians` makes them of cones.
+
+    Args:
+        width: Channels of the hidden layers.
+        depth: Hidden layers before the heads.
+        position_octaves: Frequencies of the integrated encoding, at least 1.
+        **options: The further arguments of :class:`NeRF`.
+    """
+
+    def __init__(self, width: int = 64, depth: int = 8, *, position_octaves: int = OCTAVES, **options: object) -> None:
+        options = {"position_octaves": position_octaves, "position_encoding": "integrated", **options}
+        super().__init__(width, depth, **options)  # type: ignore[arg-type]

@@ -1,0 +1,320 @@
+"""Rays to colours by all passes: one, or a second where the first found something.
+
+r rays, h x w pixels. Units as in `voronerf.rendering.volume`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.ops.resample import resample
+from voronerf.rendering.cameras import Cameras, Rays
+from voronerf.rendering.contraction import Contraction
+from voronerf.rendering.field import Field
+from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
+from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.rays import intersect_box
+from voronerf.rendering.sampling import (
+    blurred_weights,
+    interlevel_loss,
+    strata_uniforms,
+    stratified_depths,
+    stratified_edges,
+    union_depths,
+)
+from voronerf.rendering.volume import Rendered, per_ray, render_samples
+
+#: Share of the first pass in the loss where one network is asked twice (mip-NeRF, section 3.2).
+COARSE_SHARE = 0.1
+
+
+class RenderedImage(NamedTuple):
+    """What `render_image` returns.
+
+    Attributes:
+        colour: [h, w, 3], the background included.
+        opacity: [h, w].
+        depth: [h, w], as in `Rendered`.
+        heaviest: [h, w, 3], position of each ray's heaviest sample: whose cell the pixel shows. Rays without samples
+            have the point at their far end (opacity 0).
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    heaviest: Tensor
+
+
+class Renderer:
+    """How a scene's rays become colours: which fields are asked, where along a ray, and in how many passes.
+
+    - "field" alone, no fine samples: one pass over stratified samples.
+    - "field" alone with fine samples: it is asked twice (mip-NeRF, section 3.2).
+    - "coarse" and "field": the first pass is the coarse field's (NeRF, section 5.2).
+    - "proposal" and "field": the first pass is that of a field whose colours do not count, and which learns to be where
+      the second finds something (mip-NeRF 360, section 3).
+
+    The second pass asks about points of both passes, or for cones and after a proposal about new intervals alone.
+
+    Attributes:
+        fields: by name.
+        occupancy: what is empty, which a single pass over points may skip; may be set at any time.
+
+    Args:
+        fields: by name, as above.
+        samples: of the first pass, a ray.
+        fine_samples: of the second pass; 0 for a single pass.
+        cones: ask about Gaussians [n, 6] rather than points [n, 3]; rays need radii.
+        contraction: of the space that the fields live in.
+        spacing: of the strata, "linear" or "disparity".
+        occupancy: for a single pass over points.
+        backend: of the ops.
+
+    Raises:
+        ValueError: fields of other names, a second field without fine samples, or occupancy with several passes, cones
+            or a contraction.
+    """
+
+    def __init__(
+        self,
+        fields: Mapping[str, Field],
+        *,
+        samples: int,
+        fine_samples: int = 0,
+        cones: bool = False,
+        contraction: Contraction | None = None,
+        spacing: str = "linear",
+        occupancy: OccupancyGrid | None = None,
+        backend: str = "auto",
+    ) -> None:
+        if set(fields) not in ({"field"}, {"field", "coarse"}, {"field", "proposal"}):
+            raise ValueError(f"Renderer: fields must be field, and coarse or proposal, got {sorted(fields)}")
+        if min(samples, fine_samples + 1) < 1:
+            raise ValueError(f"Renderer: samples must be >= 1 and fine_samples >= 0, got {samples} and {fine_samples}")
+        if len(fields) > 1 and fine_samples < 1:
+            raise ValueError("Renderer: fine_samples must be >= 1 with two fields, got 0")
+        if occupancy is not None and (fine_samples or cones or contraction is not None):
+            raise ValueError("Renderer: occupancy must come with a single pass over points, without contraction")
+        self.fields = dict(fields)
+        self.samples, self.fine_samples, self.cones = samples, fine_samples, cones
+        self.contraction, self.spacing, self.backend = contraction, spacing, backend
+        self.occupancy = occupancy
+
+    @property
+    def field(self) -> Field:
+        """The field of the last pass, whose colours count."""
+        return self.fields["field"]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field's parameters are; the CPU for one that has none."""
+        parameters = self.field.parameters() if isinstance(self.field, nn.Module) else iter(())
+        first = next(parameters, None)
+        return torch.device("cpu") if first is None else first.device
+
+    def train(self, mode: bool = True) -> Renderer:
+        """Puts the fields into training mode, or for False into that of evaluation."""
+        for field in self.fields.values():
+            if isinstance(field, nn.Module):
+                field.train(mode)
+        return self
+
+    def render(
+        self,
+        rays: Rays,
+        near: Tensor | float,
+        far: Tensor | float,
+        *,
+        background: Tensor | None = None,
+        jitter: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Rendered | Marched, ...]:
+        """What rays see, a result for each pass; the last one's colours count, the others are for :meth:`loss`.
+
+        Args:
+            rays: r rays, with radii where the renderer works with cones.
+            near: [r] or one for all, where they begin.
+            far: [r] or one for all, where they end.
+            background: [3] or [r, 3]; None is black.
+            jitter: random samples, as for training.
+            generator: of the jitter.
+        """
+        near, far = per_ray(near, rays), per_ray(far, rays)
+        if self.occupancy is not None:
+            marched = render_marched(
+                self.field,
+                rays,
+                near,
+                far,
+                self.occupancy,
+                samples=self.samples,
+                background=background,
+                jitter=jitter,
+                generator=generator,
+                spacing=self.spacing,
+                backend=self.backend,
+            )
+            return (marched,)
+        if self.cones:
+            edges = stratified_edges(near, far, self.samples, jitter=jitter, spacing=self.spacing, generator=generator)
+            depths = (edges[:, 1:] + edges[:, :-1]) / 2
+        else:
+            depths, _, edges = stratified_depths(
+                near, far, self.samples, jitter=jitter, spacing=self.spacing, generator=generator
+            )
+        first = self._ask(
+            self.fields.get("coarse", self.fields.get("proposal", self.field)), rays, depths, edges, background
+        )
+        if not self.fine_samples:
+            return (first,)
+        weights = first.weights.detach()
+        if self.cones or "proposal" in self.fields:
+            depths, edges = self._intervals(edges, weights, jitter, generator)
+        else:
+            depths, edges = union_depths(
+                depths, edges, weights, self.fine_samples, jitter=jitter, generator=generator, backend=self.backend
+            )
+        return first, self._ask(self.field, rays, depths, edges, background)
+
+    def _ask(self, field: Field, rays: Rays, depths: Tensor, edges: Tensor, background: Tensor | None) -> Rendered:
+        return render_samples(
+            field,
+            rays,
+            depths,
+            edges,
+            cones=self.cones,
+            contraction=self.contraction,
+            background=background,
+            backend=self.backend,
+        )
+
+    def _intervals(
+        self, edges: Tensor, weights: Tensor, jitter: bool, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """New intervals where the first pass found something, and a sample in each."""
+        r, count = len(edges), self.fine_samples
+        uniforms = strata_uniforms(r, count + 1, edges, jitter, generator)
+        edges = resample(blurred_weights(weights), edges, count + 1, uniforms=uniforms, backend=self.backend)
+        if self.cones or not jitter:
+            return (edges[:, 1:] + edges[:, :-1]) / 2, edges
+        device = edges.device if generator is None else generator.device
+        inside = torch.rand(r, count, device=device, dtype=edges.dtype, generator=generator).to(edges.device)
+        return torch.lerp(edges[:, :-1], edges[:, 1:], inside), edges
+
+    def loss(self, passes: tuple[Rendered | Marched, ...], target: Tensor) -> Tensor:
+        """What training minimises: the mean squared error of every pass's colours (NeRF, equation 6).
+
+        The first pass of a field that is asked twice counts a tenth (mip-NeRF, section 3.2); a proposal is measured by
+        `interlevel_loss` instead.
+
+        Args:
+            passes: what :meth:`render` returned.
+            target: [r, 3].
+        """
+        loss = (passes[-1].colour - target).square().mean()
+        if len(passes) == 1:
+            return loss
+        first, last = passes
+        if "proposal" in self.fields:
+            assert isinstance(first, Rendered) and isinstance(last, Rendered)
+            return loss + interlevel_loss(last.edges, last.weights, first.edges, first.weights)
+        share = 1.0 if "coarse" in self.fields else COARSE_SHARE
+        return loss + share * (first.colour - target).square().mean()
+
+    @torch.no_grad()
+    def image(
+        self,
+        cameras: Cameras,
+        index: int,
+        *,
+        near: float,
+        far: float,
+        box: Tensor | None = None,
+        background: Tensor | None = None,
+        heaviest: bool = True,
+        chunk: int | None = None,
+    ) -> RenderedImage:
+        """One camera's whole image, without gradients and without randomness; see `render_image`."""
+        grid = self.occupancy
+        if chunk is None:
+            chunk = 4096 if grid is None else 32_768
+        if chunk < 1:
+            raise ValueError(f"render_image: chunk must be >= 1, got {chunk}")
+        rays = cameras.image_rays(index, cones=self.cones)
+        first, last, hit = intersect_box(rays.origins, rays.directions, box, near, far)
+        colour = torch.zeros_like(rays.origins)
+        colour = colour if background is None else background.to(colour).repeat(len(rays), 1)
+        opacity, depth = torch.zeros_like(first), torch.full_like(first, far)
+        places = rays.origins + far * rays.directions
+        places = places if self.contraction is None else self.contraction.points(places)
+        for rows in hit.nonzero()[:, 0].split(chunk):
+            ends = rays[rows], first[rows], last[rows]
+            if grid is not None:
+                seen = render_until_opaque(
+                    self.field,
+                    *ends,
+                    grid,
+                    samples=self.samples,
+                    background=background,
+                    spacing=self.spacing,
+                    heaviest=heaviest,
+                    backend=self.backend,
+                )
+                colour[rows], opacity[rows], depth[rows], places[rows] = seen
+                continue
+            part = self.render(*ends, background=background)[-1]
+            colour[rows] = part.colour.to(colour.dtype)
+            opacity[rows] = part.opacity.to(opacity.dtype)
+            depth[rows] = part.depth.to(depth.dtype)
+            if heaviest:
+                top = part.weights.argmax(-1)
+                places[rows] = part.positions[torch.arange(len(rows), device=rows.device), top]
+        size = (cameras.height, cameras.width)
+        return RenderedImage(
+            colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3)
+        )
+
+
+def render_image(
+    field: Field,
+    cameras: Cameras,
+    index: int,
+    *,
+    near: float,
+    far: float,
+    box: Tensor | None = None,
+    samples: int,
+    background: Tensor | None = None,
+    spacing: str = "linear",
+    occupancy: OccupancyGrid | None = None,
+    heaviest: bool = True,
+    chunk: int | None = None,
+    backend: str = "auto",
+) -> RenderedImage:
+    """One camera's whole image, without gradients and without randomness.
+
+    Args:
+        field: as for `render_rays`.
+        cameras: on the field's device.
+        index: the camera.
+        near: nearest distance of interest.
+        far: farthest.
+        box: [2, 3] outside of which nothing is; rays that miss it show the background without asking the field.
+        samples: s, per ray, inside the box.
+        background: [3], None is black.
+        spacing: of the strata.
+        occupancy: which cells of the box are empty; the field is asked about the others alone, up to where a ray is
+            opaque. None asks about every sample.
+        heaviest: whether to look for each ray's heaviest sample; without it the result has every ray's far end instead.
+        chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples of
+            a ray, 32,768.
+        backend: of the ops.
+    """
+    renderer = Renderer({"field": field}, samples=samples, spacing=spacing, occupancy=occupancy, backend=backend)
+    return renderer.image(
+        cameras, index, near=near, far=far, box=box, background=background, heaviest=heaviest, chunk=chunk
+    )
