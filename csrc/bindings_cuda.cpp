@@ -11,7 +11,7 @@
 
 #include "bindings_composite.h"
 #include "bindings_mlp_table.h"
-#include "grouped_mlp_cuda.h"
+#include "grouped_mlp_cuda_layers.h"
 #include "launchers.h"
 
 namespace py = pybind11;
@@ -88,18 +88,19 @@ void resample_cuda(Address weights, Address edges, Address uniforms, Address dep
 
 // precision: a number of MlpPrecision; the plan is made for the device that is current.
 const char* plan_of(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k, bool backward,
-                    voronerf::MlpCudaPlan& plan) {
-  return voronerf::mlp_cuda_plan(mlp_arguments::read_table(flat), static_cast<voronerf::MlpPrecision>(precision), n, k,
-                                 backward, voronerf::mlp_cuda_device(), plan);
+                    voronerf::MlpCudaChoice& choice) {
+  return voronerf::mlp_cuda_choose(mlp_arguments::read_table(flat), static_cast<voronerf::MlpPrecision>(precision), n,
+                                   k, backward, voronerf::mlp_cuda_device(), choice);
 }
 
 // Bytes of workspace, or the rule that a table breaks for which there is no plan.
 py::object grouped_mlp_workspace_cuda(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k,
                                       bool backward, bool parameters, int device) {
   const voronerf::CudaDevice current(device);
-  voronerf::MlpCudaPlan plan;
-  if (const char* fault = plan_of(flat, precision, n, k, backward, plan)) return py::str(fault);
-  return py::int_(voronerf::mlp_cuda_workspace(plan, k, parameters).bytes);
+  voronerf::MlpCudaChoice choice;
+  if (const char* fault = plan_of(flat, precision, n, k, backward, choice)) return py::str(fault);
+  return py::int_(choice.by_layers ? voronerf::mlp_layers_workspace(choice.layers, k, parameters).bytes
+                                   : voronerf::mlp_cuda_workspace(choice.fused, k, parameters).bytes);
 }
 
 voronerf::MlpCudaData data_of(const voronerf::MlpInputs& in) {
@@ -112,6 +113,11 @@ voronerf::MlpCudaData data_of(const voronerf::MlpInputs& in) {
   data.n = in.n;
   data.k = in.k;
   return data;
+}
+
+// Of any number of layers.
+voronerf::MlpLayersParameters layers_of(const Addresses& weights, const Addresses& biases) {
+  return {mlp_arguments::pointers<const float>(weights), mlp_arguments::pointers<const float>(biases)};
 }
 
 voronerf::MlpCudaParameters parameters_of(const Addresses& weights, const Addresses& biases) {
@@ -129,11 +135,14 @@ void grouped_mlp_cuda(const std::vector<int64_t>& flat, const Addresses& argumen
   const voronerf::CudaDevice current(device);
   voronerf::MlpCudaData data = data_of(mlp_arguments::read_inputs(arguments, {}, {}));
   data.out = at<float>(out);
-  voronerf::MlpCudaPlan plan;
-  const char* fault = plan_of(flat, precision, data.n, data.k, false, plan);
+  voronerf::MlpCudaChoice choice;
+  const char* fault = plan_of(flat, precision, data.n, data.k, false, choice);
   VN_CHECK(fault == nullptr, fault);
-  voronerf::grouped_mlp_cuda(plan, data, parameters_of(weights, biases), at<unsigned char>(workspace),
-                             at<void>(stream));
+  auto* memory = at<unsigned char>(workspace);
+  if (choice.by_layers) {
+    return voronerf::mlp_layers_cuda(choice.layers, data, layers_of(weights, biases), memory, at<void>(stream));
+  }
+  voronerf::grouped_mlp_cuda(choice.fused, data, parameters_of(weights, biases), memory, at<void>(stream));
 }
 
 // As on the CPU, except that gradients of directions are one row a sample.
@@ -146,17 +155,23 @@ void grouped_mlp_backward_cuda(const std::vector<int64_t>& flat, const Addresses
   data.grad_out = at<const float>(grad_out);
   data.grad_positions = at<float>(grad_positions);
   data.grad_directions = at<float>(grad_directions);
-  voronerf::MlpCudaPlan plan;
-  const char* fault = plan_of(flat, precision, data.n, data.k, true, plan);
+  voronerf::MlpCudaChoice choice;
+  const char* fault = plan_of(flat, precision, data.n, data.k, true, choice);
   VN_CHECK(fault == nullptr, fault);
+  auto* memory = at<unsigned char>(workspace);
+  if (choice.by_layers) {
+    const voronerf::MlpLayersGradients results = {mlp_arguments::pointers<float>(grad_weights),
+                                                  mlp_arguments::pointers<float>(grad_biases)};
+    return voronerf::mlp_layers_backward_cuda(choice.layers, data, layers_of(weights, biases),
+                                              grad_weights.empty() ? nullptr : &results, memory, at<void>(stream));
+  }
   voronerf::MlpCudaParameterGradients gradients{};
-  for (size_t l = 0; l < grad_weights.size(); ++l) {
+  for (size_t l = 0; l < grad_weights.size() && l < voronerf::kMlpCudaLayers; ++l) {
     gradients.weights[l] = at<float>(grad_weights[l]);
     gradients.biases[l] = at<float>(grad_biases[l]);
   }
-  voronerf::grouped_mlp_backward_cuda(plan, data, parameters_of(weights, biases),
-                                      grad_weights.empty() ? nullptr : &gradients, at<unsigned char>(workspace),
-                                      at<void>(stream));
+  voronerf::grouped_mlp_backward_cuda(choice.fused, data, parameters_of(weights, biases),
+                                      grad_weights.empty() ? nullptr : &gradients, memory, at<void>(stream));
 }
 
 }  // namespace

@@ -112,6 +112,39 @@ __device__ __forceinline__ void load_matrices(uint32_t (&out)[4], const void* ro
 #endif
 }
 
+// Copies 16 bytes, aligned, from global to shared memory, or clears them there; complete, for this thread, once
+// copy_wait() has waited for its group, and for others after a barrier. Before sm_80 it is complete at once.
+__device__ __forceinline__ void copy_async(void* to, const void* from, bool valid) {
+#ifdef VN_EMULATE
+  emulated_copy_async(to, from, valid);
+#elif __CUDA_ARCH__ >= 800
+  const uint32_t address = static_cast<uint32_t>(__cvta_generic_to_shared(to));
+  const int bytes = valid ? 16 : 0;
+  asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" ::"r"(address), "l"(from), "r"(bytes) : "memory");
+#else
+  *static_cast<float4*>(to) = valid ? *static_cast<const float4*>(from) : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+#endif
+}
+
+// Closes a group of copies.
+__device__ __forceinline__ void copy_commit() {
+#ifdef VN_EMULATE
+  emulated_copy_commit();
+#elif __CUDA_ARCH__ >= 800
+  asm volatile("cp.async.commit_group;" ::: "memory");
+#endif
+}
+
+// Waits until at most kPending groups, the last ones, are under way.
+template <int kPending>
+__device__ __forceinline__ void copy_wait() {
+#ifdef VN_EMULATE
+  emulated_copy_wait(kPending);
+#elif __CUDA_ARCH__ >= 800
+  asm volatile("cp.async.wait_group %0;" ::"n"(kPending) : "memory");
+#endif
+}
+
 // d [16][8] += a [16][16] b [16][8] in float32; fragments as in the PTX manual. Before sm_80 float16 alone, in two
 // steps.
 template <bool kBfloat16>

@@ -42,6 +42,7 @@ void grouped_mlp_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const 
 void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
                       void* stream);
 void mlp_cuda_zero_strays(const MlpCudaData& data, int width, float* rows, void* stream);
+void mlp_cuda_clear_gradient(const MlpCudaData& data, bool used, int width, float* gradient, void* stream);
 void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameterGradients& gradients,
                      void* stream);
 

@@ -9,22 +9,6 @@ namespace voronerf {
 
 namespace {
 
-// What a gradient is multiplied by at a layer's value y (of a sine: at its kept derivative).
-__device__ float mlp_times_slope(int activation, float gradient, float y) {
-  switch (static_cast<Activation>(activation)) {
-    case Activation::relu:
-      return y > 0.0f ? gradient : 0.0f;  // a choice: an infinite gradient stops at what is inactive
-    case Activation::softplus:
-      return gradient * -expm1f(-y);
-    case Activation::sigmoid:
-      return gradient * (y * (1.0f - y));
-    case Activation::sine:
-      return gradient * y;
-    default:
-      return gradient;
-  }
-}
-
 // sums [rows][columns] of the gradient of a source, columns from `chunk` on: what comes back from all layers that read
 // it.
 template <typename Products, int kRowTiles>
@@ -141,24 +125,8 @@ __device__ void mlp_encode_backward(const MlpCudaInput& input, const typename Pr
   for (int i = lane; i < rows * features; i += 32) {
     const int row = i / features, feature = i - row * features;
     if (first + row >= end) continue;
-    const auto* gradient = region + input.value + row * input.stride + feature;
-    const float* raw = raw_of(first + row);
-    float* result = results + mlp_source_row(data, first + row) * input.raw;
-    float sum = 0.0f, of_variance = 0.0f;
-    if (!input.integrated) {
-      sum = Products::load(gradient);
-      gradient += features;
-    }
-    for (int octave = 0; octave < input.octaves; ++octave, gradient += 2 * features) {
-      const float scale = octave_scale(octave), angle = raw[feature] * scale;
-      const float sine = sine_of_octave(angle, 0.0f), cosine = sine_of_octave(angle, 0.5f);
-      const float of_sine = Products::load(gradient), of_cosine = Products::load(gradient + features);
-      const float blur = input.integrated ? octave_blur(scale, raw[features + feature]) : 1.0f;
-      sum += scale * blur * (of_sine * cosine - of_cosine * sine);
-      of_variance += -0.5f * scale * scale * blur * (of_sine * sine + of_cosine * cosine);
-    }
-    result[feature] = sum;
-    if (input.integrated) result[features + feature] = of_variance;
+    mlp_encode_gradient<Products>(input, region + input.value + row * input.stride, raw_of(first + row), feature,
+                                  results + mlp_source_row(data, first + row) * input.raw);
   }
 }
 
@@ -269,13 +237,6 @@ void launch(const MlpCudaPlan& plan, const MlpCudaData& data, void* stream) {
   }
 }
 
-// Rows of no cell, and inputs that nothing reads, have no gradient.
-void clear(const MlpCudaData& data, const MlpCudaInput& input, float* gradient, void* stream) {
-  if (gradient == nullptr) return;
-  if (input.used) return mlp_cuda_zero_strays(data, input.raw, gradient, stream);
-  VN_CUDA_CHECK(cudaMemsetAsync(gradient, 0, sizeof(float) * data.n * input.raw, static_cast<cudaStream_t>(stream)));
-}
-
 }  // namespace
 
 void grouped_mlp_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
@@ -285,8 +246,8 @@ void grouped_mlp_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const 
   data.first_task = reinterpret_cast<int32_t*>(workspace + parts.first_task);
   data.partials = gradients == nullptr ? nullptr : reinterpret_cast<float*>(workspace + parts.partials);
   mlp_cuda_prepare(plan, data, parameters, stream);
-  clear(data, plan.positions, data.grad_positions, stream);
-  clear(data, plan.directions, data.grad_directions, stream);
+  mlp_cuda_clear_gradient(data, plan.positions.used, plan.positions.raw, data.grad_positions, stream);
+  mlp_cuda_clear_gradient(data, plan.directions.used, plan.directions.raw, data.grad_directions, stream);
   if (data.n > 0) {
     switch (plan.precision) {
       case MlpPrecision::bfloat16:

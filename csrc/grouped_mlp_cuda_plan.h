@@ -74,6 +74,7 @@ struct MlpCudaDevice {
   int capability;    // 86 for 8.6
   int shared_bytes;  // a block may ask for
   int multiprocessors;
+  int64_t cache_bytes;  // of the last level
 };
 
 // Null where the table fits, else the rule that it breaks. The plan of a table that does not fit is undefined.

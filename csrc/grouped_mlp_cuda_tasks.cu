@@ -2,6 +2,7 @@
 // want them in shared memory, so that loading them there is one straight copy; the tasks of all cells are numbered, so
 // that a block finds its rows without the host having read the offsets; rows of no cell are cleared; and the partial
 // weight gradients of a cell's tasks are summed in their order, which makes them the same every time.
+#include "grouped_mlp_cuda_tasks.h"
 #include "grouped_mlp_cuda_tile.h"
 
 namespace voronerf {
@@ -9,7 +10,6 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kScanThreads = 1024;
 
 // A block a cell and layer: grid (k, layers).
 template <typename Products>
@@ -43,32 +43,10 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// first_task [k+1] by one block: the running sum of the cells' numbers of tasks.
+// One block.
 __global__ void __launch_bounds__(kScanThreads) mlp_tasks_kernel(const MlpCudaPlan plan, const MlpCudaData data) {
-  VN_SHARED(sums, int32_t[32]);
-  const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-  int32_t carry = 0;
-  for (int64_t start = 0; start < data.k; start += kScanThreads) {
-    const int64_t cell = start + threadIdx.x;
-    const int32_t tasks = cell < data.k ? static_cast<int32_t>(ceil_div(mlp_cell_rows(data, cell), plan.task_rows)) : 0;
-    int32_t running = tasks;
-    for (int step = 1; step < 32; step *= 2) {
-      const int32_t other = __shfl_up_sync(kAllLanes, running, step);
-      if (lane >= step) running += other;
-    }
-    if (lane == 31) sums[warp] = running;
-    __syncthreads();
-    int32_t before = carry, total = 0;
-    for (int i = 0; i < 32; ++i) {
-      if (i < warp) before += sums[i];
-      total += sums[i];
-    }
-    if (cell < data.k) data.first_task[cell] = before + running - tasks;
-    carry += total;
-    __syncthreads();  // the sums are read by all
-  }
-  // Cells that overlap, which offsets that fall make, would have more tasks than the grid has blocks.
-  if (threadIdx.x == 0) data.first_task[data.k] = carry < plan.tasks ? carry : static_cast<int32_t>(plan.tasks);
+  number_tasks(data.k, plan.tasks, data.first_task,
+               [&](int64_t cell) { return static_cast<int32_t>(ceil_div(mlp_cell_rows(data, cell), plan.task_rows)); });
 }
 
 __global__ void __launch_bounds__(kThreads) mlp_strays_kernel(const MlpCudaData data, int width, float* rows) {
@@ -117,13 +95,16 @@ void pack(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParamet
 
 MlpCudaDevice mlp_cuda_device() {
   int device = 0, major = 0, minor = 0;
+  int cache = 0;
   MlpCudaDevice found{};
   VN_CUDA_CHECK(cudaGetDevice(&device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&minor, cudaDevAttrComputeCapabilityMinor, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.multiprocessors, cudaDevAttrMultiProcessorCount, device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&cache, cudaDevAttrL2CacheSize, device));
   found.capability = 10 * major + minor;
+  found.cache_bytes = cache;
   return found;
 }
 
@@ -147,6 +128,13 @@ void mlp_cuda_zero_strays(const MlpCudaData& data, int width, float* rows, void*
   const int64_t blocks = ceil_div<int64_t>(data.n, kThreads);
   VN_LAUNCH(mlp_strays_kernel, static_cast<unsigned>(blocks < 1024 ? blocks : 1024), kThreads, 0, stream, data, width,
             rows);
+}
+
+// Rows of no cell, and inputs that nothing reads, have no gradient.
+void mlp_cuda_clear_gradient(const MlpCudaData& data, bool used, int width, float* gradient, void* stream) {
+  if (gradient == nullptr || data.n == 0) return;
+  if (used) return mlp_cuda_zero_strays(data, width, gradient, stream);
+  VN_CUDA_CHECK(cudaMemsetAsync(gradient, 0, sizeof(float) * data.n * width, static_cast<cudaStream_t>(stream)));
 }
 
 void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameterGradients& gradients,

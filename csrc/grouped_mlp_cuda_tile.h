@@ -248,6 +248,45 @@ __device__ inline float mlp_activate(int activation, float x) {
   }
 }
 
+// What a gradient is multiplied by at a layer's value y (of a sine: at its kept derivative).
+__device__ inline float mlp_times_slope(int activation, float gradient, float y) {
+  switch (static_cast<Activation>(activation)) {
+    case Activation::relu:
+      return y > 0.0f ? gradient : 0.0f;  // a choice: an infinite gradient stops at what is inactive
+    case Activation::softplus:
+      return gradient * -expm1f(-y);
+    case Activation::sigmoid:
+      return gradient * (y * (1.0f - y));
+    case Activation::sine:
+      return gradient * y;
+    default:
+      return gradient;
+  }
+}
+
+// Gradient of one raw feature of a row, and of its variance, from the row's encoding.
+template <typename Products>
+__device__ void mlp_encode_gradient(const MlpCudaInput& input, const typename Products::Element* gradient,
+                                    const float* raw, int feature, float* result) {
+  const int features = input.integrated ? input.raw / 2 : input.raw;
+  gradient += feature;
+  float sum = 0.0f, of_variance = 0.0f;
+  if (!input.integrated) {
+    sum = Products::load(gradient);
+    gradient += features;
+  }
+  for (int octave = 0; octave < input.octaves; ++octave, gradient += 2 * features) {
+    const float scale = octave_scale(octave), angle = raw[feature] * scale;
+    const float sine = sine_of_octave(angle, 0.0f), cosine = sine_of_octave(angle, 0.5f);
+    const float of_sine = Products::load(gradient), of_cosine = Products::load(gradient + features);
+    const float blur = input.integrated ? octave_blur(scale, raw[features + feature]) : 1.0f;
+    sum += scale * blur * (of_sine * cosine - of_cosine * sine);
+    of_variance += -0.5f * scale * scale * blur * (of_sine * sine + of_cosine * cosine);
+  }
+  result[feature] = sum;
+  if (input.integrated) result[features + feature] = of_variance;
+}
+
 // A source of a layer in the warp's region.
 struct MlpPlace {
   int value, stride;

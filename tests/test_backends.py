@@ -181,10 +181,10 @@ def test_require_turns_skips_into_failures(pytester: pytest.Pytester, monkeypatc
     unknown.stderr.fnmatch_lines("*--require takes native,cuda,warp, got metal*")
 
 
-def test_auto_passes_over_what_runs_by_name_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_runs_networks_natively_on_every_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backends, "missing", lambda backend, device: None)
     choose = backends._choose_once.__wrapped__
-    for op in ("grouped_mlp", "grouped_linear"):
-        assert choose(op, "auto", "cuda", None, torch.float32) == "reference"
-        assert choose(op, "native", "cuda", None, torch.float32) == "native"
-        assert choose(op, "auto", "cpu", None, torch.float32) == "native"
+    for op in ("grouped_mlp", "grouped_linear", "routed_mlp"):
+        for device in ("cpu", "cuda"):
+            assert choose(op, "auto", device, None, torch.float32) == "native"
+        assert choose(op, "auto", "cuda", None, torch.float64) == "reference"

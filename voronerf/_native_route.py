@@ -2,8 +2,9 @@
 
 n samples, r rays, k cells, m centres of all diagrams together, g diagrams. The rows of a tile are gathered from where
 the samples lie and its results written to where they belong, so that nothing but the order (int32) has n rows beside
-the op's own inputs and outputs. The backward op is that of ``grouped_mlp``, given the order. Shapes and dtypes have
-been validated by ``voronerf.ops``.
+the op's own inputs and outputs. On CUDA these are launches one after another on the current stream, and nothing is
+read on the host. The backward op is that of ``grouped_mlp``, given the order. Shapes and dtypes have been validated by
+``voronerf.ops``.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def routed_mlp(
     return out.to(given.dtype), found if cells is None else cells
 
 
-@torch.library.custom_op("voronerf::routed_mlp_native", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::routed_mlp_native", mutates_args=(), device_types=("cpu", "cuda"))
 def _forward(
     positions: Tensor,
     weights: Sequence[Tensor],
@@ -102,12 +103,20 @@ def _locate(
     """Fills ``cells``: the centres of a flat diagram, or the leaves of a tree."""
     c, threads = _native._C, torch.get_num_threads()
     coords, centres, centre_weights = coords.contiguous(), centres.contiguous(), _native._contiguous(centre_weights)
-    n, m = coords.shape[0], centres.shape[0]
+    n, m, cuda = coords.shape[0], centres.shape[0], _native.on_cuda(coords)
     if child_offsets is None or child is None:
         arguments = _native._addresses(coords, centres, centre_weights, cells)
-        _native._entry("nearest_centre", coords.dtype)(*arguments, n, m, _native._ISA, threads)
+        if cuda:
+            _native._entry("nearest_centre_cuda", coords.dtype)(*arguments, n, m, *_native.stream(coords))
+        else:
+            _native._entry("nearest_centre", coords.dtype)(*arguments, n, m, _native._ISA, threads)
         return
     child_offsets, child = child_offsets.contiguous(), child.contiguous()
+    if cuda:
+        arguments = _native._addresses(coords, centres, centre_weights, child_offsets, child, cells)
+        g = child_offsets.shape[0] - 1
+        _native._entry("locate_cell_cuda", coords.dtype)(*arguments, n, m, g, depth, *_native.stream(coords))
+        return
     fault = c.locate_cell_fault(child_offsets.data_ptr(), child.data_ptr(), child_offsets.shape[0] - 1, m)
     if fault is not None:
         raise ValueError(f"routed_mlp: {fault}")
@@ -121,7 +130,9 @@ def _sort(cells: Tensor, order: Tensor, offsets: Tensor) -> None:
     n, k = cells.shape[0], offsets.shape[0] - 1
     workspace = cells.new_empty(_native._C.cell_sort_workspace(n, k))
     arguments = _native._addresses(cells, order, offsets, workspace)
-    if not _native._C.cell_sort(*arguments, n, k, torch.get_num_threads()):
+    if _native.on_cuda(cells):
+        _native._C.cell_sort_cuda(*arguments, n, k, *_native.stream(cells))
+    elif not _native._C.cell_sort(*arguments, n, k, torch.get_num_threads()):
         low, high = (int(bound) for bound in cells.aminmax())
         raise ValueError(f"routed_mlp: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
 

@@ -58,13 +58,11 @@ class Implementation:
         target: ``"module:function"``, imported on first use.
         devices: device types it runs on; empty means any.
         dtypes: dtypes of the op's first tensor it takes; empty means any.
-        by_name: device types on which it runs when it is asked for by name, but is not what "auto" takes.
     """
 
     target: str
     devices: tuple[str, ...] = ()
     dtypes: tuple[torch.dtype, ...] = ()
-    by_name: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,14 +107,9 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ),
     ("locate_cell", "native"): Implementation("voronerf._native:locate_cell", ("cpu", "cuda"), _COORDINATES),
     ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
-    # On CUDA they have no kernel for layers of more than 256 features, which "auto" must take as well.
-    ("grouped_linear", "native"): Implementation(
-        "voronerf._native_linear:grouped_linear", ("cpu", "cuda"), _FLOATS, by_name=("cuda",)
-    ),
-    ("grouped_mlp", "native"): Implementation(
-        "voronerf._native_mlp:grouped_mlp", ("cpu", "cuda"), _FLOATS, by_name=("cuda",)
-    ),
-    ("routed_mlp", "native"): Implementation("voronerf._native_route:routed_mlp", ("cpu",), _FLOATS),
+    ("grouped_linear", "native"): Implementation("voronerf._native_linear:grouped_linear", ("cpu", "cuda"), _FLOATS),
+    ("grouped_mlp", "native"): Implementation("voronerf._native_mlp:grouped_mlp", ("cpu", "cuda"), _FLOATS),
+    ("routed_mlp", "native"): Implementation("voronerf._native_route:routed_mlp", ("cpu", "cuda"), _FLOATS),
     ("composite", "native"): Implementation("voronerf._native_composite:composite", ("cpu", "cuda"), _FLOATS),
     ("frequency_encode", "native"): Implementation(
         "voronerf._native_sampling:frequency_encode", ("cpu", "cuda"), _FLOATS
@@ -258,7 +251,7 @@ def _choose_once(op: str, backend: str, device_type: str, index: int | None, dty
     if backend == "auto":
         order = ORDER.get(device_type, ("reference",))
         able = (name for name in order if why_not(op, name, device, dtype) is None)
-        backend = next(name for name in able if device_type not in _REGISTRY[op, name].by_name)
+        backend = next(able)
     else:
         reason = why_not(op, backend, device, dtype)
         if reason is not None:

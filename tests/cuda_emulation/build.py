@@ -22,7 +22,7 @@ SANITIZERS = {
 }
 PLAIN = {"emulation.cpp", "module.cpp", "bindings_cuda.cpp"}
 """Files with nothing to watch."""
-SHARED = ("grouped_mlp_cuda_plan.cpp",)
+SHARED = ("grouped_mlp_cuda_plan.cpp", "grouped_mlp_cuda_layers_plan.cpp")
 """What the launchers need of the C++ beside them."""
 
 

@@ -93,6 +93,7 @@ struct Fiber {
   void* fake_stack = nullptr;
   State state = State::ready;
   unsigned index = 0;
+  std::vector<std::vector<Copy>> copies;
 };
 
 struct Warp {
@@ -258,6 +259,10 @@ int lane() {
   return static_cast<int>(launching->current->index % 32);
 }
 
+std::vector<std::vector<Copy>>& copies() {
+  return launching->current->copies;
+}
+
 void require_all(unsigned mask) {
   if (mask != 0xffffffffu) fail("the emulation has no partial warps");
 }
@@ -327,7 +332,8 @@ void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t 
   if (grid.y > 65535 || grid.z > 65535 || grid.x > 0x7fffffffu) fail("a grid that is too large");
   if (threads == 0 || threads > 1024) fail("a block of " + std::to_string(threads) + " threads");
   if (threads % 32 != 0) fail("a block that is not of whole warps");
-  if (dynamic_bytes > static_cast<size_t>(settings().shared)) fail("more shared memory than a block may have");
+  // 48 KiB are there without being asked for, on every device.
+  if (dynamic_bytes > std::max<size_t>(kStaticShared, settings().shared)) fail("more shared memory than a block may have");
   Launch it;
   it.run = run;
   it.context = context;

@@ -12,6 +12,7 @@
 #include <cstring>
 #include <limits>
 #include <type_traits>
+#include <vector>
 
 #define __global__
 #define __device__
@@ -45,6 +46,7 @@ enum cudaFuncAttribute { cudaFuncAttributeMaxDynamicSharedMemorySize };
 enum cudaDeviceAttr {
   cudaDevAttrMaxSharedMemoryPerBlockOptin,
   cudaDevAttrMultiProcessorCount,
+  cudaDevAttrL2CacheSize,
   cudaDevAttrComputeCapabilityMajor,
   cudaDevAttrComputeCapabilityMinor,
 };
@@ -113,6 +115,14 @@ T from_lane(const unsigned char* slots, int lane) {
   return value;
 }
 
+// Asynchronous copies of the thread that runs, in groups: those of the last one are not closed yet.
+struct Copy {
+  void* to;
+  const void* from;
+  bool valid;
+};
+std::vector<std::vector<Copy>>& copies();
+
 void require_all(unsigned mask);
 [[noreturn]] void misaligned(const char* operation);
 
@@ -126,6 +136,9 @@ inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, 
       break;
     case cudaDevAttrMultiProcessorCount:
       *value = settings.multiprocessors;
+      break;
+    case cudaDevAttrL2CacheSize:
+      *value = 64 * 1024;  // little, so that a batch is cut
       break;
     case cudaDevAttrComputeCapabilityMajor:
       *value = settings.capability / 10;
@@ -274,6 +287,32 @@ void emulated_mma(const char* name, float (&d)[4], const uint32_t (&a)[4], const
       sum += static_cast<double>(value(left.a[half + 2 * side], part)) * value(right.b[side], part);
     }
     d[i] = static_cast<float>(sum);
+  }
+}
+
+// Copies are done when they are waited for, as late as they may be on a GPU.
+inline void emulated_copy_async(void* to, const void* from, bool valid) {
+  if (reinterpret_cast<uintptr_t>(to) % 16 != 0 || reinterpret_cast<uintptr_t>(from) % 16 != 0) {
+    vn_emulation::misaligned("cp.async");
+  }
+  auto& groups = vn_emulation::copies();
+  if (groups.empty()) groups.emplace_back();
+  groups.back().push_back({to, from, valid});
+}
+inline void emulated_copy_commit() {
+  auto& groups = vn_emulation::copies();
+  if (groups.empty()) groups.emplace_back();
+  groups.emplace_back();
+}
+inline void emulated_copy_wait(size_t pending) {
+  auto& groups = vn_emulation::copies();
+  while (groups.size() > pending + 1) {
+    for (const vn_emulation::Copy& copy : groups.front()) {
+      for (int word = 0; word < 4; ++word) {
+        static_cast<uint32_t*>(copy.to)[word] = copy.valid ? static_cast<const uint32_t*>(copy.from)[word] : 0;
+      }
+    }
+    groups.erase(groups.begin());
   }
 }
 

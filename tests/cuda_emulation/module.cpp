@@ -5,7 +5,7 @@
 #include "bindings_cuda.h"
 #include "bindings_mlp_table.h"
 #include "emulation.h"
-#include "grouped_mlp_cuda.h"
+#include "grouped_mlp_cuda_layers.h"
 
 namespace py = pybind11;
 
@@ -18,19 +18,33 @@ PYBIND11_MODULE(voronerf_emulation, module) {
                planted(reinterpret_cast<const float*>(values), reinterpret_cast<float*>(out),
                        reinterpret_cast<int*>(counter), blocks, threads, bug);
              });
-  // Rows of a task, tasks, bytes of shared memory.
+  // What a call's plan says.
   module.def(
       "grouped_mlp_plan", [](const std::vector<int64_t>& table, int precision, int64_t n, int64_t k, bool backward) {
-        voronerf::MlpCudaPlan plan;
+        voronerf::MlpCudaChoice choice;
         const char* fault =
-            voronerf::mlp_cuda_plan(mlp_arguments::read_table(table), static_cast<voronerf::MlpPrecision>(precision), n,
-                                    k, backward, voronerf::mlp_cuda_device(), plan);
+            voronerf::mlp_cuda_choose(mlp_arguments::read_table(table), static_cast<voronerf::MlpPrecision>(precision),
+                                      n, k, backward, voronerf::mlp_cuda_device(), choice);
         VN_CHECK(fault == nullptr, fault);
-        return std::make_tuple(plan.task_rows, plan.tasks, plan.shared_bytes);
+        py::dict plan;
+        plan["by_layers"] = choice.by_layers;
+        plan["task_rows"] = choice.fused.task_rows;
+        plan["tasks"] = choice.fused.tasks;
+        plan["shared_bytes"] = choice.fused.shared_bytes;
+        plan["block_rows"] = choice.fused.rows();
+        plan["resident"] = choice.fused.resident;
+        plan["slab"] = choice.layers.slab;
+        plan["slabs"] = choice.layers.slabs;
+        plan["tiles"] = choice.layers.tiles;
+        plan["splits"] = choice.layers.splits;
+        plan["bytes_of_row"] = choice.layers.columns * choice.layers.element;
+        plan["workspace"] = voronerf::mlp_layers_workspace(choice.layers, k, backward).bytes;
+        return plan;
       });
   module.def("seed", [](uint64_t seed) { vn_emulation::settings().seed = seed; });
   module.def("device", [](int capability, int shared_bytes) {
     vn_emulation::settings().capability = capability;
     vn_emulation::settings().shared = shared_bytes;
   });
+  module.def("multiprocessors", [](int count) { vn_emulation::settings().multiprocessors = count; });
 }

@@ -5,99 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from emulated import emulated, module
-from torch import Tensor
+from emulated_networks import ALLOWED, BRANCHED, GAUSSIANS, KIB, WIDE, case, check, run
 
 import voronerf
 from voronerf import _native_mlp
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-
-KIB = 1024
-# Relative error, in the Frobenius norm, of what is multiplied so.
-ALLOWED = {"float32": 3e-6, "tf32": 3e-3, "float16": 3e-3, "bfloat16": 2.5e-2}
-
-# Smooth, so that a rounding does not move a sample across a kink; every kind of source, and outputs in the middle.
-BRANCHED = MLP(
-    (
-        Layer((POSITIONS,), 24, "sine"),
-        Layer((0,), 33, "softplus"),
-        Layer((1, POSITIONS), 32, "sigmoid"),
-        Layer((2,), 1, "softplus"),
-        Layer((2, DIRECTIONS), 17, "softplus"),
-        Layer((0,), 5, "relu"),  # dead
-        Layer((4,), 3, "sigmoid"),
-    ),
-    (6, 3),
-    position_octaves=2,
-    direction_octaves=1,
-)
-WIDE = MLP((Layer((POSITIONS,), 130, "sine"), Layer((0, POSITIONS), 70, "sigmoid"), Layer((1,), 4)), (2,))
-GAUSSIANS = MLP((Layer((POSITIONS,), 16, "sigmoid"), Layer((0,), 2)), (1,), 3, position_encoding="integrated")
-
-
-def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.float32) -> dict:
-    """Arguments in float64, the values those of `dtype`."""
-    n, k = sum(counts), len(counts)
-    directions = torch.rand(4, 3) if layers.uses_directions else None
-    shapes = layers.weight_shapes(d, 3 if directions is not None else 0)
-    parts = {
-        "positions": torch.rand(n, d),
-        "weights": [torch.randn(k, o, i) / i**0.5 for o, i in shapes],
-        "biases": [torch.randn(k, o) / 4 if index % 3 != 1 else None for index, (o, _) in enumerate(shapes)],
-        "directions": directions,
-    }
-
-    def rounded(value):
-        if isinstance(value, list):
-            return [rounded(entry) for entry in value]
-        return None if value is None else value.to(dtype).double()
-
-    given = {name: rounded(value) for name, value in parts.items()}
-    given["offsets"] = torch.tensor([0, *counts]).cumsum(0).to(torch.int32)
-    given["direction_index"] = None if directions is None else torch.randint(0, 4, (n,), dtype=torch.int32)
-    return given
-
-
-def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str) -> list[Tensor]:
-    """Output and gradients of everything."""
-    leaves: list[Tensor] = []
-
-    def leaf(value):
-        if isinstance(value, list):
-            return [leaf(entry) for entry in value]
-        if value is None:
-            return None
-        leaves.append(value.to(dtype).requires_grad_())
-        return leaves[-1]
-
-    named = {name: leaf(given[name]) for name in ("positions", "weights", "biases", "directions")}
-    out = voronerf.grouped_mlp(
-        named["positions"],
-        given["offsets"],
-        named["weights"],
-        named["biases"],
-        layers=layers,
-        directions=named["directions"],
-        direction_index=given["direction_index"],
-        backend=backend,
-    )
-    gradient = torch.linspace(-1, 1, out.numel()).reshape(out.shape).sin().to(dtype)
-    return [out, *torch.autograd.grad(out, leaves, gradient, allow_unused=True, materialize_grads=True)]
-
-
-def check(layers: MLP, counts: list[int], d: int, precision: str) -> None:
-    dtype = torch.float32 if precision in ("float32", "tf32") else getattr(torch, precision)
-    given = case(layers, counts, d, dtype)
-    before = torch.backends.cuda.matmul.fp32_precision
-    try:
-        torch.backends.cuda.matmul.fp32_precision = "tf32" if precision == "tf32" else "ieee"
-        found = run(given, layers, dtype, "native")
-    finally:
-        torch.backends.cuda.matmul.fp32_precision = before
-    for part, exact in zip(found, run(given, layers, torch.float64, "reference")):
-        difference, scale = (part.double() - exact).norm().item(), exact.norm().item()
-        assert part.isfinite().all()
-        assert difference <= ALLOWED[precision] * max(scale, 1e-6), (list(part.shape), difference / max(scale, 1e-6))
-
+from voronerf.layers import MLP, POSITIONS, Layer
 
 @pytest.mark.parametrize("precision", ALLOWED)
 @pytest.mark.parametrize("shared", [227, 99, 64, 40])
@@ -166,14 +78,6 @@ def test_weight_gradients_are_the_same_in_every_order() -> None:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
 
 
-def test_what_does_not_fit_is_refused() -> None:
-    layers = MLP((Layer((POSITIONS,), 257), Layer((0,), 2)), (1,))
-    given = case(layers, [4], 3)
-    rule = r"grouped_mlp: a layer must have at most 256 features on CUDA; use backend='reference'"
-    with emulated(), pytest.raises(ValueError, match=rule):
-        run(given, layers, torch.float32, "native")
-
-
 @pytest.mark.parametrize("capability", [75, 80, 86, 90, 120])
 def test_workspaces_cover_any_offsets(capability: int) -> None:
     """There are at least as many tasks as the worst offsets make, whatever the sizes."""
@@ -185,7 +89,9 @@ def test_workspaces_cover_any_offsets(capability: int) -> None:
         for n, k in ((0, 1), (1, 1), (1000, 7), (4_000_000, 4096)):
             for backward in (False, True):
                 for precision in range(4):
-                    rows, tasks, bytes_shared = module().grouped_mlp_plan(table, precision, n, k, backward)
+                    plan = module().grouped_mlp_plan(table, precision, n, k, backward)
+                    assert not plan["by_layers"]
+                    rows, tasks, bytes_shared = plan["task_rows"], plan["tasks"], plan["shared_bytes"]
                     assert rows % 16 == 0 and 0 < bytes_shared <= shared
                     assert tasks >= sum(-(-part // rows) for part in (n // k,) * (k - 1) + (n - n // k * (k - 1),))
                     assert tasks >= (k if n >= k else n)

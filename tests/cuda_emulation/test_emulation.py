@@ -22,6 +22,7 @@ OPERATIONS = [
         "resample",
         "grouped_linear",
         "grouped_mlp",
+        "routed_mlp",
     )
 ]
 """Tests of the operations that have CUDA kernels."""

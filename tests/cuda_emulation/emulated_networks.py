@@ -1,0 +1,96 @@
+"""Networks for the tests of the CUDA kernels that run on the CPU, and what comes out of them against float64."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+import voronerf
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+
+KIB = 1024
+# Relative error, in the Frobenius norm, of what is multiplied so.
+ALLOWED = {"float32": 3e-6, "tf32": 3e-3, "float16": 3e-3, "bfloat16": 2.5e-2}
+
+# Smooth, so that a rounding does not move a sample across a kink; every kind of source, and outputs in the middle.
+BRANCHED = MLP(
+    (
+        Layer((POSITIONS,), 24, "sine"),
+        Layer((0,), 33, "softplus"),
+        Layer((1, POSITIONS), 32, "sigmoid"),
+        Layer((2,), 1, "softplus"),
+        Layer((2, DIRECTIONS), 17, "softplus"),
+        Layer((0,), 5, "relu"),  # dead
+        Layer((4,), 3, "sigmoid"),
+    ),
+    (6, 3),
+    position_octaves=2,
+    direction_octaves=1,
+)
+WIDE = MLP((Layer((POSITIONS,), 130, "sine"), Layer((0, POSITIONS), 70, "sigmoid"), Layer((1,), 4)), (2,))
+GAUSSIANS = MLP((Layer((POSITIONS,), 16, "sigmoid"), Layer((0,), 2)), (1,), 3, position_encoding="integrated")
+
+
+def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.float32) -> dict:
+    """Arguments in float64, the values those of `dtype`."""
+    n, k = sum(counts), len(counts)
+    directions = torch.rand(4, 3) if layers.uses_directions else None
+    shapes = layers.weight_shapes(d, 3 if directions is not None else 0)
+    parts = {
+        "positions": torch.rand(n, d),
+        "weights": [torch.randn(k, o, i) / i**0.5 for o, i in shapes],
+        "biases": [torch.randn(k, o) / 4 if index % 3 != 1 else None for index, (o, _) in enumerate(shapes)],
+        "directions": directions,
+    }
+
+    def rounded(value):
+        if isinstance(value, list):
+            return [rounded(entry) for entry in value]
+        return None if value is None else value.to(dtype).double()
+
+    given = {name: rounded(value) for name, value in parts.items()}
+    given["offsets"] = torch.tensor([0, *counts]).cumsum(0).to(torch.int32)
+    given["direction_index"] = None if directions is None else torch.randint(0, 4, (n,), dtype=torch.int32)
+    return given
+
+
+def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str) -> list[Tensor]:
+    """Output and gradients of everything."""
+    leaves: list[Tensor] = []
+
+    def leaf(value):
+        if isinstance(value, list):
+            return [leaf(entry) for entry in value]
+        if value is None:
+            return None
+        leaves.append(value.to(dtype).requires_grad_())
+        return leaves[-1]
+
+    named = {name: leaf(given[name]) for name in ("positions", "weights", "biases", "directions")}
+    out = voronerf.grouped_mlp(
+        named["positions"],
+        given["offsets"],
+        named["weights"],
+        named["biases"],
+        layers=layers,
+        directions=named["directions"],
+        direction_index=given["direction_index"],
+        backend=backend,
+    )
+    gradient = torch.linspace(-1, 1, out.numel()).reshape(out.shape).sin().to(dtype)
+    return [out, *torch.autograd.grad(out, leaves, gradient, allow_unused=True, materialize_grads=True)]
+
+
+def check(layers: MLP, counts: list[int], d: int, precision: str) -> None:
+    dtype = torch.float32 if precision in ("float32", "tf32") else getattr(torch, precision)
+    given = case(layers, counts, d, dtype)
+    before = torch.backends.cuda.matmul.fp32_precision
+    try:
+        torch.backends.cuda.matmul.fp32_precision = "tf32" if precision == "tf32" else "ieee"
+        found = run(given, layers, dtype, "native")
+    finally:
+        torch.backends.cuda.matmul.fp32_precision = before
+    for part, exact in zip(found, run(given, layers, torch.float64, "reference")):
+        difference, scale = (part.double() - exact).norm().item(), exact.norm().item()
+        assert part.isfinite().all()
+        assert difference <= ALLOWED[precision] * max(scale, 1e-6), (list(part.shape), difference / max(scale, 1e-6))
