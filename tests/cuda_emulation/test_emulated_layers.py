@@ -117,7 +117,10 @@ def test_which_way_a_network_goes() -> None:
     """What the issue measures is fused; a network of the published width is fused forward and goes by layers back."""
     with emulated():
         for layers in (nerf(64, 8), nerf(32, 2), nerf(128, 8)):
-            assert not plan(layers, 1 << 22, 16)["by_layers"] and not plan(layers, 1 << 22, 16, backward=False)["by_layers"]
+            assert (
+                not plan(layers, 1 << 22, 16)["by_layers"]
+                and not plan(layers, 1 << 22, 16, backward=False)["by_layers"]
+            )
         assert not plan(nerf(256, 8), 1 << 22, 16, backward=False)["by_layers"]
         assert plan(nerf(256, 8), 1 << 22, 16)["by_layers"]
         assert plan(nerf(512, 8), 1 << 22, 16, backward=False)["by_layers"]

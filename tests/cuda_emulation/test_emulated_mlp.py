@@ -11,6 +11,7 @@ import voronerf
 from voronerf import _native_mlp
 from voronerf.layers import MLP, POSITIONS, Layer
 
+
 @pytest.mark.parametrize("precision", ALLOWED)
 @pytest.mark.parametrize("shared", [227, 99, 64, 40])
 def test_branched_network(precision: str, shared: int) -> None:
