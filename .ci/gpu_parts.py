@@ -198,7 +198,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         ("composite", composite),
         ("resample", resample),
         *(
-            (f"grouped_mlp {name} {precision}", functools.partial(network, layers, [70, 0, 1, 150], d, precision))
+            (f"grouped_mlp {name} {precision}", functools.partial(network, layers, [70, 0, 1, 40], d, precision))
             for name, (layers, d) in networks.items()
             for precision in ALLOWED
         ),
@@ -282,6 +282,7 @@ def tests(out: Path) -> int:
 def roofs(out: Path, device: str = "cuda", n: int = N) -> int:
     """Milliseconds at full size, what that is of the machine's own limit, and what was aimed at."""
     import torch
+    from case import BACKWARD
     from harness import Stopwatch, _cuda_peak
     from networks import NETS, cost, make_batch
 
@@ -334,7 +335,7 @@ def roofs(out: Path, device: str = "cuda", n: int = N) -> int:
     forward_aims = {"w64d4": 0.4, "nerf64": 0.4, "mlp32": 0.25}
     for name, k in (("w64d4", 16), ("nerf64", 16), ("mlp32", 256), ("nerf128", 16), ("nerf256", 16)):
         net = NETS[name]
-        batch = make_batch(net, n, k, torch.bfloat16, "forward + backward", where)
+        batch = make_batch(net, n, k, torch.bfloat16, BACKWARD, where)
         options = {"layers": net, "directions": batch.directions, "direction_index": batch.direction_index}
         given = batch.positions[0], batch.offsets, batch.weights, batch.biases
         run = functools.partial(voronerf.grouped_mlp, *given, **options, backend="native")

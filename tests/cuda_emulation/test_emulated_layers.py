@@ -16,7 +16,7 @@ SMALL = 1 * KIB
 
 # Nineteen layers that all read the ones before: more than the fused kernel takes, of layers and of sources.
 DENSE = MLP(
-    tuple(Layer((POSITIONS, *range(index)), 5 + index % 3, "softplus") for index in range(18)) + (Layer((17, 3), 2),),
+    (*(Layer((POSITIONS, *range(index)), 5 + index % 3, "softplus") for index in range(18)), Layer((17, 3), 2)),
     (18, 4, 4),
 )
 BROAD = MLP((Layer((POSITIONS,), 270, "sigmoid"), Layer((0, POSITIONS), 300, "sine"), Layer((1,), 3)), (2,), 2)
