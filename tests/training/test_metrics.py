@@ -101,8 +101,8 @@ def scipy_ssim(image: np.ndarray, truth: np.ndarray) -> float:
 def test_against_other_programs(figures) -> None:
     image, truth = pictures_by_formula(figures.height, figures.width)
     found = [float(score(torch.from_numpy(image), torch.from_numpy(truth))) for score in (psnr, ssim)]
-    assert found[0] == pytest.approx(figures.psnr, abs=1e-5)
-    assert found[1] == pytest.approx(figures.ssim, abs=1e-7)
+    assert found[0] == pytest.approx(figures.psnr, abs=1e-9)
+    assert found[1] == pytest.approx(figures.ssim, abs=1e-12)
     assert found[1] == pytest.approx(scipy_ssim(image, truth), abs=1e-9)
 
 

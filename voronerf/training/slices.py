@@ -1,0 +1,84 @@
+"""The density of a field on a plane through the scene, as a picture.
+
+size x size points; densities are per scene unit.
+"""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import torch
+from torch import Tensor
+
+from voronerf.data import Scene
+from voronerf.router import VoronoiRouter
+
+#: Half the side of a slice through a scene without a box, in scene units.
+EXTENT = 1.5
+#: Density that has the map's last colour: a wall a hundredth of a scene unit thick then lets a third of the light pass.
+DENSEST = 100.0
+
+
+def slice_points(scene: Scene, *, axis: int = 2, at: float = 1 / 3, size: int = 96) -> Tensor:
+    """Points [size, size, 3] of a plane across the scene's box, at the middles of the picture's pixels.
+
+    The picture's right is the lower of the other two axes, its top the higher.
+
+    Args:
+        scene: the plane fills its box, or a cube of 3 units where it has none.
+        axis: that the plane is perpendicular to, 0 to 2.
+        at: where the plane cuts it, as a fraction of the box.
+        size: points along a side.
+
+    Raises:
+        ValueError: an axis or size out of range.
+    """
+    if axis not in (0, 1, 2):
+        raise ValueError(f"slice_points: axis must be 0, 1 or 2, got {axis}")
+    if size < 1:
+        raise ValueError(f"slice_points: size must be at least 1, got {size}")
+    box = torch.tensor(((-EXTENT,) * 3, (EXTENT,) * 3)) if scene.box is None else scene.box
+    right, up = (other for other in range(3) if other != axis)
+    steps = (torch.arange(size) + 0.5) / size
+    points = torch.lerp(box[0], box[1], at).repeat(size, size, 1)
+    points[..., right] = torch.lerp(box[0, right], box[1, right], steps)[None, :]
+    points[..., up] = torch.lerp(box[1, up], box[0, up], steps)[:, None]
+    return points
+
+
+@torch.no_grad()
+def slice_density(router: VoronoiRouter, points: Tensor, *, cones: bool = False) -> Tensor:
+    """Density [h, w] of a router's field, blended where the router's `blend` says so.
+
+    Args:
+        router: around a field of positions, directions and ray indices; it is left in the mode it is in.
+        points: [h, w, 3].
+        cones: ask about Gaussians [n, 6], means and variances, as mip-NeRF wants: cubes that fill the slice.
+    """
+    device = next(router.parameters()).device
+    flat = points.reshape(-1, 3).to(device)
+    if cones:
+        # a cube's side is the distance between neighbours, its variance a twelfth of the square
+        side = (points[-1, -1] - points[0, 0]).abs().amax() / max(max(points.shape[:2]) - 1, 1)
+        flat = torch.cat([flat, (side.square() / 12).to(flat).expand(len(flat), 3)], 1)
+    down = torch.tensor([[0.0, 0.0, -1.0]], device=device)
+    index = torch.zeros(len(flat), dtype=torch.int32, device=device)
+    was = router.training
+    router.eval()
+    try:
+        _, density = router(flat, down, index)
+    finally:
+        router.train(was)
+    return density.float().cpu().reshape(points.shape[:-1])
+
+
+def picture_of_density(density: Tensor, densest: float = DENSEST) -> Tensor:
+    """Densities [h, w] as uint8 [h, w, 3]: nothing is black, `densest` and above pale yellow, on a logarithmic scale.
+
+    The scale shows both the walls and the faint fog before and behind them: log(1 + density) / log(1 + densest).
+    """
+    if not densest > 0:
+        raise ValueError(f"picture_of_density: densest must be positive, got {densest}")
+    shown = torch.log1p(density.float().nan_to_num(0).clamp(0, densest)) / float(np.log1p(densest))
+    table = torch.from_numpy((matplotlib.colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8))
+    return table[(shown.cpu() * 255).round().long()]
