@@ -17,7 +17,9 @@ export VORONERF_CUDA ?= $(if $(wildcard /dev/nvidiactl /dev/dxg),auto,0)
 
 SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
 
-.PHONY: demo test bench check cuda-check gpu-check emulate-cuda sanitize clean
+PAPER_ARGS ?= --budget 20 --downscale 8 --rays 512 --samples 48 --eval-views 4 --final-views 12
+
+.PHONY: demo test bench paper check cuda-check gpu-check emulate-cuda sanitize clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -30,6 +32,11 @@ bench: $(VENV)/.built
 	@$(BIN)/python benchmarks/throughput.py --quick --targets
 	@$(BIN)/python benchmarks/balance.py --cells 4 16 64 --seeds 2
 	@$(BIN)/python benchmarks/time_to_quality.py --data builtin --budget 30 --eval-views 5
+
+# Every table and figure of the paper in small, on Lego and Ship where they are, into runs/paper and docs/paper.md. What is
+# there already is not made again.
+paper: $(VENV)/.built
+	@$(BIN)/python benchmarks/paper.py all $(PAPER_ARGS)
 
 check: $(VENV)/.built
 	@$(BIN)/ruff check

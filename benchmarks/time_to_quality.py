@@ -20,6 +20,7 @@ from typing import Any
 
 import tyro
 from harness import metadata
+from turns import take_turns
 
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
@@ -97,19 +98,13 @@ def configuration(name: str, options: Options, seed: int, out: Path) -> TrainCon
 
 def compare(options: Options, folder: Path) -> dict[str, Any]:
     """Trains every variant and seed in turns; returns {metadata, results}."""
-    if not options.turn > 0:
-        raise ConfigError(f"--turn must be positive, got {options.turn}")
     scene = load_scene(options.data, downscale=options.downscale)
     trainers: dict[tuple[str, int], Trainer] = {}
     for name in options.variants:
         for seed in range(options.seeds):
             config = configuration(name, options, seed, folder / f"{name}-{seed}")
             trainers[name, seed] = Trainer(config, scene, on_event=lambda line, label=name: print(f"{label:12} {line}"))
-    done = 0.0
-    while done < options.budget:
-        done += options.turn
-        for trainer in trainers.values():
-            trainer.advance(done)
+    take_turns(trainers.values(), budget=options.budget, turn=options.turn)
     results = []
     for (name, seed), trainer in trainers.items():
         summary = trainer.run()

@@ -1,0 +1,180 @@
+"""Every table and figure of "Adaptive Voronoi NeRFs" (Elsner et al. 2023) by name, at a size that fits the machine.
+
+    python benchmarks/paper.py table sampling --scene lego --downscale 4 --budget 480 --seeds 2
+    python benchmarks/paper.py figure split-kinds --scene builtin --budget 60
+    python benchmarks/paper.py all --budget 20 --downscale 8        # all of them, and docs/paper.md: `make paper`
+    python benchmarks/paper.py report                               # docs/paper.md again, from what is in --out
+
+All variants of an experiment train for the same time, in turns of a few seconds in one process. Each experiment writes
+NAME.json ({metadata, results, claims}), NAME.md and pictures into --out. A training that is there already, made with
+the same settings, is not made again, and an interrupted one goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import paper_balance
+import paper_nested
+import tyro
+from harness import metadata
+from paper_claims import Rows
+from paper_experiments import EXPERIMENTS
+from paper_report import ORDER, claims_text, write_experiment, write_report
+from paper_runs import Run, Settings, results, train_missing
+
+from voronerf.cli.main import EXPECTED
+from voronerf.training.files import write_text
+
+Table = Literal["sampling", "architecture", "kilonerf"]
+Figure = Literal[
+    "convergence",
+    "initialisation",
+    "split-kinds",
+    "early-late",
+    "cell-count",
+    "ghosting",
+    "density",
+    "balance",
+    "title",
+    "nested-2d",
+    "seams",
+    "limits",
+]
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "paper.md"
+
+
+def say(line: str) -> None:
+    """Progress, with the time."""
+    print(f"{time.strftime('%H:%M:%S')}  {line}", flush=True)
+
+
+def trainings(name: str, settings: Settings) -> list[Run]:
+    """The trainings that an experiment needs."""
+    if name == "balance":
+        return paper_balance.runs(settings)
+    return EXPERIMENTS[name].runs(settings) if name in EXPERIMENTS else []
+
+
+def experiment(name: str, settings: Settings) -> dict[str, Any]:
+    """Runs what is missing of an experiment and writes its files; returns {metadata, results, claims}."""
+    runs = trainings(name, settings)
+    if runs:
+        train_missing(runs, settings, say)
+    return finish(name, runs, settings)
+
+
+def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]:
+    """Makes an experiment's JSON, table and pictures from its trainings."""
+    if name == "nested-2d":
+        outcome = fitted(settings)
+    elif name == "balance":
+        outcome = paper_balance.measure(settings, say)
+    else:
+        rows = results(runs)
+        claims = EXPERIMENTS[name].claims(Rows(rows), settings)
+        description = metadata(
+            benchmark="paper",
+            experiment=name,
+            kind=EXPERIMENTS[name].kind,
+            scenes=list(dict.fromkeys(row["scene"] for row in rows)),
+            size=rows[0]["size"] if rows else None,
+            budget_seconds=settings.budget,
+            seeds=settings.seeds,
+            rays=settings.rays,
+            samples=settings.samples,
+            turn=settings.turn,
+            eval_views=settings.eval_views,
+            final_views=settings.final_views,
+            backend=settings.backend,
+        )
+        outcome = {"metadata": description, "results": rows, "claims": [claim.to_dict() for claim in claims]}
+        write_text(settings.out / f"{name}.json", json.dumps(outcome, indent=1) + "\n")
+    write_experiment(name, outcome, settings.out)
+    return outcome
+
+
+def fitted(settings: Settings) -> dict[str, Any]:
+    """The nested fit of a picture: the one in the output folder if it was made with these settings, or a new one."""
+    path = settings.out / "nested-2d.json"
+    if path.is_file() and not settings.again:
+        outcome: dict[str, Any] = json.loads(path.read_text())
+        if paper_nested.described(settings).items() <= outcome["metadata"].items():
+            return outcome
+    return paper_nested.nested(settings, say)
+
+
+def table(name: tyro.conf.Positional[Table], settings: Settings) -> None:
+    """Repeat one of the paper's tables."""
+    show(name, experiment(name, settings), settings)
+
+
+def figure(name: tyro.conf.Positional[Figure], settings: Settings) -> None:
+    """Repeat one of the paper's figures."""
+    show(name, experiment(name, settings), settings)
+
+
+def show(name: str, outcome: dict[str, Any], settings: Settings) -> None:
+    """Prints what came out."""
+    print((settings.out / f"{name}.md").read_text())
+    print(f"wrote {settings.out}: {name}.json, {name}.md, {name}*.png")
+
+
+def everything(settings: Settings, page: Path = PAGE, only: tuple[str, ...] = ORDER) -> None:
+    """Repeat all tables and figures, and write the page about them.
+
+    Args:
+        settings: For all of them; the experiment on limits has its own two scenes.
+        page: The page.
+        only: Experiments to run, in this order; the page shows whatever is in --out.
+    """
+    unknown = [name for name in only if name not in ORDER]
+    if unknown:
+        raise ValueError(f"--only must name experiments, of {', '.join(ORDER)}, got {', '.join(unknown)}")
+    started = time.perf_counter()
+    own = {name: replace(settings, scene=()) if name == "limits" else settings for name in only}
+    runs = {name: trainings(name, own[name]) for name in only}
+    # Together, so that all trainings of a scene and a seed take turns with each other.
+    train_missing([run for group in runs.values() for run in group], settings, say)
+    for name in only:
+        # Its trainings are there now, even where --again was asked for.
+        outcome = finish(name, runs[name], own[name])
+        say(f"{name}: done\n{claims_text(outcome.get('claims', []))}")
+    write_report(settings.out, page)
+    say(f"wrote {page} after {(time.perf_counter() - started) / 60:.1f} minutes")
+
+
+def report(out: Path = Settings.out, page: Path = PAGE) -> None:
+    """Write the page again from what is in the output folder.
+
+    Args:
+        out: The output folder of the experiments.
+        page: The page.
+    """
+    write_report(out, page)
+    say(f"wrote {page}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs one command."""
+    commands: dict[str, Callable[..., Any]] = {"table": table, "figure": figure, "all": everything, "report": report}
+    tyro.extras.subcommand_cli_from_dict(
+        commands,
+        prog="paper.py",
+        description=(__doc__ or "").split("\n\n")[0],
+        args=None if arguments is None else list(arguments),
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except EXPECTED as error:
+        sys.exit(f"paper: error: {error}")

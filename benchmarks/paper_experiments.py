@@ -1,0 +1,399 @@
+"""The paper's experiments that are trainings: which variants each compares, and what it claims.
+
+Both sides of every comparison have the same rays, samples, schedule and kernels; the learning rate follows from the
+width alone, by one rule for all (see ``voronerf train --lr``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from paper_claims import Claim, Rows, equal_claim, gain_claim, growing_claim, order_claim
+from paper_published import HIERARCHICAL, KILONERF, STRATIFIED, Scores
+from paper_runs import Run, Settings, Variant, default_scenes, make_run, open_scene
+
+from voronerf.training.config import TrainConfig
+from voronerf.training.model import count_parameters, resolve_config
+
+FIELDS = {"nerf": "NeRF", "mipnerf": "mip-NeRF"}
+SAMPLINGS = ("stratified", "hierarchical")
+WIDE, NARROW = "one network, width 256", "one network, width 64"
+BALANCED, RANDOM, UNIFORM = "balanced centres", "random centres", "uniform centres"
+INHERIT, FRESH = "inherited", "random parameters"
+NEAREST, STOCHASTIC = "nearest cell", "stochastic assignment"
+KILO_START, KILO_LATE, KILO_CELLS = (
+    "512 uniform cells from the start",
+    "512 uniform cells, inherited",
+    "16 x 16 Voronoi cells",
+)
+KILO_FIRST_STEPS = 16
+SPLIT_TIMES = (0.05, 0.1, 0.2, 0.4, 0.6)
+NEVER, TOO_EARLY, USUAL, LATE = "never split", "split at 2 %", "split at 20 %", "split at 50 %"
+SOLID, TRANSLUCENT = "builtin", "builtin-translucent"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One table or figure of the paper.
+
+    Attributes:
+        kind: "table" or "figure".
+        about: what it compares, for the reader of its table.
+        variants: for some settings and a scene.
+        claims: what the paper says, judged by the results.
+        scenes: those of the settings, or its own where the user named none.
+        published: the published scores of a variant on a scene, or None.
+        metrics: columns.
+    """
+
+    kind: str
+    about: str
+    variants: Callable[[Settings, str], list[Variant]]
+    claims: Callable[[Rows, Settings], list[Claim]] = lambda rows, settings: []
+    scenes: Callable[[], tuple[str, ...]] = default_scenes
+    published: Callable[[str, str], Scores | None] = lambda variant, scene: None
+
+    def runs(self, settings: Settings) -> list[Run]:
+        """Its trainings."""
+        return [
+            make_run(variant, scene, seed, settings)
+            for scene in settings.scene or self.scenes()
+            for variant in self.variants(settings, scene)
+            for seed in range(settings.seeds)
+        ]
+
+
+def cells_name(settings: Settings) -> str:
+    """The paper's own variant."""
+    return f"{settings.cells} Voronoi cells, width 64"
+
+
+def uniform_name(settings: Settings) -> str:
+    """The same number of cells on a grid."""
+    return f"{settings.cells} uniform cells, width 64"
+
+
+def one_or_cells(settings: Settings) -> list[Variant]:
+    """One network of width 256, one of width 64, the cells."""
+    return [
+        Variant(WIDE, {"cells": (), "width": 256}),
+        Variant(NARROW, {"cells": ()}),
+        Variant(cells_name(settings), {"cells": (settings.cells,)}),
+    ]
+
+
+def rendered(field: str, sampling: str, settings: Settings) -> dict[str, Any]:
+    """The settings of a field and a sampling; two passes share the samples of one."""
+    changes: dict[str, Any] = {} if field == "nerf" else {"field": field}
+    if sampling == "hierarchical":
+        half = settings.samples // 2
+        changes |= {"sampling": sampling, "samples": half, "fine_samples": settings.samples - half}
+    return changes
+
+
+def row_name(field: str, sampling: str, network: str) -> str:
+    """The name of a row of the tables by field and sampling."""
+    return f"{FIELDS[field]}, {sampling}: {network}"
+
+
+def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant]]:
+    def variants(settings: Settings, scene: str) -> list[Variant]:
+        found = []
+        for field in FIELDS:
+            for sampling in samplings:
+                networks = one_or_cells(settings)
+                if sampling == "stratified":  # the published comparison with uniform cells
+                    changes = {"cells": (settings.cells,), "centres": "uniform"}
+                    networks.append(Variant(uniform_name(settings), changes))
+                extra = rendered(field, sampling, settings)
+                found += [Variant(row_name(field, sampling, v.name), {**v.changes, **extra}) for v in networks]
+        return found
+
+    return variants
+
+
+def _published(variant: str, scene: str) -> Scores | None:
+    for field, name in FIELDS.items():
+        if variant.startswith(f"{name}, hierarchical") and (field, scene) in HIERARCHICAL:
+            one, cells = HIERARCHICAL[field, scene]
+            return one if WIDE in variant else cells if "12 Voronoi" in variant else None
+        if variant.startswith(f"{name}, stratified") and scene == "lego":
+            uniform, voronoi = STRATIFIED[field]
+            return uniform if "uniform" in variant else voronoi if "12 Voronoi" in variant else None
+    return None
+
+
+def _kilo_published(variant: str, scene: str) -> Scores | None:
+    if scene != "lego":
+        return None
+    return KILONERF[0] if variant == KILO_START else KILONERF[1] if variant == KILO_CELLS else None
+
+
+def _crossed_claims(samplings: Sequence[str]) -> Callable[[Rows, Settings], list[Claim]]:
+    def claims(rows: Rows, settings: Settings) -> list[Claim]:
+        found = []
+        for scene in rows.scenes:
+            for field in FIELDS:
+                for sampling in samplings:
+
+                    def named(network: str, field: str = field, sampling: str = sampling) -> str:
+                        return row_name(field, sampling, network)
+
+                    cells, what = named(cells_name(settings)), f"{scene}, {FIELDS[field]}, {sampling}: cells beat"
+                    scores = HIERARCHICAL.get((field, scene)) if sampling == "hierarchical" else None
+                    text = f"{scores[1].psnr - scores[0].psnr:+.2f} dB" if scores else "-"
+                    wide, narrow = rows.gains(cells, named(WIDE), scene), rows.gains(cells, named(NARROW), scene)
+                    found.append(gain_claim(f"{what} one network of width 256, by 2 dB", text, wide, 2.0))
+                    found.append(gain_claim(f"{what} one network of width 64, by 0.5 dB", "-", narrow, 0.5))
+                    if sampling == "stratified":
+                        uniform, voronoi = STRATIFIED[field]
+                        text = f"{voronoi.psnr - uniform.psnr:+.2f} dB" if scene == "lego" else "-"
+                        gains = rows.gains(cells, named(uniform_name(settings)), scene)
+                        found.append(gain_claim(f"{what} uniform cells", text, gains))
+        return found
+
+    return claims
+
+
+def _kilo_variants(settings: Settings, scene: str) -> list[Variant]:
+    # More samples a batch, so that 512 of them are there after a few steps; the same for all.
+    common = {"field": "kilonerf", "reservoir_batches": 100}
+    uniform = {**common, "cells": (512,), "centres": "uniform"}
+    first = {"split_at_steps": (KILO_FIRST_STEPS,)}
+    # The inherited grid is split when the Voronoi cells are for the first time.
+    config = TrainConfig(field="kilonerf", cells=(16, 16))
+    return [
+        Variant(KILO_START, {**uniform, **first}),
+        Variant(KILO_LATE, {**uniform, "split_at": config.splits[:1]}),
+        Variant(KILO_CELLS, {**common, "cells": (16, 16)}),
+    ]
+
+
+def _kilo_claims(rows: Rows, settings: Settings) -> list[Claim]:
+    text = f"{KILONERF[1].psnr - KILONERF[0].psnr:+.3f} dB"
+    return [
+        gain_claim(
+            f"{scene}: 16 x 16 Voronoi cells beat {other}, by 0.5 dB",
+            text if other == KILO_START else "-",
+            rows.gains(KILO_CELLS, other, scene),
+            0.5,
+        )
+        for scene in rows.scenes
+        for other in (KILO_START, KILO_LATE)
+    ]
+
+
+def _convergence_claims(rows: Rows, settings: Settings) -> list[Claim]:
+    cells = cells_name(settings)
+    return [
+        claim
+        for scene in rows.scenes
+        for claim in (
+            gain_claim(
+                f"{scene}: cells beat one network of width 256, by 2 dB", "-", rows.gains(cells, WIDE, scene), 2
+            ),
+            gain_claim(
+                f"{scene}: cells beat one network of width 64, by 0.5 dB", "-", rows.gains(cells, NARROW, scene), 0.5
+            ),
+            growing_claim(f"{scene}: the lead over width 64 grows with the time", "-", rows, cells, NARROW, scene),
+        )
+    ]
+
+
+def _initialisation_variants(settings: Settings, scene: str) -> list[Variant]:
+    cells = {"cells": (settings.cells,)}
+    return [Variant(INHERIT, cells), Variant(FRESH, {**cells, "init": "random"})]
+
+
+def _initialisation_claims(rows: Rows, settings: Settings) -> list[Claim]:
+    found = []
+    for scene in rows.scenes:
+        gains = rows.gains(INHERIT, FRESH, scene)
+        found.append(gain_claim(f"{scene}: inheritance beats random parameters on held-out views", "order", gains))
+    return found
+
+
+def _ghosting_claims(rows: Rows, settings: Settings) -> list[Claim]:
+    found = []
+    for scene in rows.scenes:
+        for name, when in (("after", "soon after the split"), ("end", "at the end")):
+            gains = rows.gains(INHERIT, FRESH, scene, lambda row, name=name: at_look(row, name, "psnr"))
+            found.append(gain_claim(f"{scene}: {when} inherited networks show a held-out view better", "order", gains))
+    return found
+
+
+def _split_kind_variants(settings: Settings, scene: str) -> list[Variant]:
+    cells = {"cells": (settings.cells,)}
+    return [
+        Variant(BALANCED, cells),
+        Variant(RANDOM, {**cells, "centres": "random"}),
+        Variant(UNIFORM, {**cells, "centres": "uniform"}),
+    ]
+
+
+def _split_kind_claims(rows: Rows, settings: Settings) -> list[Claim]:
+    names = (BALANCED, RANDOM, UNIFORM)
+    return [
+        order_claim(f"{scene}: balanced centres beat random, random beat uniform", "order", rows, names, scene)
+        for scene in rows.scenes
+    ]
+
+
+def _early_late_variants(settings: Settings, scene: str) -> list[Variant]:
+    usual = TrainConfig(cells=(settings.cells,)).splits
+    return [
+        Variant(
+            f"split at {100 * at:.0f} %", {"cells": (settings.cells,)} | ({} if (at,) == usual else {"split_at": (at,)})
+        )
+        for at in SPLIT_TIMES
+    ]
+
+
+def _cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
+    levels = [(4,), (8,), (12,), (16,), (32,), (4, 4), *([(16, 16)] if settings.large else [])]
+    reference = TrainConfig(data=scene, cells=(12,))
+    total = count_parameters(resolve_config(reference, open_scene(scene, replace(settings, seeds=1))))
+    own = [Variant(_levels(cells), {"cells": cells}) for cells in levels]
+    return own + [Variant(f"{_levels(cells)}, matched", {"cells": cells, "parameters": total}) for cells in levels]
+
+
+def _levels(cells: tuple[int, ...]) -> str:
+    return f"{' x '.join(map(str, cells))} cells"
+
+
+def _seam_variants(settings: Settings, scene: str) -> list[Variant]:
+    cells = {"cells": (settings.cells,)}
+    return [Variant(NEAREST, cells), Variant(STOCHASTIC, {**cells, "assignment": "stochastic"})]
+
+
+def _seam_claims(rows: Rows, settings: Settings) -> list[Claim]:
+    found = []
+    for scene in rows.scenes:
+
+        def fewer(look: str, scene: str = scene) -> list[float]:
+            gains = rows.gains(NEAREST, STOCHASTIC, scene, lambda row: at_look(row, look, "seam"))
+            levels = [at_look(row, look, "seam") for row in rows.of(NEAREST, scene)]
+            return [100 * gain / level for gain, level in zip(gains, levels) if level]
+
+        early, late = fewer("after"), fewer("end")
+        quality = rows.gains(STOCHASTIC, NEAREST, scene)
+        found += [
+            gain_claim(f"{scene}: stochastic assignment: fewer seams soon after the split", "order", early, unit="%"),
+            equal_claim(f"{scene}: as many seams at the end", "no difference", late, 10.0, "%"),
+            equal_claim(f"{scene}: the same quality at the end", "no difference", quality, 0.2),
+        ]
+    return found
+
+
+def at_look(row: dict[str, Any], look: str, value: str) -> float | None:
+    """A number of a run's look, such as its seam measure; None where it was not measured."""
+    found = [entry.get(value) for entry in row["looks"] if entry["look"] == look]
+    return found[0] if found and found[0] is not None and found[0] == found[0] else None
+
+
+def _limit_variants(settings: Settings, scene: str) -> list[Variant]:
+    cells = {"cells": (settings.cells,)}
+    return [
+        Variant(NEVER, {"cells": ()}),
+        Variant(TOO_EARLY, {**cells, "split_at": (0.02,)}),
+        Variant(USUAL, cells),
+        Variant(LATE, {**cells, "split_at": (0.5,)}),
+    ]
+
+
+def _limit_claims(rows: Rows, settings: Settings) -> list[Claim]:
+    hurt = {scene: rows.gains(USUAL, TOO_EARLY, scene) for scene in rows.scenes}
+    found = [
+        gain_claim(f"{scene}: a split before anything is known hurts", "in translucent scenes", gains)
+        for scene, gains in hurt.items()
+    ]
+    if hurt.get(SOLID) and hurt.get(TRANSLUCENT):
+        more = [a - b for a, b in zip(hurt[TRANSLUCENT], hurt[SOLID])]
+        found.append(gain_claim("it hurts more where much is translucent than where all is solid", "order", more))
+    helped = {scene: rows.gains(USUAL, NEVER, scene) for scene in rows.scenes}
+    if helped.get(SOLID) and helped.get(TRANSLUCENT):
+        less = [b - a for a, b in zip(helped[TRANSLUCENT], helped[SOLID])]
+        found.append(gain_claim("cells help less where much is translucent than where all is solid", "order", less))
+    return found
+
+
+def _title_variants(settings: Settings, scene: str) -> list[Variant]:
+    return [Variant(_levels(cells), {"cells": cells}) for cells in ((settings.cells,), (4, 4))]
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "sampling": Experiment(
+        "table",
+        "NeRF and mip-NeRF, each with stratified and with hierarchical sampling: one network against cells.",
+        _crossed(SAMPLINGS),
+        _crossed_claims(SAMPLINGS),
+        published=_published,
+    ),
+    "architecture": Experiment(
+        "table",
+        "Hierarchical NeRF and mip-NeRF on several scenes: one network against cells.",
+        _crossed(SAMPLINGS[1:]),
+        _crossed_claims(SAMPLINGS[1:]),
+        scenes=lambda: default_scenes(2),
+        published=_published,
+    ),
+    "kilonerf": Experiment(
+        "table",
+        "Networks of KiloNeRF's size for the same time: cells of a uniform grid against nested Voronoi cells. "
+        "The grid exists from the start, as in KiloNeRF, or inherits one network at the time of the first split.",
+        _kilo_variants,
+        _kilo_claims,
+        published=_kilo_published,
+    ),
+    "convergence": Experiment(
+        "figure",
+        "Test PSNR over training time: one wide network, one narrow network, cells of narrow networks.",
+        lambda settings, scene: one_or_cells(settings),
+        _convergence_claims,
+    ),
+    "initialisation": Experiment(
+        "figure",
+        "New cells start as copies of their parent, or from random parameters.",
+        _initialisation_variants,
+        _initialisation_claims,
+    ),
+    "split-kinds": Experiment(
+        "figure",
+        "Centres balanced by importance, drawn from the samples, or on a grid.",
+        _split_kind_variants,
+        _split_kind_claims,
+    ),
+    "early-late": Experiment("figure", "The time of the split, as a share of the run.", _early_late_variants),
+    "cell-count": Experiment(
+        "figure",
+        "The number of cells, with networks of width 64, and with the parameters of 12 such networks in total.",
+        _cell_count_variants,
+    ),
+    "ghosting": Experiment(
+        "figure",
+        "A held-out view soon after the split and at the end: inherited networks and random ones.",
+        _initialisation_variants,
+        _ghosting_claims,
+    ),
+    "density": Experiment(
+        "figure",
+        "Density on a horizontal slice: the coarse network, soon after the split, at the end.",
+        _initialisation_variants,
+    ),
+    "title": Experiment("figure", "Each pixel in the colour of its cell.", _title_variants),
+    "seams": Experiment(
+        "figure",
+        "Samples go to the nearest cell, or while training to one drawn from the distances: seams over time.",
+        _seam_variants,
+        _seam_claims,
+    ),
+    "limits": Experiment(
+        "figure",
+        "A scene of fog and glass beside a solid one: no split, one before anything is known, the usual, a late one.",
+        _limit_variants,
+        _limit_claims,
+        scenes=lambda: (TRANSLUCENT, SOLID),
+    ),
+}

@@ -1,0 +1,124 @@
+"""What a training looks like on the way: a held-out view, a slice through its density, its cells, its seams.
+
+A look is a file of a run directory, looks/NAME.npz; NAME says when: "before" and "after" the first split, at quarters
+of the run, "end".
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from voronerf.data import Scene
+from voronerf.training.evaluation import render_view
+from voronerf.training.files import write_bytes
+from voronerf.training.metrics import psnr
+from voronerf.training.trainer import Trainer
+
+VERSION = 1  # of what a look holds; those of another version are not used
+#: Fraction of the run after the first split at which inherited and random networks are compared.
+AFTER = 0.04
+QUARTERS = (0.25, 0.5, 0.75)
+SLICE = 96  # points on each side of a slice
+EXTENT = 1.5  # half the side of a slice of a scene without a box
+
+
+def stops(trainer: Trainer) -> list[tuple[str, float]]:
+    """Names and training seconds of a run's looks, the end left out."""
+    budget = float(trainer.config.budget or 0.0)
+    found = {f"at-{100 * at:02.0f}": at for at in QUARTERS}
+    if trainer.plan:
+        first = trainer.plan[0].at / (budget if trainer.config.split_unit == "seconds" else 1.0)
+        if trainer.config.split_unit != "steps" and first + AFTER < 1:
+            found |= {"before": first, "after": first + AFTER}
+    return sorted(((name, at * budget) for name, at in found.items()), key=lambda item: item[1])
+
+
+def held_out_view(scene: Scene) -> int:
+    """The test view that is looked at."""
+    return len(scene.test) // 3
+
+
+@torch.no_grad()
+def look(trainer: Trainer, second: float, *, again: bool) -> None:
+    """Writes a look of a trainer that has reached a stop, or the end.
+
+    Args:
+        trainer: as it is.
+        second: the stop, or the budget.
+        again: whether a look that is there already is made again.
+    """
+    names = [name for name, at in stops(trainer) if at == second] or ["end"]
+    paths = [trainer.out / "looks" / f"{name}.npz" for name in names]
+    if not again and all(path.is_file() for path in paths):
+        return
+    data = io.BytesIO()
+    np.savez_compressed(data, **picture(trainer), at=second, seconds=trainer.seconds, step=trainer.step)
+    for path in paths:
+        write_bytes(path, data.getvalue())
+
+
+def picture(trainer: Trainer) -> dict[str, Any]:
+    """The arrays of a look."""
+    scene, router = trainer.scene, trainer.router
+    view = held_out_view(scene)
+    image = render_view(trainer.renderer, scene, view)
+    cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=trainer.config.backend)
+    found = {
+        "colour": (image.colour.clamp(0, 1) * 255).round().to(torch.uint8),
+        "opacity": (image.opacity.clamp(0, 1) * 255).round().to(torch.uint8),
+        "cells": cells.reshape(image.opacity.shape).int(),
+        "truth": (scene.test.truth(view, scene.background_colour()) * 255).round().to(torch.uint8),
+    }
+    points = slice_points(scene)
+    found["density"] = density(trainer, points).half()
+    found["slice_cells"] = router.diagram.locate(points.reshape(-1, 3)).reshape(SLICE, SLICE).int()
+    score = psnr(found["colour"].float() / 255, found["truth"].float() / 255)
+    return {name: value.cpu().numpy() for name, value in found.items()} | {
+        "num_cells": router.num_cells,
+        "psnr": float(score),
+    }
+
+
+def slice_points(scene: Scene) -> Tensor:
+    """Points [SLICE, SLICE, 3] of a horizontal plane a third of the way up the scene's box, y upwards."""
+    box = torch.tensor(((-EXTENT,) * 3, (EXTENT,) * 3)) if scene.box is None else scene.box
+    x = torch.lerp(box[0, 0], box[1, 0], (torch.arange(SLICE) + 0.5) / SLICE)
+    y = torch.lerp(box[1, 1], box[0, 1], (torch.arange(SLICE) + 0.5) / SLICE)
+    height = torch.lerp(box[0, 2], box[1, 2], 1 / 3)
+    return torch.stack((x[None, :].expand(SLICE, -1), y[:, None].expand(-1, SLICE), height.expand(SLICE, SLICE)), -1)
+
+
+def density(trainer: Trainer, points: Tensor) -> Tensor:
+    """Density at points [..., 3]."""
+    flat = points.reshape(-1, 3)
+    if trainer.renderer.cones:  # Gaussians without extent
+        flat = torch.cat((flat, torch.zeros_like(flat)), -1)
+    down = torch.tensor(((0.0, 0.0, -1.0),))
+    trainer.router.eval()
+    _, sigma = trainer.router(flat, down, torch.zeros(len(flat), dtype=torch.int32))
+    return sigma.reshape(points.shape[:-1])
+
+
+def load(folder: Path, name: str) -> dict[str, Any] | None:
+    """The arrays of a run's look, None where it was not made."""
+    path = folder / "looks" / f"{name}.npz"
+    if not path.is_file():
+        return None
+    with np.load(path) as file:
+        return {key: file[key] for key in file.files}
+
+
+def numbers(folder: Path) -> list[dict[str, Any]]:
+    """What is a number in the looks of a run, in the order of time."""
+    found = []
+    for path in (folder / "looks").glob("*.npz"):
+        with np.load(path) as file:
+            values = {key: file[key].item() for key in file.files if file[key].ndim == 0}
+        found.append({"look": path.stem, **values})
+    return sorted(found, key=lambda entry: entry["at"])

@@ -1,0 +1,248 @@
+"""The trainings behind the paper's tables and figures: made once, kept by what they are, looked at on the way.
+
+A training is known by its whole configuration, so two experiments that need the same one share it, and one that is in
+the output folder already is not made again. All trainings of a scene and a seed that are missing take turns of a few
+seconds in one process. An interrupted one goes on from its last turn.
+
+    OUT/runs/SCENE-SEED-HASH/   a run directory of `voronerf train`, with result.json and looks/
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import paper_looks
+from turns import take_turns
+
+from voronerf.data import Scene, load_scene
+from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig
+from voronerf.training.files import write_text
+from voronerf.training.model import checkpoint_path
+from voronerf.training.runs import read_metrics
+from voronerf.training.trainer import Trainer
+
+Row = dict[str, Any]
+BUILTIN = ("builtin", "builtin-translucent")
+PUBLISHED_SIZE, BUILTIN_SIZE = 400, 100
+#: Of a run's settings, those that do not change what is learnt or how it is scored.
+NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device"}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How large an experiment is."""
+
+    scene: tuple[str, ...] = ()
+    """Scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), builtin, builtin-translucent;
+    default: lego where it is there, else builtin, and for tables by scene also ship."""
+    downscale: int = 4
+    """Factor on the published 400 x 400 images; the built-in scenes have 100 x 100 at 4."""
+    budget: float = 480.0
+    """Training seconds of every variant."""
+    seeds: int = 2
+    """Runs of every variant, seeds 0, 1, ..."""
+    out: Path = Path("runs/paper")
+    """Folder for runs, JSON, tables and pictures."""
+    again: bool = False
+    """Make trainings again that are in --out already."""
+    turn: float = 5.0
+    """Seconds that a variant trains before the next one has its turn."""
+    rays: int = 1024
+    """Rays per step."""
+    samples: int = 64
+    """Samples per ray; with two passes half of them in each."""
+    evaluations: int = 8
+    """Evaluations during the budget."""
+    eval_views: int = 10
+    """Test views of an evaluation during training."""
+    final_views: int | None = None
+    """Test views of the final evaluation; default all."""
+    cells: int = 12
+    """Cells of the paper's comparison with one network."""
+    large: bool = False
+    """Also what takes a larger machine: 16 x 16 cells among the numbers of cells."""
+    backend: str = "auto"
+    """Backend of the operations."""
+
+    def __post_init__(self) -> None:
+        for name in ("downscale", "seeds", "rays", "evaluations", "eval_views"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        if self.samples < 2:
+            raise ConfigError(f"--samples must be at least 2, one in each of two passes, got {self.samples}")
+        if self.cells < 2:
+            raise ConfigError(f"--cells must be at least 2, got {self.cells}")
+        for name in ("budget", "turn"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"--{name} must be a positive number of seconds, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A row of an experiment: its name and what it changes in the configuration."""
+
+    name: str
+    changes: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training: a variant on a scene with a seed."""
+
+    variant: Variant
+    scene: str
+    seed: int
+    config: TrainConfig
+
+    @property
+    def folder(self) -> Path:
+        """Its run directory."""
+        assert self.config.out is not None
+        return self.config.out
+
+
+def data_folder() -> Path:
+    """Where downloaded scenes are."""
+    return Path(os.environ.get("VORONERF_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+
+
+def scene_source(name: str) -> str:
+    """What `load_scene` takes for a scene's name.
+
+    Raises:
+        ConfigError: When there is no such scene.
+    """
+    if name in BUILTIN:
+        return name
+    for folder in (Path(name), data_folder() / name):
+        if folder.is_dir():
+            return str(folder)
+    raise ConfigError(f"--scene must be a folder, a name in {data_folder()} or {' or '.join(BUILTIN)}, got {name!r}")
+
+
+def default_scenes(count: int = 1) -> tuple[str, ...]:
+    """The first ``count`` scenes of the paper that are there, else the built-in one."""
+    found = [name for name in ("lego", "ship", "drums") if (data_folder() / name).is_dir()]
+    return tuple(found[:count]) or ("builtin",)
+
+
+def factor(name: str, settings: Settings) -> int:
+    """The factor by which a scene's own images are made smaller."""
+    if name not in BUILTIN:
+        return settings.downscale
+    return max(1, settings.downscale * BUILTIN_SIZE // PUBLISHED_SIZE)
+
+
+def open_scene(name: str, settings: Settings) -> Scene:
+    """Loads a scene at the size that the settings ask for."""
+    return _loaded(scene_source(name), factor(name, settings))
+
+
+@functools.lru_cache(maxsize=2)
+def _loaded(source: str, downscale: int) -> Scene:
+    return load_scene(source, downscale=downscale)
+
+
+def make_run(variant: Variant, scene: str, seed: int, settings: Settings) -> Run:
+    """The training that a variant stands for, with the directory that its configuration gives it."""
+    short = Path(scene).name
+    config = TrainConfig(
+        **{
+            "data": scene_source(scene),
+            "downscale": factor(scene, settings),
+            "seed": seed,
+            "budget": settings.budget,
+            "evaluations": settings.evaluations,
+            "eval_views": settings.eval_views,
+            "final_views": settings.final_views,
+            "rays": settings.rays,
+            "samples": settings.samples,
+            "backend": settings.backend,
+            "checkpoint_every": 1e9,
+            **variant.changes,
+        }
+    )
+    known = {k: v for k, v in json.loads(config.to_json()).items() if k not in (*NOT_IDENTITY, "lpips")}
+    text = json.dumps({**known, "scene": short, "looks": paper_looks.VERSION}, sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:12]
+    out = settings.out / "runs" / f"{short}-{seed}-{digest}"
+    return Run(variant, scene, seed, dataclasses.replace(config, out=out))
+
+
+def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], None] = print) -> None:
+    """Trains what is not in the output folder, all of a scene and a seed in turns."""
+    unique = {run.folder: run for run in runs}
+    missing = [run for run in unique.values() if settings.again or not (run.folder / "result.json").is_file()]
+    say(f"{len(unique)} trainings, {len(unique) - len(missing)} of them made already; {settings.budget:g} s each")
+    groups: dict[tuple[int, str], list[Run]] = {}
+    for run in missing:
+        groups.setdefault((run.seed, run.scene), []).append(run)
+    for (seed, name), group in sorted(groups.items()):
+        scene = open_scene(name, settings)
+        say(f"{scene.name}, seed {seed}: {len(group)} trainings in turns of {settings.turn:g} s")
+        train_group(group, scene, settings, say)
+
+
+def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Callable[[str], None] = print) -> None:
+    """Trains runs of one scene in turns and writes their results."""
+    trainers: dict[Path, Trainer] = {}
+    for run in group:
+        path = checkpoint_path(run.folder)
+        if settings.again:
+            path.unlink(missing_ok=True)
+        resume = path.is_file()
+        stale = [run.folder / "result.json"]
+        if not resume:
+            stale += [run.folder / "metrics.jsonl", *(run.folder / "looks").glob("*.npz")]
+        for file in stale:
+            file.unlink(missing_ok=True)
+        config = replace(run.config, resume=resume)
+        trainers[run.folder] = Trainer(
+            config, scene, on_event=lambda line, name=run.variant.name: say(f"{name:28} {line}")
+        )
+    take_turns(
+        trainers.values(),
+        budget=settings.budget,
+        turn=settings.turn,
+        stops=lambda trainer: [second for _, second in paper_looks.stops(trainer)],
+        on_stop=lambda trainer, second: paper_looks.look(trainer, second, again=False),
+        after_turn=lambda trainer: trainer.save(),
+    )
+    for run in group:
+        trainer = trainers.pop(run.folder)
+        summary = trainer.run()
+        paper_looks.look(trainer, settings.budget, again=True)
+        cameras = scene.test.cameras
+        row: Row = {
+            **summary,
+            "lr": trainer.config.lr,
+            "size": [cameras.height, cameras.width],
+            "curve": read_metrics(trainer.out),
+        }
+        write_text(run.folder / "result.json", json.dumps(row, indent=1) + "\n")
+
+
+def results(runs: Sequence[Run]) -> list[Row]:
+    """The results of runs that were trained, each with its variant's name, its scene, its seed and its folder."""
+    rows = []
+    for run in runs:
+        path = run.folder / "result.json"
+        if not path.is_file():
+            continue
+        known = {
+            "variant": run.variant.name,
+            "scene": Path(run.scene).name,
+            "seed": run.seed,
+            "changes": {key: list(v) if isinstance(v, tuple) else v for key, v in run.variant.changes.items()},
+            "run": run.folder.name,
+        }
+        rows.append({**known, **json.loads(path.read_text()), "looks": paper_looks.numbers(run.folder)})
+    return rows

@@ -1,0 +1,60 @@
+"""Several trainings in one process, a few seconds each in turns: a machine's noise falls on all of them alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol, TypeVar
+
+from voronerf.training.config import ConfigError
+
+
+class Training(Protocol):
+    """What can take turns: ``voronerf.training.trainer.Trainer``, or what counts its seconds as it does."""
+
+    seconds: float
+
+    def advance(self, until: float) -> Any:
+        """Trains until ``until`` training seconds or the end of the budget, whichever comes first."""
+
+
+T = TypeVar("T", bound=Training)
+
+
+def take_turns(
+    trainings: Iterable[T],
+    *,
+    budget: float,
+    turn: float,
+    stops: Callable[[T], Sequence[float]] = lambda training: (),
+    on_stop: Callable[[T, float], None] = lambda training, second: None,
+    after_turn: Callable[[T], None] = lambda training: None,
+) -> None:
+    """Trains all of them for the same time; what the callbacks take is nobody's training time.
+
+    Args:
+        trainings: at any point of their run; those that have come further than others wait for them.
+        budget: training seconds of each.
+        turn: seconds until the next one has its turn.
+        stops: for each the training seconds at which somebody wants to look at it, rising.
+        on_stop: called with a training and the stop that it has reached.
+        after_turn: called with a training after each of its turns.
+
+    Raises:
+        ConfigError: When ``turn`` is not positive.
+    """
+    if not turn > 0:
+        raise ConfigError(f"--turn must be positive, got {turn}")
+    trainings = list(trainings)
+    done = min((training.seconds for training in trainings), default=budget)
+    while done < budget:
+        before, done = done, min(done + turn, budget)
+        for training in trainings:
+            # a long step may have passed a stop in the turn before: what is due in this one is looked at all the same
+            due = [second for second in stops(training) if before < second <= done]
+            if training.seconds >= done and not due:
+                continue
+            for stop in due:
+                training.advance(stop)
+                on_stop(training, stop)
+            training.advance(done)
+            after_turn(training)

@@ -1,0 +1,468 @@
+"""benchmarks/paper.py: files, tables and plots of tiny runs, and verdicts that follow the figures."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from voronerf.training import trainer
+from voronerf.training.config import ConfigError
+from voronerf.training.trainer import Trainer, TrainingError
+
+BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
+Load = Callable[[str], Any]
+TINY = {
+    "scene": ("builtin",),
+    "downscale": 20,
+    "budget": 0.25,
+    "seeds": 1,
+    "rays": 48,
+    "samples": 8,
+    "evaluations": 2,
+    "eval_views": 1,
+    "final_views": 1,
+    "turn": 0.1,
+    "cells": 4,
+}
+
+
+@pytest.fixture(scope="module")
+def load() -> Iterator[Load]:
+    """Imports a module of benchmarks/ as a script there does."""
+    sys.path.insert(0, str(BENCHMARKS))
+    before = set(sys.modules)
+    yield importlib.import_module
+    sys.path.remove(str(BENCHMARKS))
+    for name in set(sys.modules) - before:
+        if str(BENCHMARKS) in str(getattr(sys.modules[name], "__file__", None)):
+            del sys.modules[name]
+
+
+@pytest.fixture(autouse=True)
+def _steady_clock(load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step takes ten milliseconds however busy the machine is, so that every run splits and ends where it should."""
+    ticks = itertools.count()
+    clock = SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks), time=time.time)
+    for module in (trainer, load("paper_nested")):
+        monkeypatch.setattr(module, "time", clock)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One output folder for the runs of this file, so that they are shared as `make paper` shares them."""
+    return tmp_path_factory.mktemp("paper")
+
+
+@pytest.fixture
+def settings(load: Load, out: Path) -> Any:
+    return load("paper_runs").Settings(**TINY, out=out)
+
+
+def synthetic(
+    experiment: Any, settings: Any, score: Callable[[int], float], scene: str = "lego"
+) -> list[dict[str, Any]]:
+    """Results of an experiment in which variant number i has a PSNR of score(i) and seams of 50 less that."""
+    variants = experiment.variants(settings, "builtin")
+    found = []
+    for index, variant in enumerate(variants):
+        for seed in range(2):
+            value = score(index) + 0.01 * seed
+            looks = [
+                {"look": name, "psnr": value, "seam": 50 - value, "step": 1, "seconds": 1.0}
+                for name in ("after", "end")
+            ]
+            curve = [{"seconds": t, "psnr": value * t / 10} for t in (5.0, 10.0)]
+            row = {"variant": variant.name, "scene": scene, "seed": seed, "psnr": value, "ssim": 0.5, "lpips": None}
+            found.append({**row, "curve": curve, "looks": looks, "cells": 4, "steps": 10, "run": "none"})
+    return found
+
+
+# --- verdicts --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gains", "wanted", "expected"),
+    [
+        ([], 0, "not measured"),
+        ([0.2, 0.1], 0, "holds for every seed"),
+        ([0.2], 0, "holds (one seed)"),
+        ([0.5, -0.1], 0, "holds in the mean, not for every seed"),
+        ([0.1, -0.5], 0, "does not hold"),
+        ([0.0, 0.0], 0, "does not hold"),
+        ([2.5, 2.1], 2, "holds for every seed"),
+        ([2.5, 1.9], 2, "holds in the mean, not for every seed"),
+        ([1.0, 0.5], 2, "the order holds for every seed, by less than 2"),
+        ([1.0, -0.5], 2, "the order holds in the mean, by less than 2"),
+        ([-1.0], 2, "does not hold (one seed)"),
+    ],
+)
+def test_verdicts(load: Load, gains: list[float], wanted: float, expected: str) -> None:
+    assert load("paper_claims").verdict(gains, wanted) == expected
+
+
+def test_gains_pair_scenes_and_seeds(load: Load) -> None:
+    claims = load("paper_claims")
+    rows = claims.Rows(
+        [{"variant": v, "scene": s, "seed": n, "psnr": p}
+         for v, s, n, p in (("a", "x", 0, 5.0), ("a", "x", 1, 7.0), ("b", "x", 0, 4.0), ("b", "y", 1, 1.0))]
+    )  # fmt: skip
+    assert rows.gains("a", "b") == [1.0] and rows.gains("a", "b", "y") == [] and rows.mean("a") == 6.0
+    assert rows.gains("a", "none") == [] and rows.scenes == ["x", "y"]
+    unmeasured = claims.Rows([{"variant": v, "scene": "x", "seed": 0, "lpips": None} for v in "ab"])
+    assert unmeasured.values("a", metric="lpips") == [] and unmeasured.gains("a", "b") == []
+
+
+def test_a_lead_grows_or_does_not(load: Load) -> None:
+    claims = load("paper_claims")
+
+    def verdict(better: list[float], worse: list[float]) -> str:
+        rows = [
+            {
+                "variant": v,
+                "scene": "x",
+                "seed": 0,
+                "curve": [{"seconds": t, "psnr": p} for t, p in zip((5, 10), curve)],
+            }
+            for v, curve in (("a", better), ("b", worse))
+        ]
+        return str(claims.growing_claim("", "", claims.Rows(rows), "a", "b", "x").verdict)
+
+    assert verdict([20, 24], [20, 22]) == "holds (one seed)"
+    assert verdict([22, 23], [20, 22.5]) == "does not hold (one seed)"
+    assert verdict([18, 21], [20, 22]) == "does not hold: there is no lead at the end"
+    row = {"curve": [{"seconds": 2.0, "psnr": 1.0}, {"seconds": 4.0, "psnr": 3.0}]}
+    assert [claims.at_share(row, share) for share in (0.25, 0.5, 0.75, 1)] == [None, 1.0, 2.0, 3.0]
+
+
+def test_claims_of_every_experiment_follow_the_figures(load: Load, settings: Any) -> None:
+    experiments, claims = load("paper_experiments"), load("paper_claims")
+    judged = 0
+    for name, experiment in experiments.EXPERIMENTS.items():
+        rising = synthetic(experiment, settings, lambda i: 20 + 3 * i)
+        falling = synthetic(experiment, settings, lambda i: 40 - 3 * i)
+        verdicts = [[c.verdict for c in experiment.claims(claims.Rows(rows), settings)] for rows in (rising, falling)]
+        assert len(verdicts[0]) == len(verdicts[1])
+        assert all(a != b for a, b in zip(*verdicts) if "within" not in a), name
+        judged += len(verdicts[0])
+        assert all(c.verdict == "not measured" for c in experiment.claims(claims.Rows([]), settings)) or not rising
+    assert judged > 20
+
+
+def test_balanced_over_random_over_uniform(load: Load, settings: Any) -> None:
+    experiments, claims = load("paper_experiments"), load("paper_claims")
+    experiment = experiments.EXPERIMENTS["split-kinds"]
+
+    def claim(scores: tuple[float, ...]) -> Any:
+        return experiment.claims(claims.Rows(synthetic(experiment, settings, scores.__getitem__)), settings)[0]
+
+    assert claim((30.0, 29.0, 28.0)).verdict == "holds for every seed"
+    other = claim((30.0, 31.0, 28.0))
+    assert "balanced centres over random centres: does not hold" in other.verdict
+    assert "random centres over uniform centres: holds for every seed" in other.verdict
+    assert "-1.00 dB" in other.here and "+3.00 dB" in other.here
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "start"),
+    [(0.2, 0.0017, "holds"), (0.5, 0.003, "the factor holds: 167"), (0.2, 0.02, "evener by a factor of 10"),
+     (0.2, 0.3, "does not hold"), (None, None, "not measured")],
+)  # fmt: skip
+def test_balance_verdict(load: Load, before: float, after: float, start: str) -> None:
+    assert load("paper_balance").balance_verdict(before, after).startswith(start)
+
+
+# --- runs ------------------------------------------------------------------------------------------------------------
+
+
+def test_turns(load: Load) -> None:
+    class Fake:
+        def __init__(self, name: str, seconds: float, step: float) -> None:
+            self.name, self.seconds, self.step = name, seconds, step
+
+        def advance(self, until: float) -> None:
+            while self.seconds < until:
+                self.seconds += self.step
+            log.append((self.name, round(until, 3)))
+
+    log: list[Any] = []
+    fakes = [Fake("a", 0.0, 0.5), Fake("b", 2.0, 0.5), Fake("c", 0.0, 2.5)]
+    load("turns").take_turns(
+        fakes,
+        budget=3.0,
+        turn=1.0,
+        stops=lambda fake: (0.5, 2.0) if fake.name == "a" else (),
+        on_stop=lambda fake, second: log.append(("look", second, fake.seconds)),
+        after_turn=lambda fake: log.append(("after", fake.name)),
+    )
+    first = [("a", 0.5), ("look", 0.5, 0.5), ("a", 1.0), ("after", "a"), ("c", 1.0), ("after", "c")]
+    assert log[:6] == first  # b has come further and waits
+    assert log[6:9] == [("a", 2.0), ("look", 2.0, 2.0), ("a", 2.0)]
+    assert log[-5:] == [("after", "a"), ("b", 3.0), ("after", "b"), ("c", 3.0), ("after", "c")]
+    assert all(fake.seconds >= 3.0 for fake in fakes)
+    with pytest.raises(ConfigError, match="--turn must be positive, got 0"):
+        load("turns").take_turns(fakes, budget=1, turn=0)
+
+
+def test_an_experiment_writes_its_files_and_is_not_run_again(
+    load: Load, settings: Any, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paper, runs = load("paper"), load("paper_runs")
+    outcome = paper.experiment("initialisation", settings)
+    stored = json.loads((out / "initialisation.json").read_text())
+    assert stored == json.loads(json.dumps(outcome)) and stored["metadata"]["experiment"] == "initialisation"
+    assert stored["metadata"]["size"] == [20, 20] and stored["metadata"]["machine"]
+    assert [row["variant"] for row in stored["results"]] == ["inherited", "random parameters"]
+    for row in stored["results"]:
+        assert row["cells"] == 4 and row["seconds"] >= 0.25 and row["psnr"] == row["curve"][-1]["psnr"]
+        assert row["looks"][0]["look"] == "before" and row["looks"][-1]["look"] == "end"
+        assert [e["num_cells"] for e in row["looks"] if e["look"] in ("before", "after", "end")] == [1, 4, 4]
+        assert row["looks"][-1]["psnr"] > 0 and (out / "runs" / row["run"] / "samples" / "level-1.npz").is_file()
+    table = (out / "initialisation.md").read_text()
+    assert "| builtin | inherited |" in table and "holds?" in table and "published" in table
+    assert f"{stored['results'][0]['psnr']:.2f}" in table and stored["claims"][0]["verdict"] in table
+    with Image.open(out / "initialisation.png") as picture:
+        assert picture.width > 400 and len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 10
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("must not be trained again")
+
+    monkeypatch.setattr(runs, "Trainer", refuse)
+    assert paper.experiment("initialisation", settings)["results"] == outcome["results"]
+    for name in ("density", "ghosting"):  # the same trainings
+        assert [row["run"] for row in paper.experiment(name, settings)["results"]] == [
+            row["run"] for row in outcome["results"]
+        ]
+        assert (out / f"{name}-pictures.png").is_file()
+    for other in (replace(settings, again=True), replace(settings, budget=0.3), replace(settings, seeds=2)):
+        with pytest.raises(AssertionError, match="trained again"):
+            paper.experiment("initialisation", other)
+
+
+def test_an_interrupted_training_goes_on(
+    load: Load, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = load("paper_runs")
+    settings = replace(settings, out=tmp_path)
+    run = runs.make_run(runs.Variant("one", {"cells": ()}), "builtin", 0, settings)
+    save, saved = Trainer.save, []
+
+    def interrupted(self: Trainer) -> None:
+        save(self)
+        saved.append(self.step)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "save", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            runs.train_missing([run], settings)
+    assert not (run.folder / "result.json").exists() and not runs.results([run])
+    began: list[int] = []
+    advance = Trainer.advance
+    monkeypatch.setattr(Trainer, "advance", lambda self, *args: (began.append(self.step), advance(self, *args))[1])
+    runs.train_missing([run, run], settings)
+    assert began[0] == saved[0] > 0
+    (row,) = runs.results([run])
+    assert row["seconds"] >= settings.budget and row["steps"] > saved[0]
+
+
+def test_failures_of_a_training_are_told(load: Load, settings: Any, tmp_path: Path) -> None:
+    runs = load("paper_runs")
+    variant = runs.Variant("too many", {"cells": (5000,), "split_at_steps": (2,)})
+    with pytest.raises(TrainingError, match="more cells than samples"):
+        small = replace(settings, out=tmp_path)
+        runs.train_missing([runs.make_run(variant, "builtin", 0, small)], small)
+
+
+def test_runs_are_known_by_what_they_learn(load: Load, settings: Any) -> None:
+    runs = load("paper_runs")
+    one = runs.Variant("one", {"cells": ()})
+
+    def folder(variant: Any = one, scene: str = "builtin", seed: int = 0, **changes: Any) -> str:
+        return str(runs.make_run(variant, scene, seed, replace(settings, **changes)).folder)
+
+    assert folder() == folder(runs.Variant("another name", {"cells": ()})) == folder(turn=3.0)
+    others = [folder(seed=1), folder(budget=1.0), folder(samples=9), folder(downscale=40), folder(final_views=2)]
+    others += [folder(scene="builtin-translucent"), folder(runs.Variant("one", {"cells": (), "width": 8}))]
+    assert len({folder(), *others}) == 1 + len(others)
+
+
+def test_sizes_and_scenes(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = load("paper_runs")
+    assert [runs.factor("builtin", runs.Settings(downscale=n)) for n in (1, 4, 8, 20)] == [1, 1, 2, 5]
+    assert runs.factor("lego", runs.Settings(downscale=8)) == 8
+    monkeypatch.setenv("VORONERF_DATA", str(tmp_path))
+    assert runs.default_scenes(2) == ("builtin",)
+    (tmp_path / "ship").mkdir()
+    assert runs.default_scenes(2) == ("ship",) and runs.scene_source("ship") == str(tmp_path / "ship")
+    with pytest.raises(ConfigError, match=r"--scene must be a folder, a name in .* got 'nowhere'"):
+        runs.scene_source("nowhere")
+    for wrong in ({"seeds": 0}, {"budget": 0.0}, {"samples": 1}, {"cells": 1}, {"turn": -1.0}):
+        with pytest.raises(ConfigError, match=f"--{next(iter(wrong))} must be"):
+            runs.Settings(**wrong)
+
+
+def test_both_sides_have_the_same_settings(load: Load, settings: Any) -> None:
+    """Variants differ in what is compared: no side has rays, samples, a rate or a schedule of its own."""
+    experiments, compared = load("paper_experiments"), {"cells", "width", "parameters", "centres", "init"}
+    compared |= {"assignment", "split_at", "split_at_steps"}
+    for name, experiment in experiments.EXPERIMENTS.items():
+        groups: dict[str, set[str]] = {}
+        for variant in experiment.variants(settings, "builtin"):
+            rest = {k: v for k, v in variant.changes.items() if k not in compared}
+            label = variant.name.split(":")[0] if ":" in variant.name else ""
+            groups.setdefault(label, set()).add(json.dumps(rest, sort_keys=True))
+            assert "lr" not in variant.changes
+        assert all(len(group) == 1 for group in groups.values()), name
+
+
+def test_matched_parameters(load: Load, settings: Any) -> None:
+    experiment = load("paper_experiments").EXPERIMENTS["cell-count"]
+    variants = {v.name: v.changes for v in experiment.variants(replace(settings, large=True), "builtin")}
+    assert variants["4 x 4 cells"] == {"cells": (4, 4)} and "16 x 16 cells" in variants
+    assert len({v["parameters"] for name, v in variants.items() if name.endswith("matched")}) == 1
+    run = load("paper_runs").make_run
+    model = importlib.import_module("voronerf.training.model")
+    scene = load("paper_runs").open_scene("builtin", settings)
+    counts = {}
+    for name in ("12 cells", "12 cells, matched", "4 cells, matched", "32 cells, matched"):
+        variant = load("paper_runs").Variant(name, variants[name])
+        counts[name] = model.count_parameters(model.resolve_config(run(variant, "builtin", 0, settings).config, scene))
+    total = counts["12 cells"]
+    assert counts["12 cells, matched"] == total and all(0.9 * total < count <= total for count in counts.values())
+
+
+# --- tables, plots, the page -----------------------------------------------------------------------------------------
+
+
+def test_published_figures_stand_beside_ours(load: Load, settings: Any) -> None:
+    experiments, tables = load("paper_experiments"), load("paper_tables")
+    paper = replace(settings, cells=12)
+    for name, expected in (
+        (
+            "sampling",
+            ("27.355 / 0.9451 / 0.091", "31.234 / 0.9752 / 0.0417", "25.603 / 0.917 / 0.134", "27.401 / 0.945"),
+        ),
+        ("kilonerf", ("27.08 / 0.938 / 0.098", "27.765 / 0.952 / 0.078")),
+    ):
+        experiment = experiments.EXPERIMENTS[name]
+        rows = synthetic(experiment, paper, lambda i: 20.0 + i)
+        text = "\n".join(tables.training_table(rows, experiment.published))
+        assert "published: 400 x 400, 24 h, RTX 2080 Ti" in text
+        assert all(figure.replace("27.08 /", "27.080 /") in text for figure in expected)
+        line = next(line for line in text.splitlines() if "16 x 16" in line or "NeRF, hierarchical: 12" in line)
+        assert "20.00" not in line and " to " in line and line.count("|") == text.splitlines()[0].count("|")
+        elsewhere = tables.training_table(
+            synthetic(experiment, paper, lambda i: 20.0 + i, "fern"), experiment.published
+        )
+        assert "published" not in elsewhere[0] and not any("27.355" in line for line in elsewhere)
+
+
+def test_bands_hold_mean_and_range(load: Load) -> None:
+    figures = load("paper_figures")
+    figure, axes = figures.panes(1)
+    line = figures.banded(axes[0], "x", [[(0, 1.0), (2, 3.0)], [(1, 4.0), (2, 5.0)]])
+    x, y = line.get_data()
+    assert (x[0], x[-1]) == (1, 2) and y[0] == pytest.approx(3.0) and y[-1] == pytest.approx(4.0)
+    (band,) = axes[0].collections
+    assert band.get_paths()[0].vertices[:, 1].min() == 2.0 and band.get_paths()[0].vertices[:, 1].max() == 5.0
+    figures.pyplot.close(figure)
+
+
+def test_every_plot_is_drawn(load: Load, settings: Any, tmp_path: Path) -> None:
+    experiments, figures = load("paper_experiments"), load("paper_figures")
+    drawn = set()
+    for name, experiment in experiments.EXPERIMENTS.items():
+        rows = synthetic(experiment, settings, lambda i: 20.0 + i)
+        drawn |= {path.name for path in figures.draw(name, rows, tmp_path)}
+    assert drawn == {f"{name}.png" for name in figures.PLOTS if name in experiments.EXPERIMENTS}
+    assert not figures.draw("convergence", [], tmp_path)
+
+
+def test_balance_and_a_nested_picture(load: Load, settings: Any, out: Path) -> None:
+    load("paper").experiment("initialisation", settings)  # its first variant keeps the samples
+    outcome = load("paper_balance").measure(settings, diagrams=3)
+    assert [row["variant"] for row in outcome["results"]] == ["kept by a training, builtin", "separate objects"]
+    for row, claim in zip(outcome["results"], outcome["claims"]):
+        assert len(row["after_all"]) == 3 and row["after"] == sorted(row["after_all"])[1] < row["before"]
+        assert claim["published"] == "0.246 -> 0.0018" and f"{row['after']:.4f}" in claim["here"]
+
+    nested = load("paper_nested")
+    small = replace(settings, budget=0.4, downscale=4 * settings.downscale)  # the picture is taken four times as large
+    outcome = load("paper").experiment("nested-2d", small)
+    cells = {row["variant"]: row["cells"] for row in outcome["results"]}
+    assert cells[nested.ONE] == cells[nested.MATCHED] == 1 and cells[nested.NESTED] >= 4
+    (levels,) = (row["levels"] for row in outcome["results"] if row["variant"] == nested.NESTED)
+    assert [level["cells"] for level in levels[:2]] == [1, 4] and len(levels) == 4
+    assert (out / "nested-2d.png").is_file() and (out / "nested-2d-pictures.png").is_file()
+    again = load("paper").experiment("nested-2d", small)
+    assert again["results"] == outcome["results"]
+
+
+def test_nested_fit_inherits_and_stays_in_the_plane(load: Load) -> None:
+    nested = load("paper_nested")
+    y, x = torch.meshgrid(torch.arange(24), torch.arange(30), indexing="ij")
+    image = torch.stack(((x // 4 + y // 4) % 2, x > 15, y > 12), -1).float()
+    fit = nested.ImageFit(image, budget=1e9, width=8, splits=(0.0,), seed=0, backend="auto")
+    for _ in range(3):
+        fit._step(0.0)
+    before = fit.picture()
+    fit._split()
+    assert fit.router.num_cells == 4 and bool((fit.router.diagram.centres[:, 2] == 0).all())
+    torch.testing.assert_close(fit.picture(), before)
+    borders = nested.outlined(fit.level().cell_of)
+    assert borders.shape == (24, 30, 3) and len(np.unique(borders.reshape(-1, 3), axis=0)) >= 4
+    width = nested.matching_width(5000, 6)
+    assert nested.parameters(width, 6) <= 5000 < nested.parameters(width + 1, 6)
+    assert nested.parameters(8, 5) == sum(p.numel() for p in nested.ImageField(8, 3, 5).parameters())
+
+
+def test_the_page_shows_what_came_out_and_keeps_notes(load: Load, settings: Any, out: Path, tmp_path: Path) -> None:
+    report = load("paper_report")
+    load("paper").experiment("initialisation", settings)
+    page = tmp_path / "docs" / "paper.md"
+    report.write_report(out, page)
+    text = page.read_text()
+    stored = json.loads((out / "initialisation.json").read_text())
+    assert all(claim["verdict"] in text and claim["here"] in text for claim in stored["claims"])
+    assert "Not run: convergence" in text and "RTX 2080 Ti" in text and "20 x 20 pixels; 0.25 s a variant" in text
+    assert "(images/paper/initialisation.png)" in text
+    assert (page.parent / "images" / "paper" / "initialisation.png").stat().st_size < 60_000
+
+    page.write_text(text + "What was seen.\n")
+    stored["claims"][0]["verdict"] = "changed"
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "initialisation.json").write_text(json.dumps(stored))
+    report.write_report(other, page)
+    assert "| changed |" in page.read_text() and page.read_text().endswith(f"{report.NOTES}\nWhat was seen.\n")
+    with pytest.raises(ValueError, match="--out must hold results of experiments"):
+        report.write_report(tmp_path / "nothing", page)
+
+
+def test_the_command_line(load: Load, settings: Any, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paper = load("paper")
+    values = {key: " ".join(v) if isinstance(v, tuple) else v for key, v in TINY.items()}
+    options = [part for key, v in values.items() for part in (f"--{key.replace('_', '-')}", str(v))]
+    paper.main(["figure", "density", *options, "--out", str(out)])
+    assert "| builtin | inherited |" in capsys.readouterr().out and (out / "density.json").is_file()
+    page = out / "page.md"
+    paper.main(["all", *options, "--out", str(out), "--page", str(page), "--only", "density", "ghosting"])
+    assert "0 trainings" not in capsys.readouterr().out and "## Figure: ghosting" in page.read_text()
+    with pytest.raises(ValueError, match="--only must name experiments"):
+        paper.everything(settings, page, ("nothing",))
+    for name in (*paper.Table.__args__, *paper.Figure.__args__):
+        assert name in paper.ORDER
+    assert len(paper.ORDER) == len(paper.Table.__args__) + len(paper.Figure.__args__)
