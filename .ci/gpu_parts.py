@@ -367,6 +367,8 @@ def training(out: Path, data: str, device: str = "cuda", seconds: float = 15.0) 
     common: dict[str, Any] = {"data": data, "device": device, "budget": seconds, "cells": (12,), "rays": 4096}
     common |= {"evaluations": 1, "eval_views": 2, "final_views": 5, "panels": 0}
     for name, options in TRAININGS.items():
+        if device == "cpu" and options.get("cuda_graph"):
+            continue
         begin = time.perf_counter()
         try:
             trainer = Trainer(TrainConfig(**common, **options, out=out / name), scene)
@@ -384,7 +386,11 @@ def training(out: Path, data: str, device: str = "cuda", seconds: float = 15.0) 
     return failed
 
 
-TRAININGS: dict[str, dict[str, Any]] = {"plain": {}}
+TRAININGS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "bf16": {"precision": "bf16"},
+    "bf16 in a graph": {"precision": "bf16", "cuda_graph": True},
+}
 """What each training sets."""
 
 

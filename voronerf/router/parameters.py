@@ -249,7 +249,7 @@ def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | No
     drawn: list[list[Tensor]] = []
     with torch.random.fork_rng(devices=[]):
         if generator is not None:
-            torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
+            torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device=generator.device)))
         for _ in range(k):
             for part in resets:
                 part.reset_parameters()  # type: ignore[operator]

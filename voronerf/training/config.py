@@ -119,6 +119,10 @@ class TrainConfig:
     """Skip the samples in cells of space found empty, in training and in its pictures; needs a scene with a box."""
     occupancy_resolution: int = 64
     """Cells of that grid along each axis."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Products of the networks while training: float32, or bfloat16 with sums, parameters and moments in float32."""
+    cuda_graph: bool = False
+    """On CUDA: capture a whole step in a graph and replay it, anew after each split; without --occupancy."""
     lr: float | None = None
     """Learning rate of Adam at the start; default: 0.02 up to width 64, beyond in inverse proportion to the width."""
     lr_final: float = 0.05
@@ -214,7 +218,19 @@ LISTS = frozenset({"cells", "split_at", "split_at_seconds", "split_at_steps", "s
 PATHS = ("out", "lpips")
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
-    {"data", "out", "resume", "device", "backend", "budget", "steps", "evaluations", "eval_views", "final_views"}
+    {
+        "data",
+        "out",
+        "resume",
+        "device",
+        "cuda_graph",
+        "backend",
+        "budget",
+        "steps",
+        "evaluations",
+        "eval_views",
+        "final_views",
+    }
     | {"checkpoint_every", "panels", "blend", "lpips"}
 )
 
@@ -259,6 +275,8 @@ def check_config(config: TrainConfig) -> None:
     largest = max(config.cells, default=0)
     need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
     need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
+    graphed = config.device.startswith("cuda") and not config.occupancy
+    need(graphed or not config.cuda_graph, "cuda_graph", "come with --device cuda and without --occupancy")
     need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
     _check_splits(config, need)
     plain = config.field != "mipnerf" and config.sampling == "stratified" and config.contraction == "none"

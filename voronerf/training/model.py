@@ -215,7 +215,10 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) ->
     """
     assert config.lr is not None
     parameters = [parameter for router in routers.values() for parameter in router.parameters()]
-    return torch.optim.Adam(parameters, lr=config.lr, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    options: dict[str, Any] = {"lr": config.lr}
+    if config.cuda_graph:  # which reads the learning rate from a tensor, and counts steps in one
+        options = {"lr": torch.tensor(config.lr, device=parameters[0].device), "capturable": True}
+    return torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True, **options)
 
 
 def checkpoint_path(run: Path) -> Path:

@@ -33,6 +33,7 @@ from voronerf.training.checkpoint import (
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.evaluation import ViewScore, evaluate, mean_scores
 from voronerf.training.files import read_json_lines, write_text
+from voronerf.training.graphs import GraphedStep, set_learning_rate
 from voronerf.training.lpips import Lpips, find_lpips
 from voronerf.training.model import (
     OCCUPANCY_DECAY,
@@ -51,6 +52,8 @@ from voronerf.training.splitting import median, save_samples, split_by_samples
 
 #: Steps between looks at random cells, which bring back those that were thought empty, and the share looked at.
 OCCUPANCY_EVERY, OCCUPANCY_SHARE = 16, 1 / 32
+#: Steps on a device other than the CPU after which the host reads the loss, and with that waits for the device.
+READ_EVERY = 50
 
 
 #: What summary.json repeats of the last evaluation.
@@ -95,13 +98,17 @@ class Trainer:
             backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
         backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
         self.generator = torch.Generator().manual_seed(config.seed)
+        # What a step draws, it draws where it is used: the host need not wait, and a graph can draw anew.
+        self.draws = self.generator
+        if self.device.type == "cuda":
+            self.draws = torch.Generator(self.device).manual_seed(config.seed)
         size = (scene.test.cameras.height, scene.test.cameras.width)
         self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, size)
         self.batches = RayBatches(scene, self.device, cones=config.field == "mipnerf")
         self.background = scene.background_colour(self.device)
         self.routers = make_routers(config, self.device)
         for router in self.routers.values():
-            router.generator = self.generator
+            router.generator = self.draws
         self.optimizer = make_optimizer(self.routers, config)
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
         self.occupancy = make_grid(config, scene, self.device) if config.occupancy else None
@@ -112,8 +119,10 @@ class Trainer:
         self.evaluated = 0
         self.metrics: list[dict[str, Any]] = []
         self.stopped = False
+        self.loss = math.nan
         if config.resume:
             self._load()
+        self._compute = self._make_step()
         write_text(self.out / "config.json", config.to_json())
 
     @property
@@ -174,7 +183,7 @@ class Trainer:
         Raises:
             As :meth:`run`.
         """
-        saved_at = self.seconds
+        saved_at, loss = self.seconds, None
         while self.fraction < 1 and self.seconds < until and not self.stopped:
             started = time.perf_counter()
             if self.level < len(self.plan) and self._now() >= self.plan[self.level].at - 1e-9:
@@ -182,33 +191,64 @@ class Trainer:
             loss = self._step()
             self.step += 1
             self.seconds += time.perf_counter() - started
-            if not math.isfinite(loss):
-                kept = "the checkpoint is as it was" if checkpoint_path(self.out).exists() else "there is no checkpoint"
-                raise TrainingError(f"{self.out}: the loss is {loss} at step {self.step}, try a smaller --lr; {kept}")
+            if self.device.type == "cpu" or self.step % READ_EVERY == 0:
+                self._read(loss)
             if self.on_step is not None:
                 speed = self.step * self.config.rays / max(self.seconds, 1e-9)
                 psnr = self.metrics[-1]["psnr"] if self.metrics else None
-                self.on_step(Progress(self.step, self.seconds, self.fraction, loss, speed, self.router.num_cells, psnr))
+                self.on_step(
+                    Progress(self.step, self.seconds, self.fraction, self.loss, speed, self.router.num_cells, psnr)
+                )
             if self._due() > self.evaluated and self.fraction < 1:
+                self._read(loss)
                 self._evaluate(self.config.eval_views)
             if self.seconds - saved_at >= self.config.checkpoint_every:
+                self._read(loss)
                 self.save()
                 saved_at = self.seconds
+        if loss is not None:
+            self._read(loss)
 
-    def _step(self) -> float:
-        config = self.config
-        rate = self.learning_rate()
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        batch = self.batches.draw(config.rays, self.generator)
-        background = self.background
-        if batch.alpha is not None and config.background == "random":
-            background = torch.rand(config.rays, 3, generator=self.generator).to(self.device)
+    def _read(self, loss: Tensor) -> None:
+        """Waits for a step's loss; the wait is training time.
+
+        Raises:
+            TrainingError: When it is not finite.
+        """
+        started = time.perf_counter()
+        self.loss = float(loss)
+        self.seconds += time.perf_counter() - started
+        if not math.isfinite(self.loss):
+            kept = "the checkpoint is as it was" if checkpoint_path(self.out).exists() else "there is no checkpoint"
+            raise TrainingError(f"{self.out}: the loss is {self.loss} at step {self.step}, try a smaller --lr; {kept}")
+
+    def _make_step(self) -> Callable[[], tuple[Tensor, Tensor | None, Tensor | None]]:
+        """The work of a step: as it is, or from now on captured in a graph."""
+        return GraphedStep(self._forward_backward, [self.draws]) if self.config.cuda_graph else self._forward_backward
+
+    def _step(self) -> Tensor:
+        """One step; returns its loss, which may not be computed yet."""
+        set_learning_rate(self.optimizer, self.learning_rate())
         if self.occupancy is not None and self.step % OCCUPANCY_EVERY == 0:
             self._look(self.occupancy)
-        passes = self.renderer.train().render(
-            batch.rays, batch.near, batch.far, background=background, jitter=True, generator=self.generator
-        )
+        self.renderer.train()
+        loss, positions, importance = self._compute()
+        if positions is not None and importance is not None:
+            self.reservoir.add(positions, importance)
+        return loss
+
+    def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """Loss, and until the last split the samples' positions [n, 3] and importance [n]; parameters are updated."""
+        config = self.config
+        batch = self.batches.draw(config.rays, self.draws)
+        background = self.background
+        if batch.alpha is not None and config.background == "random":
+            drawn = torch.rand(config.rays, 3, generator=self.draws, device=self.draws.device)
+            background = drawn.to(self.device)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=config.precision == "bf16", cache_enabled=False):
+            passes = self.renderer.render(
+                batch.rays, batch.near, batch.far, background=background, jitter=True, generator=self.draws
+            )
         if isinstance(passes[0], Marched):
             self._observe(passes[0])
         target = batch.target(background)
@@ -216,14 +256,14 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
-        if self.level < len(self.plan):
-            # Importance of a sample: its weight in the image times its ray's error (section 3.1 of the paper).
-            rendered = passes[-1]
-            wrong = (rendered.colour.detach() - target).square().sum(-1)
-            wrong = wrong[:, None] if isinstance(rendered, Rendered) else wrong[rendered.ray_index]
-            importance = rendered.weights.detach() * wrong
-            self.reservoir.add(rendered.positions.detach().reshape(-1, 3), importance.reshape(-1))
-        return float(loss.detach())
+        if self.level >= len(self.plan):
+            return loss.detach(), None, None
+        # Importance of a sample: its weight in the image times its ray's error (section 3.1 of the paper).
+        rendered = passes[-1]
+        wrong = (rendered.colour.detach() - target).square().sum(-1)
+        wrong = wrong[:, None] if isinstance(rendered, Rendered) else wrong[rendered.ray_index]
+        importance = rendered.weights.detach() * wrong
+        return loss.detach(), rendered.positions.detach().reshape(-1, 3), importance.reshape(-1)
 
     def _observe(self, marched: Marched) -> None:
         """Lets the grid learn from the samples of a step."""
@@ -268,6 +308,7 @@ class Trainer:
         after = median([balance.imbalance_after for balance in balances])
         self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
+        self._compute = self._make_step()  # parameters are others now
         when = f"at {self.seconds:.0f} s, step {self.step}"
         if balances:
             self._say(f"{self.router.num_cells} cells {when}, std(W / max W) {before:.3f} -> {after:.4f}")
@@ -322,7 +363,7 @@ class Trainer:
             **router_states(self.routers),
             "optimizer": optimizer_tensors(self.optimizer),
             "reservoir": self.reservoir.state_dict(),
-            "generator": {"state": self.generator.get_state()},
+            "generator": {"state": self.generator.get_state(), "draws": self.draws.get_state()},
         }
         if self.occupancy is not None:
             parts["occupancy"] = self.occupancy.state_dict()
@@ -351,7 +392,11 @@ class Trainer:
         if occupancy:
             self.occupancy = OccupancyGrid.from_state(occupancy, device=self.device)
             self.renderer.occupancy = self.occupancy
-        self.generator.set_state(checkpoint.group("generator")["state"])
+        generators = checkpoint.group("generator")
+        self.generator.set_state(generators["state"])
+        drawn = generators.get("draws", generators["state"])
+        if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
+            self.draws.set_state(drawn)  # else the run began on another kind of device
         self.step = checkpoint.values["step"]
         self.seconds = checkpoint.values["seconds"]
         self.stages = [Stage(**stage) for stage in checkpoint.values["stages"]]
