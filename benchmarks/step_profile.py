@@ -26,7 +26,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
-from voronerf.training.config import TrainConfig
+from voronerf.training.config import FieldName, SamplingName, TrainConfig
 from voronerf.training.files import write_text
 from voronerf.training.trainer import Trainer
 
@@ -51,12 +51,16 @@ class Options:
     """Factor by which the images are made smaller on load."""
     cells: int = 16
     """Cells; 1 is one network."""
-    width: int = 64
-    """Channels of the networks' hidden layers."""
+    field: FieldName = "nerf"
+    """The networks, as for `voronerf train`."""
+    sampling: SamplingName = "stratified"
+    """Samples along a ray, likewise."""
+    width: int | None = None
+    """Channels of the networks' hidden layers; default that of the field."""
     rays: int = TrainConfig.rays
     """Rays per step."""
-    samples: int = 64
-    """Samples per ray."""
+    samples: int | None = None
+    """Samples per ray; default that of the sampling."""
     bfloat16: bool = False
     """Networks under autocast to bfloat16."""
     steps: int = 60
@@ -95,6 +99,8 @@ def measure(options: Options) -> dict[str, Any]:
             cells=(options.cells,) if options.cells > 1 else (),
             split_at=(warm / 2 / (warm + every + 1),) if options.cells > 1 else None,
             evaluations=1,
+            field=options.field,
+            sampling=options.sampling,
             width=options.width,
             rays=options.rays,
             samples=options.samples,
@@ -145,9 +151,11 @@ def measure(options: Options) -> dict[str, Any]:
             data=Path(options.data).name,
             downscale=options.downscale,
             cells=trainer.router.num_cells,
-            width=options.width,
+            field=options.field,
+            sampling=options.sampling,
+            width=trainer.config.width,
             rays=options.rays,
-            samples=options.samples,
+            samples=trainer.config.samples,
             bfloat16=options.bfloat16,
             steps=options.steps,
             step_ms=median,
@@ -165,7 +173,8 @@ def show(result: dict[str, Any], top: int) -> None:
     """Prints the parts of a step and its dearest operators."""
     about = result["metadata"]
     print(
-        f"{about['data']}, {about['cells']} cells of width {about['width']}, {about['rays']} rays x "
+        f"{about['data']}, {about['field']}, {about['sampling']}, {about['cells']} cells of width {about['width']}, "
+        f"{about['rays']} rays x "
         f"{about['samples']} samples, {about['threads']} threads: {about['step_ms']:.2f} ms a step "
         f"(spread {about['step_iqr_ms']:.2f}; profiled {about['profiled_step_ms']:.2f})"
     )

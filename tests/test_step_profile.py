@@ -14,10 +14,13 @@ SCRIPT = Path(__file__).resolve().parent.parent / "benchmarks" / "step_profile.p
 def test_step_profile_accounts_for_the_step(tmp_path: Path) -> None:
     path = tmp_path / "profile.json"
     small = ["--cells", "2", "--width", "16", "--rays", "64", "--samples", "8", "--steps", "2", "--json", str(path)]
+    small += ["--field", "mipnerf", "--sampling", "hierarchical"]
     subprocess.run([sys.executable, str(SCRIPT), *small], check=True, capture_output=True)
     outcome = json.loads(path.read_text())
     about, rows = outcome["metadata"], outcome["results"]
-    assert (about["benchmark"], about["cells"], about["rays"]) == ("step_profile", 2, 64) and about["step_ms"] > 0
+    assert (about["benchmark"], about["cells"], about["rays"]) == ("step_profile", 2, 64)
+    assert (about["field"], about["sampling"], about["width"], about["samples"]) == ("mipnerf", "hierarchical", 16, 8)
+    assert about["step_ms"] > 0
     parts = {row["part"]: row["ms"] for row in rows if "part" in row}
     operators = {row["operator"]: row["ms"] for row in rows if "operator" in row}
     assert all(parts[part] > 0 for part in ("route", "composite", "optimiser", "other operators"))

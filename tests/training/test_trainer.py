@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -260,6 +261,19 @@ def test_octaves_follow_the_pixels() -> None:
     """100 x 100 images of a Blender-like scene: 8 octaves; the paper's 10 at 400 x 400; one more for half the pixel."""
     octaves = [octaves_for(builtin_scene(size, train_views=2, test_views=1)) for size in (50, 100, 200, 400)]
     assert octaves == [7, 8, 9, 10]
+
+
+def test_octaves_of_cones_are_those_that_a_pixel_leaves() -> None:
+    """At the middle of the scene the last octave keeps more than a thousandth, the next would keep nothing."""
+    for size in (50, 100):
+        scene = builtin_scene(size, train_views=2, test_views=1)
+        config = resolve_config(TrainConfig(field="mipnerf"), scene)
+        assert config.position_octaves == octaves_for(scene) + 2
+        rays = scene.train.cameras.rays(0, torch.tensor([size // 2]), torch.tensor([size // 2]), cones=True)
+        assert rays.radii is not None
+        variance = float(4 * rays.radii) ** 2 / 4
+        left = [math.exp(-0.5 * 4.0**octave * variance) for octave in range(config.position_octaves + 1)]
+        assert left[-2] > 1e-4 and left[-1] < 1e-9
 
 
 def tensors(run: Path) -> dict[str, torch.Tensor]:

@@ -64,7 +64,7 @@ class TrainConfig:
     more than five layers, else none."""
     position_octaves: int | None = None
     """Frequencies of the position's encoding; default: until the finest wave spans two pixels of the training views,
-    mipnerf 16 as published."""
+    for mipnerf two octaves beyond, where a pixel's cone leaves nothing of it (published: 16)."""
     direction_octaves: int = 4
     """Frequencies of the view direction's encoding."""
     view_directions: bool = True
