@@ -43,6 +43,7 @@ OPS = (
     "balance_centres",
     "camera_rays",
     "select_heaviest",
+    "cast_solids",
 )
 
 
@@ -137,6 +138,7 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("balance_centres", "warp"): _warp("balance_centres", dtypes=(torch.float32,)),
     ("camera_rays", "warp"): _warp("camera_rays", dtypes=(torch.float32,)),
     ("select_heaviest", "warp"): _warp("select_heaviest", dtypes=(torch.float32,)),
+    ("cast_solids", "warp"): _warp("cast_solids", dtypes=(torch.float32,)),
     ("update_occupancy", "warp"): _warp("update_occupancy", dtypes=(torch.float32,)),
 }
 

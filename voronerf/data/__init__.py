@@ -1,4 +1,4 @@
-"""Scenes: the files of Blender synthetic scenes and of real captures, and two computed from formulas."""
+"""Scenes: the files of Blender synthetic scenes and of real captures, and three computed from formulas."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ from pathlib import Path
 from voronerf.data.blender import load_blender
 from voronerf.data.builtin import builtin_scene
 from voronerf.data.capture import load_capture
+from voronerf.data.rich import rich_scene
 from voronerf.data.scene import Scene, SceneError, Split
 from voronerf.data.translucent import translucent_scene
 
-__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "load_scene", "translucent_scene"]
+__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "load_scene", "rich_scene", "translucent_scene"]
 
 BUILTIN_SIZE = 100
-BUILTIN = {"builtin": builtin_scene, "builtin-translucent": translucent_scene}
+BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene, "builtin-translucent": translucent_scene}
 
 
 def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
     """Loads a scene.
 
     Args:
-        source: "builtin" or "builtin-translucent", or a folder with `transforms_train.json` (Blender synthetic) or
-            `transforms.json` (capture).
+        source: "builtin", "builtin-rich" or "builtin-translucent", or a folder with `transforms_train.json` (Blender
+            synthetic) or `transforms.json` (capture).
         downscale: factor by which images are made smaller, >= 1. Divides the built-in scenes' 100 pixels too.
 
     Raises:

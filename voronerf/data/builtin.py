@@ -7,9 +7,10 @@ Images have alpha, by supersampling. Units, axes and camera distance are those o
 
 from __future__ import annotations
 
+import functools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from voronerf.data.builtin_solids import SOLIDS
 from voronerf.data.scene import Scene, Split
-from voronerf.data.solids import Array, candidates, normalised, slab, turned
+from voronerf.data.solids import Array, Rows, Solid, first_hits, normalised, slab, turned
 from voronerf.rendering.cameras import Cameras, look_at
 
 TRAIN_VIEWS, TEST_VIEWS = 100, 25
@@ -32,6 +33,8 @@ AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.46, 0.64, 0.50
 BAND = 1 << 15  # rays at a time, so that their arrays stay in the cache
 # from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity, [r, 4]
 See = Callable[[Array, Array], Array]
+# from origins and unit directions, [r, 3] or one [1, 3] for all, to distances [r] and numbers of solids [r]
+Hits = Callable[[Array, Array], tuple[Array, Rows]]
 LIFT = 2e-3  # a shadow's ray starts this far above the surface
 
 
@@ -45,8 +48,8 @@ def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views
     """
     train, test = builtin_cameras("builtin_scene", size, train_views, test_views)
     box = bounds()
-    train_split = render_views(train, "train", _see, box=box, supersamples=SUPERSAMPLES)
-    test_split = render_views(test, "test", _see, box=box, supersamples=SUPERSAMPLES)
+    train_split = render_views(train, "train", see, box=box, supersamples=SUPERSAMPLES)
+    test_split = render_views(test, "test", see, box=box, supersamples=SUPERSAMPLES)
     return Scene("builtin", train_split, test_split, NEAR, FAR, torch.from_numpy(box), "linear", "white")
 
 
@@ -67,50 +70,52 @@ def builtin_cameras(caller: str, size: int, train_views: int, test_views: int) -
     return train, _cameras(torch.deg2rad(28 + 16 * torch.sin(2 * turn)), turn + 0.05, size)
 
 
-def bounds() -> Array:
+def bounds(solids: Sequence[Solid] = SOLIDS) -> Array:
     """The box that holds all solids, [2, 3]."""
-    boxes = np.stack([solid.bounds() for solid in SOLIDS])
+    boxes = np.stack([solid.bounds() for solid in solids])
     return np.stack((boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)))
 
 
-def cast(origin: Array, directions: Array) -> tuple[Array, Array]:
+def cast(
+    origin: Array, directions: Array, solids: Sequence[Solid] = SOLIDS, hits: Hits | None = None
+) -> tuple[Array, Array]:
     """First hits of rays from one point, and their light.
 
     Args:
         origin: [1, 3].
         directions: [r, 3], unit.
+        solids: what there is.
+        hits: finds the first of them on a ray; default: `first_hits`.
 
     Returns:
         (colour [r, 3] in 0..1, zero where nothing is hit; depth [r], infinite there).
     """
-    depth = np.full(len(directions), np.inf, dtype=np.float32)
-    which = np.zeros(len(directions), dtype=np.int8)
-    for index, (solid, rows) in enumerate(zip(SOLIDS, candidates(SOLIDS, origin, directions))):
-        found = solid.hit(origin, directions[rows])
-        closer = found < depth[rows]
-        depth[rows[closer]], which[rows[closer]] = found[closer], index
+    if hits is None:
+        hits = functools.partial(first_hits, solids)
+    depth, which = hits(origin, directions)
     rows = np.isfinite(depth).nonzero()[0]
     which, seen_along = which[rows], directions[rows]
     points = origin + depth[rows, None] * seen_along
     normals, albedo = np.zeros_like(points), np.zeros_like(points)
     gloss, sharpness = np.zeros(len(rows), dtype=np.float32), np.ones(len(rows), dtype=np.float32)
-    for index, solid in enumerate(SOLIDS):
-        mine = (which == index).nonzero()[0]
+    for index in np.unique(which):
+        solid, mine = solids[index], (which == index).nonzero()[0]
         normals[mine], albedo[mine] = solid.surface(points[mine])
         gloss[mine], sharpness[mine] = solid.gloss, solid.sharpness
     colour = np.zeros_like(directions)
-    colour[rows] = _shade(points, normals, albedo, gloss, sharpness, seen_along)
+    colour[rows] = _shade(points, normals, albedo, gloss, sharpness, seen_along, hits)
     return colour, depth
 
 
-def _shade(points: Array, normals: Array, albedo: Array, gloss: Array, sharpness: Array, directions: Array) -> Array:
+def _shade(
+    points: Array, normals: Array, albedo: Array, gloss: Array, sharpness: Array, directions: Array, hits: Hits
+) -> Array:
     """Sky light from above, one lamp far away with hard shadows, Phong highlights."""
     facing = np.maximum((normals * LIGHT).sum(axis=-1), 0)
     lit = (facing > 0).nonzero()[0]
     start = points[lit] + np.float32(LIFT) * normals[lit]
     lamp = (facing > 0).astype(np.float32)
-    for solid, rows in zip(SOLIDS, candidates(SOLIDS, start, LIGHT)):
-        lamp[lit[rows[np.isfinite(solid.hit(start[rows], LIGHT))]]] = 0.0
+    lamp[lit[np.isfinite(hits(start, LIGHT)[0])]] = 0.0
     ambient = AMBIENT_DOWN + (AMBIENT_UP - AMBIENT_DOWN) * (0.5 + 0.5 * normals[:, 2])
     mirrored = 2 * facing[:, None] * normals - LIGHT
     highlight = gloss * np.maximum(-(mirrored * directions).sum(axis=-1), 0) ** sharpness
@@ -125,9 +130,9 @@ def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
     return Cameras(poses, torch.tensor((focal, focal, size / 2, size / 2)).repeat(len(poses), 1), size, size)
 
 
-def _see(origin: Array, directions: Array) -> Array:
-    """First hits of rays from one point as premultiplied colour and coverage, [r, 4]."""
-    colour, depth = cast(origin, directions)
+def see(origin: Array, directions: Array, solids: Sequence[Solid] = SOLIDS, hits: Hits | None = None) -> Array:
+    """First hits of rays from one point as premultiplied colour and coverage, [r, 4]; arguments as of `cast`."""
+    colour, depth = cast(origin, directions, solids, hits)
     return np.concatenate((colour, np.isfinite(depth)[:, None]), axis=-1, dtype=np.float32)
 
 

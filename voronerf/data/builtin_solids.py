@@ -37,11 +37,12 @@ def _azimuth(points: Array) -> Array:
     return turn + np.float32(0.5)
 
 
-def _plain(colour: Colour) -> Texture:
+def plain(colour: Colour) -> Texture:
+    """One colour."""
     return lambda points, normals: np.broadcast_to(_paint(colour), points.shape)
 
 
-def _mosaic(points: Array, normals: Array) -> Array:
+def mosaic(points: Array, normals: Array) -> Array:
     """Rings of tiles in five colours; a striped band on the rim."""
     x, y, _ = points.T
     ring = np.floor(np.hypot(x, y) / 0.1686)
@@ -51,13 +52,13 @@ def _mosaic(points: Array, normals: Array) -> Array:
     return np.where(normals[:, 2:] > 0.5, top, rim)
 
 
-def _checker(points: Array, normals: Array) -> Array:
+def checker(points: Array, normals: Array) -> Array:
     """A fine checker of longitudes and latitudes."""
     climb = np.arccos(np.clip(normals[:, 2], -1, 1)) / math.pi
     return _pick(((0.86, 0.22, 0.20), (0.97, 0.62, 0.48)), np.floor(_azimuth(points) * 14) + np.floor(climb * 7))
 
 
-def _diagonals(points: Array, normals: Array) -> Array:
+def diagonals(points: Array, normals: Array) -> Array:
     """Diagonal stripes, in other colours on each pair of faces."""
     stripe = np.floor((points.sum(axis=-1) + 9) / 0.15) % 2
     pair = np.argmax(np.abs(normals), axis=-1)
@@ -72,7 +73,7 @@ def _diagonals(points: Array, normals: Array) -> Array:
     return _pick(dark_and_light, 2 * pair + stripe)
 
 
-def _bricks(points: Array, normals: Array) -> Array:
+def bricks(points: Array, normals: Array) -> Array:
     """Courses of bricks of three reds in pale mortar; rings on top."""
     x, y, z = points.T
     height = (z + 1) / 0.105
@@ -85,12 +86,12 @@ def _bricks(points: Array, normals: Array) -> Array:
     return np.where(np.abs(normals[:, 2:]) > 0.5, rings, side)
 
 
-def _barber_pole(points: Array, normals: Array) -> Array:
+def barber_pole(points: Array, normals: Array) -> Array:
     """Two-coloured helix."""
     return _pick(((0.95, 0.94, 0.92), (0.46, 0.50, 0.60)), 2 * _azimuth(points) + points[:, 2] / 0.16)
 
 
-def _globe(points: Array, normals: Array) -> Array:
+def globe(points: Array, normals: Array) -> Array:
     """Continents in a sea."""
     x, y, z = normals.T
     land = np.sin(4 * x + 1.3) * np.sin(5 * y + 0.4) + 0.7 * np.sin(6 * z + 2 * x) > 0.15
@@ -100,7 +101,7 @@ def _globe(points: Array, normals: Array) -> Array:
     return np.where(land[:, None], ground, sea).astype(np.float32)
 
 
-def _spiral(points: Array, normals: Array) -> Array:
+def spiral(points: Array, normals: Array) -> Array:
     """Bands wound around the tube, in step with itself after a full turn of either."""
     outward = (normals[:, :2] * points[:, :2]).sum(axis=-1) / np.hypot(points[:, 0], points[:, 1])
     tube = np.arctan2(normals[:, 2], outward) / (2 * math.pi)
@@ -110,20 +111,20 @@ def _spiral(points: Array, normals: Array) -> Array:
 def _solids() -> tuple[Solid, ...]:
     """Everything in the scene."""
     parts: list[Solid] = [
-        Cylinder((0, 0, FLOOR - 0.08), _mosaic, 0.08, 10, radius=1.18, half_height=0.08),
-        Sphere((0.62, 0.30, FLOOR + 0.36), _checker, 0.55, 40, rotation("x", 24), radius=0.36),
-        Box((-0.60, 0.38, FLOOR + 0.30), _diagonals, 0.15, 12, rotation("z", 28), half=(0.27, 0.27, 0.30)),
-        Cylinder((-0.02, -0.70, FLOOR + 0.21), _bricks, 0.10, 10, radius=0.31, half_height=0.21),
-        Cylinder((0, 0, FLOOR + 0.50), _barber_pole, 0.25, 20, radius=0.13, half_height=0.50),
-        Sphere((0, 0, FLOOR + 1.22), _globe, 0.45, 30, radius=0.24),
-        Torus((0, 0, FLOOR + 0.66), _spiral, 0.40, 30, rotation("x", -20), ring=0.38, tube=0.105),
+        Cylinder((0, 0, FLOOR - 0.08), mosaic, 0.08, 10, radius=1.18, half_height=0.08),
+        Sphere((0.62, 0.30, FLOOR + 0.36), checker, 0.55, 40, rotation("x", 24), radius=0.36),
+        Box((-0.60, 0.38, FLOOR + 0.30), diagonals, 0.15, 12, rotation("z", 28), half=(0.27, 0.27, 0.30)),
+        Cylinder((-0.02, -0.70, FLOOR + 0.21), bricks, 0.10, 10, radius=0.31, half_height=0.21),
+        Cylinder((0, 0, FLOOR + 0.50), barber_pole, 0.25, 20, radius=0.13, half_height=0.50),
+        Sphere((0, 0, FLOOR + 1.22), globe, 0.45, 30, radius=0.24),
+        Torus((0, 0, FLOOR + 0.66), spiral, 0.40, 30, rotation("x", -20), ring=0.38, tube=0.105),
     ]
     count = 12
     for index in range(count):
         azimuth = 2 * math.pi * (index + 0.5) / count
         colour = colorsys.hsv_to_rgb(index / count, 0.75, 0.92)
         place = (1.05 * math.cos(azimuth), 1.05 * math.sin(azimuth), FLOOR + 0.095)
-        parts.append(Sphere(place, _plain(colour), 0.6, 40, radius=0.095))
+        parts.append(Sphere(place, plain(colour), 0.6, 40, radius=0.095))
     return tuple(parts)
 
 

@@ -234,3 +234,22 @@ def candidates(solids: Sequence[Solid], origins: Array, directions: Array) -> li
         apart = square - 2 * (ox * cx + oy * cy + oz * cz) + (cx * cx + cy * cy + cz * cz)
         rows.append(((apart - along * along <= reach) & (along >= -np.sqrt(reach))).nonzero()[0])
     return rows
+
+
+def first_hits(solids: Sequence[Solid], origins: Array, directions: Array) -> tuple[Array, Rows]:
+    """The first solid on each ray: (distance [r], infinite where there is none; its number [r], 0 there).
+
+    Arguments as of `candidates`.
+    """
+    (count,) = np.broadcast_shapes(origins.shape[:1], directions.shape[:1])
+    depth, which = np.full(count, np.inf, dtype=np.float32), np.zeros(count, dtype=np.int64)
+    for index, (solid, rows) in enumerate(zip(solids, candidates(solids, origins, directions))):
+        found = solid.hit(_rows_of(origins, rows), _rows_of(directions, rows))
+        closer = found < depth[rows]
+        depth[rows[closer]], which[rows[closer]] = found[closer], index
+    return depth, which
+
+
+def _rows_of(vectors: Array, rows: Rows) -> Array:
+    """Rows of vectors [r, 3]; all of [1, 3], which stands for each."""
+    return vectors if len(vectors) == 1 else vectors[rows]

@@ -8,6 +8,7 @@ of arrays sorted by cell.
 from voronerf.layers import MLP, Layer
 from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.camera_rays import camera_rays
+from voronerf.ops.cast_solids import cast_solids
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
@@ -31,6 +32,7 @@ __all__ = [
     "March",
     "balance_centres",
     "camera_rays",
+    "cast_solids",
     "cell_sort",
     "centre_grid",
     "composite",

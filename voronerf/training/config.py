@@ -31,8 +31,8 @@ class TrainConfig:
     """Settings of a training run."""
 
     data: str = "builtin"
-    """Scene folder (Blender synthetic or transforms.json), or a scene computed from formulas: "builtin", or
-    "builtin-translucent" with fog and glass."""
+    """Scene folder (Blender synthetic or transforms.json), or a scene computed from formulas: "builtin",
+    "builtin-rich" with hundreds of solids, or "builtin-translucent" with fog and glass."""
     downscale: int = 1
     """Factor by which the images are made smaller on load."""
     out: Path | None = None

@@ -1,0 +1,55 @@
+"""First hits of rays on spheres, boxes, cylinders and tori. r rays, s solids."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
+
+_OP = "cast_solids"
+
+
+def cast_solids(
+    kinds: Tensor, frames: Tensor, sizes: Tensor, origins: Tensor, directions: Tensor, *, backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
+    """The first solid on each ray, for ground truth computed from formulas.
+
+    A ray that starts inside of a solid does not see that one. Not differentiable.
+
+    Args:
+        kinds: int32 [s], 0 sphere, 1 box, 2 cylinder around z with flat ends, 3 torus around z; others are not checked.
+        frames: float32 [s, 4, 3]: a rotation M in the first three rows, the solid's centre in the last. A point p of
+            the world is (p - centre) @ M in the solid's own frame.
+        sizes: float32 [s, 3], positive: a sphere's radius; a box's half sides; a cylinder's radius and half height; a
+            torus' radius of the ring and of the tube. What a kind does not have is not looked at.
+        origins: float32 [r, 3].
+        directions: float32 [r, 3], unit.
+        backend: "auto", "reference" or "warp". Warp finds the solids near a ray by a tree of their boxes, which makes
+            it the faster one for many solids on the CPU as well, on one thread.
+
+    Returns:
+        (depths float32 [r], infinite for a ray that hits nothing; solids int32 [r], -1 there). Of solids hit at the
+        same distance the first counts.
+
+    Raises:
+        ValueError: shapes, devices or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes_of: dict[str, int] = {}
+    check_shape(_OP, "kinds", kinds, ("s",), sizes_of)
+    check_shape(_OP, "frames", frames, ("s", 4, 3), sizes_of)
+    check_shape(_OP, "sizes", sizes, ("s", 3), sizes_of)
+    check_shape(_OP, "origins", origins, ("r", 3), sizes_of)
+    check_shape(_OP, "directions", directions, ("r", 3), sizes_of)
+    check_dtype(_OP, "kinds", kinds, INDEX)
+    check_dtype(_OP, "frames", frames, (torch.float32,))
+    check_same_dtype(_OP, frames=frames, sizes=sizes, origins=origins, directions=directions)
+    check_same_device(_OP, kinds=kinds, frames=frames, sizes=sizes, origins=origins, directions=directions)
+    check_count(_OP, "origins", sizes_of["r"])
+    check_count(_OP, "kinds", sizes_of["s"])
+    run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
+    depths, solids = run(kinds, *(tensor.detach() for tensor in (frames, sizes, origins, directions)))
+    return depths, solids
