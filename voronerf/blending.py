@@ -21,6 +21,7 @@ same weight, which for 4 takes more borders in a place than cells in general pos
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import torch
@@ -73,35 +74,40 @@ def blend_cells(diagram: VoronoiDiagram, points: Tensor, margin: float, *, most:
         )
     ]
     if margin > 0 and diagram.num_cells > 1:
-        widest = int(diagram.child_offsets.diff().max())
-        size = max(1, _CHUNK_ELEMENTS // (3 * widest))
+        apart = _apart(diagram, dtype)
+        size = max(1, _CHUNK_ELEMENTS // (3 * apart.shape[1]))
         for start in range(0, points.shape[0], size):
-            rows, cells, weights = _soft_leaves(diagram, points[start : start + size].to(dtype), margin, widest)
+            rows, cells, weights = _soft_leaves(diagram, points[start : start + size].to(dtype), margin, apart)
             rows, cells, weights = _heaviest(rows, cells, weights, most)
             found.append((rows + start, cells, weights))
     rows, cells, weights = (torch.cat(parts) for parts in zip(*found, strict=True))
     return Blend(rows, cells, weights)
 
 
-def _soft_leaves(diagram: VoronoiDiagram, points: Tensor, margin: float, widest: int) -> tuple[Tensor, Tensor, Tensor]:
-    """(rows, leaves, weights) of all leaves with a weight, level by level."""
+def _soft_leaves(
+    diagram: VoronoiDiagram, points: Tensor, margin: float, apart: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(rows, leaves, weights) of all leaves with a weight, level by level; `apart` is what `_apart` gives."""
     centres = diagram.centres.to(points.dtype)
     power = None if diagram.power is None else diagram.power.to(points.dtype)
     offsets, child = diagram.child_offsets.long(), diagram.child
-    column = torch.arange(widest, device=points.device)
     rows = torch.arange(points.shape[0], device=points.device)
     node, weights = torch.zeros_like(rows), torch.ones_like(points[:, 0])
     leaves = []
-    for _ in range(diagram.depth):
-        siblings = offsets[node][:, None] + column
-        absent = siblings >= offsets[node + 1][:, None]
-        siblings = siblings.clamp(max=centres.shape[0] - 1)
-        places = centres[siblings]
-        squared = (points[rows][:, None] - places).square().sum(2)
-        if power is not None:
-            squared = squared - power[siblings]
-        squared = squared.masked_fill(absent, float("inf"))
-        entry, member, share = _soft_siblings(squared, places, margin)
+    for level in range(diagram.depth):
+        if level == 0:  # the same siblings for all points
+            siblings = torch.arange(int(offsets[1]), device=points.device)[None]
+            squared = torch.cdist(points, centres[siblings[0]], compute_mode="donot_use_mm_for_euclid_dist").square_()
+            squared = squared if power is None else squared - power[siblings]
+            siblings = siblings.expand(len(rows), -1)
+        else:
+            siblings = offsets[node][:, None] + torch.arange(apart.shape[1], device=points.device)
+            absent = siblings >= offsets[node + 1][:, None]
+            siblings = siblings.clamp(max=centres.shape[0] - 1)
+            squared = (points[rows][:, None] - centres[siblings]).square().sum(2)
+            squared = squared if power is None else squared - power[siblings]
+            squared = squared.masked_fill(absent, float("inf"))
+        entry, member, share = _soft_siblings(squared, siblings, apart, margin)
         weights = weights[entry] * share
         rows, link = rows[entry], child[siblings[entry, member]]
         final = link < 0
@@ -113,49 +119,49 @@ def _soft_leaves(diagram: VoronoiDiagram, points: Tensor, margin: float, widest:
     return found[0], found[1], found[2]
 
 
-def _soft_siblings(squared: Tensor, places: Tensor, margin: float) -> tuple[Tensor, Tensor, Tensor]:
+def _apart(diagram: VoronoiDiagram, dtype: torch.dtype) -> Tensor:
+    """[centres of all diagrams, most siblings]: how far each centre's siblings are, in the order of their rows."""
+    offsets, centres = diagram.child_offsets.tolist(), diagram.centres.to(dtype)
+    widest = max(last - first for first, last in itertools.pairwise(offsets))
+    table = centres.new_zeros(centres.shape[0], widest)
+    for first, last in itertools.pairwise(offsets):
+        own = centres[first:last]
+        table[first:last, : last - first] = (own[:, None] - own).norm(dim=2)
+    return table
+
+
+def _soft_siblings(squared: Tensor, siblings: Tensor, apart: Tensor, margin: float) -> tuple[Tensor, Tensor, Tensor]:
     """The weights of siblings.
 
     Args:
         squared: [e, k], squared distances less power weights; infinite for what is no sibling.
-        places: [e, k, 3], the centres.
+        siblings: int64 [e, k], rows of the centres.
+        apart: [m, >= k], what `_apart` gives.
         margin: M.
 
     Returns:
         (entry [q], sibling [q], weight [q] > 0), the weights of an entry summing to 1.
     """
-    every = torch.arange(squared.shape[0], device=squared.device)
-    nearest = squared.argmin(1)
-    outside = -_planes(squared, places, every, nearest)  # how far the nearest cell's planes are, negative
-    near = (outside > -margin).any(1)
-    alone = ~near
-    entry, member = ((outside > -margin) & near[:, None]).nonzero(as_tuple=True)
-    own = every[near]
+    every, k = torch.arange(squared.shape[0], device=squared.device), squared.shape[1]
+    least, nearest = squared.min(1)
+    # nearer to the plane between a sibling and the nearest than M; never so for the nearest itself, or in its place
+    beyond = squared - least[:, None] < 2 * margin * apart[siblings[every, nearest], :k]
+    near = beyond.any(1)
+    entry, member = beyond.nonzero(as_tuple=True)
+    own, alone = every[near], every[~near]
     entry, member = torch.cat([entry, own]), torch.cat([member, nearest[own]])
-    inside = _planes(squared, places, entry, member).amin(1)
-    share = (0.5 + inside / (2 * margin)).clamp(0, 1)
-    total = torch.zeros_like(squared[:, 0]).index_add_(0, entry, share)
+    lead = squared[entry] - squared[entry, member][:, None]
+    side = apart[siblings[entry, member], :k]
+    column = torch.arange(k, device=squared.device)
+    # to itself, and by whose cell it is between centres in one place
+    ahead = (lead > 0) | ((lead == 0) & (column >= member[:, None]))
+    inside = torch.where(side > 0, lead / (2 * side), torch.where(ahead, float("inf"), -float("inf")))
+    share = (0.5 + inside.amin(1) / (2 * margin)).clamp(0, 1)
+    total = torch.zeros_like(least).index_add_(0, entry, share)
     share = share / total[entry]
     kept = share > 0
-    entry = torch.cat([entry[kept], every[alone]])
-    member = torch.cat([member[kept], nearest[alone]])
-    return entry, member, torch.cat([share[kept], torch.ones_like(squared[alone, 0])])
-
-
-def _planes(squared: Tensor, places: Tensor, entry: Tensor, member: Tensor) -> Tensor:
-    """[q, k]: the signed distance of entry q's point to the planes between sibling `member` and the others.
-
-    It is infinite to the sibling itself and, by whose cell it is, between centres in one place.
-    """
-    here, own = squared[entry], squared[entry, member][:, None]
-    apart = (places[entry] - places[entry, member][:, None]).norm(dim=2)
-    lead = here - own
-    distance = lead / (2 * apart)
-    column = torch.arange(squared.shape[1], device=squared.device)
-    ahead = (lead > 0) | ((lead == 0) & (column >= member[:, None]))
-    infinity = torch.full_like(distance, float("inf"))
-    distance = torch.where(apart > 0, distance, torch.where(ahead, infinity, -infinity))
-    return distance.nan_to_num(nan=float("inf"), posinf=float("inf"), neginf=-float("inf"))
+    entry, member = torch.cat([entry[kept], alone]), torch.cat([member[kept], nearest[alone]])
+    return entry, member, torch.cat([share[kept], torch.ones_like(least[alone])])
 
 
 def _heaviest(rows: Tensor, cells: Tensor, weights: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
