@@ -17,7 +17,7 @@ export VORONERF_CUDA ?= $(if $(wildcard /dev/nvidiactl /dev/dxg),auto,0)
 
 SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
 
-PAPER_ARGS ?= --budget 20 --downscale 8 --rays 512 --samples 48 --eval-views 4 --final-views 12
+PAPER_ARGS ?= --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
 .PHONY: demo test bench paper check cuda-check gpu-check emulate-cuda sanitize clean
 

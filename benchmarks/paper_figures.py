@@ -17,6 +17,7 @@ from torch import Tensor
 
 from voronerf.training.files import write_bytes
 from voronerf.training.panels import contact_sheet, picture_of_cells, picture_of_error, save_picture
+from voronerf.training.slices import picture_of_density
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
@@ -25,7 +26,6 @@ Row = dict[str, Any]
 Point = tuple[float, float]
 GRID = 200  # times at which the curves of several seeds are compared
 DPI = 100
-DENSEST = 100.0  # per scene unit: the last colour of a density slice, on a logarithmic scale
 
 
 def save(figure: Any, path: Path) -> Path:
@@ -152,13 +152,6 @@ def balance(path: Path, rows: Sequence[Row]) -> Path:
 # --- pictures -------------------------------------------------------------------------------------------------------
 
 
-def picture_of_density(density: np.ndarray[Any, Any]) -> Tensor:
-    """A slice [h, w]: nothing (dark) to a density of 100 and above (bright), logarithmic."""
-    shown = np.log1p(np.nan_to_num(density.astype(np.float32)).clip(0, DENSEST)) / np.log1p(DENSEST)
-    table = (matplotlib.colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
-    return torch.from_numpy(table[(shown * 255).round().astype(np.int64)])
-
-
 def _error(look: dict[str, Any]) -> Tensor:
     colour, truth = (torch.from_numpy(look[name]).float() / 255 for name in ("colour", "truth"))
     return picture_of_error(colour, truth)
@@ -173,8 +166,8 @@ def _view(look: dict[str, Any]) -> Tensor:
     return torch.from_numpy(look["colour"])
 
 
-def _density(look: dict[str, Any]) -> Tensor | None:
-    return picture_of_density(look["density"]) if "density" in look else None
+def _density(look: dict[str, Any]) -> Tensor:
+    return picture_of_density(torch.from_numpy(look["density"]).float())
 
 
 def sheet(

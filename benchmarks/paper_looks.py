@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from voronerf.data import Scene
 from voronerf.training.evaluation import render_view
 from voronerf.training.files import write_bytes
 from voronerf.training.metrics import psnr
+from voronerf.training.seams import seam
+from voronerf.training.slices import slice_density, slice_points
 from voronerf.training.trainer import Trainer
 
 VERSION = 1  # of what a look holds; those of another version are not used
@@ -25,7 +26,7 @@ VERSION = 1  # of what a look holds; those of another version are not used
 AFTER = 0.04
 QUARTERS = (0.25, 0.5, 0.75)
 SLICE = 96  # points on each side of a slice
-EXTENT = 1.5  # half the side of a slice of a scene without a box
+SEAM_VIEWS = 2  # test views whose seams are measured
 
 
 def stops(trainer: Trainer) -> list[tuple[str, float]]:
@@ -75,34 +76,23 @@ def picture(trainer: Trainer) -> dict[str, Any]:
         "cells": cells.reshape(image.opacity.shape).int(),
         "truth": (scene.test.truth(view, scene.background_colour()) * 255).round().to(torch.uint8),
     }
-    points = slice_points(scene)
-    found["density"] = density(trainer, points).half()
+    points = slice_points(scene, size=SLICE)
+    found["density"] = slice_density(router, points, cones=trainer.renderer.cones).half()
     found["slice_cells"] = router.diagram.locate(points.reshape(-1, 3)).reshape(SLICE, SLICE).int()
     score = psnr(found["colour"].float() / 255, found["truth"].float() / 255)
     return {name: value.cpu().numpy() for name, value in found.items()} | {
         "num_cells": router.num_cells,
         "psnr": float(score),
+        **seams(trainer),
     }
 
 
-def slice_points(scene: Scene) -> Tensor:
-    """Points [SLICE, SLICE, 3] of a horizontal plane a third of the way up the scene's box, y upwards."""
-    box = torch.tensor(((-EXTENT,) * 3, (EXTENT,) * 3)) if scene.box is None else scene.box
-    x = torch.lerp(box[0, 0], box[1, 0], (torch.arange(SLICE) + 0.5) / SLICE)
-    y = torch.lerp(box[1, 1], box[0, 1], (torch.arange(SLICE) + 0.5) / SLICE)
-    height = torch.lerp(box[0, 2], box[1, 2], 1 / 3)
-    return torch.stack((x[None, :].expand(SLICE, -1), y[:, None].expand(-1, SLICE), height.expand(SLICE, SLICE)), -1)
-
-
-def density(trainer: Trainer, points: Tensor) -> Tensor:
-    """Density at points [..., 3]."""
-    flat = points.reshape(-1, 3)
-    if trainer.renderer.cones:  # Gaussians without extent
-        flat = torch.cat((flat, torch.zeros_like(flat)), -1)
-    down = torch.tensor(((0.0, 0.0, -1.0),))
-    trainer.router.eval()
-    _, sigma = trainer.router(flat, down, torch.zeros(len(flat), dtype=torch.int32))
-    return sigma.reshape(points.shape[:-1])
+def seams(trainer: Trainer) -> dict[str, float]:
+    """The step in colour across the borders of cells; of trainings with one field of points, others are not asked."""
+    if len(trainer.routers) > 1 or trainer.renderer.fine_samples or trainer.renderer.cones:
+        return {}
+    scene, renderer = trainer.scene, trainer.renderer
+    return {"seam": seam(trainer.router, scene, lambda view: render_view(renderer, scene, view), views=SEAM_VIEWS)}
 
 
 def load(folder: Path, name: str) -> dict[str, Any] | None:
