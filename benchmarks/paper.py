@@ -89,6 +89,7 @@ def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]
             seeds=settings.seeds,
             rays=settings.rays,
             samples=settings.samples,
+            rates=list(settings.rates),
             turn=settings.turn,
             eval_views=settings.eval_views,
             final_views=settings.final_views,

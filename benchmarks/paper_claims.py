@@ -119,6 +119,12 @@ def order_claim(claim: str, published: str, rows: Rows, variants: Sequence[str],
     return Claim(claim, published, here, "; ".join(parts))
 
 
+def at_look(row: dict[str, Any], look: str, value: str) -> float | None:
+    """A number of a run's look, such as its seam measure; None where it was not measured."""
+    found = [entry.get(value) for entry in row["looks"] if entry["look"] == look]
+    return found[0] if found and found[0] is not None and found[0] == found[0] else None
+
+
 def at_share(row: Row, share: float) -> float | None:
     """PSNR of a run at a share of its time, between its evaluations in a straight line; None before the first."""
     points = [(entry["seconds"], entry["psnr"]) for entry in row["curve"]]

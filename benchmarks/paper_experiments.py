@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from paper_claims import Claim, Rows, equal_claim, gain_claim, growing_claim, order_claim
+from paper_claims import Claim, Rows, at_look, equal_claim, gain_claim, growing_claim, order_claim
 from paper_published import HIERARCHICAL, KILONERF, STRATIFIED, Scores
 from paper_runs import Run, Settings, Variant, default_scenes, make_run, open_scene
 
@@ -60,9 +60,10 @@ class Experiment:
     def runs(self, settings: Settings) -> list[Run]:
         """Its trainings."""
         return [
-            make_run(variant, scene, seed, settings)
+            make_run(variant, scene, seed, settings, rate)
             for scene in settings.scene or self.scenes()
             for variant in self.variants(settings, scene)
+            for rate in settings.rates
             for seed in range(settings.seeds)
         ]
 
@@ -297,12 +298,6 @@ def _seam_claims(rows: Rows, settings: Settings) -> list[Claim]:
             equal_claim(f"{scene}: the same quality at the end", "no difference", quality, 0.2),
         ]
     return found
-
-
-def at_look(row: dict[str, Any], look: str, value: str) -> float | None:
-    """A number of a run's look, such as its seam measure; None where it was not measured."""
-    found = [entry.get(value) for entry in row["looks"] if entry["look"] == look]
-    return found[0] if found and found[0] is not None and found[0] == found[0] else None
 
 
 def _limit_variants(settings: Settings, scene: str) -> list[Variant]:

@@ -7,6 +7,7 @@ of the run, "end".
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
 from typing import Any
 
@@ -45,23 +46,24 @@ def held_out_view(scene: Scene) -> int:
     return len(scene.test) // 3
 
 
-@torch.no_grad()
-def look(trainer: Trainer, second: float, *, again: bool) -> None:
-    """Writes a look of a trainer that has reached a stop, or the end.
-
-    Args:
-        trainer: as it is.
-        second: the stop, or the budget.
-        again: whether a look that is there already is made again.
-    """
-    names = [name for name, at in stops(trainer) if at == second] or ["end"]
-    paths = [trainer.out / "looks" / f"{name}.npz" for name in names]
-    if not again and all(path.is_file() for path in paths):
+def reached(trainer: Trainer, second: float) -> None:
+    """Looks at a trainer that has come to one of its stops, unless that was done before an interruption."""
+    names = [name for name, at in stops(trainer) if at == second]
+    if all((trainer.out / "looks" / f"{name}.npz").is_file() for name in names):
         return
+    if "after" in names and trainer.level == 0:
+        # Steps may be longer than the time between the two stops; this one makes the split.
+        trainer.advance(math.nextafter(trainer.seconds, math.inf))
+    for name in names:
+        look(trainer, second, name)
+
+
+@torch.no_grad()
+def look(trainer: Trainer, second: float, name: str = "end") -> None:
+    """Writes a look of a trainer as it is; ``second`` is when it was due."""
     data = io.BytesIO()
     np.savez_compressed(data, **picture(trainer), at=second, seconds=trainer.seconds, step=trainer.step)
-    for path in paths:
-        write_bytes(path, data.getvalue())
+    write_bytes(trainer.out / "looks" / f"{name}.npz", data.getvalue())
 
 
 def picture(trainer: Trainer) -> dict[str, Any]:

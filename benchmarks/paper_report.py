@@ -72,6 +72,7 @@ def conditions(described: Mapping[str, Any]) -> str:
         else f"{described['budget_seconds']:g} s a variant",
         f"{described['seeds']} seeds" if described["seeds"] > 1 else "one seed",
         f"{described['rays']} rays x {described['samples']} samples" if "rays" in described else "",
+        f"the best of {len(described['rates'])} learning rates for each" if len(described.get("rates", [])) > 1 else "",
         f"{described['threads']} threads",
         described["machine"],
     ]

@@ -9,11 +9,11 @@ seconds in one process. An interrupted one goes on from its last turn.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import json
 import os
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from turns import take_turns
 from voronerf.data import Scene, load_scene
 from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig
 from voronerf.training.files import write_text
-from voronerf.training.model import checkpoint_path
+from voronerf.training.model import checkpoint_path, resolve_config
 from voronerf.training.runs import read_metrics
 from voronerf.training.trainer import Trainer
 
@@ -67,6 +67,8 @@ class Settings:
     """Test views of the final evaluation; default all."""
     cells: int = 12
     """Cells of the paper's comparison with one network."""
+    rates: tuple[float, ...] = (1.0,)
+    """Factors on the learning rate: every variant is trained with each of them, and its best mean PSNR counts."""
     large: bool = False
     """Also what takes a larger machine: 16 x 16 cells among the numbers of cells."""
     backend: str = "auto"
@@ -80,6 +82,8 @@ class Settings:
             raise ConfigError(f"--samples must be at least 2, one in each of two passes, got {self.samples}")
         if self.cells < 2:
             raise ConfigError(f"--cells must be at least 2, got {self.cells}")
+        if not self.rates or not all(0 < rate < float("inf") for rate in self.rates):
+            raise ConfigError(f"--rates must be positive factors, got {self.rates}")
         for name in ("budget", "turn"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ConfigError(f"--{name} must be a positive number of seconds, got {getattr(self, name)}")
@@ -95,11 +99,12 @@ class Variant:
 
 @dataclass(frozen=True)
 class Run:
-    """One training: a variant on a scene with a seed."""
+    """One training: a variant on a scene with a seed, at its learning rate times a factor."""
 
     variant: Variant
     scene: str
     seed: int
+    rate: float
     config: TrainConfig
 
     @property
@@ -151,7 +156,7 @@ def _loaded(source: str, downscale: int) -> Scene:
     return load_scene(source, downscale=downscale)
 
 
-def make_run(variant: Variant, scene: str, seed: int, settings: Settings) -> Run:
+def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: float = 1.0) -> Run:
     """The training that a variant stands for, with the directory that its configuration gives it."""
     short = Path(scene).name
     config = TrainConfig(
@@ -170,11 +175,15 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings) -> Run
             **variant.changes,
         }
     )
+    if rate != 1.0:
+        usual = resolve_config(config, open_scene(scene, settings)).lr
+        assert usual is not None
+        config = replace(config, lr=rate * usual)
     known = {k: v for k, v in json.loads(config.to_json()).items() if k not in (*NOT_IDENTITY, "lpips")}
     text = json.dumps({**known, "scene": short, "looks": paper_looks.VERSION}, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     out = settings.out / "runs" / f"{short}-{seed}-{digest}"
-    return Run(variant, scene, seed, dataclasses.replace(config, out=out))
+    return Run(variant, scene, seed, rate, replace(config, out=out))
 
 
 def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], None] = print) -> None:
@@ -213,13 +222,13 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
         budget=settings.budget,
         turn=settings.turn,
         stops=lambda trainer: [second for _, second in paper_looks.stops(trainer)],
-        on_stop=lambda trainer, second: paper_looks.look(trainer, second, again=False),
+        on_stop=paper_looks.reached,
         after_turn=lambda trainer: trainer.save(),
     )
     for run in group:
         trainer = trainers.pop(run.folder)
         summary = trainer.run()
-        paper_looks.look(trainer, settings.budget, again=True)
+        paper_looks.look(trainer, settings.budget)
         cameras = scene.test.cameras
         row: Row = {
             **summary,
@@ -231,18 +240,30 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
 
 
 def results(runs: Sequence[Run]) -> list[Row]:
-    """The results of runs that were trained, each with its variant's name, its scene, its seed and its folder."""
-    rows = []
+    """The results of runs that were trained, each with its variant's name, its scene, its seed and its folder.
+
+    Of several learning rates that with the best mean PSNR counts, for every scene and variant alike; "rates" has the
+    means of all.
+    """
+    tried: dict[tuple[str, str], dict[float, list[Row]]] = {}
     for run in runs:
         path = run.folder / "result.json"
         if not path.is_file():
             continue
-        known = {
+        row = {
             "variant": run.variant.name,
             "scene": Path(run.scene).name,
             "seed": run.seed,
+            "rate": run.rate,
             "changes": {key: list(v) if isinstance(v, tuple) else v for key, v in run.variant.changes.items()},
             "run": run.folder.name,
+            **json.loads(path.read_text()),
+            "looks": paper_looks.numbers(run.folder),
         }
-        rows.append({**known, **json.loads(path.read_text()), "looks": paper_looks.numbers(run.folder)})
-    return rows
+        tried.setdefault((row["scene"], row["variant"]), {}).setdefault(run.rate, []).append(row)
+    found = []
+    for group in tried.values():
+        means = {rate: statistics.fmean(row["psnr"] for row in rows) for rate, rows in group.items()}
+        best = max(means, key=lambda rate: means[rate])
+        found += [{**row, "rates": {f"{rate:g}": mean for rate, mean in means.items()}} for row in group[best]]
+    return found

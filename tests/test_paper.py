@@ -299,6 +299,30 @@ def test_runs_are_known_by_what_they_learn(load: Load, settings: Any) -> None:
     assert len({folder(), *others}) == 1 + len(others)
 
 
+def test_every_variant_has_the_best_of_the_same_rates(load: Load, settings: Any, tmp_path: Path) -> None:
+    runs = load("paper_runs")
+    searched = replace(settings, rates=(1.0, 2.0), seeds=2, out=tmp_path)
+    made = load("paper_experiments").EXPERIMENTS["initialisation"].runs(searched)
+    assert len(made) == 2 * 2 * 2 and len({run.folder for run in made}) == 8
+    usual, doubled = (next(run.config for run in made if run.rate == rate) for rate in searched.rates)
+    assert usual.lr is not None and doubled.lr == 2 * usual.lr
+    scores = {("inherited", 1.0): 20.0, ("inherited", 2.0): 21.0}
+    for run in made:
+        run.folder.mkdir(parents=True)
+        score = scores.get((run.variant.name, run.rate), 19.0 - run.rate) + run.seed
+        (run.folder / "result.json").write_text(json.dumps({"psnr": score}))
+    rows = runs.results(made)
+    assert [(row["variant"], row["seed"], row["rate"], row["psnr"]) for row in rows] == [
+        ("inherited", 0, 2.0, 21.0),
+        ("inherited", 1, 2.0, 22.0),
+        ("random parameters", 0, 1.0, 18.0),
+        ("random parameters", 1, 1.0, 19.0),
+    ]
+    assert rows[0]["rates"] == {"1": 20.5, "2": 21.5}
+    with pytest.raises(ConfigError, match="--rates must be positive factors, got"):
+        runs.Settings(rates=(0.0,))
+
+
 def test_sizes_and_scenes(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = load("paper_runs")
     assert [runs.factor("builtin", runs.Settings(downscale=n)) for n in (1, 4, 8, 20)] == [1, 1, 2, 5]
