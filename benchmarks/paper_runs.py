@@ -22,7 +22,7 @@ from typing import Any
 import paper_looks
 from turns import take_turns
 
-from voronerf.data import Scene, load_scene
+from voronerf.data import BUILTIN, BUILTIN_SIZE, Scene, load_scene
 from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig
 from voronerf.training.files import write_text
 from voronerf.training.model import checkpoint_path, resolve_config
@@ -30,8 +30,7 @@ from voronerf.training.runs import read_metrics
 from voronerf.training.trainer import Trainer
 
 Row = dict[str, Any]
-BUILTIN = ("builtin", "builtin-translucent")
-PUBLISHED_SIZE, BUILTIN_SIZE = 400, 100
+PUBLISHED_SIZE = 400
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device"}
 
@@ -41,8 +40,8 @@ class Settings:
     """How large an experiment is."""
 
     scene: tuple[str, ...] = ()
-    """Scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), builtin, builtin-translucent;
-    default: lego where it is there, else builtin, and for tables by scene also ship."""
+    """Scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), or built-in ones; default: lego
+    where it is there, else builtin, and for the table by architecture also ship."""
     downscale: int = 4
     """Factor on the published 400 x 400 images; the built-in scenes have 100 x 100 at 4."""
     budget: float = 480.0
@@ -130,7 +129,7 @@ def scene_source(name: str) -> str:
     for folder in (Path(name), data_folder() / name):
         if folder.is_dir():
             return str(folder)
-    raise ConfigError(f"--scene must be a folder, a name in {data_folder()} or {' or '.join(BUILTIN)}, got {name!r}")
+    raise ConfigError(f"--scene must be a folder, a name in {data_folder()} or {', '.join(BUILTIN)}, got {name!r}")
 
 
 def default_scenes(count: int = 1) -> tuple[str, ...]:
