@@ -60,14 +60,22 @@ def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]]) -> Any:
     return line
 
 
+def shown(evaluation: dict[str, Any]) -> Point:
+    """Seconds and PSNR of the mean error, which for a single picture is its PSNR."""
+    return evaluation["seconds"], evaluation.get("psnr_of_mean_error", evaluation["psnr"])
+
+
 def curves(path: Path, rows: Sequence[Row]) -> Path:
-    """PSNR over training seconds, a pane a scene; bands are the range over the seeds, dotted lines the splits."""
+    """PSNR of the mean squared error, as the paper's curves, over training seconds, a pane a scene.
+
+    Bands are the range over the seeds, dotted lines the splits.
+    """
     table = Rows(rows)
     figure, axes = panes(len(table.scenes))
     for pane, scene in zip(axes, table.scenes):
         for variant in table.variants:
             group = table.of(variant, scene)
-            line = banded(pane, variant, [[(m["seconds"], m["psnr"]) for m in row["curve"]] for row in group])
+            line = banded(pane, variant, [[shown(m) for m in row["curve"]] for row in group])
             for stage in (group[0].get("stages") or [])[1:] if group and line is not None else []:
                 pane.axvline(stage["started_at_second"], color=line.get_color(), linestyle=":", linewidth=1)
         pane.set(xlabel="training time [s]", ylabel="test PSNR [dB]", title=scene)

@@ -24,6 +24,7 @@ from turns import take_turns
 
 from voronerf.data import BUILTIN, BUILTIN_SIZE, Scene, load_scene
 from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig
+from voronerf.training.evaluation import evaluate, mean_scores
 from voronerf.training.files import write_text
 from voronerf.training.model import checkpoint_path, resolve_config
 from voronerf.training.runs import read_metrics
@@ -233,9 +234,19 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
             **summary,
             "lr": trainer.config.lr,
             "size": [cameras.height, cameras.width],
-            "curve": read_metrics(trainer.out),
+            "curve": curve(trainer),
         }
         write_text(run.folder / "result.json", json.dumps(row, indent=1) + "\n")
+
+
+def curve(trainer: Trainer) -> list[Row]:
+    """The evaluations of a finished training, all on the views of those on the way: other views are another curve."""
+    found = read_metrics(trainer.out)
+    config, count = trainer.config, len(trainer.scene.test)
+    if min(config.final_views or count, count) != min(config.eval_views, count):
+        found[-1] |= mean_scores(evaluate(trainer.renderer, trainer.scene, views=config.eval_views))
+        found[-1]["views"] = config.eval_views
+    return found
 
 
 def results(runs: Sequence[Run]) -> list[Row]:

@@ -278,6 +278,16 @@ def test_an_interrupted_training_goes_on(
     assert row["seconds"] >= settings.budget and row["steps"] > saved[0]
 
 
+def test_a_curve_is_of_the_same_views_throughout(load: Load, settings: Any, tmp_path: Path) -> None:
+    runs = load("paper_runs")
+    settings = replace(settings, out=tmp_path, final_views=3)
+    made = runs.make_run(runs.Variant("one", {"cells": (), "width": 8}), "builtin", 0, settings)
+    runs.train_missing([made], settings)
+    (row,) = runs.results([made])
+    assert row["views"] == 3 and [entry["views"] for entry in row["curve"]] == [1, 1]
+    assert row["psnr"] != row["curve"][-1]["psnr"] and row["curve"][-1]["seconds"] >= settings.budget
+
+
 def test_failures_of_a_training_are_told(load: Load, settings: Any, tmp_path: Path) -> None:
     runs = load("paper_runs")
     variant = runs.Variant("too many", {"cells": (5000,), "split_at_steps": (2,)})
