@@ -1,6 +1,7 @@
 """What skipping empty space gives: training with half the time, and pictures of a trained scene.
 
     python benchmarks/occupancy.py --budget 60 --json benchmarks/results/occupancy.json
+    python benchmarks/occupancy.py --trained RUN      pictures of a run that is there, trained without a grid
 
 Two runs of one scene take turns in one process: one without a grid, one with, which gets `--share` of the time. Then
 test views of the first run are rendered at `--size`, alternately asking the field for every sample and through a grid
@@ -14,6 +15,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,13 +25,17 @@ from harness import metadata
 
 from voronerf.cli.main import EXPECTED
 from voronerf.data import builtin_scene
+from voronerf.router import VoronoiRouter
 from voronerf.training.config import TrainConfig
 from voronerf.training.evaluation import render_view
 from voronerf.training.files import write_text
 from voronerf.training.metrics import psnr
-from voronerf.training.model import load_grid, make_renderer
+from voronerf.training.model import load_grid, load_run, make_renderer
 from voronerf.training.runs import read_metrics
 from voronerf.training.trainer import Trainer
+
+Run = tuple[Path, TrainConfig, Mapping[str, VoronoiRouter]]
+"""Directory, configuration and networks."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,9 @@ class Options:
     size: int = 400
     """Pixels along the side of the rendered pictures."""
     views: int = 3
-    """Test views rendered."""
+    """Test views rendered; 0 for none."""
+    trained: Path | None = None
+    """Run directory, trained on the built-in scene without a grid: its pictures alone, no training."""
     repeats: int = 3
     """Times each is rendered; the median counts."""
     seed: int = 0
@@ -82,18 +90,22 @@ def train(options: Options, folder: Path) -> dict[str, Trainer]:
     return trainers
 
 
-def render(options: Options, trainers: dict[str, Trainer]) -> list[dict[str, Any]]:
+def render(
+    options: Options, runs: dict[str, tuple[Path, TrainConfig, Mapping[str, VoronoiRouter]]]
+) -> list[dict[str, Any]]:
     """Seconds and PSNR of test views, dense and through a grid in turn."""
+    if options.views < 1:
+        return []
     scene = builtin_scene(options.size, train_views=1, test_views=options.views)
     background = scene.background_colour()
     results = []
-    for name, trainer in trainers.items():
-        renderer = make_renderer(trainer.config, scene, trainer.routers)
+    for name, (folder, config, routers) in runs.items():
+        renderer = make_renderer(config, scene, routers)
         started = time.perf_counter()
-        grid = load_grid(trainer.out, trainer.config, trainer.router, scene, wanted=True)
+        grid = load_grid(folder, config, routers["field"], scene, wanted=True)
         made_in = time.perf_counter() - started
         assert grid is not None
-        ways = {"dense": None, "grid": grid} if name == "plain" else {"own grid": grid}
+        ways = {"own grid": grid} if config.occupancy else {"dense": None, "grid": grid}
         seconds: dict[str, list[float]] = {way: [] for way in ways}
         scores: dict[str, list[float]] = {way: [] for way in ways}
         for repeat in range(options.repeats + 1):
@@ -127,8 +139,11 @@ def main() -> int:
     """Measures, prints and, where asked to, writes."""
     options = tyro.cli(Options, description=__doc__)
     with tempfile.TemporaryDirectory() as folder:
-        trainers = train(options, Path(folder))
-        pictures = render(options, trainers)
+        trainers = {} if options.trained is not None else train(options, Path(folder))
+        fields = {name: (trainer.out, trainer.config, trainer.routers) for name, trainer in trainers.items()}
+        if options.trained is not None:
+            fields[options.trained.name] = (options.trained, *load_run(options.trained))
+        pictures = render(options, fields)
         runs = [
             {
                 "run": name,
@@ -143,8 +158,10 @@ def main() -> int:
         print(f"{run['run']:10} {run['seconds']:6.1f} s  {run['steps']:6d} steps  {run['psnr']:.2f} dB")
     for row in pictures:
         print(f"{row['run']:10} {row['way']:9} {row['seconds']:7.3f} s a picture  {row['psnr']:.2f} dB")
-    dense, grid = (next(row for row in pictures if row["way"] == way) for way in ("dense", "grid"))
-    print(f"rendering: {dense['seconds'] / grid['seconds']:.1f} x, {grid['psnr'] - dense['psnr']:+.3f} dB")
+    both = {row["way"]: row for row in pictures}
+    if "dense" in both:
+        dense, grid = both["dense"], both["grid"]
+        print(f"rendering: {dense['seconds'] / grid['seconds']:.1f} x, {grid['psnr'] - dense['psnr']:+.3f} dB")
     outcome = {
         "metadata": metadata(
             benchmark="occupancy", scene="builtin", budget=options.budget, share=options.share, size=options.size

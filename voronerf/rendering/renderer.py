@@ -241,7 +241,7 @@ class Renderer:
         """One camera's whole image, without gradients and without randomness; see `render_image`."""
         grid = self.occupancy
         if chunk is None:
-            chunk = 4096 if grid is None else 32_768
+            chunk = 4096 if grid is None else 131_072
         if chunk < 1:
             raise ValueError(f"render_image: chunk must be >= 1, got {chunk}")
         rays = cameras.image_rays(index, cones=self.cones)
@@ -311,7 +311,7 @@ def render_image(
             opaque. None asks about every sample.
         heaviest: whether to look for each ray's heaviest sample; without it the result has every ray's far end instead.
         chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples of
-            a ray, 32,768.
+            a ray, 131,072.
         backend: of the ops.
     """
     renderer = Renderer({"field": field}, samples=samples, spacing=spacing, occupancy=occupancy, backend=backend)

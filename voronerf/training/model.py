@@ -28,7 +28,7 @@ PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
 #: A sample that takes less of the light than this, were its cell that dense throughout, is not worth asking for: in
 #: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
 #: through empty space lies between the two, and would keep a third of the samples.
-LEAST_OPACITY, TRAINING_OPACITY = 0.01, 0.05
+LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
 #: What a cell remembers each time a sample of a training batch lies in it, and how many samples in a row have to find
 #: nothing in a new cell: some thirty steps, until which the field has said nothing about most of them.
 OCCUPANCY_DECAY, OCCUPANCY_PATIENCE = 0.8, 8
