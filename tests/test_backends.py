@@ -188,3 +188,20 @@ def test_auto_runs_networks_natively_on_every_device(monkeypatch: pytest.MonkeyP
         for device in ("cpu", "cuda"):
             assert choose(op, "auto", device, None, torch.float32) == "native"
         assert choose(op, "auto", "cuda", None, torch.float64) == "reference"
+
+
+def test_a_source_folder_that_is_not_installed_says_so() -> None:
+    """As on a machine that has the sources alone: no finder of an editable install, no ``voronerf.kernels``."""
+    code = f"""
+import sys
+sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder).lower()]
+sys.path.insert(0, {str(Path(__file__).parent.parent)!r})
+import torch
+from voronerf import backends
+reason = backends.missing("warp", torch.device("cpu"))
+assert reason == "the Warp kernels are not installed; run `pip install -e .`", reason
+assert backends.describe()["warp"] == {{"available": False, "reason": reason}}
+assert len(backends.table()) == len(backends.OPS) * len(backends.BACKENDS)
+"""
+    result = run_python(code)
+    assert result.returncode == 0, result.stderr

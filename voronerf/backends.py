@@ -19,6 +19,7 @@ import importlib
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -192,11 +193,25 @@ def missing(backend: str, device: torch.device) -> str | None:
     if backend == "reference":
         return None
     try:
-        module = importlib.import_module("voronerf._native" if backend == "native" else "voronerf.kernels")
+        module = _import("voronerf._native" if backend == "native" else "voronerf.kernels")
     except BackendUnavailable as error:
         return str(error)
     reason: str | None = module.missing(device)
     return reason
+
+
+def _import(module: str) -> ModuleType:
+    """A backend's module. Run from its source folder, the package has no ``voronerf.kernels``, which lie beside it.
+
+    Raises:
+        BackendUnavailable: It cannot be used here.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != "voronerf.kernels":
+            raise
+        raise BackendUnavailable("the Warp kernels are not installed; run `pip install -e .`") from None
 
 
 def table() -> list[Row]:
@@ -231,7 +246,7 @@ def describe() -> dict[str, Any]:
 
 def _describe(module: str) -> dict[str, Any]:
     try:
-        described: dict[str, Any] = importlib.import_module(module).describe()
+        described: dict[str, Any] = _import(module).describe()
     except BackendUnavailable as error:
         return {"available": False, "reason": str(error)}
     return {"available": True, **described}

@@ -60,7 +60,8 @@ def test_roofs(parts: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 
 def test_training(parts: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert parts.training(tmp_path, "builtin", "cpu", 0.5) == 0
-    assert capsys.readouterr().out.count("PSNR") == len(parts.TRAININGS)
+    ungraphed = [settings for settings in parts.TRAININGS.values() if "cuda_graph" not in settings]
+    assert capsys.readouterr().out.count("PSNR") == len(ungraphed) == 2
 
 
 def test_machine(parts: ModuleType, capsys: pytest.CaptureFixture) -> None:
