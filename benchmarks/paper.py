@@ -27,7 +27,7 @@ from harness import metadata
 from paper_claims import Rows
 from paper_experiments import EXPERIMENTS
 from paper_report import ORDER, claims_text, write_experiment, write_report
-from paper_runs import Run, Settings, results, train_missing
+from paper_runs import Run, Settings, default_scenes, results, train_missing
 
 from voronerf.cli.main import EXPECTED
 from voronerf.training.files import write_text
@@ -131,7 +131,8 @@ def everything(settings: Settings, page: Path = PAGE, only: tuple[str, ...] = OR
     """Repeat all tables and figures, and write the page about them.
 
     Args:
-        settings: For all of them; the experiment on limits has its own two scenes.
+        settings: For all of them. The experiment on limits has its own two scenes; without --scene the table by
+            sampling has one, since that by architecture has more.
         page: The page.
         only: Experiments to run, in this order; the page shows whatever is in --out.
     """
@@ -139,7 +140,8 @@ def everything(settings: Settings, page: Path = PAGE, only: tuple[str, ...] = OR
     if unknown:
         raise ValueError(f"--only must name experiments, of {', '.join(ORDER)}, got {', '.join(unknown)}")
     started = time.perf_counter()
-    own = {name: replace(settings, scene=()) if name == "limits" else settings for name in only}
+    own = dict.fromkeys(only, settings) | {"limits": replace(settings, scene=())}
+    own["sampling"] = replace(settings, scene=settings.scene or default_scenes())
     runs = {name: trainings(name, own[name]) for name in only}
     # Together, so that all trainings of a scene and a seed take turns with each other.
     train_missing([run for group in runs.values() for run in group], settings, say)

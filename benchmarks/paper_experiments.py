@@ -336,6 +336,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         "NeRF and mip-NeRF, each with stratified and with hierarchical sampling: one network against cells.",
         _crossed(SAMPLINGS),
         _crossed_claims(SAMPLINGS),
+        scenes=lambda: default_scenes(2),
         published=_published,
     ),
     "architecture": Experiment(

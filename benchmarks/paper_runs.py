@@ -42,7 +42,7 @@ class Settings:
 
     scene: tuple[str, ...] = ()
     """Scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), or built-in ones; default: lego
-    where it is there, else builtin, and for the table by architecture also ship."""
+    where it is there, else builtin, and for the tables by sampling and architecture also ship."""
     downscale: int = 4
     """Factor on the published 400 x 400 images; the built-in scenes have 100 x 100 at 4."""
     budget: float = 480.0
