@@ -28,7 +28,7 @@ from voronerf.training.evaluation import evaluate, mean_scores
 from voronerf.training.files import write_text
 from voronerf.training.model import checkpoint_path, resolve_config
 from voronerf.training.runs import read_metrics
-from voronerf.training.trainer import Trainer
+from voronerf.training.trainer import Trainer, TrainingError
 
 Row = dict[str, Any]
 PUBLISHED_SIZE = 400
@@ -217,14 +217,21 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
         trainers[run.folder] = Trainer(
             config, scene, on_event=lambda line, name=run.variant.name: say(f"{name:28} {line}")
         )
-    take_turns(
-        trainers.values(),
-        budget=settings.budget,
-        turn=settings.turn,
-        stops=lambda trainer: [second for _, second in paper_looks.stops(trainer)],
-        on_stop=paper_looks.reached,
-        after_turn=lambda trainer: trainer.save(),
-    )
+    try:
+        take_turns(
+            trainers.values(),
+            budget=settings.budget,
+            turn=settings.turn,
+            stops=lambda trainer: [second for _, second in paper_looks.stops(trainer)],
+            on_stop=paper_looks.reached,
+            after_turn=lambda trainer: trainer.save(),
+        )
+    except TrainingError as error:
+        # What failed would fail again from where it stands: it starts anew next time, the others go on.
+        for folder in trainers:
+            if str(error).startswith(f"{folder}:"):
+                checkpoint_path(folder).unlink(missing_ok=True)
+        raise
     for run in group:
         trainer = trainers.pop(run.folder)
         summary = trainer.run()

@@ -291,9 +291,13 @@ def test_a_curve_is_of_the_same_views_throughout(load: Load, settings: Any, tmp_
 def test_failures_of_a_training_are_told(load: Load, settings: Any, tmp_path: Path) -> None:
     runs = load("paper_runs")
     variant = runs.Variant("too many", {"cells": (5000,), "split_at_steps": (2,)})
+    small = replace(settings, out=tmp_path)
+    failing = runs.make_run(variant, "builtin", 0, small)
+    other = runs.make_run(runs.Variant("one", {"cells": ()}), "builtin", 0, small)
     with pytest.raises(TrainingError, match="more cells than samples"):
-        small = replace(settings, out=tmp_path)
-        runs.train_missing([runs.make_run(variant, "builtin", 0, small)], small)
+        runs.train_missing([other, failing], small)
+    kept = [(run.folder / "checkpoints" / "last.safetensors").is_file() for run in (other, failing)]
+    assert kept == [True, False]  # the next start begins anew with what failed, and goes on with the other
 
 
 def test_runs_are_known_by_what_they_learn(load: Load, settings: Any) -> None:
