@@ -96,7 +96,9 @@ def write_report(out: Path, page: Path) -> None:
     if not outcomes:
         raise ValueError(f"--out must hold results of experiments, got {out}")
     lines = [INTRODUCTION, "", "## What the paper claims, and what came out", ""]
-    lines += claims_table([claim for outcome in outcomes.values() for claim in outcome.get("claims", [])])
+    claims = [claim for outcome in outcomes.values() for claim in outcome.get("claims", [])]
+    # two experiments that share trainings may judge the same claim by the same figures
+    lines += claims_table(list({tuple(claim.values()): claim for claim in claims}.values()))
     missing = [name for name in ORDER if name not in outcomes]
     if missing:
         lines += ["", f"Not run: {', '.join(missing)}."]

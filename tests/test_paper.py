@@ -476,6 +476,8 @@ def test_the_page_shows_what_came_out_and_keeps_notes(load: Load, settings: Any,
     text = page.read_text()
     stored = json.loads((out / "initialisation.json").read_text())
     assert all(claim["verdict"] in text and claim["here"] in text for claim in stored["claims"])
+    summary = text.split("## Figure")[0]
+    assert all(summary.count(f"| {claim['claim']} |") == 1 for claim in stored["claims"])
     assert "Not run: convergence" in text and "RTX 2080 Ti" in text and "20 x 20 pixels; 0.25 s a variant" in text
     assert "(images/paper/initialisation.png)" in text
     assert (page.parent / "images" / "paper" / "initialisation.png").stat().st_size < 60_000
