@@ -9,6 +9,8 @@ REQUIRE ?=
 TEST_ARGS ?=
 # Test cases are small: more threads than this wait for each other longer than they work. Some tests ask for their own.
 THREADS ?= 1
+# Processes that share the tests.
+JOBS ?= auto
 # Every architecture nvcc 13 knows that a user may have; the last also as PTX.
 CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
 
@@ -25,7 +27,7 @@ demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
 
 test: $(VENV)/.built
-	@OMP_NUM_THREADS=$(THREADS) $(BIN)/pytest -q $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
+	@OMP_NUM_THREADS=$(THREADS) $(BIN)/pytest -q -n $(JOBS) --dist worksteal $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
 
 # A few minutes; for figures to keep, run the scripts with --json and the settings they document.
 bench: $(VENV)/.built

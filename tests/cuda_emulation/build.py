@@ -6,6 +6,7 @@ module for each sanitizer, which are told nothing of the scheduler (emulation.cp
 
 from __future__ import annotations
 
+import fcntl
 import platform
 import shlex
 import subprocess
@@ -28,10 +29,16 @@ SHARED = ("grouped_mlp_cuda_plan.cpp", "grouped_mlp_cuda_layers_plan.cpp")
 
 def build(sanitizer: str = "none") -> Path:
     """The module, built where it was not up to date."""
-    import pybind11
-
     out = ROOT / "build" / "cuda-emulation" / f"{platform.machine()}-{sys.implementation.cache_tag}"
     (out / sanitizer).mkdir(parents=True, exist_ok=True)
+    with (out / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # tests in several processes share the folder
+        return _build(out, sanitizer)
+
+
+def _build(out: Path, sanitizer: str) -> Path:
+    import pybind11
+
     module = out / sanitizer / f"voronerf_emulation{sysconfig.get_config_var('EXT_SUFFIX')}"
     sources = [*sorted((ROOT / "csrc").glob("*.cu")), *sorted(HERE.glob("*.cu")), *sorted(HERE.glob("*.cpp"))]
     sources += [ROOT / "csrc" / name for name in ("bindings_cuda.cpp", *SHARED) if (ROOT / "csrc" / name).exists()]
