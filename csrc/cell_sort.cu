@@ -17,6 +17,8 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kWarps = kThreads / 32;
+constexpr int kAhead = 4;             // steps of 32 rows that are read before they are counted
+constexpr int kSharedBuckets = 1024;  // of a warp: 32 KiB of a block
 constexpr int kScanThreads = 1024;
 constexpr int kScanItems = static_cast<int>(kScanTile) / kScanThreads;
 constexpr unsigned kAll = 0xffffffffu;
@@ -25,47 +27,76 @@ __device__ int64_t bucket_of(int32_t cell, int64_t k) {
   return cell < 0 ? 0 : cell >= k ? k + 1 : cell + 1;
 }
 
-// Calls place(row, bucket, position) for every row of the warp's chunk, where position is the value of the row's
-// counter before it. Counters belong to this warp alone; __syncwarp makes the write of one lane visible to the lane
-// that reads next.
+// Calls place(row, position) for every row of the warp's chunk, where position is the value of the row's counter before
+// it; the counter of bucket b is counters[b * stride]. Counters belong to this warp alone; __syncwarp makes the write
+// of one lane visible to the lane that reads next. Cells are read some steps ahead.
 template <typename Place>
-__device__ void count_rows(const int32_t* cells, int32_t* counts, int64_t chunk, int64_t chunks, int64_t rows,
+__device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t stride, int64_t chunk, int64_t rows,
                            int64_t n, int64_t k, Place place) {
   const int lane = threadIdx.x % 32;
   const int64_t end = (chunk + 1) * rows < n ? (chunk + 1) * rows : n;
-  for (int64_t start = chunk * rows; start < end; start += 32) {
-    const int64_t row = start + lane;
-    const bool active = row < end;
-    // Lanes past the end form a group of their own, which counts nothing.
-    const int64_t bucket = active ? bucket_of(cells[row], k) : -1;
-    const unsigned peers = __match_any_sync(kAll, static_cast<int>(bucket));
-    const int leader = __ffs(static_cast<int>(peers)) - 1;
-    int32_t before = 0;
-    if (active && lane == leader) {
-      int32_t* counter = counts + bucket * chunks + chunk;
-      before = *counter;
-      *counter = before + __popc(peers);
+  for (int64_t start = chunk * rows; start < end; start += 32 * kAhead) {
+    int32_t ahead[kAhead];
+#pragma unroll
+    for (int step = 0; step < kAhead; ++step) {
+      const int64_t row = start + 32 * step + lane;
+      ahead[step] = row < end ? cells[row] : 0;
     }
-    before = __shfl_sync(kAll, before, leader);
-    if (active) place(row, before + __popc(peers & ((1u << lane) - 1u)));
-    __syncwarp();
+#pragma unroll
+    for (int step = 0; step < kAhead; ++step) {
+      const int64_t row = start + 32 * step + lane;
+      const bool active = row < end;
+      // Lanes past the end form a group of their own, which counts nothing.
+      const int64_t bucket = active ? bucket_of(ahead[step], k) : -1;
+      const unsigned peers = __match_any_sync(kAll, static_cast<int>(bucket));
+      const int leader = __ffs(static_cast<int>(peers)) - 1;
+      int32_t before = 0;
+      if (active && lane == leader) {
+        int32_t* counter = counters + bucket * stride;
+        before = *counter;
+        *counter = before + __popc(peers);
+      }
+      before = __shfl_sync(kAll, before, leader);
+      if (active) place(row, before + __popc(peers & ((1u << lane) - 1u)));
+      __syncwarp();
+    }
   }
 }
 
-__global__ void __launch_bounds__(kThreads) cell_sort_count(const int32_t* __restrict__ cells, int32_t* counts,
-                                                            int64_t chunks, int64_t rows, int64_t n, int64_t k) {
+// The same with the chunk's counters in shared memory, where they fit: a warp waits for one at every step.
+template <bool kShared, bool kWriteBack, typename Place>
+__device__ void count_chunk(const int32_t* cells, int32_t* counts, int64_t chunks, int64_t rows, int64_t n, int64_t k,
+                            Place place) {
   const int64_t chunk = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
   if (chunk >= chunks) return;  // whole warps leave; there is no barrier of the block
-  count_rows(cells, counts, chunk, chunks, rows, n, k, [](int64_t, int32_t) {});
+  if constexpr (kShared) {
+    VN_SHARED(counters, int32_t[kWarps][kSharedBuckets]);
+    int32_t* own = counters[threadIdx.x / 32];
+    for (int64_t bucket = threadIdx.x % 32; bucket < k + 2; bucket += 32) own[bucket] = counts[bucket * chunks + chunk];
+    __syncwarp();
+    count_rows(cells, own, 1, chunk, rows, n, k, place);
+    if constexpr (kWriteBack) {
+      for (int64_t bucket = threadIdx.x % 32; bucket < k + 2; bucket += 32) {
+        counts[bucket * chunks + chunk] = own[bucket];
+      }
+    }
+  } else {
+    count_rows(cells, counts + chunk, chunks, chunk, rows, n, k, place);
+  }
 }
 
+template <bool kShared>
+__global__ void __launch_bounds__(kThreads) cell_sort_count(const int32_t* __restrict__ cells, int32_t* counts,
+                                                            int64_t chunks, int64_t rows, int64_t n, int64_t k) {
+  count_chunk<kShared, true>(cells, counts, chunks, rows, n, k, [](int64_t, int32_t) {});
+}
+
+template <bool kShared>
 __global__ void __launch_bounds__(kThreads)
     cell_sort_scatter(const int32_t* __restrict__ cells, int32_t* counts, int32_t* __restrict__ order, int64_t chunks,
                       int64_t rows, int64_t n, int64_t k) {
-  const int64_t chunk = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
-  if (chunk >= chunks) return;
-  count_rows(cells, counts, chunk, chunks, rows, n, k,
-             [order](int64_t row, int32_t position) { order[position] = static_cast<int32_t>(row); });
+  count_chunk<kShared, false>(cells, counts, chunks, rows, n, k,
+                              [order](int64_t row, int32_t position) { order[position] = static_cast<int32_t>(row); });
 }
 
 // Exclusive scan over the threads of a block of kScanThreads; `total` is the sum of all. `warp_sums` is shared scratch.
@@ -154,11 +185,20 @@ void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, int3
   int32_t* counts = workspace;
   int32_t* tile_sums = workspace + size;
   VN_CUDA_CHECK(cudaMemsetAsync(counts, 0, sizeof(int32_t) * size, stream));
-  VN_LAUNCH(cell_sort_count, blocks, kThreads, 0, stream, cells, counts, chunks, rows, n, k);
+  const bool shared = k + 2 <= kSharedBuckets;
+  if (shared) {
+    VN_LAUNCH(cell_sort_count<true>, blocks, kThreads, 0, stream, cells, counts, chunks, rows, n, k);
+  } else {
+    VN_LAUNCH(cell_sort_count<false>, blocks, kThreads, 0, stream, cells, counts, chunks, rows, n, k);
+  }
   VN_LAUNCH(scan_sums, tiles, kScanThreads, 0, stream, counts, tile_sums, size);
   VN_LAUNCH(scan_tiles, 1, kScanThreads, 0, stream, tile_sums, tiles);
   VN_LAUNCH(scan_places, tiles, kScanThreads, 0, stream, counts, tile_sums, offsets, size, chunks);
-  VN_LAUNCH(cell_sort_scatter, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);
+  if (shared) {
+    VN_LAUNCH(cell_sort_scatter<true>, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);
+  } else {
+    VN_LAUNCH(cell_sort_scatter<false>, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);
+  }
 }
 
 }  // namespace voronerf

@@ -90,6 +90,22 @@ __device__ __forceinline__ float round_to_tf32(float x) {
 #endif
 }
 
+// Sine and cosine of -pi..pi to about 5e-7, by the device's own unit.
+__device__ __forceinline__ float fast_sine(float x) {
+#ifdef VN_EMULATE
+  return sinf(x);
+#else
+  return __sinf(x);
+#endif
+}
+__device__ __forceinline__ float fast_cosine(float x) {
+#ifdef VN_EMULATE
+  return cosf(x);
+#else
+  return __cosf(x);
+#endif
+}
+
 // Loads four 8 x 8 matrices of 16-bit elements from shared memory: lane l gives the address of row l % 8 of matrix l /
 // 8 (16 bytes, aligned) and gets elements 2 (l % 4) and the next of row l / 4 of each; transposed, of column l / 4.
 template <bool kTransposed>

@@ -151,8 +151,8 @@ __global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan 
     const int64_t first = tile + warp * kRows;
     const auto positions = [&](int64_t row) { return mlp_positions(plan, data, row); };
     const auto directions = [&](int64_t row) { return mlp_directions(plan, data, row); };
-    mlp_encode<Products>(plan.positions, region, kRows, first, task.end, positions);
-    mlp_encode<Products>(plan.directions, region, kRows, first, task.end, directions);
+    mlp_encode<Products, kRows>(plan.positions, region, first, task.end, positions);
+    mlp_encode<Products, kRows>(plan.directions, region, first, task.end, directions);
     __syncwarp();
     mlp_run<Products, kRowTiles>(plan, region, slot, packed, [](int, int, const MlpSums<kRowTiles, kMlpTiles>&) {});
     // Every layer, then positions and directions, which are layers without a product of their own.
@@ -187,21 +187,40 @@ __global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan 
           }
         }
         mlp_gather<Products, kRowTiles>(plan, region, slot, packed, l, chunk, columns, sums);
-#pragma unroll
-        for (int r = 0; r < kRowTiles; ++r) {
+        const auto at = [&](int r, int t, int half) {
+          return (16 * r + lane / 4 + 8 * half) * place.stride + chunk + 8 * t + 2 * (lane % 4);
+        };
+        if (mlp_is_simple(activation)) {
 #pragma unroll
           for (int t = 0; t < kMlpTiles; ++t) {
             if (8 * t >= columns) continue;
 #pragma unroll
-            for (int half = 0; half < 2; ++half) {
-              const int row = 16 * r + lane / 4 + 8 * half, column = chunk + 8 * t + 2 * (lane % 4);
-              const int at = row * place.stride + column;
-              const float x = mlp_times_slope(activation, sums[r][t][2 * half], Products::load(region + slope + at));
-              const float y =
-                  mlp_times_slope(activation, sums[r][t][2 * half + 1], Products::load(region + slope + at + 1));
-              Products::store(region + place.value + at, x, y);
+            for (int r = 0; r < kRowTiles; ++r) {
+#pragma unroll
+              for (int half = 0; half < 2; ++half) {
+                Element* pair = region + place.value + at(r, t, half);
+                const float x = sums[r][t][2 * half], y = sums[r][t][2 * half + 1];
+                const bool all = activation == static_cast<int>(Activation::none);
+                Products::store(pair, all || Products::load(pair) > 0.0f ? x : 0.0f,
+                                all || Products::load(pair + 1) > 0.0f ? y : 0.0f);
+              }
             }
           }
+        } else {
+          mlp_for_each_tile(sums, [&](int t, const MlpSums<kRowTiles, 1>& each) {
+            if (8 * t >= columns) return;
+#pragma unroll
+            for (int r = 0; r < kRowTiles; ++r) {
+#pragma unroll
+              for (int half = 0; half < 2; ++half) {
+                const int from = slope + at(r, t, half);
+                const float x = mlp_times_slope(activation, each[r][0][2 * half], Products::load(region + from));
+                const float y =
+                    mlp_times_slope(activation, each[r][0][2 * half + 1], Products::load(region + from + 1));
+                Products::store(region + place.value + at(r, t, half), x, y);
+              }
+            }
+          });
         }
       }
       if (l < 0) {

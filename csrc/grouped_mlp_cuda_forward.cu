@@ -23,10 +23,10 @@ __global__ void __launch_bounds__(128, 3) mlp_forward_kernel(const MlpCudaPlan p
   }
   for (int64_t tile = task.begin; tile < task.end; tile += plan.warps * kRows) {
     const int64_t first = tile + warp * kRows;
-    mlp_encode<Products>(plan.positions, region, kRows, first, task.end,
-                         [&](int64_t row) { return mlp_positions(plan, data, row); });
-    mlp_encode<Products>(plan.directions, region, kRows, first, task.end,
-                         [&](int64_t row) { return mlp_directions(plan, data, row); });
+    mlp_encode<Products, kRows>(plan.positions, region, first, task.end,
+                                [&](int64_t row) { return mlp_positions(plan, data, row); });
+    mlp_encode<Products, kRows>(plan.directions, region, first, task.end,
+                                [&](int64_t row) { return mlp_directions(plan, data, row); });
     __syncwarp();
     mlp_run<Products, kRowTiles>(
         plan, region, slot, packed, [&](int l, int chunk, const MlpSums<kRowTiles, kMlpTiles>& sums) {

@@ -10,7 +10,9 @@ namespace voronerf {
 namespace {
 
 constexpr int kWidest = 256;
-constexpr int kTasksPerMultiprocessor = 4;
+// Tasks of a multiprocessor: many, since the last ones leave others idle; backward each has a partial gradient.
+constexpr int kForwardTasks = 32;
+constexpr int kBackwardTasks = 8;
 
 int pad(int64_t width) {
   return static_cast<int>(ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth);
@@ -207,7 +209,8 @@ const char* mlp_cuda_plan(const MlpTable& table, MlpPrecision precision, int64_t
     const int64_t bytes = (int64_t{plan.region} * shape.warps + plan.slot) * size;
     if (bytes > device.shared_bytes) continue;
     plan.shared_bytes = static_cast<int>(bytes);
-    const int64_t wanted = std::max<int64_t>(1, int64_t{kTasksPerMultiprocessor} * device.multiprocessors);
+    const int64_t wanted =
+        std::max<int64_t>(1, int64_t{backward ? kBackwardTasks : kForwardTasks} * device.multiprocessors);
     plan.task_rows = ceil_div(std::max<int64_t>(1, ceil_div(n, wanted)), int64_t{plan.rows()}) * plan.rows();
     plan.tasks = n / plan.task_rows + k;  // every cell's last task may be short
     return nullptr;

@@ -21,9 +21,13 @@ template <bool kBfloat16>
 struct HalfProducts {
   using Element = uint16_t;
   static constexpr int kSkew = 8;
+  static constexpr bool kRounded = true;  // operands have far fewer bits than float32
 
   static __device__ void store(Element* to, float x, float y) {
     *reinterpret_cast<uint32_t*>(to) = pack_halves<kBfloat16>(x, y);
+  }
+  static __device__ void store_one(Element* to, float x) {
+    *to = static_cast<Element>(pack_halves<kBfloat16>(x, 0.0f));
   }
   static __device__ float load(const Element* from) { return unpack_half<kBfloat16>(*from); }
 
@@ -69,10 +73,12 @@ template <bool kTf32>
 struct FloatProducts {
   using Element = float;
   static constexpr int kSkew = 4;
+  static constexpr bool kRounded = kTf32;
 
   static __device__ void store(Element* to, float x, float y) {
     *reinterpret_cast<float2*>(to) = kTf32 ? make_float2(round_to_tf32(x), round_to_tf32(y)) : make_float2(x, y);
   }
+  static __device__ void store_one(Element* to, float x) { *to = kTf32 ? round_to_tf32(x) : x; }
   static __device__ float load(const Element* from) { return *from; }
 
   template <bool kTransposed>
@@ -215,13 +221,92 @@ __device__ inline float mlp_encoded(const MlpCudaInput& input, const float* raw,
   return input.integrated ? value * octave_blur(scale, raw[features + feature]) : value;
 }
 
+// x / 2 pi in two parts, exact to float32's square, so that a multiple of it by a power of 2 has a fraction.
+struct MlpTurns {
+  float high, low;
+};
+__device__ inline MlpTurns mlp_turns(float x) {
+  constexpr float kHigh = 0.159154937f, kLow = 6.42063833e-9f;
+  const float high = x * kHigh;
+  return {high, fmaf(x, kLow, fmaf(x, kHigh, -high))};
+}
+
+// The encoding of three coordinates, a row a lane (with 16 rows, the octaves between two lanes), for rounded operands:
+// an angle is reduced once for its sine and cosine, and neither is computed more exactly than is kept. By counting, a
+// tenth of the instructions of going column by column, which were more than those of four layers of width 64.
+template <typename Products>
+__device__ void mlp_encode_three(const MlpCudaInput& input, typename Products::Element* to, const float* raw, int part,
+                                 int parts) {
+  const int before = input.integrated ? 0 : 3;
+  MlpTurns turns[3];
+#pragma unroll
+  for (int feature = 0; feature < 3; ++feature) turns[feature] = mlp_turns(raw[feature]);
+  for (int octave = part; octave < input.octaves; octave += parts) {
+    const float scale = octave_scale(octave);
+    float sines[3], cosines[3];
+#pragma unroll
+    for (int feature = 0; feature < 3; ++feature) {
+      const float whole = turns[feature].high * scale;
+      const float nearest = (whole + 12582912.0f) - 12582912.0f;
+      const float angle = 6.28318531f * fmaf(turns[feature].low, scale, whole - nearest);
+      const float blur = input.integrated ? octave_blur(scale, raw[3 + feature]) : 1.0f;
+      sines[feature] = blur * fast_sine(angle);
+      cosines[feature] = blur * fast_cosine(angle);
+    }
+    auto* columns = to + before + 6 * octave;
+    if (input.integrated) {
+      Products::store(columns, sines[0], sines[1]);
+      Products::store(columns + 2, sines[2], cosines[0]);
+      Products::store(columns + 4, cosines[1], cosines[2]);
+    } else {
+      // Pairs begin at even columns; the odd ends of an octave are stored alone.
+      Products::store_one(columns, sines[0]);
+      Products::store(columns + 1, sines[1], sines[2]);
+      Products::store(columns + 3, cosines[0], cosines[1]);
+      Products::store_one(columns + 5, cosines[2]);
+    }
+  }
+  if (part > 0) return;
+  if (!input.integrated) {
+    Products::store(to, raw[0], raw[1]);
+    Products::store_one(to + 2, raw[2]);
+  }
+  for (int column = input.width; column < input.padded; ++column) Products::store_one(to + column, 0.0f);
+}
+
+// Whether mlp_encode_three() holds for a row: angles whose turns a float32 counts.
+__device__ inline bool mlp_are_near(const MlpCudaInput& input, const float* raw) {
+  const float scale = octave_scale(input.octaves);
+  return fabsf(raw[0]) * scale <= kLargestDeviceAngle && fabsf(raw[1]) * scale <= kLargestDeviceAngle &&
+         fabsf(raw[2]) * scale <= kLargestDeviceAngle;
+}
+
 // Encodes a warp's rows into its region; rows past the end are zero.
-template <typename Products, typename Raw>
-__device__ void mlp_encode(const MlpCudaInput& input, typename Products::Element* region, int rows, int64_t first,
-                           int64_t end, const Raw& raw_of) {
+template <typename Products, int kRows, typename Raw>
+__device__ void mlp_encode(const MlpCudaInput& input, typename Products::Element* region, int64_t first, int64_t end,
+                           const Raw& raw_of) {
   if (!input.used) return;
   const int lane = threadIdx.x % 32, pairs = input.padded / 2;
-  for (int i = lane; i < rows * pairs; i += 32) {
+  bool by_columns = true;
+  if constexpr (Products::kRounded) {
+    if (input.octaves > 0 && input.raw == (input.integrated ? 6 : 3)) {
+      const int row = lane % kRows;
+      const bool there = first + row < end;
+      const float* raw = there ? raw_of(first + row) : nullptr;
+      const bool near = !there || mlp_are_near(input, raw);
+      by_columns = __ballot_sync(kAllLanes, near) != kAllLanes;
+      auto* to = region + input.value + row * input.stride;
+      if (there && near) mlp_encode_three<Products>(input, to, raw, lane / kRows, 32 / kRows);
+      if (!there) {
+        for (int column = 2 * (lane / kRows); column < input.padded; column += 64 / kRows) {
+          Products::store(to + column, 0.0f, 0.0f);
+        }
+      }
+      if (by_columns) __syncwarp();
+    }
+  }
+  if (!by_columns) return;
+  for (int i = lane; i < kRows * pairs; i += 32) {
     const int row = i / pairs, column = 2 * (i - row * pairs);
     float x = 0.0f, y = 0.0f;
     if (first + row < end) {
@@ -245,6 +330,40 @@ __device__ inline float mlp_activate(int activation, float x) {
       return sinf(x);
     default:
       return x;
+  }
+}
+
+// Activations that are an instruction or two, which the kernels repeat for every register.
+__device__ inline bool mlp_is_simple(int activation) {
+  return activation <= static_cast<int>(Activation::relu);
+}
+__device__ inline float mlp_activate_simply(int activation, float x) {
+  return activation == static_cast<int>(Activation::relu) && x < 0.0f ? 0.0f : x;
+}
+
+// visit(tile, its sums) for every tile, by code that is there once: the others are long, and repeated for every
+// register they would fill the cache of instructions. Registers cannot be indexed, so all sums move on by a tile each
+// time.
+template <int kRowTiles, int kTiles, typename Visit>
+__device__ __forceinline__ void mlp_for_each_tile(MlpSums<kRowTiles, kTiles>& sums, const Visit& visit) {
+#pragma unroll 1
+  for (int tile = 0; tile < kTiles; ++tile) {
+    MlpSums<kRowTiles, 1> each;
+#pragma unroll
+    for (int r = 0; r < kRowTiles; ++r) {
+#pragma unroll
+      for (int i = 0; i < 4; ++i) each[r][0][i] = sums[r][0][i];
+    }
+    visit(tile, each);
+#pragma unroll
+    for (int r = 0; r < kRowTiles; ++r) {
+#pragma unroll
+      for (int i = 0; i < 4; ++i) {
+#pragma unroll
+        for (int t = 0; t + 1 < kTiles; ++t) sums[r][t][i] = sums[r][t + 1][i];
+        sums[r][kTiles - 1][i] = each[r][0][i];
+      }
+    }
   }
 }
 
@@ -351,23 +470,40 @@ __device__ void mlp_run(const MlpCudaPlan& plan, typename Products::Element* reg
                                                   layer.weight_stride, source.padded, columns / 8);
       }
       __syncwarp();  // the result may lie where a source was
-#pragma unroll
-      for (int r = 0; r < kRowTiles; ++r) {
+      const auto at = [&](int r, int tile, int half) {
+        return (16 * r + group + 8 * half) * layer.stride + chunk + 8 * tile + 2 * member;
+      };
+      if (mlp_is_simple(layer.activation)) {
 #pragma unroll
         for (int tile = 0; tile < kMlpTiles; ++tile) {
-          if (8 * tile < columns) {
-            const int row = 16 * r + group, column = chunk + 8 * tile + 2 * member;
+          if (8 * tile >= columns) continue;
+#pragma unroll
+          for (int r = 0; r < kRowTiles; ++r) {
 #pragma unroll
             for (int half = 0; half < 2; ++half) {
               float* pair = sums[r][tile] + 2 * half;
-              const int at = (row + 8 * half) * layer.stride + column;
-              if (layer.slope >= 0) Products::store(region + layer.slope + at, cosf(pair[0]), cosf(pair[1]));
-              pair[0] = mlp_activate(layer.activation, pair[0]);
-              pair[1] = mlp_activate(layer.activation, pair[1]);
-              Products::store(region + layer.value + at, pair[0], pair[1]);
+              pair[0] = mlp_activate_simply(layer.activation, pair[0]);
+              pair[1] = mlp_activate_simply(layer.activation, pair[1]);
+              Products::store(region + layer.value + at(r, tile, half), pair[0], pair[1]);
             }
           }
         }
+      } else {
+        mlp_for_each_tile(sums, [&](int tile, MlpSums<kRowTiles, 1>& each) {
+          if (8 * tile >= columns) return;
+#pragma unroll
+          for (int r = 0; r < kRowTiles; ++r) {
+#pragma unroll
+            for (int half = 0; half < 2; ++half) {
+              float* pair = each[r][0] + 2 * half;
+              const int place = at(r, tile, half);
+              if (layer.slope >= 0) Products::store(region + layer.slope + place, cosf(pair[0]), cosf(pair[1]));
+              pair[0] = mlp_activate(layer.activation, pair[0]);
+              pair[1] = mlp_activate(layer.activation, pair[1]);
+              Products::store(region + layer.value + place, pair[0], pair[1]);
+            }
+          }
+        });
       }
       visit(l, chunk, sums);
       __syncwarp();

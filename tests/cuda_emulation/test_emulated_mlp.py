@@ -40,6 +40,29 @@ def test_before_ampere(precision: str) -> None:
         check(BRANCHED, [70, 5], 3, precision)
 
 
+@pytest.mark.parametrize("integrated", [False, True])
+@pytest.mark.parametrize(("octaves", "extent"), [(10, 4.0), (16, 3.0), (4, 1000.0), (12, 1e5)])
+def test_encodings_are_exact_to_the_rounding_of_operands(octaves: int, extent: float, integrated: bool) -> None:
+    """An identity shows them. The last extent has angles beyond those that are reduced fast, in some rows."""
+    encoding = "integrated" if integrated else "frequency"
+    width = 6 * octaves + (0 if integrated else 3)
+    layers = MLP((Layer((POSITIONS,), width),), (0,), octaves, position_encoding=encoding)
+    positions = (2 * torch.rand(50, 3) - 1) * extent
+    positions[::7] /= extent
+    positions = torch.cat([positions, 1e-4 * torch.rand(50, 3)], dim=1) if integrated else positions
+    offsets, identity = torch.tensor([0, 50], dtype=torch.int32), torch.eye(width)[None]
+
+    def encoded(dtype: torch.dtype, backend: str, x: torch.Tensor) -> torch.Tensor:
+        return voronerf.grouped_mlp(x, offsets, [identity.to(dtype)], [None], layers=layers, backend=backend)
+
+    exact = encoded(torch.float64, "reference", positions.double())[:, width % 6 :]
+    for dtype in (torch.float16, torch.bfloat16, torch.float32):
+        with emulated():
+            found = encoded(dtype, "native", positions)[:, width % 6 :].double()
+        rounding = (exact.to(dtype).double() - exact).abs().max()
+        assert (found - exact).abs().max() <= 1.01 * rounding + 2e-7
+
+
 def test_values_beyond_float16_stay_finite() -> None:
     layers = MLP((Layer((POSITIONS,), 16, "relu"), Layer((0,), 16), Layer((1,), 2)), (2,))
     given = case(layers, [20], 3, torch.float16)

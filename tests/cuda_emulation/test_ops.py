@@ -50,7 +50,7 @@ def test_locate_cell(dtype: torch.dtype) -> None:
     assert torch.equal(found, voronerf.locate_cell(*arguments, depth=diagram.depth, backend="reference"))
 
 
-@pytest.mark.parametrize(("n", "k"), [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600)])
+@pytest.mark.parametrize(("n", "k"), [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600), (2100, 1022), (2100, 1023)])
 def test_cell_sort(n: int, k: int) -> None:
     cells = torch.randint(0, k, (n,), dtype=torch.int32)
     order, offsets = voronerf.cell_sort(cells, k, backend="native")
