@@ -19,7 +19,7 @@ export VORONERF_CUDA ?= $(if $(wildcard /dev/nvidiactl /dev/dxg),auto,0)
 
 SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
 
-PAPER_ARGS ?= --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
+PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
 .PHONY: demo test bench paper check cuda-check gpu-check emulate-cuda sanitize clean
 
@@ -35,8 +35,8 @@ bench: $(VENV)/.built
 	@$(BIN)/python benchmarks/balance.py --cells 4 16 64 --seeds 2
 	@$(BIN)/python benchmarks/time_to_quality.py --data builtin --budget 30 --eval-views 5
 
-# Every table and figure of the paper in small, on Lego and Ship where they are, into runs/paper and docs/paper.md. What is
-# there already is not made again.
+# Every table and figure of the paper in small, on Lego and Ship where they are, into runs/paper-small and docs/paper.md.
+# What is there already is not made again.
 paper: $(VENV)/.built
 	@$(BIN)/python benchmarks/paper.py all $(PAPER_ARGS)
 

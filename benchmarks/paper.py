@@ -5,9 +5,10 @@
     python benchmarks/paper.py all --budget 20 --downscale 8        # all of them, and docs/paper.md: `make paper`
     python benchmarks/paper.py report                               # docs/paper.md again, from what is in --out
 
-All variants of an experiment train for the same time, in turns of a few seconds in one process. Each experiment writes
-NAME.json ({metadata, results, claims}), NAME.md and pictures into --out. A training that is there already, made with
-the same settings, is not made again, and an interrupted one goes on.
+All variants of an experiment train for the same time. Each experiment writes NAME.json ({metadata, results, claims}),
+NAME.md and pictures into --out. A training that is there already, made with the same settings, is not made again, and
+an interrupted one goes on. Trainings made in one go take turns of a few seconds in one process; those that were there
+may be of another session.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from harness import metadata
 from paper_claims import Rows
 from paper_experiments import EXPERIMENTS
 from paper_report import ORDER, claims_text, write_experiment, write_report
-from paper_runs import Run, Settings, default_scenes, results, train_missing
+from paper_runs import Run, Settings, default_scenes, failures, results, train_missing
 
 from voronerf.cli.main import EXPECTED
 from voronerf.training.files import write_text
@@ -94,6 +95,7 @@ def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]
             eval_views=settings.eval_views,
             final_views=settings.final_views,
             backend=settings.backend,
+            failed=failures(runs),
         )
         outcome = {"metadata": description, "results": rows, "claims": [claim.to_dict() for claim in claims]}
         write_text(settings.out / f"{name}.json", json.dumps(outcome, indent=1) + "\n")

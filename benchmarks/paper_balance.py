@@ -103,10 +103,10 @@ def balance_verdict(before: float | None, after: float | None) -> str:
     """Whether balancing reaches the published figure, or at least its factor, or nothing of it."""
     if before is None or after is None:
         return NOT_MEASURED
-    if after <= BALANCE[1]:
-        return "holds"
     if after >= before:
         return "does not hold"
+    if after <= BALANCE[1]:
+        return "holds"
     factor, published = before / after, BALANCE[0] / BALANCE[1]
     if factor >= published:
         return f"the factor holds: {factor:.0f}, published {published:.0f}"

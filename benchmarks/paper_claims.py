@@ -45,12 +45,18 @@ class Rows:
         self, better: str, worse: str, scene: str | None = None, value: Callable[[Row], float | None] | None = None
     ) -> list[float]:
         """Value of one variant less that of another, for each scene and seed that both have; PSNR by default."""
+        return list(self.paired(better, worse, scene, value).values())
+
+    def paired(
+        self, better: str, worse: str, scene: str | None = None, value: Callable[[Row], float | None] | None = None
+    ) -> dict[tuple[str, int], float]:
+        """The same by scene and seed."""
         get = value or (lambda row: row.get("psnr"))
         first, second = (
             {(row["scene"], row["seed"]): get(row) for row in self.of(name, scene)} for name in (better, worse)
         )
-        pairs = [(first[key], second[key]) for key in first if key in second]
-        return [a - b for a, b in pairs if a is not None and b is not None]
+        pairs = {key: (first[key], second[key]) for key in first if key in second}
+        return {key: a - b for key, (a, b) in pairs.items() if a is not None and b is not None}
 
 
 @dataclass(frozen=True)
@@ -121,8 +127,28 @@ def order_claim(claim: str, published: str, rows: Rows, variants: Sequence[str],
 
 def at_look(row: dict[str, Any], look: str, value: str) -> float | None:
     """A number of a run's look, such as its seam measure; None where it was not measured."""
-    found = [entry.get(value) for entry in row["looks"] if entry["look"] == look]
-    return found[0] if found and found[0] is not None and found[0] == found[0] else None
+    return next((entry.get(value) for entry in row["looks"] if entry["look"] == look), None)
+
+
+def fewer_seams(rows: Rows, scene: str, usual: str, other: str, looks: Sequence[str]) -> list[float]:
+    """By how many per cent of the usual variant's mean the other's seams are lower, for each seed.
+
+    Of each seed those looks count that both variants have.
+    """
+    ours, theirs = (
+        {
+            row["seed"]: {name: seam for name in looks if (seam := at_look(row, name, "seam")) is not None}
+            for row in group
+        }
+        for group in (rows.of(usual, scene), rows.of(other, scene))
+    )
+    means = []
+    for seed, seams in ours.items():
+        shared = sorted(seams.keys() & theirs.get(seed, {}).keys())
+        if shared:
+            means.append([statistics.fmean(of[seed][name] for name in shared) for of in (ours, theirs)])
+    level = statistics.fmean(a for a, _ in means) if means else 0.0
+    return [100 * (a - b) / level for a, b in means] if level > 0 else []
 
 
 def at_share(row: Row, share: float) -> float | None:
@@ -142,9 +168,11 @@ def at_share(row: Row, share: float) -> float | None:
 def growing_claim(claim: str, published: str, rows: Rows, better: str, worse: str, scene: str | None) -> Claim:
     """A claim that a lead grows with the time: its size at 60 %, 80 % and the end."""
     shares = (0.6, 0.8, 1.0)
-    leads = [rows.gains(better, worse, scene, lambda row, share=share: at_share(row, share)) for share in shares]
-    if not all(leads):
+    by_seed = [rows.paired(better, worse, scene, lambda row, share=share: at_share(row, share)) for share in shares]
+    shared = [key for key in by_seed[-1] if all(key in found for found in by_seed)]
+    if not shared:
         return Claim(claim, published, "-", NOT_MEASURED)
+    leads = [[found[key] for key in shared] for found in by_seed]
     here = ", ".join(f"{statistics.fmean(lead):+.2f} at {100 * share:.0f} %" for share, lead in zip(shares, leads))
     changes = [last - first for first, last in zip(leads[0], leads[-1])]
     leading = statistics.fmean(leads[-1]) > 0
@@ -153,8 +181,14 @@ def growing_claim(claim: str, published: str, rows: Rows, better: str, worse: st
 
 
 def equal_claim(claim: str, published: str, gains: Sequence[float], tolerance: float, unit: str = "dB") -> Claim:
-    """A claim that two variants come out alike: their mean difference within a tolerance."""
+    """A claim that two variants come out alike: their difference within a tolerance."""
     if not gains:
         return Claim(claim, published, "-", NOT_MEASURED)
-    text = "holds" if abs(statistics.fmean(gains)) <= tolerance else "does not hold"
+    single = " (one seed)" if len(gains) == 1 else ""
+    if max(map(abs, gains)) <= tolerance:
+        text = f"holds{single or ' for every seed'}"
+    elif abs(statistics.fmean(gains)) <= tolerance:
+        text = "in the mean only"
+    else:
+        text = f"does not hold{single}"
     return Claim(claim, published, spread(gains, unit), f"{text} (within {tolerance:g} {unit})")

@@ -6,13 +6,12 @@ width alone, by one rule for all (see ``voronerf train --lr``).
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from paper_claims import Claim, Rows, at_look, equal_claim, gain_claim, growing_claim, order_claim
-from paper_published import HIERARCHICAL, KILONERF, STRATIFIED, Scores
+from paper_claims import Claim, Rows, at_look, equal_claim, fewer_seams, gain_claim, growing_claim, order_claim
+from paper_published import CELLS, HIERARCHICAL, KILONERF, STRATIFIED, Scores
 from paper_runs import Run, Settings, Variant, default_scenes, make_run, open_scene
 
 from voronerf.training.config import TrainConfig
@@ -68,14 +67,14 @@ class Experiment:
         ]
 
 
-def cells_name(settings: Settings) -> str:
+def cells_name(count: int) -> str:
     """The paper's own variant."""
-    return f"{settings.cells} Voronoi cells, width 64"
+    return f"{count} Voronoi cells, width 64"
 
 
-def uniform_name(settings: Settings) -> str:
+def uniform_name(count: int) -> str:
     """The same number of cells on a grid."""
-    return f"{settings.cells} uniform cells, width 64"
+    return f"{count} uniform cells, width 64"
 
 
 def one_or_cells(settings: Settings) -> list[Variant]:
@@ -83,7 +82,7 @@ def one_or_cells(settings: Settings) -> list[Variant]:
     return [
         Variant(WIDE, {"cells": (), "width": 256}),
         Variant(NARROW, {"cells": ()}),
-        Variant(cells_name(settings), {"cells": (settings.cells,)}),
+        Variant(cells_name(settings.cells), {"cells": (settings.cells,)}),
     ]
 
 
@@ -109,7 +108,7 @@ def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant
                 networks = one_or_cells(settings)
                 if sampling == "stratified":  # the published comparison with uniform cells
                     changes = {"cells": (settings.cells,), "centres": "uniform"}
-                    networks.append(Variant(uniform_name(settings), changes))
+                    networks.append(Variant(uniform_name(settings.cells), changes))
                 extra = rendered(field, sampling, settings)
                 found += [Variant(row_name(field, sampling, v.name), {**v.changes, **extra}) for v in networks]
         return found
@@ -118,14 +117,20 @@ def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant
 
 
 def _published(variant: str, scene: str) -> Scores | None:
-    for field, name in FIELDS.items():
-        if variant.startswith(f"{name}, hierarchical") and (field, scene) in HIERARCHICAL:
+    found: dict[str, Scores] = {}
+    for field in FIELDS:
+        if (field, scene) in HIERARCHICAL:
             one, cells = HIERARCHICAL[field, scene]
-            return one if WIDE in variant else cells if "12 Voronoi" in variant else None
-        if variant.startswith(f"{name}, stratified") and scene == "lego":
-            uniform, voronoi = STRATIFIED[field]
-            return uniform if "uniform" in variant else voronoi if "12 Voronoi" in variant else None
-    return None
+            found |= {row_name(field, "hierarchical", n): s for n, s in ((WIDE, one), (cells_name(CELLS), cells))}
+        if scene == "lego":
+            names = (uniform_name(CELLS), cells_name(CELLS))
+            found |= {row_name(field, "stratified", n): s for n, s in zip(names, STRATIFIED[field])}
+    return found.get(variant)
+
+
+def _published_gain(better: str, worse: str, scene: str) -> str:
+    high, low = _published(better, scene), _published(worse, scene)
+    return f"{high.psnr - low.psnr:+.2f} dB" if high and low else "-"
 
 
 def _kilo_published(variant: str, scene: str) -> Scores | None:
@@ -144,16 +149,14 @@ def _crossed_claims(samplings: Sequence[str]) -> Callable[[Rows, Settings], list
                     def named(network: str, field: str = field, sampling: str = sampling) -> str:
                         return row_name(field, sampling, network)
 
-                    cells, what = named(cells_name(settings)), f"{scene}, {FIELDS[field]}, {sampling}: cells beat"
-                    scores = HIERARCHICAL.get((field, scene)) if sampling == "hierarchical" else None
-                    text = f"{scores[1].psnr - scores[0].psnr:+.2f} dB" if scores else "-"
+                    cells, what = named(cells_name(settings.cells)), f"{scene}, {FIELDS[field]}, {sampling}: cells beat"
+                    text = _published_gain(cells, named(WIDE), scene)
                     wide, narrow = rows.gains(cells, named(WIDE), scene), rows.gains(cells, named(NARROW), scene)
                     found.append(gain_claim(f"{what} one network of width 256, by 2 dB", text, wide, 2.0))
                     found.append(gain_claim(f"{what} one network of width 64, by 0.5 dB", "-", narrow, 0.5))
                     if sampling == "stratified":
-                        uniform, voronoi = STRATIFIED[field]
-                        text = f"{voronoi.psnr - uniform.psnr:+.2f} dB" if scene == "lego" else "-"
-                        gains = rows.gains(cells, named(uniform_name(settings)), scene)
+                        uniform = named(uniform_name(settings.cells))
+                        text, gains = _published_gain(cells, uniform, scene), rows.gains(cells, uniform, scene)
                         found.append(gain_claim(f"{what} uniform cells", text, gains))
         return found
 
@@ -179,7 +182,7 @@ def _kilo_claims(rows: Rows, settings: Settings) -> list[Claim]:
     return [
         gain_claim(
             f"{scene}: 16 x 16 Voronoi cells beat {other}, by 0.5 dB",
-            text if other == KILO_START else "-",
+            text if scene == "lego" and other == KILO_START else "-",
             rows.gains(KILO_CELLS, other, scene),
             0.5,
         )
@@ -189,7 +192,7 @@ def _kilo_claims(rows: Rows, settings: Settings) -> list[Claim]:
 
 
 def _convergence_claims(rows: Rows, settings: Settings) -> list[Claim]:
-    cells = cells_name(settings)
+    cells = cells_name(settings.cells)
     return [
         claim
         for scene in rows.scenes
@@ -276,21 +279,7 @@ def _seam_variants(settings: Settings, scene: str) -> list[Variant]:
 def _seam_claims(rows: Rows, settings: Settings) -> list[Claim]:
     found = []
     for scene in rows.scenes:
-
-        def fewer(looks: Sequence[str], scene: str = scene) -> list[float]:
-            """By how many per cent of the nearest assignment's mean the seams of each seed are lower."""
-
-            def seams(row: dict[str, Any]) -> float | None:
-                values = [value for value in (at_look(row, name, "seam") for name in looks) if value is not None]
-                return statistics.fmean(values) if values else None
-
-            levels = [level for level in map(seams, rows.of(NEAREST, scene)) if level is not None]
-            if not levels or statistics.fmean(levels) == 0:
-                return []
-            gains = rows.gains(NEAREST, STOCHASTIC, scene, seams)
-            return [100 * gain / statistics.fmean(levels) for gain in gains]
-
-        early, late = fewer(EARLY), fewer(("end",))
+        early, late = (fewer_seams(rows, scene, NEAREST, STOCHASTIC, looks) for looks in (EARLY, ("end",)))
         quality = rows.gains(STOCHASTIC, NEAREST, scene)
         found += [
             gain_claim(f"{scene}: stochastic assignment: fewer seams in the first half", "order", early, unit="%"),
@@ -311,18 +300,24 @@ def _limit_variants(settings: Settings, scene: str) -> list[Variant]:
 
 
 def _limit_claims(rows: Rows, settings: Settings) -> list[Claim]:
-    hurt = {scene: rows.gains(USUAL, TOO_EARLY, scene) for scene in rows.scenes}
-    found = [
-        gain_claim(f"{scene}: a split before anything is known hurts", "in translucent scenes", gains)
-        for scene, gains in hurt.items()
-    ]
-    if hurt.get(SOLID) and hurt.get(TRANSLUCENT):
-        more = [a - b for a, b in zip(hurt[TRANSLUCENT], hurt[SOLID])]
-        found.append(gain_claim("it hurts more where much is translucent than where all is solid", "order", more))
-    helped = {scene: rows.gains(USUAL, NEVER, scene) for scene in rows.scenes}
-    if helped.get(SOLID) and helped.get(TRANSLUCENT):
-        less = [b - a for a, b in zip(helped[TRANSLUCENT], helped[SOLID])]
-        found.append(gain_claim("cells help less where much is translucent than where all is solid", "order", less))
+    found = []
+    for scene in rows.scenes:
+        name = f"{scene}, a control" if scene == SOLID else scene
+        text = "in translucent scenes" if scene == TRANSLUCENT else "-"
+        gains = rows.gains(USUAL, TOO_EARLY, scene)
+        found.append(gain_claim(f"{name}: a split before anything is known hurts", text, gains))
+    if {SOLID, TRANSLUCENT} <= set(rows.scenes):
+
+        def more(scene: str, than: str, worse: str) -> list[float]:
+            """By how much the usual split's gain over another variant is larger in a scene than in another."""
+            first, second = (
+                {seed: gain for (_, seed), gain in rows.paired(USUAL, worse, where).items()} for where in (scene, than)
+            )
+            return [first[seed] - second[seed] for seed in first if seed in second]
+
+        hurts, helps = more(TRANSLUCENT, SOLID, TOO_EARLY), more(SOLID, TRANSLUCENT, NEVER)
+        found.append(gain_claim("it hurts more where much is translucent than where all is solid", "order", hurts))
+        found.append(gain_claim("cells help less where much is translucent than where all is solid", "order", helps))
     return found
 
 

@@ -129,11 +129,7 @@ def seams(path: Path, rows: Sequence[Row]) -> Path:
     for pane, scene in zip(axes, table.scenes):
         for variant in table.variants:
             found = [
-                [
-                    (e["seconds"], e["seam"])
-                    for e in row["looks"]
-                    if e.get("seam") is not None and e["seam"] == e["seam"]
-                ]
+                [(e["seconds"], e["seam"]) for e in row["looks"] if e.get("seam") is not None]
                 for row in table.of(variant, scene)
             ]
             banded(pane, variant, found)

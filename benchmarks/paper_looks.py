@@ -58,6 +58,18 @@ def reached(trainer: Trainer, second: float) -> None:
         look(trainer, second, name)
 
 
+def forget_later(trainer: Trainer) -> None:
+    """Deletes a resumed run's looks at steps after its checkpoint, which will be made again."""
+    for entry in numbers(trainer.out):
+        if entry["seconds"] > trainer.seconds:
+            (trainer.out / "looks" / f"{entry['look']}.npz").unlink()
+
+
+def missed(trainer: Trainer) -> list[str]:
+    """The looks that a finished run has not: their time had passed when it was resumed."""
+    return [name for name, _ in stops(trainer) if not (trainer.out / "looks" / f"{name}.npz").is_file()]
+
+
 @torch.no_grad()
 def look(trainer: Trainer, second: float, name: str = "end") -> None:
     """Writes a look of a trainer as it is; ``second`` is when it was due."""
@@ -90,11 +102,15 @@ def picture(trainer: Trainer) -> dict[str, Any]:
 
 
 def seams(trainer: Trainer) -> dict[str, float]:
-    """The step in colour across the borders of cells; of trainings with one field of points, others are not asked."""
+    """The step in colour across the borders of cells, {} where none is visible.
+
+    Of trainings with one field of points; others are not asked.
+    """
     if len(trainer.routers) > 1 or trainer.renderer.fine_samples or trainer.renderer.cones:
         return {}
     scene, renderer = trainer.scene, trainer.renderer
-    return {"seam": seam(trainer.router, scene, lambda view: render_view(renderer, scene, view), views=SEAM_VIEWS)}
+    found = seam(trainer.router, scene, lambda view: render_view(renderer, scene, view), views=SEAM_VIEWS)
+    return {} if math.isnan(found) else {"seam": found}
 
 
 def load(folder: Path, name: str) -> dict[str, Any] | None:

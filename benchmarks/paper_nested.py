@@ -18,11 +18,13 @@ from typing import Any
 import torch
 from harness import metadata
 from paper_claims import Rows, gain_claim
+from paper_looks import held_out_view
 from paper_runs import Settings, default_scenes, open_scene
 from torch import Tensor, nn
 from turns import take_turns
 
 from voronerf import SampleReservoir, VoronoiDiagram, VoronoiRouter, frequency_encode, split_diagram
+from voronerf.training.config import default_learning_rate
 from voronerf.training.files import write_text
 from voronerf.training.panels import contact_sheet, palette, picture_of_colour, picture_of_error, save_picture
 
@@ -30,7 +32,7 @@ CHILDREN, LEVELS = 4, 3
 SPLITS = (0.15, 0.35, 0.55)  # of the budget, a level each
 WIDTH, DEPTH = 16, 3
 BATCH = 4096
-RATE, RATE_FINAL = 0.01, 0.05
+RATE, RATE_FINAL = 0.01, 0.05  # of networks of WIDTH, and what is left of it at the end
 LEAST_SAMPLES = 16
 EVALUATIONS = 20
 ONE, MATCHED, NESTED = "one network", "one network, as many parameters", "nested Voronoi cells"
@@ -109,7 +111,7 @@ class ImageFit:
             field = ImageField(width, DEPTH, octaves_of(image))
         self.router = VoronoiRouter(field, VoronoiDiagram(torch.zeros(1, 3)), coords="first3", backend=backend)
         # the same rule for all widths as that of `voronerf train`
-        self.rate = RATE * min(1.0, 64 / width)
+        self.rate = RATE * default_learning_rate(width) / default_learning_rate(WIDTH)
         self.optimizer = torch.optim.Adam(self.router.parameters(), lr=self.rate, betas=(0.9, 0.99), eps=1e-15)
         self.reservoir = SampleReservoir(10_000, 100)
         self.seconds, self.step = 0.0, 0
@@ -192,7 +194,7 @@ def nested(settings: Settings, say: Callable[[str], None] = print) -> dict[str, 
     name = (settings.scene or default_scenes())[0]
     # one picture is little to learn: it is taken four times as large as the scene's
     scene = open_scene(name, replace(settings, downscale=max(1, settings.downscale // 4)))
-    image = scene.test.truth(len(scene.test) // 3, torch.ones(3))
+    image = scene.test.truth(held_out_view(scene), torch.ones(3))
     octaves = octaves_of(image)
     total = CHILDREN**LEVELS * parameters(WIDTH, octaves)
     widths = {ONE: WIDTH, MATCHED: matching_width(total, octaves), NESTED: WIDTH}
@@ -235,9 +237,7 @@ def nested(settings: Settings, say: Callable[[str], None] = print) -> dict[str, 
         gain_claim(f"a picture: nested cells beat {other}", "-", rows.gains(NESTED, other)) for other in (ONE, MATCHED)
     ]
     outcome = {
-        "metadata": metadata(
-            **described(settings), size=list(image.shape[:2]), splits=SPLITS, children=CHILDREN, batch=BATCH, rate=RATE
-        ),
+        "metadata": metadata(**described(settings), size=list(image.shape[:2])),
         "results": results,
         "claims": [claim.to_dict() for claim in claims],
     }
@@ -256,6 +256,14 @@ def described(settings: Settings) -> dict[str, Any]:
         "budget_seconds": settings.budget,
         "seeds": settings.seeds,
         "backend": settings.backend,
+        "splits": list(SPLITS),
+        "children": CHILDREN,
+        "levels": LEVELS,
+        "width": WIDTH,
+        "depth": DEPTH,
+        "batch": BATCH,
+        "rate": RATE,
+        "rate_final": RATE_FINAL,
     }
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from paper_experiments import EXPERIMENTS
 from paper_figures import draw
-from paper_tables import claims_table, markdown
+from paper_tables import all_claims_table, markdown
 from PIL import Image
 
 from voronerf.training.files import write_bytes, write_text
@@ -75,6 +75,7 @@ def conditions(described: Mapping[str, Any]) -> str:
         f"the best of {len(described['rates'])} learning rates for each" if len(described.get("rates", [])) > 1 else "",
         f"{described['threads']} threads",
         described["machine"],
+        *(f"failed: {failure}" for failure in described.get("failed", [])),
     ]
     return "; ".join(part for part in parts if part)
 
@@ -96,9 +97,7 @@ def write_report(out: Path, page: Path) -> None:
     if not outcomes:
         raise ValueError(f"--out must hold results of experiments, got {out}")
     lines = [INTRODUCTION, "", "## What the paper claims, and what came out", ""]
-    claims = [claim for outcome in outcomes.values() for claim in outcome.get("claims", [])]
-    # two experiments that share trainings may judge the same claim by the same figures
-    lines += claims_table(list({tuple(claim.values()): claim for claim in claims}.values()))
+    lines += all_claims_table(outcomes.values())
     missing = [name for name in ORDER if name not in outcomes]
     if missing:
         lines += ["", f"Not run: {', '.join(missing)}."]

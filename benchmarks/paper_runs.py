@@ -2,7 +2,8 @@
 
 A training is known by its whole configuration, so two experiments that need the same one share it, and one that is in
 the output folder already is not made again. All trainings of a scene and a seed that are missing take turns of a few
-seconds in one process. An interrupted one goes on from its last turn.
+seconds in one process. An interrupted one goes on from its last turn. One that fails leaves its group, and its
+result.json says why.
 
     OUT/runs/SCENE-SEED-HASH/   a run directory of `voronerf train`, with result.json and looks/
 """
@@ -42,9 +43,11 @@ class Settings:
 
     scene: tuple[str, ...] = ()
     """Scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), or built-in ones; default: lego
-    where it is there, else builtin, and for the tables by sampling and architecture also ship."""
+    where it is there, else builtin, and for the tables by sampling and architecture also ship. Results are kept by a
+    scene's name: another scene of that name, or other images in its folder, need another --out, or --again."""
     downscale: int = 4
-    """Factor on the published 400 x 400 images; the built-in scenes have 100 x 100 at 4."""
+    """Factor on a scene's own images, 400 x 400 as published; the built-in scenes have 100 x 100 at 4. Results are kept
+    by the factor, not by the size that comes out."""
     budget: float = 480.0
     """Training seconds of every variant."""
     seeds: int = 2
@@ -52,9 +55,10 @@ class Settings:
     out: Path = Path("runs/paper")
     """Folder for runs, JSON, tables and pictures."""
     again: bool = False
-    """Make trainings again that are in --out already."""
+    """Make trainings again that are in --out already: their results are deleted before the first one starts. What is
+    interrupted goes on without --again; with it, all begins anew."""
     turn: float = 5.0
-    """Seconds that a variant trains before the next one has its turn."""
+    """Seconds that a variant trains before the next one has its turn, of those that are trained in one go."""
     rays: int = 1024
     """Rays per step."""
     samples: int = 64
@@ -157,7 +161,7 @@ def _loaded(source: str, downscale: int) -> Scene:
 
 
 def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: float = 1.0) -> Run:
-    """The training that a variant stands for, with the directory that its configuration gives it."""
+    """The training that a variant stands for, with the directory that its settings and the scene's name give it."""
     short = Path(scene).name
     config = TrainConfig(
         **{
@@ -191,6 +195,10 @@ def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], 
     unique = {run.folder: run for run in runs}
     missing = [run for run in unique.values() if settings.again or not (run.folder / "result.json").is_file()]
     say(f"{len(unique)} trainings, {len(unique) - len(missing)} of them made already; {settings.budget:g} s each")
+    if settings.again:
+        # all before the first training: an interruption leaves no old result among new ones
+        for run in missing:
+            clear(run.folder)
     groups: dict[tuple[int, str], list[Run]] = {}
     for run in missing:
         groups.setdefault((run.seed, run.scene), []).append(run)
@@ -200,40 +208,46 @@ def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], 
         train_group(group, scene, settings, say)
 
 
+def clear(folder: Path) -> None:
+    """Deletes what a training left: its result, its checkpoint, its evaluations and its looks."""
+    files = [folder / "result.json", checkpoint_path(folder), folder / "metrics.jsonl"]
+    for file in (*files, *(folder / "looks").glob("*.npz")):
+        file.unlink(missing_ok=True)
+
+
 def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Callable[[str], None] = print) -> None:
-    """Trains runs of one scene in turns and writes their results."""
+    """Trains runs of one scene in turns, from their checkpoints where there are, and writes their results."""
     trainers: dict[Path, Trainer] = {}
+    names = {run.folder: f"{run.variant.name:28}" for run in group}
     for run in group:
-        path = checkpoint_path(run.folder)
-        if settings.again:
-            path.unlink(missing_ok=True)
-        resume = path.is_file()
-        stale = [run.folder / "result.json"]
+        resume = checkpoint_path(run.folder).is_file()
         if not resume:
-            stale += [run.folder / "metrics.jsonl", *(run.folder / "looks").glob("*.npz")]
-        for file in stale:
-            file.unlink(missing_ok=True)
+            clear(run.folder)
         config = replace(run.config, resume=resume)
-        trainers[run.folder] = Trainer(
-            config, scene, on_event=lambda line, name=run.variant.name: say(f"{name:28} {line}")
-        )
-    try:
-        take_turns(
-            trainers.values(),
-            budget=settings.budget,
-            turn=settings.turn,
-            stops=lambda trainer: [second for _, second in paper_looks.stops(trainer)],
-            on_stop=paper_looks.reached,
-            after_turn=lambda trainer: trainer.save(),
-        )
-    except TrainingError as error:
-        # What failed would fail again from where it stands: it starts anew next time, the others go on.
-        for folder in trainers:
-            if str(error).startswith(f"{folder}:"):
-                checkpoint_path(folder).unlink(missing_ok=True)
-        raise
-    for run in group:
-        trainer = trainers.pop(run.folder)
+        trainer = Trainer(config, scene, on_event=lambda line, name=names[run.folder]: say(f"{name} {line}"))
+        trainers[run.folder] = trainer
+        paper_looks.forget_later(trainer)
+
+    def failed(trainer: Trainer, error: TrainingError) -> None:
+        """Keeps why a training failed in place of its result."""
+        message = str(error).removeprefix(f"{trainer.out}: ")
+        say(f"{names[trainer.out]} failed: {message}")
+        write_text(trainer.out / "result.json", json.dumps({"failed": message, "psnr": None}, indent=1) + "\n")
+        del trainers[trainer.out]
+
+    take_turns(
+        trainers.values(),
+        budget=settings.budget,
+        turn=settings.turn,
+        stops=lambda trainer: [second for _, second in paper_looks.stops(trainer)],
+        on_stop=paper_looks.reached,
+        after_turn=lambda trainer: trainer.save(),
+        on_failure=failed,
+    )
+    for folder in list(trainers):
+        trainer = trainers.pop(folder)
+        for name in paper_looks.missed(trainer):
+            say(f"{names[folder]} no look {name!r}: its time had passed before an interruption")
         summary = trainer.run()
         paper_looks.look(trainer, settings.budget)
         cameras = scene.test.cameras
@@ -243,7 +257,7 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
             "size": [cameras.height, cameras.width],
             "curve": curve(trainer),
         }
-        write_text(run.folder / "result.json", json.dumps(row, indent=1) + "\n")
+        write_text(folder / "result.json", json.dumps(row, indent=1) + "\n")
 
 
 def curve(trainer: Trainer) -> list[Row]:
@@ -260,7 +274,7 @@ def results(runs: Sequence[Run]) -> list[Row]:
     """The results of runs that were trained, each with its variant's name, its scene, its seed and its folder.
 
     Of several learning rates that with the best mean PSNR counts, for every scene and variant alike; "rates" has the
-    means of all.
+    means of all. A rate at which a seed failed does not count.
     """
     tried: dict[tuple[str, str], dict[float, list[Row]]] = {}
     for run in runs:
@@ -280,7 +294,25 @@ def results(runs: Sequence[Run]) -> list[Row]:
         tried.setdefault((row["scene"], row["variant"]), {}).setdefault(run.rate, []).append(row)
     found = []
     for group in tried.values():
-        means = {rate: statistics.fmean(row["psnr"] for row in rows) for rate, rows in group.items()}
+        means = {
+            rate: statistics.fmean(row["psnr"] for row in rows)
+            for rate, rows in group.items()
+            if not any("failed" in row for row in rows)
+        }
+        if not means:
+            continue
         best = max(means, key=lambda rate: means[rate])
         found += [{**row, "rates": {f"{rate:g}": mean for rate, mean in means.items()}} for row in group[best]]
+    return found
+
+
+def failures(runs: Sequence[Run]) -> list[str]:
+    """Of runs that failed, each training and why."""
+    found = []
+    for run in {run.folder: run for run in runs}.values():
+        path = run.folder / "result.json"
+        row = json.loads(path.read_text()) if path.is_file() else {}
+        if "failed" in row:
+            rate = f", rate x {run.rate:g}" if run.rate != 1 else ""
+            found.append(f"{run.variant.name} on {Path(run.scene).name}, seed {run.seed}{rate}: {row['failed']}")
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from paper_published import CONDITIONS, Scores
@@ -93,10 +93,32 @@ def balance_table(rows: Sequence[Row]) -> list[str]:
     return grid(("samples", "median before", "median after", "worst after"), lines)
 
 
-def claims_table(claims: Sequence[dict[str, str]]) -> list[str]:
-    """Claims, what was published, what came out, whether it holds."""
-    lines = [[c["claim"], c["published"], c["here"], c["verdict"]] for c in claims]
-    return grid(("claim", "published", "here", "holds?"), lines)
+CLAIM = ("claim", "published", "here", "holds?")
+
+
+def claim_line(claim: Mapping[str, str]) -> list[str]:
+    """A claim, what was published, what came out, whether it holds."""
+    return [claim["claim"], claim["published"], claim["here"], claim["verdict"]]
+
+
+def claims_table(claims: Sequence[Mapping[str, str]]) -> list[str]:
+    """The claims of one experiment."""
+    return grid(CLAIM, [claim_line(claim) for claim in claims])
+
+
+def all_claims_table(outcomes: Iterable[Mapping[str, Any]]) -> list[str]:
+    """The claims of several experiments, each with the training seconds, seeds and pixels that it was judged by."""
+    lines = []
+    for outcome in outcomes:
+        described = outcome["metadata"]
+        size = described.get("size")
+        # balance is judged over diagrams, which the claim names
+        trained = "diagrams" not in described
+        under = [f"{described['budget_seconds']:g}", str(described["seeds"])] if trained else ["-", "-"]
+        under.append(f"{size[1]} x {size[0]}" if size else "-")
+        lines += [[*claim_line(claim), *under] for claim in outcome.get("claims", [])]
+    # two experiments that share trainings may judge the same claim by the same figures
+    return grid((*CLAIM, "seconds", "seeds", "image size"), list({tuple(line): line for line in lines}.values()))
 
 
 def markdown(name: str, outcome: dict[str, Any], published: Callable[[str, str], Scores | None]) -> list[str]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, TypeVar
 
 from voronerf.training.config import ConfigError
+from voronerf.training.trainer import TrainingError
 
 
 class Training(Protocol):
@@ -28,6 +30,7 @@ def take_turns(
     stops: Callable[[T], Sequence[float]] = lambda training: (),
     on_stop: Callable[[T, float], None] = lambda training, second: None,
     after_turn: Callable[[T], None] = lambda training: None,
+    on_failure: Callable[[T, TrainingError], None] | None = None,
 ) -> None:
     """Trains all of them for the same time; what the callbacks take is nobody's training time.
 
@@ -38,23 +41,33 @@ def take_turns(
         stops: for each the training seconds at which somebody wants to look at it, rising.
         on_stop: called with a training and the stop that it has reached.
         after_turn: called with a training after each of its turns.
+        on_failure: called with a training that failed and its error; the others go on. None: the error ends all.
 
     Raises:
         ConfigError: When ``turn`` is not positive.
+        TrainingError: When a training fails and there is no ``on_failure``.
     """
     if not turn > 0:
         raise ConfigError(f"--turn must be positive, got {turn}")
     trainings = list(trainings)
-    done = min((training.seconds for training in trainings), default=budget)
+    # those that go on begin with a whole turn: what was due in it may have been passed, but not looked at
+    done = turn * math.floor(min((training.seconds for training in trainings), default=budget) / turn)
     while done < budget:
         before, done = done, min(done + turn, budget)
-        for training in trainings:
+        for training in list(trainings):
             # a long step may have passed a stop in the turn before: what is due in this one is looked at all the same
             due = [second for second in stops(training) if before < second <= done]
             if training.seconds >= done and not due:
                 continue
-            for stop in due:
-                training.advance(stop)
-                on_stop(training, stop)
-            training.advance(done)
+            try:
+                for stop in due:
+                    training.advance(stop)
+                    on_stop(training, stop)
+                training.advance(done)
+            except TrainingError as error:
+                if on_failure is None:
+                    raise
+                trainings.remove(training)
+                on_failure(training, error)
+                continue
             after_turn(training)

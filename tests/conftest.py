@@ -20,9 +20,11 @@ is a skip with its reason; ``--require native,cuda,warp`` turns those skips into
 from __future__ import annotations
 
 import contextlib
+import importlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -30,6 +32,7 @@ import torch
 from voronerf import backends
 
 PARTS = ("native", "cuda", "warp")
+BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 
 pytest_plugins = ("pytester",)
 
@@ -71,6 +74,18 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 @pytest.fixture
 def device(request: pytest.FixtureRequest) -> torch.device:
     return torch.device(request.param)
+
+
+@pytest.fixture(scope="module")
+def load() -> Iterator[Callable[[str], Any]]:
+    """Imports a module of benchmarks/ as a script there does; each test file has modules of its own."""
+    sys.path.insert(0, str(BENCHMARKS))
+    before = set(sys.modules)
+    yield importlib.import_module
+    sys.path.remove(str(BENCHMARKS))
+    for name in set(sys.modules) - before:
+        if str(BENCHMARKS) in str(getattr(sys.modules[name], "__file__", None)):
+            del sys.modules[name]
 
 
 @pytest.fixture(autouse=True)

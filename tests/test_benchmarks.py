@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import runpy
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,17 +36,6 @@ COLUMNS = [
     *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "median_ms", "iqr_ms", "throughput", "unit"),
     *("percent_of_peak", "alternatives", "speedup_over_best", "max_error"),
 ]
-
-
-@pytest.fixture
-def load(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Any]]:
-    """Imports a script or a module beside it, as it is when a script runs."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    before = set(sys.modules)
-    yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if str(BENCHMARKS) in str(getattr(sys.modules[name], "__file__", None)):
-            del sys.modules[name]
 
 
 def test_metadata_says_what_was_measured_where() -> None:

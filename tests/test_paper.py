@@ -1,13 +1,11 @@
-"""benchmarks/paper.py: files, tables and plots of tiny runs, and verdicts that follow the figures."""
+"""benchmarks/paper.py: files, tables and plots of tiny runs."""
 
 from __future__ import annotations
 
 import importlib
 import itertools
 import json
-import sys
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,39 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from paper_results import TINY, Load, synthetic
 from PIL import Image
 
 from voronerf.training import trainer
 from voronerf.training.config import ConfigError
 from voronerf.training.trainer import Trainer, TrainingError
-
-BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
-Load = Callable[[str], Any]
-TINY = {
-    "scene": ("builtin",),
-    "downscale": 20,
-    "budget": 0.25,
-    "seeds": 1,
-    "rays": 48,
-    "samples": 8,
-    "evaluations": 2,
-    "eval_views": 1,
-    "final_views": 1,
-    "turn": 0.1,
-    "cells": 4,
-}
-
-
-@pytest.fixture(scope="module")
-def load() -> Iterator[Load]:
-    """Imports a module of benchmarks/ as a script there does."""
-    sys.path.insert(0, str(BENCHMARKS))
-    before = set(sys.modules)
-    yield importlib.import_module
-    sys.path.remove(str(BENCHMARKS))
-    for name in set(sys.modules) - before:
-        if str(BENCHMARKS) in str(getattr(sys.modules[name], "__file__", None)):
-            del sys.modules[name]
 
 
 @pytest.fixture(autouse=True)
@@ -69,119 +40,6 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def settings(load: Load, out: Path) -> Any:
     return load("paper_runs").Settings(**TINY, out=out)
-
-
-def synthetic(
-    experiment: Any, settings: Any, score: Callable[[int], float], scene: str = "lego"
-) -> list[dict[str, Any]]:
-    """Results of an experiment in which variant number i has a PSNR of score(i) and seams of 50 less that."""
-    variants = experiment.variants(settings, "builtin")
-    found = []
-    for index, variant in enumerate(variants):
-        for seed in range(2):
-            value = score(index) + 0.01 * seed
-            looks = [
-                {"look": name, "psnr": value, "seam": 50 - value, "step": 1, "seconds": 1.0}
-                for name in ("after", "end")
-            ]
-            curve = [{"seconds": t, "psnr": value * t / 10} for t in (5.0, 10.0)]
-            row = {"variant": variant.name, "scene": scene, "seed": seed, "psnr": value, "ssim": 0.5, "lpips": None}
-            found.append({**row, "curve": curve, "looks": looks, "cells": 4, "steps": 10, "run": "none"})
-    return found
-
-
-# --- verdicts --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("gains", "wanted", "expected"),
-    [
-        ([], 0, "not measured"),
-        ([0.2, 0.1], 0, "holds for every seed"),
-        ([0.2], 0, "holds (one seed)"),
-        ([0.5, -0.1], 0, "holds in the mean, not for every seed"),
-        ([0.1, -0.5], 0, "does not hold"),
-        ([0.0, 0.0], 0, "does not hold"),
-        ([2.5, 2.1], 2, "holds for every seed"),
-        ([2.5, 1.9], 2, "holds in the mean, not for every seed"),
-        ([1.0, 0.5], 2, "the order holds for every seed, by less than 2"),
-        ([1.0, -0.5], 2, "the order holds in the mean, by less than 2"),
-        ([-1.0], 2, "does not hold (one seed)"),
-    ],
-)
-def test_verdicts(load: Load, gains: list[float], wanted: float, expected: str) -> None:
-    assert load("paper_claims").verdict(gains, wanted) == expected
-
-
-def test_gains_pair_scenes_and_seeds(load: Load) -> None:
-    claims = load("paper_claims")
-    rows = claims.Rows(
-        [{"variant": v, "scene": s, "seed": n, "psnr": p}
-         for v, s, n, p in (("a", "x", 0, 5.0), ("a", "x", 1, 7.0), ("b", "x", 0, 4.0), ("b", "y", 1, 1.0))]
-    )  # fmt: skip
-    assert rows.gains("a", "b") == [1.0] and rows.gains("a", "b", "y") == [] and rows.mean("a") == 6.0
-    assert rows.gains("a", "none") == [] and rows.scenes == ["x", "y"]
-    unmeasured = claims.Rows([{"variant": v, "scene": "x", "seed": 0, "lpips": None} for v in "ab"])
-    assert unmeasured.values("a", metric="lpips") == [] and unmeasured.gains("a", "b") == []
-
-
-def test_a_lead_grows_or_does_not(load: Load) -> None:
-    claims = load("paper_claims")
-
-    def verdict(better: list[float], worse: list[float]) -> str:
-        rows = [
-            {
-                "variant": v,
-                "scene": "x",
-                "seed": 0,
-                "curve": [{"seconds": t, "psnr": p} for t, p in zip((5, 10), curve)],
-            }
-            for v, curve in (("a", better), ("b", worse))
-        ]
-        return str(claims.growing_claim("", "", claims.Rows(rows), "a", "b", "x").verdict)
-
-    assert verdict([20, 24], [20, 22]) == "holds (one seed)"
-    assert verdict([22, 23], [20, 22.5]) == "does not hold (one seed)"
-    assert verdict([18, 21], [20, 22]) == "does not hold: there is no lead at the end"
-    row = {"curve": [{"seconds": 2.0, "psnr": 1.0}, {"seconds": 4.0, "psnr": 3.0}]}
-    assert [claims.at_share(row, share) for share in (0.25, 0.5, 0.75, 1)] == [None, 1.0, 2.0, 3.0]
-
-
-def test_claims_of_every_experiment_follow_the_figures(load: Load, settings: Any) -> None:
-    experiments, claims = load("paper_experiments"), load("paper_claims")
-    judged = 0
-    for name, experiment in experiments.EXPERIMENTS.items():
-        rising = synthetic(experiment, settings, lambda i: 20 + 3 * i)
-        falling = synthetic(experiment, settings, lambda i: 40 - 3 * i)
-        verdicts = [[c.verdict for c in experiment.claims(claims.Rows(rows), settings)] for rows in (rising, falling)]
-        assert len(verdicts[0]) == len(verdicts[1])
-        assert all(a != b for a, b in zip(*verdicts) if "within" not in a), name
-        judged += len(verdicts[0])
-        assert all(c.verdict == "not measured" for c in experiment.claims(claims.Rows([]), settings)) or not rising
-    assert judged > 20
-
-
-def test_balanced_over_random_over_uniform(load: Load, settings: Any) -> None:
-    experiments, claims = load("paper_experiments"), load("paper_claims")
-    experiment = experiments.EXPERIMENTS["split-kinds"]
-
-    def claim(scores: tuple[float, ...]) -> Any:
-        return experiment.claims(claims.Rows(synthetic(experiment, settings, scores.__getitem__)), settings)[0]
-
-    assert claim((30.0, 29.0, 28.0)).verdict == "holds for every seed"
-    other = claim((30.0, 31.0, 28.0))
-    assert "balanced centres over random centres: does not hold" in other.verdict
-    assert "random centres over uniform centres: holds for every seed" in other.verdict
-    assert "-1.00 dB" in other.here and "+3.00 dB" in other.here
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "start"),
-    [(0.2, 0.0017, "holds"), (0.5, 0.003, "the factor holds: 167"), (0.2, 0.02, "evener by a factor of 10"),
-     (0.2, 0.3, "does not hold"), (None, None, "not measured")],
-)  # fmt: skip
-def test_balance_verdict(load: Load, before: float, after: float, start: str) -> None:
-    assert load("paper_balance").balance_verdict(before, after).startswith(start)
 
 
 # --- runs ------------------------------------------------------------------------------------------------------------
@@ -214,6 +72,42 @@ def test_turns(load: Load) -> None:
     assert all(fake.seconds >= 3.0 for fake in fakes)
     with pytest.raises(ConfigError, match="--turn must be positive, got 0"):
         load("turns").take_turns(fakes, budget=1, turn=0)
+
+    # resumed in the midst of a turn, after a stop that a long step had passed: it is due all the same
+    log.clear()
+    load("turns").take_turns(
+        [Fake("a", 4.7, 0.5)],
+        budget=6.0,
+        turn=2.0,
+        stops=lambda fake: (3.0, 4.5, 5.0),
+        on_stop=lambda fake, second: log.append(("look", second)),
+    )
+    assert [entry for entry in log if entry[0] == "look"] == [("look", 4.5), ("look", 5.0)]
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_one_that_fails_leaves_the_turns(load: Load, told: bool) -> None:
+    class Fake:
+        def __init__(self, limit: float) -> None:
+            self.seconds, self.limit = 0.0, limit
+
+        def advance(self, until: float) -> None:
+            if until > self.limit:
+                raise TrainingError("the loss is nan")
+            self.seconds = until
+
+    failing, other = Fake(1.0), Fake(9.0)
+    failed: list[Any] = []
+    turns = [failing, other]
+    if told:
+        load("turns").take_turns(
+            turns, budget=3, turn=1, on_failure=lambda fake, error: failed.append((fake, str(error)))
+        )
+        assert failed == [(failing, "the loss is nan")] and other.seconds == 3
+    else:
+        with pytest.raises(TrainingError):
+            load("turns").take_turns(turns, budget=3, turn=1)
+    assert turns == [failing, other] and failing.seconds == 1
 
 
 def test_an_experiment_writes_its_files_and_is_not_run_again(
@@ -278,6 +172,66 @@ def test_an_interrupted_training_goes_on(
     assert row["seconds"] >= settings.budget and row["steps"] > saved[0]
 
 
+def test_again_leaves_no_old_result_and_goes_on(
+    load: Load, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = load("paper_runs")
+    settings = replace(settings, out=tmp_path, seeds=2)
+    variant = runs.Variant("one", {"cells": (), "width": 8})
+    made = [runs.make_run(variant, "builtin", seed, settings) for seed in range(2)]
+    runs.train_missing(made, settings)
+    assert len(runs.results(made)) == 2
+    save = Trainer.save
+
+    def interrupted(self: Trainer) -> None:
+        save(self)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "save", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            runs.train_missing(made, replace(settings, again=True))
+    assert runs.results(made) == [] and not list((made[1].folder / "looks").glob("*.npz"))
+    resumed: list[bool] = []
+    start = Trainer.__init__
+    monkeypatch.setattr(
+        Trainer,
+        "__init__",
+        lambda self, config, *a, **k: (resumed.append(config.resume), start(self, config, *a, **k))[1],
+    )
+    runs.train_missing(made, settings)
+    assert resumed == [True, False] and len(runs.results(made)) == 2
+
+
+def test_looks_of_steps_that_are_made_again_are_not_kept(
+    load: Load, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs, looks = load("paper_runs"), load("paper_looks")
+    settings = replace(settings, out=tmp_path)
+    made = runs.make_run(runs.Variant("one", {"cells": (), "width": 8}), "builtin", 0, settings)
+    scene = runs.open_scene("builtin", settings)
+    first = Trainer(made.config, scene)
+    first.advance(0.07)
+    looks.look(first, 0.0625, "at-25")
+    first.save()
+    first.advance(0.14)
+    looks.look(first, 0.125, "at-50")
+    lost = first.step
+    second = Trainer(replace(made.config, resume=True), scene)
+    looks.forget_later(second)
+    assert [entry["look"] for entry in looks.numbers(made.folder)] == ["at-25"] and second.step < lost
+    assert looks.missed(second) == ["at-50", "at-75"]
+    monkeypatch.setattr(looks, "seam", lambda *_, **__: 0.25)
+    assert looks.seams(second) == {"seam": 0.25}
+    monkeypatch.setattr(looks, "seam", lambda *_, **__: float("nan"))  # no border is visible
+    assert looks.seams(second) == {}
+    said: list[str] = []
+    (made.folder / "looks" / "at-25.npz").unlink()  # its time is passed for good where turns are shorter than it
+    runs.train_group([made], scene, replace(settings, turn=0.01), said.append)
+    assert [entry["look"] for entry in looks.numbers(made.folder)] == ["at-50", "at-75", "end"]
+    assert any("no look 'at-25': its time had passed" in line for line in said)
+
+
 def test_a_curve_is_of_the_same_views_throughout(load: Load, settings: Any, tmp_path: Path) -> None:
     runs = load("paper_runs")
     settings = replace(settings, out=tmp_path, final_views=3)
@@ -294,10 +248,16 @@ def test_failures_of_a_training_are_told(load: Load, settings: Any, tmp_path: Pa
     small = replace(settings, out=tmp_path)
     failing = runs.make_run(variant, "builtin", 0, small)
     other = runs.make_run(runs.Variant("one", {"cells": ()}), "builtin", 0, small)
-    with pytest.raises(TrainingError, match="more cells than samples"):
-        runs.train_missing([other, failing], small)
-    kept = [(run.folder / "checkpoints" / "last.safetensors").is_file() for run in (other, failing)]
-    assert kept == [True, False]  # the next start begins anew with what failed, and goes on with the other
+    said: list[str] = []
+    runs.train_missing([other, failing], small, said.append)
+    assert any("too many" in line and "failed: more cells than samples" in line for line in said)
+    (row,) = runs.results([other, failing])
+    assert row["variant"] == "one" and row["seconds"] >= small.budget
+    stored = json.loads((failing.folder / "result.json").read_text())
+    assert stored["psnr"] is None and stored["failed"].startswith("more cells than samples")
+    assert runs.failures([failing, other, failing]) == [f"too many on builtin, seed 0: {stored['failed']}"]
+    runs.train_missing([other, failing], small, said.append)
+    assert said[-1].startswith("2 trainings, 2 of them made already")
 
 
 def test_runs_are_known_by_what_they_learn(load: Load, settings: Any) -> None:
@@ -333,6 +293,20 @@ def test_every_variant_has_the_best_of_the_same_rates(load: Load, settings: Any,
         ("random parameters", 1, 1.0, 19.0),
     ]
     assert rows[0]["rates"] == {"1": 20.5, "2": 21.5}
+    claims = load("paper_experiments").EXPERIMENTS["initialisation"].claims
+    rows_of = load("paper_claims").Rows
+
+    def fail(rate: float) -> list[tuple[str, float]]:
+        (run,) = (r for r in made if (r.variant.name, r.rate, r.seed) == ("inherited", rate, 1))
+        (run.folder / "result.json").write_text(json.dumps({"failed": "the loss is nan", "psnr": None}))
+        return [(row["variant"], row["rate"]) for row in runs.results(made)]
+
+    rest = [("random parameters", 1.0)] * 2
+    assert fail(2.0) == [("inherited", 1.0)] * 2 + rest  # a rate at which a seed failed is none to choose
+    assert runs.failures(made) == ["inherited on builtin, seed 1, rate x 2: the loss is nan"]
+    assert claims(rows_of(runs.results(made)), searched)[0].verdict == "holds for every seed"
+    assert fail(1.0) == rest
+    assert claims(rows_of(runs.results(made)), searched)[0].verdict == "not measured"
     with pytest.raises(ConfigError, match="--rates must be positive factors, got"):
         runs.Settings(rates=(0.0,))
 
@@ -386,29 +360,6 @@ def test_matched_parameters(load: Load, settings: Any) -> None:
 # --- tables, plots, the page -----------------------------------------------------------------------------------------
 
 
-def test_published_figures_stand_beside_ours(load: Load, settings: Any) -> None:
-    experiments, tables = load("paper_experiments"), load("paper_tables")
-    paper = replace(settings, cells=12)
-    for name, expected in (
-        (
-            "sampling",
-            ("27.355 / 0.9451 / 0.091", "31.234 / 0.9752 / 0.0417", "25.603 / 0.917 / 0.134", "27.401 / 0.945"),
-        ),
-        ("kilonerf", ("27.08 / 0.938 / 0.098", "27.765 / 0.952 / 0.078")),
-    ):
-        experiment = experiments.EXPERIMENTS[name]
-        rows = synthetic(experiment, paper, lambda i: 20.0 + i)
-        text = "\n".join(tables.training_table(rows, experiment.published))
-        assert "published: 400 x 400, 24 h, RTX 2080 Ti" in text
-        assert all(figure.replace("27.08 /", "27.080 /") in text for figure in expected)
-        line = next(line for line in text.splitlines() if "16 x 16" in line or "NeRF, hierarchical: 12" in line)
-        assert "20.00" not in line and " to " in line and line.count("|") == text.splitlines()[0].count("|")
-        elsewhere = tables.training_table(
-            synthetic(experiment, paper, lambda i: 20.0 + i, "fern"), experiment.published
-        )
-        assert "published" not in elsewhere[0] and not any("27.355" in line for line in elsewhere)
-
-
 def test_bands_hold_mean_and_range(load: Load) -> None:
     figures = load("paper_figures")
     figure, axes = figures.panes(1)
@@ -430,7 +381,7 @@ def test_every_plot_is_drawn(load: Load, settings: Any, tmp_path: Path) -> None:
     assert not figures.draw("convergence", [], tmp_path)
 
 
-def test_balance_and_a_nested_picture(load: Load, settings: Any, out: Path) -> None:
+def test_balance_and_a_nested_picture(load: Load, settings: Any, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load("paper").experiment("initialisation", settings)  # its first variant keeps the samples
     outcome = load("paper_balance").measure(settings, diagrams=3)
     assert [row["variant"] for row in outcome["results"]] == ["kept by a training, builtin", "separate objects"]
@@ -449,11 +400,25 @@ def test_balance_and_a_nested_picture(load: Load, settings: Any, out: Path) -> N
     again = load("paper").experiment("nested-2d", small)
     assert again["results"] == outcome["results"]
 
+    def refuse(*_: Any) -> None:
+        raise AssertionError("fitted again")
+
+    monkeypatch.setattr(nested, "nested", refuse)
+    assert load("paper").experiment("nested-2d", small)["results"] == outcome["results"]
+    for name, value in (("WIDTH", 8), ("SPLITS", (0.5,)), ("RATE", 0.02)):
+        with monkeypatch.context() as patched, pytest.raises(AssertionError, match="fitted again"):
+            patched.setattr(nested, name, value)
+            load("paper").experiment("nested-2d", small)
+
 
 def test_nested_fit_inherits_and_stays_in_the_plane(load: Load) -> None:
     nested = load("paper_nested")
     y, x = torch.meshgrid(torch.arange(24), torch.arange(30), indexing="ij")
     image = torch.stack(((x // 4 + y // 4) % 2, x > 15, y > 12), -1).float()
+    rates = [
+        nested.ImageFit(image, budget=1.0, width=width, splits=(), seed=0, backend="auto").rate for width in (16, 128)
+    ]
+    assert rates == [nested.RATE, nested.RATE / 2]
     fit = nested.ImageFit(image, budget=1e9, width=8, splits=(0.0,), seed=0, backend="auto")
     for _ in range(3):
         fit._step(0.0)
@@ -478,17 +443,22 @@ def test_the_page_shows_what_came_out_and_keeps_notes(load: Load, settings: Any,
     assert all(claim["verdict"] in text and claim["here"] in text for claim in stored["claims"])
     summary = text.split("## Figure")[0]
     assert all(summary.count(f"| {claim['claim']} |") == 1 for claim in stored["claims"])
+    assert all(f"| {claim['verdict']} | 0.25 | 1 | 20 x 20 |" in summary for claim in stored["claims"])
+    assert "failed:" not in text
     assert "Not run: convergence" in text and "RTX 2080 Ti" in text and "20 x 20 pixels; 0.25 s a variant" in text
     assert "(images/paper/initialisation.png)" in text
     assert (page.parent / "images" / "paper" / "initialisation.png").stat().st_size < 60_000
 
     page.write_text(text + "What was seen.\n")
     stored["claims"][0]["verdict"] = "changed"
+    stored["metadata"] |= {"budget_seconds": 30.0, "seeds": 3, "failed": ["random parameters on builtin: nan"]}
     other = tmp_path / "other"
     other.mkdir()
     (other / "initialisation.json").write_text(json.dumps(stored))
     report.write_report(other, page)
-    assert "| changed |" in page.read_text() and page.read_text().endswith(f"{report.NOTES}\nWhat was seen.\n")
+    text = page.read_text()
+    assert "| changed | 30 | 3 | 20 x 20 |" in text and "; failed: random parameters on builtin: nan." in text
+    assert text.endswith(f"{report.NOTES}\nWhat was seen.\n")
     with pytest.raises(ValueError, match="--out must hold results of experiments"):
         report.write_report(tmp_path / "nothing", page)
 
@@ -501,7 +471,8 @@ def test_the_command_line(load: Load, settings: Any, out: Path, capsys: pytest.C
     assert "| builtin | inherited |" in capsys.readouterr().out and (out / "density.json").is_file()
     page = out / "page.md"
     paper.main(["all", *options, "--out", str(out), "--page", str(page), "--only", "density", "ghosting"])
-    assert "0 trainings" not in capsys.readouterr().out and "## Figure: ghosting" in page.read_text()
+    printed = capsys.readouterr().out
+    assert "  2 trainings, 2 of them made already" in printed and "## Figure: ghosting" in page.read_text()
     with pytest.raises(ValueError, match="--only must name experiments"):
         paper.everything(settings, page, ("nothing",))
     for name in (*paper.Table.__args__, *paper.Figure.__args__):

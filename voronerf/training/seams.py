@@ -15,6 +15,7 @@ gradients of the picture, so the measure needs no truth and is as good at 100 x 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Protocol
 
@@ -58,7 +59,7 @@ def seam(
     views: int | None = None,
     margin: float | None = None,
 ) -> float:
-    """The mean step in colour across visible borders of cells, in 0..1; 0 for one network, or where no border shows.
+    """The mean step in colour across visible borders of cells, in 0..1; 0 for one network, NaN where no border shows.
 
     Args:
         router: whose `blend` is changed while this runs.
@@ -95,4 +96,4 @@ def seam(
             given += float(share[shown].double().sum())
     finally:
         router.blend = before
-    return change / given if given > 0 else 0.0
+    return change / given if given > 0 else math.nan
