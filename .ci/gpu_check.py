@@ -7,8 +7,8 @@ some of them, ``--data DIR`` is a Blender scene for the training.
 
     machine    versions, and what is missing
     build      the extension for this GPU alone
-    small      every operation once against float64, each case for itself
-    captured   a step of the route in a CUDA graph
+    small      every operation once against float64, each case for itself and with a time limit of its own
+    captured   steps of the route in CUDA graphs, fused and layer by layer
     roofs      the kernels at full size, beside the machine's own limits
     training   short trainings, on --data or the built-in scene
     tests      the tests of the operations on CUDA, a process for each file
@@ -22,14 +22,17 @@ DIR gets summary.json and what each part said. The last lines printed are the su
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 ROOT = Path(__file__).resolve().parent.parent
 PYTHON = sys.executable
@@ -81,26 +84,30 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
     architecture = capability()
     # nvcc optimises the kernels of a file in parallel, where it can.
     built = (("VORONERF_CUDA", "1"), ("VORONERF_CUDA_ARCHITECTURES", architecture or ""), ("NVCC_APPEND_FLAGS", SPLIT))
-    sanitize = [sanitizer or "", "--error-exitcode", "9", "--target-processes", "all"]
     own = [PYTHON, str(ROOT / ".ci" / "gpu_parts.py")]
+    # Each allocation for itself, so that what reads or writes beyond one leaves all of them.
+    apart = (("PYTORCH_NO_CUDA_MEMORY_CACHING", "1"),)
     benchmark = [PYTHON, str(ROOT / "benchmarks" / "throughput.py"), "--device", "cuda", "--quick", "--json"]
-    no_gpu, no_sanitizer = "torch sees no GPU", "no compute-sanitizer"
 
-    def part(command: list[str], seconds: int) -> Part:
-        return Part(command, seconds) if architecture else Part(no_gpu, 0)
+    def part(command: list[str], seconds: int, environment: tuple[tuple[str, str], ...] = ()) -> Part:
+        return Part(command, seconds, environment) if architecture else Part("torch sees no GPU", 0)
+
+    def sanitized(tool: str, environment: tuple[tuple[str, str], ...] = ()) -> Part:
+        if sanitizer is None:
+            return Part("no compute-sanitizer", 0)
+        command = [sanitizer, "--error-exitcode", "9", "--target-processes", "all", "--tool", tool, *own, "small"]
+        return part([*command, "--case-seconds", "30"], 60, environment)
 
     return {
         "machine": Part([*own, "machine"], 30),
-        "build": Part([PYTHON, "setup.py", "build_ext", "--inplace"], 180, built) if architecture else Part(no_gpu, 0),
+        "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 180, built),
         "small": part([*own, "small"], 60),
-        "captured": part([*own, "captured"], 30),
+        "captured": part([*own, "captured"], 45),
         "roofs": part([*own, "roofs", str(out)], 60),
         "training": part([*own, "training", str(out / "training"), "builtin" if data is None else str(data)], 75),
         "tests": part([*own, "tests", str(out / "tests")], 100),
-        "memcheck": part([*sanitize, "--tool", "memcheck", *own, "small"], 60) if sanitizer else Part(no_sanitizer, 0),
-        "racecheck": part([*sanitize, "--tool", "racecheck", *own, "small"], 60)
-        if sanitizer
-        else Part(no_sanitizer, 0),
+        "memcheck": sanitized("memcheck", apart),
+        "racecheck": sanitized("racecheck"),
         "benchmark": part([*benchmark, str(out / "throughput.json")], 60),
     }
 
@@ -112,15 +119,12 @@ def run(name: str, part: Part, out: Path, left: float) -> dict[str, object]:
     limit = min(part.seconds, left)
     if limit < SHORTEST:
         return {"outcome": "left out", "seconds": 0.0, "last": "no time left"}
-    environment = {**os.environ, **dict(part.environment), "PYTHONPATH": str(ROOT)}
+    paths = os.pathsep.join(path for path in (str(ROOT), os.environ.get("PYTHONPATH")) if path)
+    environment = {**os.environ, **dict(part.environment), "PYTHONPATH": paths}
     begin = time.perf_counter()
-    with (out / f"{name}.txt").open("w+") as log:
+    with (out / f"{name}.txt").open("w+", errors="replace") as log:
         try:
-            status: int | str = subprocess.run(
-                part.command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, timeout=limit
-            ).returncode
-        except subprocess.TimeoutExpired:
-            status = f"stopped after {limit:.0f} s"
+            status = run_group(part.command, environment, log, limit)
         except OSError as error:
             status = str(error)
         log.seek(0)
@@ -133,6 +137,24 @@ def run(name: str, part: Part, out: Path, left: float) -> dict[str, object]:
         "seconds": time.perf_counter() - begin,
         "last": last if isinstance(status, int) else f"{status}; {last}",
     }
+
+
+def run_group(command: list[str], environment: dict[str, str], log: TextIO, limit: float) -> int | str:
+    """Exit status of a command, or what became of it: past ``limit`` seconds, all that it started is ended with it."""
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+    )
+    try:
+        return process.wait(limit)
+    except subprocess.TimeoutExpired:
+        return f"stopped after {limit:.0f} s"
+    finally:
+        # Of a command that has ended, what it left behind; nothing more is to run beside the next part.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        # A process that waits inside of the driver may not end.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(10)
 
 
 def capability() -> str | None:

@@ -1,17 +1,19 @@
-"""Parts of ``gpu_check.py`` that are programs of their own: ``gpu_parts.py PART [OUT] [DATA]``.
+"""Parts of ``gpu_check.py`` that are programs of their own: ``gpu_parts.py PART [OUT] [DATA] [--case-seconds S]``.
 
     machine    what a build and the tests need, each with what is missing
     small      every operation once, forward and backward, against float64: each case for itself
-    captured   a step of the route in a CUDA graph
+    captured   steps of the route in CUDA graphs
     tests      tests/ops on CUDA, a process for each file
     roofs      the kernels at full size, beside the machine's own copy and products
     training   a short training, and one whose steps are replayed from a CUDA graph
 
-A CUDA error of a kernel ends all that its process could still do: ``small`` then starts itself anew after that case.
+A CUDA error of a kernel ends all that its process could still do, and so does a kernel that does not end: ``small``,
+``captured`` and ``roofs`` then start themselves anew with the case after it.
 """
 
 from __future__ import annotations
 
+import argparse
 import functools
 import importlib.util
 import json
@@ -21,18 +23,26 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import threading
 import time
 import traceback
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests" / "cuda_emulation")]
+sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in (".ci", "benchmarks", "tests/cuda_emulation"))]
+
+from gpu_cases import captured_steps, small_cases  # noqa: E402
 
 N = 1 << 22
 """Samples of the timings, as the targets have them."""
+CASE_SECONDS = 10.0
+"""For one case, after which it is said to hang."""
+FILE_SECONDS = 60.0
+"""For one file of the tests."""
 
 
 def machine() -> int:
@@ -75,155 +85,90 @@ def machine() -> int:
     return int(any("build" in name or "GPU" in name for name in missing))
 
 
-def small(start: int = 0, failed: int = 0) -> int:
-    """Every case; after one that leaves the device unusable, the rest in a new process."""
-    import torch
+@dataclass(frozen=True)
+class Again:
+    """Where a part begins, and how it starts itself anew: its arguments, its first case and the cases failed before."""
 
-    cases = small_cases("cuda")
-    for number in range(start, len(cases)):
+    arguments: tuple[str, ...]
+    start: int = 0
+    failed: int = 0
+    case_seconds: float = CASE_SECONDS
+
+    def go_on(self, number: int, failed: int, said: str = "") -> None:
+        """The cases from ``number`` on, in a process that takes the place of this one."""
+        if said:
+            print(said, flush=True)
+        state = {"start": number, "failed": failed, "case-seconds": self.case_seconds}
+        options = [part for name, value in state.items() for part in (f"--{name}", str(value))]
+        os.execv(sys.executable, [sys.executable, sys.argv[0], *self.arguments, *options])
+
+
+Case = tuple[str, Callable[[], "str | None"]]
+"""A name, and what raises, or says something to be told."""
+
+
+def one_by_one(cases: list[Case], again: Again, settle: Callable[[], None]) -> int:
+    """Every case for itself; after one that leaves the device unusable, or does not end, the rest in a new process.
+
+    ``settle()`` waits for the device, and raises where that is of no use any more.
+    """
+    settle()  # makes the context, in the time of no case
+    failed = again.failed
+    for number in range(again.start, len(cases)):
         name, run = cases[number]
+        said = f"WRONG  {name}: hangs, stopped after {again.case_seconds:g} s"
+        watch = threading.Timer(again.case_seconds, again.go_on, (number + 1, failed + 1, said))
+        watch.daemon = True
+        watch.start()
         try:
-            torch.manual_seed(0)
-            run()
-            torch.cuda.synchronize()
-            print(f"right  {name}", flush=True)
+            result = run()
+            settle()
+            print(f"right  {name}{f': {result}' if result else ''}", flush=True)
         except Exception as error:
             failed += 1
-            print(
-                f"WRONG  {name}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}", flush=True
-            )
+            reason = str(error).splitlines()[0] if str(error) else ""
+            print(f"WRONG  {name}: {type(error).__name__}: {reason}", flush=True)
             traceback.print_exc(file=sys.stdout)
             sys.stdout.flush()
             try:
-                torch.cuda.synchronize()
+                settle()
             except Exception:
-                arguments = [sys.executable, __file__, "small", str(number + 1), str(failed)]
-                os.execv(sys.executable, arguments)
+                watch.cancel()
+                again.go_on(number + 1, failed)
+        finally:
+            watch.cancel()
     print(f"{len(cases) - failed} of {len(cases)} cases are right")
     return failed
 
 
-def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
-    """Names and checks, which raise."""
-    import torch
-    from emulated_networks import ALLOWED, BRANCHED, GAUSSIANS, WIDE, check
-    from test_emulated_layers import BROAD, DENSE
-
-    import voronerf
-
-    where = torch.device(device)
-
-    def lookup(op: str, n: int, k: int, dtype: Any) -> None:
-        points = torch.randint(-3, 4, (n, 3), device=where).to(dtype)
-        centres = torch.randint(-3, 4, (k, 3), device=where).to(dtype)
-        if op == "nearest_centre":
-            found, expected = (voronerf.nearest_centre(points, centres, backend=b) for b in ("native", "reference"))
-        else:
-            diagram = voronerf.VoronoiDiagram(torch.rand(4, 3)).refine({1: torch.rand(k, 3)})[0]
-            tables = [x.to(where) for x in (diagram.centres, diagram.child_offsets, diagram.child)]
-            points = points.float() / 8 + 0.5
-            found, expected = (
-                voronerf.locate_cell(points, *tables, depth=diagram.depth, backend=b) for b in ("native", "reference")
-            )
-        assert torch.equal(found, expected)
-
-    def sort(n: int, k: int) -> None:
-        cells = torch.randint(0, k, (n,), dtype=torch.int32, device=where)
-        found, expected = (voronerf.cell_sort(cells, k, backend=b) for b in ("native", "reference"))
-        assert all(torch.equal(a, b) for a, b in zip(found, expected))
-
-    def close(run: Callable[..., Any], leaves: list[Any]) -> None:
-        """Results and gradients against the reference in float64."""
-        outcomes = []
-        for backend, dtype in (("native", torch.float32), ("reference", torch.float64)):
-            given = [leaf.to(where, dtype).requires_grad_() for leaf in leaves]
-            out = run(given, backend)
-            parts = [part for part in (out if isinstance(out, tuple) else (out,)) if part.is_floating_point()]
-            total = sum(
-                (part * torch.linspace(0.5, 1.5, part.numel(), device=where).view_as(part)).sum() for part in parts
-            )
-            outcomes.append([*parts, *torch.autograd.grad(total, given, allow_unused=True, materialize_grads=True)])
-        for part, exact in zip(*outcomes):
-            assert (part.double() - exact).norm() <= 1e-5 * exact.norm() + 1e-6, (
-                list(part.shape),
-                part.isfinite().all(),
-            )
-
-    def composite() -> None:
-        offsets = torch.tensor([0, 0, 1, 71, 180], dtype=torch.int32, device=where)
-        close(
-            lambda x, b: tuple(voronerf.composite(*x, ray_offsets=offsets, backend=b)),
-            [torch.rand(180), torch.rand(180, 3), torch.rand(180).cumsum(0), torch.rand(180)],
-        )
-
-    def resample() -> None:
-        weights, edges = torch.rand(6, 45), torch.rand(6, 46).cumsum(1)
-        found = voronerf.resample(weights.to(where), edges.to(where), 70, backend="native")
-        torch.testing.assert_close(found.cpu(), voronerf.resample(weights, edges, 70, backend="reference"))
-
-    def route() -> None:
-        layers = WIDE
-        shapes = layers.weight_shapes(3)
-        centres = torch.rand(5, 3)
-
-        def run(x: list[Any], backend: str) -> Any:
-            options: dict[str, Any] = {"centres": centres.to(where), "layers": layers, "backend": backend}
-            return voronerf.routed_mlp(x[0], x[1:], [None] * len(shapes), **options)[0]
-
-        close(run, [torch.rand(300, 3), *(torch.randn(5, o, i) / i**0.5 for o, i in shapes)])
-
-    def network(layers: Any, counts: list[int], d: int, precision: str) -> None:
-        with where:
-            check(layers, counts, d, precision)
-
-    networks = {"branched": (BRANCHED, 3), "wide": (WIDE, 7), "gaussians": (GAUSSIANS, 6), "broad": (BROAD, 3)}
-    cases: list[tuple[str, Callable[[], None]]] = [
-        *(
-            (f"nearest_centre {k} {d}", functools.partial(lookup, "nearest_centre", 300, k, d))
-            for k, d in ((17, torch.float32), (700, torch.float32), (17, torch.float64))
-        ),
-        ("locate_cell", functools.partial(lookup, "locate_cell", 300, 3, torch.float32)),
-        *((f"cell_sort {n} {k}", functools.partial(sort, n, k)) for n, k in ((5000, 3), (4200, 600), (20_000, 4096))),
-        (
-            "frequency_encode",
-            lambda: close(lambda x, b: voronerf.frequency_encode(x[0], 10, backend=b), [torch.rand(90, 3)]),
-        ),
-        (
-            "integrated_encode",
-            lambda: close(
-                lambda x, b: voronerf.integrated_encode(x[0], x[1], 4, backend=b),
-                [torch.rand(90, 3), torch.rand(90, 3)],
-            ),
-        ),
-        ("composite", composite),
-        ("resample", resample),
-        *(
-            (f"grouped_mlp {name} {precision}", functools.partial(network, layers, [70, 0, 1, 40], d, precision))
-            for name, (layers, d) in networks.items()
-            for precision in ALLOWED
-        ),
-        ("grouped_mlp dense float32", functools.partial(network, DENSE, [37, 3], 3, "float32")),
-        ("routed_mlp", route),
-    ]
-    return cases
-
-
-def captured() -> int:
-    """Nearest centre, sort, networks and their gradients, captured once and replayed."""
+def settling(device: str) -> Callable[[], None]:
+    """What waits for all that a device has been given."""
     import torch
 
-    import voronerf
-    from voronerf.layers import MLP, POSITIONS, Layer
+    return torch.cuda.synchronize if device == "cuda" else lambda: None
 
-    layers = MLP((Layer((POSITIONS,), 64, "relu"), Layer((0,), 64, "relu"), Layer((1,), 4)), (2,), 10)
-    shapes = layers.weight_shapes(3)
-    weights = [(torch.randn(8, o, i, device="cuda") / i**0.5).requires_grad_() for o, i in shapes]
-    biases = [torch.zeros(8, o, device="cuda", requires_grad=True) for o, _ in shapes]
-    points, centres = torch.rand(4096, 3, device="cuda"), torch.rand(8, 3, device="cuda")
 
-    def step() -> Any:
-        out, _ = voronerf.routed_mlp(points, weights, biases, layers=layers, centres=centres, backend="native")
-        return torch.autograd.grad(out.square().mean(), [*weights, *biases])
+def small(again: Again) -> int:
+    """Every operation, forward and backward."""
+    import torch
+
+    def seeded(run: Callable[[], None]) -> None:
+        torch.manual_seed(0)
+        run()
+
+    cases: list[Case] = [(name, functools.partial(seeded, run)) for name, run in small_cases("cuda")]
+    return one_by_one(cases, again, settling("cuda"))
+
+
+def captured(again: Again) -> int:
+    """Steps captured once and replayed: nearest centre, sort, networks and their gradients."""
+    cases: list[Case] = [(name, functools.partial(capture, step)) for name, step in captured_steps("cuda")]
+    return one_by_one(cases, again, settling("cuda"))
+
+
+def capture(step: Callable[[], list[Any]]) -> None:
+    """Three replays of a step have the results of the step itself."""
+    import torch
 
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -234,44 +179,39 @@ def captured() -> int:
     with torch.cuda.graph(graph):
         found = step()
     for _ in range(3):
+        for part in found:
+            part.zero_()
         graph.replay()
-    torch.cuda.synchronize()
-    assert all(torch.equal(a, b) for a, b in zip(expected, found)), "a replay differs from the step itself"
-    print("a step was captured and replays with the same gradients")
-    return 0
+        torch.cuda.synchronize()
+        assert all(torch.equal(a, b) for a, b in zip(expected, found)), "a replay differs from the step itself"
 
 
-def tests(out: Path) -> int:
+def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECONDS) -> int:
     """Every file of tests/ops in a process of its own, four at a time; its output goes to ``out``."""
     out.mkdir(parents=True, exist_ok=True)
-    files = sorted((ROOT / "tests" / "ops").glob("test_*.py"))
+    files = files or sorted((ROOT / "tests" / "ops").glob("test_*.py"))
+    options = ["-q", "-p", "no:cacheprovider", "--tb=short", "-k", "cuda", "--require", "native,cuda"]
 
-    def run(file: Path) -> tuple[Path, int, list[str]]:
-        command = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-q",
-            "-p",
-            "no:cacheprovider",
-            "--tb=short",
-            "-k",
-            "cuda",
-            str(file),
-        ]
-        with (out / f"{file.stem}.txt").open("w+") as log:
-            status = subprocess.run([*command, "--require", "cuda"], cwd=ROOT, stdout=log, stderr=log).returncode
+    def run(file: Path) -> tuple[Path, int | str, list[str]]:
+        command = [sys.executable, "-m", "pytest", *options, str(file)]
+        with (out / f"{file.stem}.txt").open("w+", errors="replace") as log:
+            status: int | str
+            try:
+                # gpu_check.py ends the whole group, of which this is a part, when the time of all is over.
+                status = subprocess.run(command, cwd=ROOT, stdout=log, stderr=log, timeout=seconds).returncode
+            except subprocess.TimeoutExpired:
+                status = f"stopped after {seconds:g} s"
             log.seek(0)
             return file, status, log.read().splitlines()
 
     failed = 0
     with ThreadPoolExecutor(4) as pool:
-        for file, status, lines in pool.map(run, files):
+        for done in as_completed([pool.submit(run, file) for file in files]):
+            file, status, lines = done.result()
             # 5: no test of this file is for CUDA.
             failed += status not in (0, 5)
-            print(
-                f"{'passed' if status in (0, 5) else 'FAILED'}  {file.name}: {lines[-1] if lines else ''}", flush=True
-            )
+            said = "; ".join([status] * isinstance(status, str) + lines[-1:])
+            print(f"{'passed' if status in (0, 5) else 'FAILED'}  {file.name}: {said}", flush=True)
             for line in lines:
                 if line.startswith(("FAILED", "ERROR", "E  ")):
                     print(f"    {line[:200]}", flush=True)
@@ -279,7 +219,7 @@ def tests(out: Path) -> int:
     return failed
 
 
-def roofs(out: Path, device: str = "cuda", n: int = N) -> int:
+def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     """Milliseconds at full size, what that is of the machine's own limit, and what was aimed at."""
     import torch
     from case import BACKWARD
@@ -287,74 +227,72 @@ def roofs(out: Path, device: str = "cuda", n: int = N) -> int:
     from networks import NETS, cost, make_batch
 
     import voronerf
-    from voronerf.backends import BackendUnavailable
 
-    where, rows, failed = torch.device(device), [], 0
-    limits = {kind: _cuda_peak(kind, where) for kind in ("bfloat16", "float32", "copy")}
-    print("limits: " + ", ".join(f"{kind} {value / 1e12:.2f} T/s" for kind, value in limits.items()), flush=True)
-
-    stopwatch = Stopwatch(where)
-
-    def timed(run: Callable[[], Any], repeats: int = 7) -> float:
-        times = [stopwatch(lambda _: run(), 0, 1) for _ in range(repeats + 2)]
-        return sorted(times[2:])[repeats // 2]
-
-    def row(name: str, run: Callable[[], Any], limit: str, work: float, aim: float | None) -> None:
-        nonlocal failed
-        try:
-            seconds = timed(run)
-        except (RuntimeError, ValueError, BackendUnavailable) as error:
-            failed += 1
-            print(f"FAILED {name}: {error}", flush=True)
-            return
-        share = work / seconds / limits[limit]
-        rows.append({"name": name, "seconds": seconds, "limit": limit, "share": share, "aim": aim})
-        aimed = "" if aim is None else f", aimed at {100 * aim:.0f} %: {'reached' if share >= aim else 'MISSED'}"
-        print(f"{name:36} {1e3 * seconds:9.3f} ms  {100 * share:6.1f} % of {limit}{aimed}", flush=True)
-        (out / "roofs.json").write_text(json.dumps({"limits": limits, "rows": rows}, indent=1) + "\n")
-
+    where, path = torch.device(device), out / "roofs.json"
     out.mkdir(parents=True, exist_ok=True)
-    points = torch.rand(n, 3, device=where)
-    for k, limit, work, aim in ((16, "copy", 16.0 * n, 0.6), (512, "float32", 8.0 * 512 * n, 0.5)):
-        centres = torch.rand(k, 3, device=where)
-        find = functools.partial(voronerf.nearest_centre, points, centres, backend="native")
-        row(f"nearest_centre k={k}", find, limit, work, aim)
-    for k in (16, 256, 4096):
+    if again.start:
+        kept = json.loads(path.read_text())
+    else:
+        kept = {"limits": {kind: _cuda_peak(kind, where) for kind in ("bfloat16", "float32", "copy")}, "rows": []}
+        path.write_text(json.dumps(kept, indent=1) + "\n")
+        print("limits: " + ", ".join(f"{k} {value / 1e12:.2f} T/s" for k, value in kept["limits"].items()), flush=True)
+    stopwatch = Stopwatch(where)
+    cases: list[Case] = []
+
+    def row(name: str, prepare: Callable[[], Callable[[], Any]], limit: str, work: float, aim: float | None) -> None:
+        """Times what ``prepare()`` returns."""
+
+        def case(repeats: int = 7) -> str:
+            run = prepare()
+            times = [stopwatch(lambda _: run(), 0, 1) for _ in range(repeats + 2)]
+            seconds = sorted(times[2:])[repeats // 2]
+            share = work / seconds / kept["limits"][limit]
+            kept["rows"].append({"name": name, "seconds": seconds, "limit": limit, "share": share, "aim": aim})
+            path.write_text(json.dumps(kept, indent=1) + "\n")
+            aimed = "" if aim is None else f", aimed at {100 * aim:.0f} %: {'reached' if share >= aim else 'MISSED'}"
+            return f"{1e3 * seconds:.3f} ms, {100 * share:.1f} % of {limit}{aimed}"
+
+        cases.append((name, case))
+
+    def find(k: int) -> Callable[[], Any]:
+        points, centres = torch.rand(n, 3, device=where), torch.rand(k, 3, device=where)
+        return functools.partial(voronerf.nearest_centre, points, centres, backend="native")
+
+    def sort(k: int, dtype: torch.dtype | None) -> Callable[[], Any]:
         cells = torch.randint(0, k, (n,), dtype=torch.int32, device=where)
-        row(
-            f"cell_sort k={k}", functools.partial(voronerf.cell_sort, cells, k, backend="native"), "copy", 8.0 * n, None
-        )
-        short = cells.to(torch.uint8 if k <= 256 else torch.int16)
-        row(
-            f"  torch.sort {short.dtype} k={k}",
-            functools.partial(torch.sort, short, stable=True),
-            "copy",
-            8.0 * n,
-            None,
-        )
-    forward_aims = {"w64d4": 0.4, "nerf64": 0.4, "mlp32": 0.25}
-    for name, k in (("w64d4", 16), ("nerf64", 16), ("mlp32", 256), ("nerf128", 16), ("nerf256", 16)):
-        net = NETS[name]
-        batch = make_batch(net, n, k, torch.bfloat16, BACKWARD, where)
-        options = {"layers": net, "directions": batch.directions, "direction_index": batch.direction_index}
-        given = batch.positions[0], batch.offsets, batch.weights, batch.biases
-        run = functools.partial(voronerf.grouped_mlp, *given, **options, backend="native")
-        price = cost(net)
+        if dtype is None:
+            return functools.partial(voronerf.cell_sort, cells, k, backend="native")
+        return functools.partial(torch.sort, cells.to(dtype), stable=True)
 
-        def forward(run: Callable[[], Any] = run) -> None:
-            with torch.no_grad():
-                run()
-
-        def both(run: Callable[[], Any] = run, batch: Any = batch) -> None:
-            torch.autograd.grad(run(), [*batch.weights, *batch.biases], batch.gradients[1])
-
-        row(f"{name} k={k} forward", forward, "bfloat16", price.forward * n, forward_aims.get(name))
-        both_aim = 0.25 if name == "nerf64" else None
-        row(f"{name} k={k} forward + backward", both, "bfloat16", (price.forward + price.backward) * n, both_aim)
-        del batch, given, run
+    def network(name: str, k: int, backward: bool) -> Callable[[], Any]:
         if where.type == "cuda":
             torch.cuda.empty_cache()
-    return failed
+        batch = make_batch(NETS[name], n, k, torch.bfloat16, BACKWARD, where)
+        options = {"layers": batch.net, "directions": batch.directions, "direction_index": batch.direction_index}
+        given = batch.positions[0], batch.offsets, batch.weights, batch.biases
+
+        def run() -> None:
+            with torch.set_grad_enabled(backward):
+                result = voronerf.grouped_mlp(*given, **options, backend="native")
+                if backward:
+                    torch.autograd.grad(result, [*batch.weights, *batch.biases], batch.gradients[1])
+
+        return run
+
+    for k, limit, work, aim in ((16, "copy", 16.0 * n, 0.6), (512, "float32", 8.0 * 512 * n, 0.5)):
+        row(f"nearest_centre k={k}", functools.partial(find, k), limit, work, aim)
+    for k in (16, 256, 4096):
+        short = torch.uint8 if k <= 256 else torch.int16
+        row(f"cell_sort k={k}", functools.partial(sort, k, None), "copy", 8.0 * n, None)
+        row(f"torch.sort {short} k={k}", functools.partial(sort, k, short), "copy", 8.0 * n, None)
+    aims = {"w64d4": 0.4, "nerf64": 0.4, "mlp32": 0.25}
+    for name, k in (("w64d4", 16), ("nerf64", 16), ("mlp32", 256), ("nerf128", 16), ("nerf256", 16)):
+        price = cost(NETS[name])
+        forward, both = (functools.partial(network, name, k, backward) for backward in (False, True))
+        both_work, both_aim = (price.forward + price.backward) * n, 0.25 if name == "nerf64" else None
+        row(f"{name} k={k} forward", forward, "bfloat16", price.forward * n, aims.get(name))
+        row(f"{name} k={k} forward + backward", both, "bfloat16", both_work, both_aim)
+    return one_by_one(cases, again, settling(device))
 
 
 def training(out: Path, data: str, device: str = "cuda", seconds: float = 15.0) -> int:
@@ -394,16 +332,29 @@ TRAININGS: dict[str, dict[str, Any]] = {
 """What each training sets."""
 
 
-def main(part: str, *arguments: str) -> int:
+def main(arguments: list[str]) -> int:
     """Run one part."""
-    if part == "small":
-        return small(*(int(argument) for argument in arguments))
-    if part in ("tests", "roofs"):
-        return (tests if part == "tests" else roofs)(Path(arguments[0]))
-    if part == "training":
-        return training(Path(arguments[0]), arguments[1])
-    return {"machine": machine, "captured": captured}[part]()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("machine", "small", "captured", "roofs", "training", "tests"))
+    parser.add_argument("out", nargs="?", type=Path, default=ROOT / "build" / "gpu-check")
+    parser.add_argument("data", nargs="?", default="builtin")
+    parser.add_argument("--case-seconds", type=float, help="for one case, after which it is said to hang")
+    parser.add_argument("--start", type=int, default=0, help="the first case")
+    parser.add_argument("--failed", type=int, default=0, help="cases before it that failed")
+    given = parser.parse_args(arguments)
+    # A case of the timings makes a batch as well.
+    seconds = given.case_seconds or (2 * CASE_SECONDS if given.part == "roofs" else CASE_SECONDS)
+    again = Again((given.part, str(given.out)), given.start, given.failed, seconds)
+    runs: dict[str, Callable[[], int]] = {
+        "machine": machine,
+        "small": lambda: small(again),
+        "captured": lambda: captured(again),
+        "roofs": lambda: roofs(given.out, again),
+        "training": lambda: training(given.out, given.data),
+        "tests": lambda: tests(given.out),
+    }
+    return runs[given.part]()
 
 
 if __name__ == "__main__":
-    sys.exit(min(main(*sys.argv[1:]), 100))
+    sys.exit(min(main(sys.argv[1:]), 100))

@@ -4,24 +4,37 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import subprocess
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 
 import pytest
-from emulated import emulated
+import torch
+from emulated import emulated, module
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def program(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    loaded = sys.modules[name] = importlib.util.module_from_spec(spec)  # its dataclasses look for it there
+    spec.loader.exec_module(loaded)
+    return loaded
 
 
 @pytest.fixture
 def parts(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.setattr(sys, "path", [*sys.path])
-    spec = importlib.util.spec_from_file_location("gpu_parts", ROOT / ".ci" / "gpu_parts.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return program("gpu_parts")
+
+
+@pytest.fixture
+def check() -> ModuleType:
+    return program("gpu_check")
 
 
 def test_every_small_case_is_right_on_the_emulated_device(parts: ModuleType) -> None:
@@ -33,6 +46,26 @@ def test_every_small_case_is_right_on_the_emulated_device(parts: ModuleType) -> 
                 raise AssertionError(name) from error
 
 
+def test_steps_to_capture_are_right_on_the_emulated_device(parts: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    ways = []
+    with emulated() as loaded:
+        entry = loaded.grouped_mlp_cuda
+
+        def forward(numbers: list[int], arguments: list[int], *others: object) -> None:
+            sizes = arguments[5], arguments[7]
+            ways.append(module().grouped_mlp_plan(numbers, numbers[4], *sizes, False)["by_layers"])
+            entry(numbers, arguments, *others)
+
+        monkeypatch.setattr(loaded, "grouped_mlp_cuda", forward)
+        for name, step in parts.captured_steps("cpu", 40):
+            allowed = 8e-2 if "bfloat16" in name else 1e-5  # rounding moves samples across kinks
+            for found, exact in zip(step(), step("reference", torch.float64)):
+                difference = (found.double() - exact).norm()
+                assert difference <= allowed * exact.norm() + 1e-7, (name, list(found.shape))
+            assert ways[-1] == ("by layers" in name), name
+    assert len(ways) == 5
+
+
 def test_a_wrong_result_is_told(
     parts: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -41,21 +74,67 @@ def test_a_wrong_result_is_told(
 
     monkeypatch.setattr(parts, "small_cases", lambda device: [("fine", lambda: None), ("bad", wrong)])
     monkeypatch.setattr("torch.cuda.synchronize", lambda: None)
-    assert parts.small() == 1
+    assert parts.main(["small"]) == 1
     said = capsys.readouterr().out
     assert "right  fine" in said and "WRONG  bad: ValueError: not what it should be" in said
     assert said.endswith("1 of 2 cases are right\n")
 
 
+AFTER_FAULTS = """
+import sys, threading, types
+sys.path.insert(0, {ci!r})
+import gpu_parts
+
+broken = False
+
+def synchronize():
+    if broken:
+        raise RuntimeError("an illegal memory access was encountered")
+
+def breaks():
+    global broken
+    broken = True
+    synchronize()
+
+cuda = types.SimpleNamespace(synchronize=synchronize)
+sys.modules["torch"] = types.SimpleNamespace(cuda=cuda, manual_seed=lambda seed: None)
+cases = [("first", lambda: None), ("breaks", breaks), ("between", lambda: None)]
+cases += [("hangs", lambda: threading.Event().wait(60)), ("last", lambda: None)]
+gpu_parts.small_cases = lambda device: cases
+sys.exit(gpu_parts.main(sys.argv[1:]))
+"""
+
+
+def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path: Path) -> None:
+    """In processes that truly start themselves anew, with a device that stays broken."""
+    (tmp_path / "faults.py").write_text(AFTER_FAULTS.format(ci=str(ROOT / ".ci")))
+    command = [sys.executable, "faults.py", "small", "--case-seconds", "0.5"]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=50)
+    told = [line for line in result.stdout.splitlines() if line.startswith(("right", "WRONG"))]
+    assert told == [
+        "right  first",
+        "WRONG  breaks: RuntimeError: an illegal memory access was encountered",
+        "right  between",
+        "WRONG  hangs: hangs, stopped after 0.5 s",
+        "right  last",
+    ]
+    assert result.stdout.endswith("3 of 5 cases are right\n") and result.returncode == 2
+
+
 @pytest.mark.native
 def test_roofs(parts: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Every row is measured, on the CPU's kernels."""
+    """Every row is measured, on the CPU's kernels, and what a first process measured stays."""
     import harness  # of benchmarks/, to which gpu_parts.py has led
 
     monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
-    assert parts.roofs(tmp_path, "cpu", 256) == 0
+    again = parts.Again(("roofs",), case_seconds=60.0)
+    assert parts.roofs(tmp_path, again, "cpu", 256) == 0
     rows = json.loads((tmp_path / "roofs.json").read_text())["rows"]
     assert len(rows) == 18 and all(row["seconds"] > 0 and row["share"] > 0 for row in rows)
+    again = parts.Again(("roofs",), start=17, failed=1, case_seconds=60.0)
+    assert parts.roofs(tmp_path, again, "cpu", 256) == 1
+    after = json.loads((tmp_path / "roofs.json").read_text())["rows"]
+    assert after[:18] == rows and [row["name"] for row in after[18:]] == [rows[17]["name"]]
 
 
 def test_training(parts: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -65,5 +144,75 @@ def test_training(parts: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_machine(parts: ModuleType, capsys: pytest.CaptureFixture) -> None:
-    parts.machine()
+    parts.main(["machine"])
     assert "missing: " in capsys.readouterr().out
+
+
+def test_a_file_of_tests_that_hangs_fails_alone(
+    parts: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "conftest.py").write_text("def pytest_addoption(parser):\n    parser.addoption('--require')\n")
+    bodies = {
+        "hangs": "import time\ndef test_cuda():\n    time.sleep(60)\n",
+        "passes": "def test_cuda(pytestconfig):\n    assert pytestconfig.getoption('require') == 'native,cuda'\n",
+        "wrong": "def test_cuda():\n    assert 1 + 1 == 3\n",
+        "other": "def test_elsewhere():\n    assert False\n",
+    }
+    files = []
+    for name, body in bodies.items():
+        files.append(tmp_path / f"test_planted_{name}.py")
+        files[-1].write_text(body)
+    assert parts.tests(tmp_path / "out", files, 6.0) == 2
+    said = capsys.readouterr().out.splitlines()
+    outcomes = {line.split()[1].removeprefix("test_planted_"): line for line in said if "  test_planted_" in line}
+    assert outcomes["hangs.py:"].startswith("FAILED  test_planted_hangs.py: stopped after 6 s")
+    assert list(outcomes)[-1] == "hangs.py:", "the others are told before it"
+    assert outcomes["passes.py:"].startswith("passed") and "1 passed" in outcomes["passes.py:"]
+    assert outcomes["wrong.py:"].startswith("FAILED") and outcomes["other.py:"].startswith("passed")
+    assert said[-1] == "2 of 4 files passed"
+
+
+def test_a_part_that_hangs_is_ended_with_all_that_it_started(
+    check: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(check, "SHORTEST", 0.0)
+    child = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    result = check.run("hangs", check.Part([sys.executable, "-c", script], 2), tmp_path, 100.0)
+    assert result["outcome"] == "failed" and result["last"].startswith("stopped after 2 s")
+    child_pid = int((tmp_path / "pid").read_text())
+    for _ in range(100):
+        state = Path(f"/proc/{child_pid}/stat")
+        # One that has ended may still wait for whoever adopts it.
+        if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
+            return
+        time.sleep(0.05)
+    raise AssertionError("the child of the part still runs")
+
+
+def test_what_a_part_says_is_kept_whatever_it_is(
+    check: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", "/somewhere/else")
+    script = "import os, sys; print(os.environ['PYTHONPATH'], os.environ['GIVEN'], flush=True); "
+    script += r"sys.stdout.buffer.write(b'\xff\xfe not text\n')"
+    part = check.Part([sys.executable, "-c", script], 20, (("GIVEN", "1"),))
+    result = check.run("bytes", part, tmp_path, 100.0)
+    assert result["outcome"] == "passed" and result["last"].endswith(" not text")
+    assert (tmp_path / "bytes.txt").read_bytes().startswith(f"{ROOT}{os.pathsep}/somewhere/else 1".encode())
+    assert check.run("none", check.Part(["/not/there"], 20), tmp_path, 100.0)["outcome"] == "failed"
+
+
+def test_the_sanitizer_sees_every_allocation(
+    check: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    tool = tmp_path / "compute-sanitizer"
+    tool.write_text("#!/bin/sh\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(check, "capability", lambda: "90")
+    known = check.parts(tmp_path, None)
+    assert dict(known["memcheck"].environment) == {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
+    assert known["racecheck"].environment == () and known["racecheck"].command[0] == str(tool)
+    monkeypatch.setattr(check, "capability", lambda: None)
+    assert {name for name, part in check.parts(tmp_path, None).items() if isinstance(part.command, list)} == {"machine"}

@@ -1,0 +1,161 @@
+"""What ``gpu_parts.py`` tries: every operation once against float64, and the steps that it captures."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+STEPS: dict[str, tuple[int, str, bool]] = {
+    "fused": (64, "float32", False),
+    "fused, bfloat16": (64, "bfloat16", False),
+    "fused, directions by an index": (64, "float32", True),
+    "by layers": (300, "float32", False),
+    "by layers, bfloat16, directions by an index": (300, "bfloat16", True),
+}
+"""Steps to capture: the width, beyond 256 layer by layer, the type of the weights, and whether there are directions."""
+
+
+def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
+    """Names and checks, which raise."""
+    import torch
+    from emulated_networks import ALLOWED, BRANCHED, GAUSSIANS, WIDE, check
+    from test_emulated_layers import BROAD, DENSE
+
+    import voronerf
+
+    where = torch.device(device)
+
+    def lookup(op: str, n: int, k: int, dtype: Any) -> None:
+        points = torch.randint(-3, 4, (n, 3), device=where).to(dtype)
+        centres = torch.randint(-3, 4, (k, 3), device=where).to(dtype)
+        if op == "nearest_centre":
+            found, expected = (voronerf.nearest_centre(points, centres, backend=b) for b in ("native", "reference"))
+        else:
+            diagram = voronerf.VoronoiDiagram(torch.rand(4, 3)).refine({1: torch.rand(k, 3)})[0]
+            tables = [x.to(where) for x in (diagram.centres, diagram.child_offsets, diagram.child)]
+            points = points.float() / 8 + 0.5
+            found, expected = (
+                voronerf.locate_cell(points, *tables, depth=diagram.depth, backend=b) for b in ("native", "reference")
+            )
+        assert torch.equal(found, expected)
+
+    def sort(n: int, k: int) -> None:
+        cells = torch.randint(0, k, (n,), dtype=torch.int32, device=where)
+        found, expected = (voronerf.cell_sort(cells, k, backend=b) for b in ("native", "reference"))
+        assert all(torch.equal(a, b) for a, b in zip(found, expected))
+
+    def close(run: Callable[..., Any], leaves: list[Any]) -> None:
+        """Results and gradients against the reference in float64."""
+        outcomes = []
+        for backend, dtype in (("native", torch.float32), ("reference", torch.float64)):
+            given = [leaf.to(where, dtype).requires_grad_() for leaf in leaves]
+            out = run(given, backend)
+            parts = [part for part in (out if isinstance(out, tuple) else (out,)) if part.is_floating_point()]
+            total = sum(
+                (part * torch.linspace(0.5, 1.5, part.numel(), device=where).view_as(part)).sum() for part in parts
+            )
+            outcomes.append([*parts, *torch.autograd.grad(total, given, allow_unused=True, materialize_grads=True)])
+        for part, exact in zip(*outcomes):
+            assert (part.double() - exact).norm() <= 1e-5 * exact.norm() + 1e-6, (
+                list(part.shape),
+                part.isfinite().all(),
+            )
+
+    def composite() -> None:
+        offsets = torch.tensor([0, 0, 1, 71, 180], dtype=torch.int32, device=where)
+        close(
+            lambda x, b: tuple(voronerf.composite(*x, ray_offsets=offsets, backend=b)),
+            [torch.rand(180), torch.rand(180, 3), torch.rand(180).cumsum(0), torch.rand(180)],
+        )
+
+    def resample() -> None:
+        weights, edges = torch.rand(6, 45), torch.rand(6, 46).cumsum(1)
+        found = voronerf.resample(weights.to(where), edges.to(where), 70, backend="native")
+        torch.testing.assert_close(found.cpu(), voronerf.resample(weights, edges, 70, backend="reference"))
+
+    def route() -> None:
+        layers = WIDE
+        shapes = layers.weight_shapes(3)
+        centres = torch.rand(5, 3)
+
+        def run(x: list[Any], backend: str) -> Any:
+            options: dict[str, Any] = {"centres": centres.to(where), "layers": layers, "backend": backend}
+            return voronerf.routed_mlp(x[0], x[1:], [None] * len(shapes), **options)[0]
+
+        close(run, [torch.rand(300, 3), *(torch.randn(5, o, i) / i**0.5 for o, i in shapes)])
+
+    def network(layers: Any, counts: list[int], d: int, precision: str) -> None:
+        with where:
+            check(layers, counts, d, precision)
+
+    networks = {"branched": (BRANCHED, 3), "wide": (WIDE, 7), "gaussians": (GAUSSIANS, 6), "broad": (BROAD, 3)}
+    cases: list[tuple[str, Callable[[], None]]] = [
+        *(
+            (f"nearest_centre {k} {d}", functools.partial(lookup, "nearest_centre", 300, k, d))
+            for k, d in ((17, torch.float32), (700, torch.float32), (17, torch.float64))
+        ),
+        ("locate_cell", functools.partial(lookup, "locate_cell", 300, 3, torch.float32)),
+        *((f"cell_sort {n} {k}", functools.partial(sort, n, k)) for n, k in ((5000, 3), (4200, 600), (20_000, 4096))),
+        (
+            "frequency_encode",
+            lambda: close(lambda x, b: voronerf.frequency_encode(x[0], 10, backend=b), [torch.rand(90, 3)]),
+        ),
+        (
+            "integrated_encode",
+            lambda: close(
+                lambda x, b: voronerf.integrated_encode(x[0], x[1], 4, backend=b),
+                [torch.rand(90, 3), torch.rand(90, 3)],
+            ),
+        ),
+        ("composite", composite),
+        ("resample", resample),
+        *(
+            (f"grouped_mlp {name} {precision}", functools.partial(network, layers, [70, 0, 1, 40], d, precision))
+            for name, (layers, d) in networks.items()
+            for precision in ALLOWED
+        ),
+        ("grouped_mlp dense float32", functools.partial(network, DENSE, [37, 3], 3, "float32")),
+        ("routed_mlp", route),
+    ]
+    return cases
+
+
+def captured_steps(device: str, n: int = 4096) -> list[tuple[str, Callable[..., list[Any]]]]:
+    """Names and steps: nearest centre, sort, networks and the gradients of their parameters."""
+    return [(name, _step(*settings, device, n)) for name, settings in STEPS.items()]
+
+
+def _step(width: int, dtype: str, directed: bool, device: str, n: int) -> Callable[..., list[Any]]:
+    import torch
+
+    import voronerf
+    from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+
+    kind, k = getattr(torch, dtype), 8
+    last = Layer((1, DIRECTIONS) if directed else (1,), 4)
+    layers = MLP((Layer((POSITIONS,), width, "relu"), Layer((0,), width, "relu"), last), (2,), 10, 4)
+    shapes = layers.weight_shapes(3, 3 if directed else 0)
+    weights = [(torch.randn(k, o, i) / i**0.5).to(device, kind).requires_grad_() for o, i in shapes]
+    biases = [torch.zeros(k, o, dtype=kind, device=device, requires_grad=True) for o, _ in shapes]
+    options: dict[str, Any] = {"layers": layers, "centres": torch.rand(k, 3).to(device)}
+    points = torch.rand(n, 3).to(device)
+    if directed:
+        options["directions"] = torch.nn.functional.normalize(torch.randn(16, 3), dim=1).to(device)
+        options["direction_index"] = torch.randint(0, 16, (n,), dtype=torch.int32).to(device)
+
+    def step(backend: str = "native", dtype: Any = None) -> list[Any]:
+        """The gradients, with everything in another type where one is given."""
+
+        def cast(value: Any) -> Any:
+            return value.to(dtype) if isinstance(value, torch.Tensor) and value.is_floating_point() else value
+
+        given, leaves = {"positions": points, **options}, [*weights, *biases]
+        if dtype is not None:
+            given = {name: cast(value) for name, value in given.items()}
+            leaves = [cast(leaf.detach()).requires_grad_() for leaf in leaves]
+        given |= {"weights": leaves[: len(shapes)], "biases": leaves[len(shapes) :]}
+        out, _ = voronerf.routed_mlp(**given, backend=backend)
+        return list(torch.autograd.grad((out if dtype else out.float()).square().mean(), leaves))
+
+    return step
