@@ -91,7 +91,9 @@ def picture(trainer: Trainer) -> dict[str, Any]:
         "truth": (scene.test.truth(view, scene.background_colour()) * 255).round().to(torch.uint8),
     }
     points = slice_points(scene, size=SLICE)
-    found["density"] = slice_density(router, points, cones=trainer.renderer.cones).half()
+    found["density"] = slice_density(
+        router, points, cones=trainer.renderer.cones, contraction=trainer.renderer.contraction
+    ).half()
     found["slice_cells"] = router.diagram.locate(points.reshape(-1, 3)).reshape(SLICE, SLICE).int()
     score = psnr(found["colour"].float() / 255, found["truth"].float() / 255)
     return {name: value.cpu().numpy() for name, value in found.items()} | {

@@ -175,6 +175,16 @@ def test_a_spoiled_density_spoils_the_weights_from_there_on(device: torch.device
     assert weights.flatten().isnan().tolist() == [False, False, True, True, True]
 
 
+def test_sums_are_float32_under_autocast(device: torch.device, backend: str) -> None:
+    need("composite", backend, device, torch.float32)
+    inputs = [tensor.to(device) for tensor in rays(4, 9)]
+    expected = composite(*inputs, backend=backend)
+    with torch.autocast(device.type, torch.bfloat16):
+        found = composite(*inputs, backend=backend)
+    for one, other in zip(found, expected):
+        assert torch.equal(one, other)
+
+
 def test_gradcheck() -> None:
     inputs = [tensor.requires_grad_() for tensor in rays(2, 4, 2, torch.float64)]
     background = torch.rand(2, 2, dtype=torch.float64, requires_grad=True)

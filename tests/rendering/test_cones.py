@@ -131,3 +131,9 @@ def test_contracted_cones_are_those_of_space_inside_of_the_sphere() -> None:
     torch.testing.assert_close(frustum_gaussians(rays, edges, Contraction(torch.zeros(3), 2.0)), plain)
     bent = frustum_gaussians(rays, edges, Contraction(torch.zeros(3), 0.5))
     assert float((bent[..., :3]).norm(dim=-1).max()) < 1
+
+
+@pytest.mark.parametrize(("centre", "radius"), [(3, 0.0), (3, float("inf")), (3, float("nan")), (2, 1.0)])
+def test_a_sphere_has_a_centre_and_a_radius(centre: int, radius: float) -> None:
+    with pytest.raises(ValueError, match=r"centre must have shape \[3\] and radius be positive and finite, got "):
+        Contraction(torch.zeros(centre), radius)

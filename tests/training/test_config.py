@@ -69,6 +69,7 @@ def test_json_of_something_else(text: str) -> None:
         ({"parameters": 0}, "--parameters must be at least 1, got 0"),
         ({"blend": -1.0}, "--blend must be a distance of 0 or more, got -1.0"),
         ({"fine_samples": 0}, "--fine-samples must be at least 1, got 0"),
+        ({"split_proposal": True}, "--split-proposal must come with --sampling proposal, got True"),
         ({"backend": "fast"}, "--backend must be auto, .*got 'fast'"),
         ({"eval_views": 0}, "--eval-views must be at least 1, got 0"),
         ({"temperature": -1.0}, "--temperature must be positive and finite, got -1.0"),

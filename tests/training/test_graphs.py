@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from voronerf.data import Scene, builtin_scene
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.graphs import WARMUP, GraphedStep, set_learning_rate
+from voronerf.training.model import load_grid
 from voronerf.training.trainer import Trainer
 
 aten = torch.ops.aten
@@ -124,6 +126,7 @@ def fake_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.Stream", FakeStream)
     monkeypatch.setattr("torch.cuda.current_stream", FakeStream)
     monkeypatch.setattr("torch.cuda.stream", lambda stream: contextlib.nullcontext())
+    monkeypatch.setattr("torch.cuda.device", lambda device: contextlib.nullcontext())
 
 
 def test_every_call_is_one_step(fake_cuda: None) -> None:
@@ -193,3 +196,20 @@ def test_replayed_steps_are_the_steps_themselves(tmp_path: Path, scene: Scene, s
         for trainer.step in range(12):
             losses[-1].append(float(trainer._step()))
     torch.testing.assert_close(torch.tensor(losses[1]), torch.tensor(losses[0]), rtol=0.02, atol=1e-4)
+
+
+def test_a_graph_is_captured_on_the_trainers_device(fake_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    entered = []
+    monkeypatch.setattr("torch.cuda.device", lambda device: entered.append(device) or contextlib.nullcontext())
+    generator = torch.Generator()
+    graphed = GraphedStep(lambda: None, [generator])
+    for _ in range(WARMUP + 2):
+        graphed()
+    assert entered == [generator.device] * (WARMUP + 2)
+
+
+def test_pictures_through_a_grid_of_a_run_that_was_graphed(tmp_path: Path, scene: Scene) -> None:
+    trainer = Trainer(small(tmp_path, steps=2, cells=(), split_at=None), scene)
+    trainer.run()
+    config = replace(trainer.config, device="cuda", cuda_graph=True)
+    assert load_grid(tmp_path, config, trainer.router, scene, wanted=True) is not None

@@ -114,3 +114,8 @@ def test_means_and_the_psnr_of_the_mean_error() -> None:
     assert means["psnr_of_mean_error"] == pytest.approx(-10 * math.log10((0.01 + 0.001) / 2))
     assert mean_scores([*scores, ViewScore("c", 25.0, 0.5)])["lpips"] is None
     assert mean_scores([ViewScore("perfect", math.inf, 1.0)])["psnr_of_mean_error"] == math.inf
+
+
+def test_scores_that_are_no_numbers_are_not_perfect() -> None:
+    scores = [ViewScore("a", 20.0, 0.5, None), ViewScore("b", math.nan, math.nan, None)]
+    assert math.isnan(mean_scores(scores)["psnr_of_mean_error"])

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from voronerf import VoronoiRouter
 from voronerf.data import Scene, builtin_scene
 from voronerf.fields import MipNeRF, NeRF
+from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.renderer import Renderer
 from voronerf.training.evaluation import render_view
 from voronerf.training.seams import seam
@@ -128,3 +129,19 @@ def test_a_slice_through_a_layer_table(scene: Scene, cones: bool) -> None:
     router = VoronoiRouter(field, torch.randn(4, 3), blend=0.1)
     density = slice_density(router, slice_points(scene, size=8), cones=cones)
     assert density.shape == (8, 8) and (density > 0).all()
+
+
+@pytest.mark.parametrize("cones", [False, True])
+def test_a_slice_through_contracted_space(scene: Scene, cones: bool) -> None:
+    field = MipNeRF(width=8, depth=2, position_octaves=2) if cones else NeRF(width=8, depth=2, position_octaves=2)
+    router, points = VoronoiRouter(field, torch.randn(4, 3)), slice_points(scene, size=8)
+    within = Contraction(torch.zeros(3), 10.0)
+    torch.testing.assert_close(
+        slice_density(router, points, cones=cones, contraction=within), slice_density(router, points, cones=cones)
+    )
+    across = Contraction(torch.zeros(3), 0.5)
+    density = slice_density(router, points, cones=cones, contraction=across)
+    if cones:
+        assert not torch.equal(density, slice_density(router, points, cones=True))
+    else:
+        torch.testing.assert_close(density, slice_density(router, across.points(points)))

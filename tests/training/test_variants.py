@@ -135,8 +135,7 @@ def test_importance_is_that_of_the_last_pass(tmp_path: Path, scene: Scene, monke
     config = small(tmp_path, sampling="hierarchical", reservoir=50, reservoir_batches=1, split_at=(0.9,))
     trainer = Trainer(config, scene)
     results = []
-    render, loss = trainer.renderer.render, trainer.renderer.loss
-    monkeypatch.setattr(trainer.renderer, "render", lambda *a, **k: render(*a, **k))
+    loss = trainer.renderer.loss
     monkeypatch.setattr(trainer.renderer, "loss", lambda *a: results.append(a) or loss(*a))
     trainer.on_step = lambda p: trainer.request_stop()
     trainer.advance()
@@ -247,3 +246,37 @@ def test_pictures_may_blend_cells(tmp_path: Path, scene: Scene, variant: str) ->
         router.blend = 0.3
     blended = render_view(trainer.renderer, scene, 0).colour
     assert not torch.equal(plain, blended) and float((plain - blended).abs().max()) < 0.5
+
+
+def test_a_worst_cell_without_samples_is_split_when_it_has_them(tmp_path: Path, scene: Scene) -> None:
+    """Few samples a step, and splits planned sooner than enough are kept."""
+    config = small(
+        tmp_path, cells=(2,), split="worst", max_cells=4, split_at_steps=(4, 6), reservoir=200, min_cell_samples=20
+    )
+    trainer = Trainer(replace(config, reservoir_batches=40), scene)  # 5 samples a step
+    trainer.advance()
+    started = [stage.started_at_step for stage in trainer.stages]
+    assert [stage.cells for stage in trainer.stages] == [1, 2, 3, 4]
+    assert started[1] == 4 and started[2] > 6 and all(step % 5 == 0 for step in started[2:])
+
+
+def test_turns_leave_checkpoints(tmp_path: Path, scene: Scene) -> None:
+    trainer = Trainer(small(tmp_path, steps=100_000, checkpoint_every=0.05), scene)
+    while trainer.seconds < 0.15:
+        trainer.advance(trainer.seconds + 1e-4)  # a step
+    assert checkpoint_path(tmp_path).exists()
+
+
+def test_a_cell_of_a_proposal_is_a_module(tmp_path: Path, scene: Scene) -> None:
+    trainer = Trainer(small(tmp_path, sampling="proposal"), scene)
+    router, points = trainer.routers["proposal"], torch.rand(5, 3)
+    for found, expected in zip(router.cell(0)(points), router(points, torch.rand(5, 3), torch.arange(5).int())):
+        torch.testing.assert_close(found, expected)
+
+
+def test_a_sphere_needs_cameras_in_several_places(scene: Scene) -> None:
+    poses = scene.train.cameras.poses.clone()
+    poses[:, :3, 3] = 0
+    train = replace(scene.train, cameras=replace(scene.train.cameras, poses=poses))
+    with pytest.raises(ConfigError, match="--contraction sphere needs cameras in several places"):
+        make_contraction(replace(scene, box=None, train=train))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import TracebackType
 
 from rich.console import Console
@@ -43,7 +44,7 @@ class TrainingDisplay:
             refresh_per_second=4,
         )
         self.task = self.progress.add_task(label, total=1.0, step=0, stage="", speed=0.0, loss=0.0, psnr="")
-        self.loss = 0.0
+        self.loss = math.nan  # until the first is read
 
     def __enter__(self) -> TrainingDisplay:
         self.progress.start()
@@ -56,7 +57,7 @@ class TrainingDisplay:
 
     def on_step(self, now: TrainingProgress) -> None:
         """Shows the state after a step; the loss is smoothed over about twenty steps."""
-        self.loss = now.loss if now.step <= 1 else 0.95 * self.loss + 0.05 * now.loss
+        self.loss = now.loss if math.isnan(self.loss) else 0.95 * self.loss + 0.05 * now.loss
         self.progress.update(
             self.task,
             completed=now.fraction,

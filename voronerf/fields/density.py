@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from voronerf.fields.nerf import INITIAL_DENSITY
+from voronerf.fields.single import run_network
 from voronerf.layers import MLP, Layer
 
 
@@ -71,3 +72,18 @@ class DensityField(nn.Module):
         """Raw [n, 1] to (black [n, 3], density [n] >= 0 per scene unit), float32 or wider."""
         raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
         return raw.new_zeros(raw.shape[0], 3), F.softplus(raw.squeeze(-1)) * self.density_scale
+
+    def forward(
+        self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Evaluates the field.
+
+        Args:
+            positions: [n, 3] in scene units, or Gaussians [n, 6] for the integrated encoding.
+            directions: Not looked at; here because a field is called with them.
+            ray_index: Likewise.
+
+        Returns:
+            (black [n, 3], density [n] per scene unit).
+        """
+        return self.activate(run_network(self.layers, self.linears(), positions))

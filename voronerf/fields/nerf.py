@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from voronerf.fields.single import run_network
 from voronerf.layers import MLP, Layer
-from voronerf.ops.grouped_mlp import grouped_mlp
 
 #: Density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2:
 #: translucent enough that every sample of a ray receives a gradient, opaque enough that the colours do as well.
@@ -182,15 +182,5 @@ class NeRF(nn.Module):
         """
         if self.view_directions and directions is None:
             raise ValueError("NeRF: directions must be given, since the colour depends on the view direction")
-        offsets = torch.tensor([0, positions.shape[0]], dtype=torch.int32, device=positions.device)
-        linears = self.linears()
-        raw = grouped_mlp(
-            positions,
-            offsets,
-            [layer.weight[None] for layer in linears],
-            [layer.bias[None] for layer in linears],
-            layers=self.layers,
-            directions=directions if self.view_directions else None,
-            direction_index=ray_index if self.view_directions else None,
-        )
-        return self.activate(raw)
+        seen = (directions, ray_index) if self.view_directions else (None, None)
+        return self.activate(run_network(self.layers, self.linears(), positions, *seen))

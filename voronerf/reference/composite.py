@@ -43,7 +43,7 @@ def composite(
     optical = sigma.clamp(max=_OPAQUE) * deltas
     if ray_offsets is None:
         weights = _in_front(optical) * -torch.expm1(-optical)
-        colour = (weights[:, None, :] @ rgb)[:, 0]
+        colour = (weights[:, :, None] * rgb).sum(dim=1)  # no product, which autocast would narrow
         opacity = weights.sum(dim=1)
         depth = (weights * depths).sum(dim=1)
     else:

@@ -16,12 +16,22 @@ class Contraction:
     """``c + R f((x - c) / R)`` with ``f(x) = x`` up to length 1 and ``(2 - 1 / |x|) x / |x|`` beyond.
 
     Attributes:
-        centre: [3], c.
+        centre: [3], c. On the device of the points: from another it would be copied at every call.
         radius: R > 0.
+
+    Raises:
+        ValueError: a centre of another shape, or a radius that is not positive and finite.
     """
 
     centre: Tensor
     radius: float
+
+    def __post_init__(self) -> None:
+        if self.centre.shape != (3,) or not 0 < self.radius < float("inf"):
+            raise ValueError(
+                "Contraction: centre must have shape [3] and radius be positive and finite, "
+                f"got {list(self.centre.shape)} and {self.radius}"
+            )
 
     def points(self, points: Tensor) -> Tensor:
         """Points [..., 3] to points [..., 3] less than 2 R from the centre."""

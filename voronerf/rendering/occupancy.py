@@ -144,7 +144,8 @@ class OccupancyGrid:
         """Learns from samples that have been rendered anyway: their cells keep the densities seen, or fade.
 
         A sample that less than `HIDDEN` of the light reaches counts as one of density 0, so that the inside of what is
-        opaque becomes empty like the space around it; neither changes a picture.
+        opaque becomes empty like the space around it, which changes no picture. A surface that few of the rays through
+        its cell see fades as well, until `update` looks at it again.
 
         Args:
             positions: float32 [m, 3] in the box; what lies outside counts for the cell at the border.

@@ -25,7 +25,7 @@ class Rendered(NamedTuple):
     Attributes:
         colour: [r, 3], the background included.
         opacity: [r], 0..1: the sum of the weights.
-        depth: [r], expected distance, normalised by the opacity; `far` for a ray with none.
+        depth: [r], expected distance, normalised by the opacity; the last edge for a ray with none.
         weights: [r, s], each sample's contribution.
         positions: [r, s, 3].
         rgb: [r, s, 3], each sample's colour.

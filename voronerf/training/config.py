@@ -281,6 +281,8 @@ def check_config(config: TrainConfig) -> None:
     _check_splits(config, need)
     plain = config.field != "mipnerf" and config.sampling == "stratified" and config.contraction == "none"
     need(plain or not config.occupancy, "occupancy", OCCUPANCY_RULE)
+    proposes = config.sampling == "proposal"
+    need(proposes or not config.split_proposal, "split_proposal", "come with --sampling proposal")
 
 
 def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -> None:

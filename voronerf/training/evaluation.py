@@ -69,5 +69,5 @@ def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
         "psnr": sum(s.psnr for s in scores) / len(scores),
         "ssim": sum(s.ssim for s in scores) / len(scores),
         "lpips": sum(perceived) / len(scores) if len(perceived) == len(scores) else None,
-        "psnr_of_mean_error": -10 * math.log10(error) if error > 0 else math.inf,
+        "psnr_of_mean_error": math.inf if error == 0 else -10 * math.log10(error),
     }

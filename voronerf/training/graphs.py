@@ -35,6 +35,11 @@ class GraphedStep:
 
     def __call__(self) -> Any:
         """One step. A replay's results are the same tensors each time, with new contents."""
+        # Streams and captures are those of the current device, which need not be the trainer's.
+        with torch.cuda.device(self.generators[0].device):
+            return self._run()
+
+    def _run(self) -> Any:
         if self.runs < WARMUP:
             self.runs += 1
             side = torch.cuda.Stream()

@@ -21,7 +21,7 @@ from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint
-from voronerf.training.config import ConfigError, TrainConfig, check_config, default_learning_rate
+from voronerf.training.config import ConfigError, TrainConfig, default_learning_rate
 
 #: Channels, layers and frequencies of the proposal's density network: small, and asked about coarse intervals alone.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
@@ -134,7 +134,7 @@ def solve_width(config: TrainConfig, total: int) -> int:
 
 def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, VoronoiRouter]:
     """A router of one cell around each of the configured networks: the coarse stage. Depends on the seed alone."""
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng():  # of GPUs as well: manual_seed reaches them
         torch.manual_seed(config.seed)
         fields: dict[str, torch.nn.Module] = {}
         for name in network_names(config):
@@ -166,23 +166,31 @@ def make_renderer(
 ) -> Renderer:
     """How the configured networks become pictures of a scene; samples and backend differ from the configuration's where
     they are given."""
+    device = next(routers["field"].parameters()).device
     return Renderer(
         routers,
         samples=int(config.samples or 0) if samples is None else samples,
         fine_samples=0 if config.sampling == "stratified" else fine_samples or config.fine_samples,
         cones=config.field == "mipnerf",
-        contraction=None if config.contraction == "none" else make_contraction(scene),
+        contraction=None if config.contraction == "none" else make_contraction(scene, device),
         spacing=scene.spacing,
         occupancy=occupancy,
         backend=config.backend if backend is None else backend,
     )
 
 
-def make_contraction(scene: Scene) -> Contraction:
-    """The sphere around a scene's box, or without one around the origin and all cameras."""
+def make_contraction(scene: Scene, device: torch.device | str = "cpu") -> Contraction:
+    """The sphere around a scene's box, or without one around the origin and all cameras.
+
+    Raises:
+        ConfigError: When all cameras are at the origin, so that there is no such sphere.
+    """
     if scene.box is not None:
-        return Contraction(scene.box.mean(0), float((scene.box[1] - scene.box[0]).norm()) / 2)
-    return Contraction(torch.zeros(3), float(scene.train.cameras.origins.norm(dim=-1).max()))
+        return Contraction(scene.box.mean(0).to(device), float((scene.box[1] - scene.box[0]).norm()) / 2)
+    radius = float(scene.train.cameras.origins.norm(dim=-1).max())
+    if radius == 0:
+        raise ConfigError(f"--contraction sphere needs cameras in several places, those of {scene.name} are in one")
+    return Contraction(torch.zeros(3, device=device), radius)
 
 
 def make_grid(
@@ -285,7 +293,7 @@ def load_grid(
         return OccupancyGrid.from_state(state, device=device)
     if not wanted:
         return None
-    check_config(replace(config, occupancy=True))
+    replace(config, occupancy=True, cuda_graph=False)  # checks that the run can use one
     grid = make_grid(config, scene, device, PICTURE_RESOLUTION, LEAST_OPACITY)
     generator = torch.Generator().manual_seed(0)
     for points in range(PICTURE_POINTS):

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from voronerf.data import Scene
+from voronerf.rendering.contraction import Contraction
 from voronerf.router import VoronoiRouter
 
 #: Half the side of a slice through a scene without a box, in scene units.
@@ -47,20 +48,30 @@ def slice_points(scene: Scene, *, axis: int = 2, at: float = 1 / 3, size: int = 
 
 
 @torch.no_grad()
-def slice_density(router: VoronoiRouter, points: Tensor, *, cones: bool = False) -> Tensor:
+def slice_density(
+    router: VoronoiRouter, points: Tensor, *, cones: bool = False, contraction: Contraction | None = None
+) -> Tensor:
     """Density [h, w] of a router's field, blended where the router's `blend` says so.
 
     Args:
         router: around a field of positions, directions and ray indices; it is left in the mode it is in.
         points: [h, w, 3].
         cones: ask about Gaussians [n, 6], means and variances, as mip-NeRF wants: cubes that fill the slice.
+        contraction: of the space that the field lives in, see `Renderer.contraction`.
     """
     device = next(router.parameters()).device
     flat = points.reshape(-1, 3).to(device)
     if cones:
         # a cube's side is the distance between neighbours, its variance a twelfth of the square
         side = (points[-1, -1] - points[0, 0]).abs().amax() / max(max(points.shape[:2]) - 1, 1)
-        flat = torch.cat([flat, (side.square() / 12).to(flat).expand(len(flat), 3)], 1)
+        variance = (side.square() / 12).to(flat).expand(len(flat), 1)
+        spread = variance.expand(-1, 3)
+        if contraction is not None:
+            any_axis = torch.tensor([[0.0, 0.0, 1.0]], device=device)
+            flat, spread = contraction.gaussians(flat, any_axis, variance, variance)
+        flat = torch.cat([flat, spread], 1)
+    elif contraction is not None:
+        flat = contraction.points(flat)
     down = torch.tensor([[0.0, 0.0, -1.0]], device=device)
     index = torch.zeros(len(flat), dtype=torch.int32, device=device)
     was = router.training

@@ -54,6 +54,8 @@ from voronerf.training.splitting import median, save_samples, split_by_samples
 OCCUPANCY_EVERY, OCCUPANCY_SHARE = 16, 1 / 32
 #: Steps on a device other than the CPU after which the host reads the loss, and with that waits for the device.
 READ_EVERY = 50
+#: Steps between tries to split the worst cell.
+SPLIT_EVERY = 5
 
 
 #: What summary.json repeats of the last evaluation.
@@ -122,6 +124,7 @@ class Trainer:
         self.loss = math.nan
         if config.resume:
             self._load()
+        self.saved_at = self.seconds
         self._compute = self._make_step()
         write_text(self.out / "config.json", config.to_json())
 
@@ -183,10 +186,10 @@ class Trainer:
         Raises:
             As :meth:`run`.
         """
-        saved_at, loss = self.seconds, None
+        loss = None
         while self.fraction < 1 and self.seconds < until and not self.stopped:
             started = time.perf_counter()
-            if self.level < len(self.plan) and self._now() >= self.plan[self.level].at - 1e-9:
+            if self._split_is_due():
                 self._split()
             loss = self._step()
             self.step += 1
@@ -202,10 +205,9 @@ class Trainer:
             if self._due() > self.evaluated and self.fraction < 1:
                 self._read(loss)
                 self._evaluate(self.config.eval_views)
-            if self.seconds - saved_at >= self.config.checkpoint_every:
+            if self.seconds - self.saved_at >= self.config.checkpoint_every:
                 self._read(loss)
                 self.save()
-                saved_at = self.seconds
         if loss is not None:
             self._read(loss)
 
@@ -283,6 +285,13 @@ class Trainer:
             self.router, cells.to(self.device), decay=1.0, generator=self.generator, backend=self.config.backend
         )
 
+    def _split_is_due(self) -> bool:
+        if self.level >= len(self.plan):
+            return False
+        planned = self.plan[self.level]
+        # A split of the worst cell waits for samples where no cell holds enough, and is tried again.
+        return self._now() >= planned.at - 1e-9 and (planned.most is None or self.step % SPLIT_EVERY == 0)
+
     def _split(self) -> None:
         """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
         config, level, planned = self.config, self.level, self.plan[self.level]
@@ -294,11 +303,14 @@ class Trainer:
             self.save()
             raise TrainingError(
                 f"{self.out}: more cells than samples: --cells asks for {k}, {points.shape[0]} samples were kept in "
-                f"{self.step} steps; split later or keep more a batch (--reservoir, --reservoir-batches)"
+                f"{self.step} steps; in another --out, split later or keep more a batch (--reservoir, "
+                "--reservoir-batches)"
             )
-        save_samples(self.out / "samples" / f"level-{level + 1}.npz", points, importance)
         split = split_by_samples(config, planned, self.router.diagram, k, points, importance, self.generator)
         balances = [] if split is None else list(split.balances.values())
+        if planned.most is not None and not balances:
+            return  # samples go on being kept
+        save_samples(self.out / "samples" / f"level-{level + 1}.npz", points, importance)
         for name, router in self.routers.items():
             if split is not None and balances and (name != "proposal" or config.split_proposal):
                 router.subdivide(
@@ -376,6 +388,7 @@ class Trainer:
             "stages": [asdict(stage) for stage in self.stages],
         }
         save_checkpoint(checkpoint_path(self.out), Checkpoint(tensors, values))
+        self.saved_at = self.seconds
 
     def _load(self) -> None:
         path = checkpoint_path(self.out)
