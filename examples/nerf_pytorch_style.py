@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=1024, help="in a batch")
     parser.add_argument("--samples", type=int, default=64, help="of a ray")
     parser.add_argument("--lr", type=float, default=2e-3)
-    parser.add_argument("--views", type=int, default=5, help="test views that are rendered")
+    parser.add_argument("--views", type=int, default=5, help="test views that are rendered, at the most")
     parser.add_argument("--voronoi", action="store_true", help="16 cells, split after a fifth of the seconds")
     options = parser.parse_args()
 
@@ -79,13 +79,15 @@ def main() -> None:
         if step % 100 == 0:
             print(f"step {step}, {spent:.0f} s, {-10 * error.mean().log10():.2f} dB in the batch", flush=True)
 
-    errors = []
+    scores = []
     with torch.no_grad():
         for i in range(0, len(scene.test), -(-len(scene.test) // options.views)):
+            errors = []
             for part in view(scene.test, i).split(4096):
                 colour = render(model, part[:, :6], scene.near, scene.far, options.samples, jitter=False)[0]
                 errors.append((colour - part[:, 6:]).square().mean(-1))
-    psnr = torch.stack([-10 * e.mean().log10() for e in torch.cat(errors).chunk(options.views)]).mean()
+            scores.append(-10 * torch.cat(errors).mean().log10())
+    psnr = torch.stack(scores).mean()
     cells = f"{model.num_cells} cells" if options.voronoi else "one network"
     print(f"{cells} of width {options.width}: {step} steps in {spent:.0f} s, test PSNR {psnr:.2f} dB")
 

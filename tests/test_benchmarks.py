@@ -107,10 +107,12 @@ def test_other_processes_are_noticed(load: Callable[[str], Any]) -> None:
 
     others = load("harness").Others()
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
-        time.sleep(1.0)
-        found = others.cores()
+        deadline, most = time.monotonic() + 60, 0.0
+        while most <= 0.3 and time.monotonic() < deadline:
+            time.sleep(0.5)
+            most = max(most, others.cores() or 0.0)
         process.kill()
-    assert found is not None and found > 0.3
+    assert most > 0.3
 
 
 def test_quartiles(load: Callable[[str], Any]) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -137,7 +138,12 @@ def test_roofs(parts: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert after[:18] == rows and [row["name"] for row in after[18:]] == [rows[17]["name"]]
 
 
-def test_training(parts: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_training(
+    parts: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A step takes twenty milliseconds however busy the machine is.
+    ticks = itertools.count()
+    monkeypatch.setattr("voronerf.training.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0201 * next(ticks)))
     assert parts.training(tmp_path, "builtin", "cpu", 0.5) == 0
     ungraphed = [settings for settings in parts.TRAININGS.values() if "cuda_graph" not in settings]
     assert capsys.readouterr().out.count("PSNR") == len(ungraphed) == 2

@@ -1,7 +1,8 @@
 """Solids that rays are cast against: spheres, boxes, cylinders and tori, each in its own frame.
 
 r rays, n points. Distances are along unit directions, infinite where a ray misses. Rays start outside of every
-solid. NumPy, so that views can be cast in parallel threads.
+solid; one that starts inside of the box around a torus does not see it. `voronerf.reference.cast_solids` is the same
+for many solids of any kind at once, in torch. NumPy, so that views can be cast in parallel threads.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from voronerf.reference.cast_solids import SURFACE, TRACE_STEPS
+
 Array = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
-TRACE_STEPS = 40
-SURFACE = 5e-4  # a traced ray closer than this to the torus has hit it
 
 # points [n, 3] and normals [n, 3] in the solid's frame -> colour [n, 3] in 0..1
 Texture = Callable[[Array, Array], Array]

@@ -16,7 +16,7 @@ def cast_solids(
 ) -> tuple[Tensor, Tensor]:
     """The first solid on each ray, for ground truth computed from formulas.
 
-    A ray that starts inside of a solid does not see that one. Not differentiable.
+    A ray that starts inside of a solid, or of the box around a torus, does not see that one. Not differentiable.
 
     Args:
         kinds: int32 [s], 0 sphere, 1 box, 2 cylinder around z with flat ends, 3 torus around z; others are not checked.
