@@ -162,10 +162,13 @@ def main() -> int:
     if "dense" in both:
         dense, grid = both["dense"], both["grid"]
         print(f"rendering: {dense['seconds'] / grid['seconds']:.1f} x, {grid['psnr'] - dense['psnr']:+.3f} dB")
+    how: dict[str, Any] = {"budget": options.budget, "share": options.share}
+    if options.trained is not None:
+        config = fields[options.trained.name][1]
+        names = ("data", "downscale", "steps", "budget", "rays", "samples", "seed")
+        how = {"trained": {name: getattr(config, name) for name in names}}
     outcome = {
-        "metadata": metadata(
-            benchmark="occupancy", scene="builtin", budget=options.budget, share=options.share, size=options.size
-        ),
+        "metadata": metadata(benchmark="occupancy", scene="builtin", size=options.size, **how),
         "results": {"training": runs, "rendering": pictures},
     }
     if options.json is not None:
