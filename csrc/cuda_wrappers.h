@@ -37,10 +37,11 @@ constexpr unsigned kAllLanes = 0xffffffffu;
 // Largest value of float16: what is larger would become infinite, and infinities in a network soon are no numbers.
 constexpr float kLargestHalf = 65504.0f;
 
-// Two floats rounded to 16 bits each, the first in the low half.
-template <bool kBfloat16>
+// Two floats rounded to 16 bits each, the first in the low half. Gradients are not to be saturated: whoever scales a
+// loss looks for the infinite ones.
+template <bool kBfloat16, bool kSaturated = true>
 __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
-  if constexpr (!kBfloat16) {
+  if constexpr (!kBfloat16 && kSaturated) {
     // Comparisons keep what is no number.
     x = x > kLargestHalf ? kLargestHalf : x < -kLargestHalf ? -kLargestHalf : x;
     y = y > kLargestHalf ? kLargestHalf : y < -kLargestHalf ? -kLargestHalf : y;

@@ -201,8 +201,8 @@ __global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan 
                 Element* pair = region + place.value + at(r, t, half);
                 const float x = sums[r][t][2 * half], y = sums[r][t][2 * half + 1];
                 const bool all = activation == static_cast<int>(Activation::none);
-                Products::store(pair, all || Products::load(pair) > 0.0f ? x : 0.0f,
-                                all || Products::load(pair + 1) > 0.0f ? y : 0.0f);
+                Products::store_gradient(pair, all || Products::load(pair) > 0.0f ? x : 0.0f,
+                                         all || Products::load(pair + 1) > 0.0f ? y : 0.0f);
               }
             }
           }
@@ -217,7 +217,7 @@ __global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan 
                 const float x = mlp_times_slope(activation, each[r][0][2 * half], Products::load(region + from));
                 const float y =
                     mlp_times_slope(activation, each[r][0][2 * half + 1], Products::load(region + from + 1));
-                Products::store(region + place.value + at(r, t, half), x, y);
+                Products::store_gradient(region + place.value + at(r, t, half), x, y);
               }
             }
           });
@@ -246,12 +246,10 @@ template <typename Products>
 void launch(const MlpCudaPlan& plan, const MlpCudaData& data, void* stream) {
   const unsigned blocks = static_cast<unsigned>(plan.tasks), threads = 32 * plan.warps;
   if (plan.row_tiles == 2) {
-    VN_CUDA_CHECK(cudaFuncSetAttribute(mlp_backward_kernel<Products, 2>, cudaFuncAttributeMaxDynamicSharedMemorySize,
-                                       plan.shared_bytes));
+    mlp_allow_shared(mlp_backward_kernel<Products, 2>);
     VN_LAUNCH((mlp_backward_kernel<Products, 2>), blocks, threads, plan.shared_bytes, stream, plan, data);
   } else {
-    VN_CUDA_CHECK(cudaFuncSetAttribute(mlp_backward_kernel<Products, 1>, cudaFuncAttributeMaxDynamicSharedMemorySize,
-                                       plan.shared_bytes));
+    mlp_allow_shared(mlp_backward_kernel<Products, 1>);
     VN_LAUNCH((mlp_backward_kernel<Products, 1>), blocks, threads, plan.shared_bytes, stream, plan, data);
   }
 }

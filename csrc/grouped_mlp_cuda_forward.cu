@@ -55,8 +55,7 @@ __global__ void __launch_bounds__(128, 3) mlp_forward_kernel(const MlpCudaPlan p
 template <typename Products>
 void launch(const MlpCudaPlan& plan, const MlpCudaData& data, void* stream) {
   const unsigned blocks = static_cast<unsigned>(plan.tasks), threads = 32 * plan.warps;
-  VN_CUDA_CHECK(cudaFuncSetAttribute(mlp_forward_kernel<Products, 2>, cudaFuncAttributeMaxDynamicSharedMemorySize,
-                                     plan.shared_bytes));
+  mlp_allow_shared(mlp_forward_kernel<Products, 2>);
   VN_LAUNCH((mlp_forward_kernel<Products, 2>), blocks, threads, plan.shared_bytes, stream, plan, data);
 }
 

@@ -163,7 +163,8 @@ struct Backward {
     }
     const int64_t at = row * padded + column;
     const float low = Products::load(slope + at), high = Products::load(slope + at + 1);
-    Products::store(value + at, mlp_times_slope(activation, pair[0], low), mlp_times_slope(activation, pair[1], high));
+    Products::store_gradient(value + at, mlp_times_slope(activation, pair[0], low),
+                             mlp_times_slope(activation, pair[1], high));
   }
 };
 

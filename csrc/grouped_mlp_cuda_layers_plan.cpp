@@ -11,6 +11,7 @@ constexpr int kCaches = 4;
 constexpr int kTilesPerMultiprocessor = 4;
 constexpr int kBlocksPerMultiprocessor = 8;
 constexpr int kMostSplits = 64;
+constexpr int64_t kMostPartialBytes = int64_t{512} << 20;  // unless one split has more
 
 int64_t pad(int64_t width) {
   return ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth;
@@ -130,18 +131,21 @@ const char* mlp_layers_plan(const MlpTable& table, MlpPrecision precision, int64
   plan.slab = tiles * kLayersRows;
   plan.slabs = ceil_div(std::max<int64_t>(n, 1), plan.slab);
   plan.tiles = plan.slab / kLayersRows + k;  // every cell's last tile may be short
-  // Blocks of the largest layer's gradient fill the device, and each has rows to work on.
+  // Blocks of the largest layer's gradient fill the device, and each has rows to work on. Of evenly filled cells, which
+  // are sorted, a slab has few.
+  const int64_t cells = std::min(k, k / plan.slabs + 2);
   int64_t blocks = 1;
   for (const MlpLayersLayer& layer : plan.layers) {
     if (!layer.live) continue;
     for (const MlpLayersSource& source : layer.sources) {
-      blocks = std::max(
-          blocks, k * ceil_div<int64_t>(layer.padded, kLayersRows) * ceil_div<int64_t>(source.padded, kLayersColumns));
+      blocks = std::max(blocks, cells * ceil_div<int64_t>(layer.padded, kLayersRows) *
+                                    ceil_div<int64_t>(source.padded, kLayersColumns));
     }
   }
   const int64_t wanted = ceil_div<int64_t>(int64_t{kBlocksPerMultiprocessor} * device.multiprocessors, blocks);
   const int64_t useful = ceil_div<int64_t>(plan.slab, 4 * kLayersRows);
-  plan.splits = static_cast<int>(std::max<int64_t>(1, std::min<int64_t>({wanted, useful, kMostSplits})));
+  const int64_t affordable = kMostPartialBytes / std::max<int64_t>(1, 4 * k * plan.partial);
+  plan.splits = static_cast<int>(std::max<int64_t>(1, std::min<int64_t>({wanted, useful, affordable, kMostSplits})));
   return nullptr;
 }
 

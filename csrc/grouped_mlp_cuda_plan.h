@@ -71,7 +71,7 @@ struct MlpCudaPlan {
 
 // What is known of a device.
 struct MlpCudaDevice {
-  int capability;    // 86 for 8.6
+  int capability;    // 86 for 8.6; of the architecture that the kernels are compiled for, where that is lower
   int shared_bytes;  // a block may ask for
   int multiprocessors;
   int64_t cache_bytes;  // of the last level

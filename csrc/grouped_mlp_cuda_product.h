@@ -244,6 +244,8 @@ __global__ void __launch_bounds__(kLayersThreads, 3)
       ceil_div(ceil_div<int64_t>(of_cell.end - of_cell.begin, to.splits), int64_t{Chunk::kDepth}) * Chunk::kDepth;
   const int64_t begin = of_cell.begin + blockIdx.y * share;
   const int64_t end = begin + share < of_cell.end ? begin + share : of_cell.end;
+  // Most cells have no rows in a slab; there is nothing to add then, and to begin with zero.
+  if (begin >= end && !to.first) return;  // the whole block
   const int64_t outputs = to.outputs - output, inputs = to.inputs - input;
   const int tiles = mlp_warp_row() < outputs ? mlp_warp_tiles(inputs) : 0;
 

@@ -2,6 +2,8 @@
 // want them in shared memory, so that loading them there is one straight copy; the tasks of all cells are numbered, so
 // that a block finds its rows without the host having read the offsets; rows of no cell are cleared; and the partial
 // weight gradients of a cell's tasks are summed in their order, which makes them the same every time.
+#include <algorithm>
+
 #include "grouped_mlp_cuda_tasks.h"
 #include "grouped_mlp_cuda_tile.h"
 
@@ -10,8 +12,17 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
+constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels with blocks for each cell
 
-// A block a cell and layer: grid (k, layers).
+// Blocks for a cell and a layer: few cells need several for each.
+unsigned blocks_of_layer(const MlpCudaPlan& plan, int64_t k, int64_t elements) {
+  const int64_t blocks = kBlocksPerMultiprocessor * mlp_cuda_device().multiprocessors;
+  const int64_t wanted = ceil_div(blocks, std::max<int64_t>(1, k * plan.layer_count));
+  const int64_t useful = ceil_div(elements, int64_t{kThreads});
+  return static_cast<unsigned>(wanted < useful ? wanted : useful);
+}
+
+// Grid (k, layers, blocks of a layer).
 template <typename Products>
 __global__ void __launch_bounds__(kThreads)
     mlp_pack_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameters parameters) {
@@ -24,7 +35,8 @@ __global__ void __launch_bounds__(kThreads)
   const float* weight = parameters.weights[blockIdx.y] + cell * layer.width * layer.inputs;
   const float* bias = parameters.biases[blockIdx.y];
   const int pairs = layer.weight_stride / 2;
-  for (int i = threadIdx.x; i < layer.padded * pairs; i += kThreads) {
+  const int thread = blockIdx.z * kThreads + threadIdx.x, step = gridDim.z * kThreads;
+  for (int i = thread; i < layer.padded * pairs; i += step) {
     const int row = i / pairs, column = 2 * (i - row * pairs);
     float values[2] = {0.0f, 0.0f};
     for (int s = 0; s < layer.source_count; ++s) {
@@ -38,7 +50,7 @@ __global__ void __launch_bounds__(kThreads)
     }
     Products::store(to + row * layer.weight_stride + column, values[0], values[1]);
   }
-  for (int i = threadIdx.x; i < layer.padded; i += kThreads) {
+  for (int i = thread; i < layer.padded; i += step) {
     biases[i] = bias == nullptr || i >= layer.width ? 0.0f : bias[cell * layer.width + i];
   }
 }
@@ -59,7 +71,7 @@ __global__ void __launch_bounds__(kThreads) mlp_strays_kernel(const MlpCudaData 
   }
 }
 
-// A block a cell and layer: grid (k, layers).
+// Grid (k, layers, blocks of a layer).
 __global__ void __launch_bounds__(kThreads)
     mlp_reduce_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameterGradients gradients) {
   const int64_t cell = blockIdx.x;
@@ -70,25 +82,31 @@ __global__ void __launch_bounds__(kThreads)
     for (int64_t task = first; task < last; ++task) total += data.partials[task * plan.partial + at];
     return total;
   };
+  const int thread = blockIdx.z * kThreads + threadIdx.x, step = gridDim.z * kThreads;
   float* weights = gradients.weights[blockIdx.y];
   float* biases = gradients.biases[blockIdx.y];
   for (int s = 0; s < layer.source_count; ++s) {
     const MlpCudaSource& source = layer.sources[s];
-    for (int i = threadIdx.x; i < layer.width * source.width; i += kThreads) {
+    for (int i = thread; i < layer.width * source.width; i += step) {
       const int row = i / source.width, feature = i - row * source.width;
       weights[(cell * layer.width + row) * layer.inputs + source.column + feature] =
           sum(layer.partial + row * layer.partial_stride + source.packed + feature);
     }
   }
-  for (int i = threadIdx.x; biases != nullptr && i < layer.width; i += kThreads) {
+  for (int i = thread; biases != nullptr && i < layer.width; i += step) {
     biases[cell * layer.width + i] = sum(layer.partial_bias + i);
   }
 }
 
 template <typename Products>
 void pack(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters, void* stream) {
-  VN_LAUNCH((mlp_pack_kernel<Products>), dim3(static_cast<unsigned>(data.k), plan.layer_count), kThreads, 0, stream,
-            plan, data, parameters);
+  int64_t pairs = 1;
+  for (int l = 0; l < plan.layer_count; ++l) {
+    pairs = std::max(pairs, int64_t{plan.layers[l].padded} * plan.layers[l].weight_stride / 2);
+  }
+  VN_LAUNCH((mlp_pack_kernel<Products>),
+            dim3(static_cast<unsigned>(data.k), plan.layer_count, blocks_of_layer(plan, data.k, pairs)), kThreads, 0,
+            stream, plan, data, parameters);
 }
 
 }  // namespace
@@ -103,7 +121,10 @@ MlpCudaDevice mlp_cuda_device() {
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.multiprocessors, cudaDevAttrMultiProcessorCount, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&cache, cudaDevAttrL2CacheSize, device));
-  found.capability = 10 * major + minor;
+  // Code for a lower architecture than the device's chooses its instructions by that.
+  cudaFuncAttributes compiled{};
+  VN_CUDA_CHECK(cudaFuncGetAttributes(&compiled, mlp_tasks_kernel));
+  found.capability = std::min(10 * major + minor, compiled.ptxVersion);
   found.cache_bytes = cache;
   return found;
 }
@@ -139,8 +160,15 @@ void mlp_cuda_clear_gradient(const MlpCudaData& data, bool used, int width, floa
 
 void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameterGradients& gradients,
                      void* stream) {
-  VN_LAUNCH(mlp_reduce_kernel, dim3(static_cast<unsigned>(data.k), plan.layer_count), kThreads, 0, stream, plan, data,
-            gradients);
+  int64_t weights = 1;
+  for (int l = 0; l < plan.layer_count; ++l) {
+    for (int s = 0; s < plan.layers[l].source_count; ++s) {
+      weights = std::max(weights, int64_t{plan.layers[l].width} * plan.layers[l].sources[s].width);
+    }
+  }
+  VN_LAUNCH(mlp_reduce_kernel,
+            dim3(static_cast<unsigned>(data.k), plan.layer_count, blocks_of_layer(plan, data.k, weights)), kThreads, 0,
+            stream, plan, data, gradients);
 }
 
 }  // namespace voronerf

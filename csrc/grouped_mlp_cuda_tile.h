@@ -9,6 +9,14 @@ namespace voronerf {
 
 constexpr int kMlpTiles = kMlpChunk / 8;  // 8-column tiles that a warp has in registers
 
+// Lets a kernel have all the shared memory that a block may ask for. Always the same, since what one host thread sets
+// must do for the launch of another.
+template <typename Kernel>
+void mlp_allow_shared(Kernel* kernel) {
+  VN_CUDA_CHECK(
+      cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, mlp_cuda_device().shared_bytes));
+}
+
 // A warp's sums: [16 rows][8 columns] each, in the layout of mma's accumulators. Lane l has rows l / 4 and l / 4 + 8,
 // columns 2 (l % 4) and the next.
 template <int kRowTiles, int kTiles>
@@ -25,6 +33,9 @@ struct HalfProducts {
 
   static __device__ void store(Element* to, float x, float y) {
     *reinterpret_cast<uint32_t*>(to) = pack_halves<kBfloat16>(x, y);
+  }
+  static __device__ void store_gradient(Element* to, float x, float y) {
+    *reinterpret_cast<uint32_t*>(to) = pack_halves<kBfloat16, false>(x, y);
   }
   static __device__ void store_one(Element* to, float x) {
     *to = static_cast<Element>(pack_halves<kBfloat16>(x, 0.0f));
@@ -78,6 +89,7 @@ struct FloatProducts {
   static __device__ void store(Element* to, float x, float y) {
     *reinterpret_cast<float2*>(to) = kTf32 ? make_float2(round_to_tf32(x), round_to_tf32(y)) : make_float2(x, y);
   }
+  static __device__ void store_gradient(Element* to, float x, float y) { store(to, x, y); }
   static __device__ void store_one(Element* to, float x) { *to = kTf32 ? round_to_tf32(x) : x; }
   static __device__ float load(const Element* from) { return *from; }
 

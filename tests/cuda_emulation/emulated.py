@@ -44,11 +44,16 @@ class _Both:
 
 
 @contextmanager
-def emulated(*, seed: int = 0, capability: int = 90, shared_bytes: int = 227 * 1024) -> Iterator[ModuleType]:
-    """The native backend on the emulated device: its compute capability and shared memory of a block."""
+def emulated(
+    *, seed: int = 0, capability: int = 90, compiled: int = 120, shared_bytes: int = 227 * 1024
+) -> Iterator[ModuleType]:
+    """The native backend on the emulated device: its compute capability and shared memory of a block.
+
+    ``compiled``: the architecture that the kernels are compiled for.
+    """
     loaded = module()
     loaded.seed(seed)
-    loaded.device(capability, shared_bytes)
+    loaded.device(capability, compiled, shared_bytes)
     _native._entry.cache_clear()
     with (
         mock.patch.object(_native, "_C", _Both(loaded, _native._C)),

@@ -67,10 +67,10 @@ inline cudaError_t cudaMemsetAsync(void* to, int value, size_t size, cudaStream_
   std::memset(to, value, size);
   return cudaSuccess;
 }
-template <typename Kernel>
-cudaError_t cudaFuncSetAttribute(Kernel, cudaFuncAttribute, int) {
-  return cudaSuccess;
-}
+constexpr cudaError_t cudaErrorInvalidValue = 1;
+struct cudaFuncAttributes {
+  int ptxVersion;
+};
 
 namespace vn_emulation {
 
@@ -79,6 +79,7 @@ constexpr size_t kSlot = 64;  // bytes a lane may hand to the others of its warp
 struct Settings {
   uint64_t seed = 0;
   int capability = 90;      // of the device that is played
+  int compiled = 120;       // architecture that kernels are compiled for
   int multiprocessors = 2;  // few, so that loops over a grid are walked
   int shared = 227 * 1024;  // bytes a block may ask for
 };
@@ -148,6 +149,17 @@ inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, 
       break;
   }
   return cudaSuccess;
+}
+
+template <typename Kernel>
+cudaError_t cudaFuncGetAttributes(cudaFuncAttributes* attributes, Kernel) {
+  attributes->ptxVersion = vn_emulation::settings().compiled;
+  return cudaSuccess;
+}
+// An error unless it is all that there is: host threads that set what they need themselves take it from each other.
+template <typename Kernel>
+cudaError_t cudaFuncSetAttribute(Kernel, cudaFuncAttribute, int value) {
+  return value == vn_emulation::settings().shared ? cudaSuccess : cudaErrorInvalidValue;
 }
 
 #define threadIdx vn_emulation::thread_index

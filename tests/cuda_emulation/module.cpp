@@ -28,6 +28,7 @@ PYBIND11_MODULE(voronerf_emulation, module) {
         VN_CHECK(fault == nullptr, fault);
         py::dict plan;
         plan["by_layers"] = choice.by_layers;
+        plan["precision"] = static_cast<int>(choice.by_layers ? choice.layers.precision : choice.fused.precision);
         plan["task_rows"] = choice.fused.task_rows;
         plan["tasks"] = choice.fused.tasks;
         plan["shared_bytes"] = choice.fused.shared_bytes;
@@ -37,13 +38,15 @@ PYBIND11_MODULE(voronerf_emulation, module) {
         plan["slabs"] = choice.layers.slabs;
         plan["tiles"] = choice.layers.tiles;
         plan["splits"] = choice.layers.splits;
+        plan["partial_bytes"] = 4 * k * choice.layers.partial;
         plan["bytes_of_row"] = choice.layers.columns * choice.layers.element;
         plan["workspace"] = voronerf::mlp_layers_workspace(choice.layers, k, backward).bytes;
         return plan;
       });
   module.def("seed", [](uint64_t seed) { vn_emulation::settings().seed = seed; });
-  module.def("device", [](int capability, int shared_bytes) {
+  module.def("device", [](int capability, int compiled, int shared_bytes) {
     vn_emulation::settings().capability = capability;
+    vn_emulation::settings().compiled = compiled;
     vn_emulation::settings().shared = shared_bytes;
   });
   module.def("multiprocessors", [](int count) { vn_emulation::settings().multiprocessors = count; });

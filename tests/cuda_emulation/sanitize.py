@@ -124,7 +124,7 @@ def grouped_mlp(module: ModuleType) -> None:
     given = TABLE, arguments, [at(x) for x in weights], [at(x) for x in biases]
     # The last one fits no fused network: layer by layer.
     for precision, shared in ((0, 227), (1, 40), (3, 64), (1, 1)):
-        module.device(90, shared * 1024)
+        module.device(90, 120, shared * 1024)
 
         def workspace(backward: bool, precision: int = precision) -> np.ndarray:
             size = module.grouped_mlp_workspace_cuda(TABLE, precision, n, k, backward, True, 0)

@@ -126,6 +126,36 @@ def test_which_way_a_network_goes() -> None:
         assert plan(nerf(512, 8), 1 << 22, 16, backward=False)["by_layers"]
 
 
+@pytest.mark.parametrize(("capability", "compiled"), [(90, 120), (75, 120), (90, 75), (80, 80)])
+def test_what_is_multiplied_is_what_the_kernels_were_compiled_for(capability: int, compiled: int) -> None:
+    """A newer device runs code for an older one, which does not have the newer one's instructions."""
+    modern = min(capability, compiled) >= 80
+    expected = {"float32": 0, "bfloat16": 1 if modern else 0, "float16": 2, "tf32": 3 if modern else 0}
+    for shared in (64 * KIB, SMALL):
+        with emulated(capability=capability, compiled=compiled, shared_bytes=shared):
+            for precision, number in expected.items():
+                found = plan(BRANCHED, 100, 3, precision=precision)
+                assert found["precision"] == number and found["by_layers"] == (shared == SMALL)
+            check(BRANCHED, [30, 5], 3, "bfloat16")
+
+
+def test_splits_fill_the_device_within_their_memory() -> None:
+    """A slab of sorted rows has few of the cells, whatever their number."""
+    loaded, most = module(), 512 << 20
+    loaded.multiprocessors(132)
+    try:
+        with emulated():
+            found = {k: plan(nerf(256, 8), 1 << 22, k) for k in (1, 16, 4096)}
+    finally:
+        loaded.multiprocessors(2)
+    # Blocks of the largest gradient, 256 x (256 + 63): 4 x 3 tiles a cell, in two cells of a slab.
+    assert found[1]["splits"] == 64 and -(-8 * 132 // (16 * 12)) < found[16]["splits"] <= 8 * 132 // (2 * 12)
+    for each in found.values():
+        assert each["splits"] == 1 or each["splits"] * each["partial_bytes"] <= most
+        assert each["splits"] * each["partial_bytes"] <= each["workspace"]
+    assert found[4096]["splits"] == 1
+
+
 @pytest.mark.parametrize("shared", [64, 99, 227])
 def test_memory_is_bounded(shared: int) -> None:
     """Values of a slab keep within their share whatever the batch, and tiles cover any offsets."""

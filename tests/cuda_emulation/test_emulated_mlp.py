@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import pytest
 import torch
 from emulated import emulated, module
@@ -74,6 +76,21 @@ def test_values_beyond_float16_stay_finite() -> None:
             assert not part.isnan().any()
 
 
+@pytest.mark.parametrize("shared", [227, 1])
+def test_gradients_beyond_float16_are_infinite(shared: int) -> None:
+    """Fused and layer by layer: torch's GradScaler must see that it has scaled by too much."""
+    layers = MLP((Layer((POSITIONS,), 16), Layer((0,), 16), Layer((1,), 2)), (2,))
+    given = case(layers, [20], 3, torch.float16)
+    given["weights"][0] *= 2.0**-10
+    given["weights"][1] = torch.full_like(given["weights"][1], 2.0**-10)
+    given["weights"][2] = torch.full_like(given["weights"][2], 6e4)
+    given["biases"] = [None] * 3
+    with emulated(shared_bytes=shared * KIB):
+        out, _, first, second, third, *_ = run(given, layers, torch.float16, "native")
+    assert out.isfinite().all() and third.isfinite().all()
+    assert not first.isfinite().all() and not second.isfinite().all()
+
+
 def test_rows_of_no_cell_and_unsound_offsets() -> None:
     layers = MLP((Layer((POSITIONS,), 8, "relu"), Layer((0,), 2)), (1,))
     given = case(layers, [20, 13], 3)
@@ -90,6 +107,33 @@ def test_rows_of_no_cell_and_unsound_offsets() -> None:
                 backend="native",
             )
         assert (out[list(strays)] == 0).all()
+
+
+def test_cells_that_overlap_stay_inside_the_workspace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have more tasks than there are partial gradients; what lies behind those is no number, and is not read."""
+    layers, n, beyond = MLP((Layer((POSITIONS,), 8, "relu"), Layer((0,), 2)), (1,)), 600, 1 << 20
+    leaves = [torch.rand(n, 3), torch.rand(5, 8, 3), torch.rand(5, 2, 8)]
+    leaves = [leaf.requires_grad_() for leaf in leaves]
+    sizes = []
+    with emulated() as loaded:
+        size_of, backward = loaded.grouped_mlp_workspace_cuda, loaded.grouped_mlp_backward_cuda
+
+        def larger(numbers: list[int], precision: int, *others: int) -> int:
+            plan = module().grouped_mlp_plan(numbers, precision, *others[:3])
+            assert not plan["by_layers"] and 3 * -(-n // plan["task_rows"]) > plan["tasks"]
+            sizes.append(size_of(numbers, precision, *others) + beyond)
+            return sizes[-1]
+
+        def poisoned(*given: object) -> None:
+            ctypes.memset(given[-3], 0xFF, sizes[-1])
+            backward(*given)
+
+        monkeypatch.setattr(loaded, "grouped_mlp_workspace_cuda", larger)
+        monkeypatch.setattr(loaded, "grouped_mlp_backward_cuda", poisoned)
+        offsets = torch.tensor([0, n, 0, n, 0, n], dtype=torch.int32)
+        out = voronerf.grouped_mlp(leaves[0], offsets, leaves[1:], [None, None], layers=layers, backend="native")
+        gradients = torch.autograd.grad(out.sum(), leaves)
+    assert len(sizes) == 2 and all(gradient.isfinite().all() for gradient in gradients)
 
 
 def test_weight_gradients_are_the_same_in_every_order() -> None:
