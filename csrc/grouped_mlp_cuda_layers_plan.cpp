@@ -2,6 +2,7 @@
 
 #include "common.h"
 #include "grouped_mlp_cuda_layers.h"
+#include "grouped_mlp_layout.h"
 
 namespace voronerf {
 
@@ -22,7 +23,7 @@ MlpLayersInput input_of(int64_t raw, int octaves, bool integrated) {
   input.raw = static_cast<int>(raw);
   input.octaves = octaves;
   input.integrated = integrated;
-  input.width = static_cast<int>(octaves < 0 ? raw : integrated ? raw * octaves : raw * (1 + 2 * octaves));
+  input.width = static_cast<int>(encoded_width(raw, octaves, integrated));
   input.padded = pad(input.width);
   return input;
 }

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "common.h"
+#include "grouped_mlp_layout.h"
 
 namespace voronerf {
 
@@ -22,41 +23,12 @@ bool is_half(MlpPrecision precision) {
   return precision == MlpPrecision::bfloat16 || precision == MlpPrecision::float16;
 }
 
-// Values whose lifetimes do not overlap share memory: first fit. A lifetime is closed at both ends.
-class Arena {
- public:
-  int take(int size, int start, int end) {
-    int offset = 0;
-    for (bool moved = true; moved;) {
-      moved = false;
-      for (const Block& other : blocks_) {
-        const bool together = start <= other.end && other.start <= end;
-        if (together && offset < other.offset + other.size && other.offset < offset + size) {
-          offset = other.offset + other.size;
-          moved = true;
-        }
-      }
-    }
-    blocks_.push_back({offset, size, start, end});
-    total_ = std::max(total_, offset + size);
-    return offset;
-  }
-  int total() const { return total_; }
-
- private:
-  struct Block {
-    int offset, size, start, end;
-  };
-  std::vector<Block> blocks_;
-  int total_ = 0;
-};
-
 MlpCudaInput input_of(int64_t raw, int octaves, bool integrated) {
   MlpCudaInput input{};
   input.raw = static_cast<int>(raw);
   input.octaves = octaves;
   input.integrated = integrated;
-  input.width = static_cast<int>(octaves < 0 ? raw : integrated ? raw * octaves : raw * (1 + 2 * octaves));
+  input.width = static_cast<int>(encoded_width(raw, octaves, integrated));
   input.padded = pad(input.width);
   return input;
 }
@@ -148,7 +120,7 @@ int place_values(MlpCudaPlan& plan, int rows, int skew) {
   Arena arena;
   const auto place_input = [&](MlpCudaInput& input, int until) {
     input.stride = input.padded + skew;
-    if (input.used) input.value = arena.take(rows * input.stride, 0, plan.backward ? end : until);
+    if (input.used) input.value = static_cast<int>(arena.take(rows * input.stride, 0, plan.backward ? end : until));
   };
   place_input(plan.positions, last_position);
   place_input(plan.directions, last_direction);
@@ -158,12 +130,13 @@ int place_values(MlpCudaPlan& plan, int rows, int skew) {
     layer.slope = -1;
     if (!layer.live) continue;
     const int start = 2 * l + 2 + (layer.padded <= kMlpChunk ? 1 : 0);
-    layer.value = arena.take(rows * layer.stride, start, plan.backward ? end : std::max(last[l], start));
+    layer.value =
+        static_cast<int>(arena.take(rows * layer.stride, start, plan.backward ? end : std::max(last[l], start)));
     if (plan.backward && layer.activation == static_cast<int>(Activation::sine)) {
-      layer.slope = arena.take(rows * layer.stride, 0, end);
+      layer.slope = static_cast<int>(arena.take(rows * layer.stride, 0, end));
     }
   }
-  return arena.total();
+  return static_cast<int>(arena.total());
 }
 
 // Elements of the largest piece of weights that passes through the slot.

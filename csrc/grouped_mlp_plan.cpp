@@ -1,6 +1,7 @@
 #include <algorithm>
 
 #include "common.h"
+#include "grouped_mlp_layout.h"
 #include "grouped_mlp_planner.h"
 
 namespace voronerf {
@@ -19,35 +20,6 @@ constexpr int64_t kMostDots = 4, kMostDotSources = 8;
 int64_t pad(int64_t width) {
   return ceil_div(width, kGranule) * kGranule;
 }
-
-// Buffers that live over intervals of time share the workspace: first fit, in the order of asking.
-class Arena {
- public:
-  int64_t take(int64_t size, int64_t start, int64_t end) {
-    int64_t offset = 0;
-    for (bool moved = true; moved;) {
-      moved = false;
-      for (const Block& other : blocks_) {
-        const bool together = start <= other.end && other.start <= end;
-        if (together && offset < other.offset + other.size && other.offset < offset + size) {
-          offset = other.offset + other.size;
-          moved = true;
-        }
-      }
-    }
-    blocks_.push_back({offset, size, start, end});
-    total_ = std::max(total_, offset + size);
-    return offset;
-  }
-  int64_t total() const { return total_; }
-
- private:
-  struct Block {
-    int64_t offset, size, start, end;
-  };
-  std::vector<Block> blocks_;
-  int64_t total_ = 0;
-};
 
 }  // namespace
 
@@ -188,7 +160,7 @@ MlpPlanner::MlpPlanner(const MlpTable& table, const MlpGathered& gathered, const
     it.raw = raw;
     it.octaves = octaves;
     it.integrated = integrated;
-    it.width = octaves < 0 ? raw : integrated ? raw * octaves : raw * (1 + 2 * octaves);
+    it.width = encoded_width(raw, octaves, integrated);
     it.copied = octaves >= 0 || gather || wanted.half;
     it.gradient_wanted = gradient;
     return it;

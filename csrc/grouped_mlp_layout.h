@@ -1,0 +1,45 @@
+// What the plans of grouped_mlp for the CPU and for CUDA share.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+namespace voronerf {
+
+// Features of `raw` values after their encoding; no octaves (-1) leave them as they are.
+inline int64_t encoded_width(int64_t raw, int octaves, bool integrated) {
+  return octaves < 0 ? raw : integrated ? raw * octaves : raw * (1 + 2 * octaves);
+}
+
+// Buffers whose lifetimes do not overlap share memory: first fit, in the order of asking. A lifetime is closed at both
+// ends.
+class Arena {
+ public:
+  int64_t take(int64_t size, int64_t start, int64_t end) {
+    int64_t offset = 0;
+    for (bool moved = true; moved;) {
+      moved = false;
+      for (const Block& other : blocks_) {
+        const bool together = start <= other.end && other.start <= end;
+        if (together && offset < other.offset + other.size && other.offset < offset + size) {
+          offset = other.offset + other.size;
+          moved = true;
+        }
+      }
+    }
+    blocks_.push_back({offset, size, start, end});
+    total_ = std::max(total_, offset + size);
+    return offset;
+  }
+  int64_t total() const { return total_; }
+
+ private:
+  struct Block {
+    int64_t offset, size, start, end;
+  };
+  std::vector<Block> blocks_;
+  int64_t total_ = 0;
+};
+
+}  // namespace voronerf
