@@ -7,8 +7,16 @@
 
 All variants of an experiment train for the same time. Each experiment writes NAME.json ({metadata, results, claims}),
 NAME.md and pictures into --out. A training that is there already, made with the same settings, is not made again, and
-an interrupted one goes on. Trainings made in one go take turns of a few seconds in one process; those that were there
-may be of another session.
+an interrupted one goes on. Trainings made in one go take turns of a few seconds in one process.
+
+A long table is made in parts, over several sittings, with a file that can be committed:
+
+    python benchmarks/paper.py table sampling --record RECORD.json --variants 'NeRF, strat' --only-seeds 0
+    python benchmarks/paper.py table sampling --record RECORD.json               # what is missing still
+    python benchmarks/paper.py table sampling --record RECORD.json --no-train    # the table as far as it goes
+    python benchmarks/paper.py export RECORD.json --out runs/paper               # all trainings of a folder
+
+Tables and pages show what is there and name what is missing. Gains are taken between trainings of one machine only.
 """
 
 from __future__ import annotations
@@ -27,8 +35,9 @@ import tyro
 from harness import metadata
 from paper_claims import Rows
 from paper_experiments import EXPERIMENTS
+from paper_records import keep, machine_name
 from paper_report import ORDER, claims_text, write_experiment, write_report
-from paper_runs import Run, Settings, default_scenes, failures, results, train_missing
+from paper_runs import Run, Settings, default_scenes, failures, results, still_missing, train_missing
 
 from voronerf.cli.main import EXPECTED
 from voronerf.training.files import write_text
@@ -79,12 +88,13 @@ def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]
         outcome = paper_balance.measure(settings, say)
     else:
         rows = results(runs)
-        claims = EXPERIMENTS[name].claims(Rows(rows), settings)
+        asked = list(dict.fromkeys(Path(run.scene).name for run in runs))
+        claims = EXPERIMENTS[name].claims(Rows(rows, asked), settings)
         description = metadata(
             benchmark="paper",
             experiment=name,
             kind=EXPERIMENTS[name].kind,
-            scenes=list(dict.fromkeys(row["scene"] for row in rows)),
+            scenes=asked,
             size=rows[0]["size"] if rows else None,
             budget_seconds=settings.budget,
             seeds=settings.seeds,
@@ -96,6 +106,8 @@ def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]
             final_views=settings.final_views,
             backend=settings.backend,
             failed=failures(runs),
+            missing=still_missing(runs),
+            machines=list(dict.fromkeys(machine_name(row["made_on"]) for row in rows if "made_on" in row)),
         )
         outcome = {"metadata": description, "results": rows, "claims": [claim.to_dict() for claim in claims]}
         write_text(settings.out / f"{name}.json", json.dumps(outcome, indent=1) + "\n")
@@ -166,9 +178,24 @@ def report(out: Path = Settings.out, page: Path = PAGE) -> None:
     say(f"wrote {page}")
 
 
+def export(record: tyro.conf.Positional[Path], out: Path = Settings.out) -> None:
+    """Add the results of all trainings in the output folder to a file that can be committed.
+
+    Args:
+        record: The file; results that it holds already stay, those of the same training are replaced.
+        out: The output folder of the experiments.
+    """
+    folders = sorted(path.parent for path in (out / "runs").glob("*/result.json"))
+    if not folders:
+        raise ValueError(f"--out must hold finished trainings in runs/, got {out}")
+    new, count = keep(folders, record)
+    say(f"wrote {record}: {count} trainings, {new} of them new")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs one command."""
     commands: dict[str, Callable[..., Any]] = {"table": table, "figure": figure, "all": everything, "report": report}
+    commands["export"] = export
     tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="paper.py",

@@ -31,11 +31,22 @@ def runs(settings: Settings) -> list[Run]:
     return [make_run(variant, scene, seed, settings) for scene in scenes for seed in range(settings.seeds)]
 
 
+def samples_path(run: Run) -> Path:
+    """The samples that a training kept for its first split; results from a record have none."""
+    return run.folder / "samples" / "level-1.npz"
+
+
+def without_samples(settings: Settings) -> list[str]:
+    """The trainings whose samples are not there."""
+    absent = [run for run in runs(settings) if not samples_path(run).is_file()]
+    return [f"samples of {Path(run.scene).name}, seed {run.seed}" for run in absent]
+
+
 def sample_sets(settings: Settings) -> dict[str, Callable[[int], tuple[Tensor, Tensor]]]:
     """For each source the samples of its diagram number i: points [m, 3] and importance [m]."""
     paths: dict[str, list[Path]] = {}
     for run in runs(settings):
-        path = run.folder / "samples" / "level-1.npz"
+        path = samples_path(run)
         if path.is_file():
             paths.setdefault(f"{KEPT}, {Path(run.scene).name}", []).append(path)
     found: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {}
@@ -71,6 +82,7 @@ def measure(settings: Settings, say: Callable[[str], None] = print, *, diagrams:
             cells=CELLS,
             seeds=settings.seeds,
             budget_seconds=settings.budget,
+            missing=without_samples(settings),
         ),
         "results": results,
         "claims": [claim.to_dict() for claim in claims(results)],

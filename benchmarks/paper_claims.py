@@ -8,19 +8,27 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from paper_records import comparable
+
 Row = dict[str, Any]
 
 
 class Rows:
-    """Results by scene and variant, a value a seed."""
+    """Results by scene and variant, a value a seed.
 
-    def __init__(self, rows: Sequence[Row]) -> None:
+    Args:
+        rows: the results.
+        scenes: those that were asked for, of which some may have no results yet.
+    """
+
+    def __init__(self, rows: Sequence[Row], scenes: Sequence[str] = ()) -> None:
         self.rows = list(rows)
+        self.asked = list(scenes)
 
     @property
     def scenes(self) -> list[str]:
-        """The scenes in the order of the results."""
-        return list(dict.fromkeys(row["scene"] for row in self.rows))
+        """The scenes that were asked for, and those of the results in their order."""
+        return list(dict.fromkeys((*self.asked, *(row["scene"] for row in self.rows))))
 
     @property
     def variants(self) -> list[str]:
@@ -44,7 +52,10 @@ class Rows:
     def gains(
         self, better: str, worse: str, scene: str | None = None, value: Callable[[Row], float | None] | None = None
     ) -> list[float]:
-        """Value of one variant less that of another, for each scene and seed that both have; PSNR by default."""
+        """Value of one variant less that of another, for each scene and seed that both have; PSNR by default.
+
+        Trainings of different machines are no pair: as many seconds are not as many steps there.
+        """
         return list(self.paired(better, worse, scene, value).values())
 
     def paired(
@@ -52,10 +63,12 @@ class Rows:
     ) -> dict[tuple[str, int], float]:
         """The same by scene and seed."""
         get = value or (lambda row: row.get("psnr"))
-        first, second = (
-            {(row["scene"], row["seed"]): get(row) for row in self.of(name, scene)} for name in (better, worse)
-        )
-        pairs = {key: (first[key], second[key]) for key in first if key in second}
+        first, second = ({(row["scene"], row["seed"]): row for row in self.of(name, scene)} for name in (better, worse))
+        pairs = {
+            key: (get(row), get(second[key]))
+            for key, row in first.items()
+            if key in second and comparable(row, second[key])
+        }
         return {key: a - b for key, (a, b) in pairs.items() if a is not None and b is not None}
 
 
@@ -135,18 +148,15 @@ def fewer_seams(rows: Rows, scene: str, usual: str, other: str, looks: Sequence[
 
     Of each seed those looks count that both variants have.
     """
-    ours, theirs = (
-        {
-            row["seed"]: {name: seam for name in looks if (seam := at_look(row, name, "seam")) is not None}
-            for row in group
-        }
-        for group in (rows.of(usual, scene), rows.of(other, scene))
-    )
+    others = {row["seed"]: row for row in rows.of(other, scene)}
     means = []
-    for seed, seams in ours.items():
-        shared = sorted(seams.keys() & theirs.get(seed, {}).keys())
+    for row in rows.of(usual, scene):
+        if row["seed"] not in others or not comparable(row, others[row["seed"]]):
+            continue
+        pairs = [(at_look(row, name, "seam"), at_look(others[row["seed"]], name, "seam")) for name in looks]
+        shared = [(a, b) for a, b in pairs if a is not None and b is not None]
         if shared:
-            means.append([statistics.fmean(of[seed][name] for name in shared) for of in (ours, theirs)])
+            means.append((statistics.fmean(a for a, _ in shared), statistics.fmean(b for _, b in shared)))
     level = statistics.fmean(a for a, _ in means) if means else 0.0
     return [100 * (a - b) / level for a, b in means] if level > 0 else []
 

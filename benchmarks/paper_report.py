@@ -56,9 +56,11 @@ def about(name: str) -> str:
 
 
 def table_of(name: str, outcome: Mapping[str, Any]) -> list[str]:
-    """Tables of one experiment."""
+    """Tables of one experiment, and what is missing of it."""
     published = EXPERIMENTS[name].published if name in EXPERIMENTS else lambda variant, scene: None
-    return markdown(name, dict(outcome), published)
+    lines = markdown(name, dict(outcome), published)
+    absent = outcome["metadata"].get("missing", [])
+    return [*lines, *(["", f"Missing: {'; '.join(absent)}."] if absent else [])]
 
 
 def conditions(described: Mapping[str, Any]) -> str:
@@ -73,8 +75,7 @@ def conditions(described: Mapping[str, Any]) -> str:
         f"{described['seeds']} seeds" if described["seeds"] > 1 else "one seed",
         f"{described['rays']} rays x {described['samples']} samples" if "rays" in described else "",
         f"the best of {len(described['rates'])} learning rates for each" if len(described.get("rates", [])) > 1 else "",
-        f"{described['threads']} threads",
-        described["machine"],
+        *(described.get("machines") or [f"{described['threads']} threads", described["machine"]]),
         *(f"failed: {failure}" for failure in described.get("failed", [])),
     ]
     return "; ".join(part for part in parts if part)

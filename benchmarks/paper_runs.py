@@ -3,7 +3,8 @@
 A training is known by its whole configuration, so two experiments that need the same one share it, and one that is in
 the output folder already is not made again. All trainings of a scene and a seed that are missing take turns of a few
 seconds in one process. An interrupted one goes on from its last turn. One that fails leaves its group, and its
-result.json says why.
+result.json says why. A long table is made in parts: settings say which of its trainings are made now, and a file keeps
+the results of all sittings.
 
     OUT/runs/SCENE-SEED-HASH/   a run directory of `voronerf train`, with result.json and looks/
 """
@@ -14,6 +15,7 @@ import functools
 import hashlib
 import json
 import os
+import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import paper_looks
+from paper_records import changed_settings, forget, keep, made_on, read_result, restore
 from turns import take_turns
 
 from voronerf.data import BUILTIN, BUILTIN_SIZE, Scene, load_scene
@@ -77,8 +80,24 @@ class Settings:
     """Also what takes a larger machine: 16 x 16 cells among the numbers of cells."""
     backend: str = "auto"
     """Backend of the operations."""
+    variants: str = ""
+    """Train now only variants in whose name this regular expression is found. Tables show what is there of all
+    variants, and say what is missing."""
+    only_seeds: tuple[int, ...] = ()
+    """Train now only these of the seeds."""
+    train: bool = True
+    """With --no-train nothing is trained: tables are made of what is there."""
+    record: Path | None = None
+    """A file of results, to be kept where --out is not: trainings that it knows are not made again, and those made are
+    added to it."""
 
     def __post_init__(self) -> None:
+        try:
+            re.compile(self.variants)
+        except re.error as error:
+            raise ConfigError(f"--variants must be a regular expression, got {self.variants!r}: {error}") from None
+        if not set(self.only_seeds) <= set(range(self.seeds)):
+            raise ConfigError(f"--only-seeds must be below --seeds {self.seeds}, got {self.only_seeds}")
         for name in ("downscale", "seeds", "rays", "evaluations", "eval_views"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
@@ -116,6 +135,16 @@ class Run:
         """Its run directory."""
         assert self.config.out is not None
         return self.config.out
+
+    @property
+    def result(self) -> Path:
+        """The file that says that it was made."""
+        return self.folder / "result.json"
+
+    def wanted(self, settings: Settings) -> bool:
+        """Whether it is one of those to be made now."""
+        of_seeds = not settings.only_seeds or self.seed in settings.only_seeds
+        return settings.train and of_seeds and re.search(settings.variants, self.variant.name) is not None
 
 
 def data_folder() -> Path:
@@ -184,6 +213,8 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: 
         assert usual is not None
         config = replace(config, lr=rate * usual)
     known = {k: v for k, v in json.loads(config.to_json()).items() if k not in (*NOT_IDENTITY, "lpips")}
+    if float(known["budget"]).is_integer():
+        known["budget"] = int(known["budget"])  # 480 and 480.0 are one
     text = json.dumps({**known, "scene": short, "looks": paper_looks.VERSION}, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     out = settings.out / "runs" / f"{short}-{seed}-{digest}"
@@ -191,12 +222,20 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: 
 
 
 def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], None] = print) -> None:
-    """Trains what is not in the output folder, all of a scene and a seed in turns."""
+    """Trains what is wanted now and neither in the output folder nor in the record, a scene and a seed in turns."""
     unique = {run.folder: run for run in runs}
-    missing = [run for run in unique.values() if settings.again or not (run.folder / "result.json").is_file()]
-    say(f"{len(unique)} trainings, {len(unique) - len(missing)} of them made already; {settings.budget:g} s each")
+    if settings.record is not None:
+        count = restore(unique, settings.record)
+        say(f"{count} results taken from {settings.record}")
+    missing = [run for run in unique.values() if settings.again or not run.result.is_file()]
+    made, left = len(unique) - len(missing), [run for run in missing if not run.wanted(settings)]
+    missing = [run for run in missing if run.wanted(settings)]
+    later = f", {len(left)} left for later" if left and not settings.again else ""
+    say(f"{len(unique)} trainings, {made} of them made already{later}; {settings.budget:g} s each")
     if settings.again:
         # all before the first training: an interruption leaves no old result among new ones
+        if settings.record is not None:
+            forget([run.folder for run in missing], settings.record)
         for run in missing:
             clear(run.folder)
     groups: dict[tuple[int, str], list[Run]] = {}
@@ -206,6 +245,10 @@ def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], 
         scene = open_scene(name, settings)
         say(f"{scene.name}, seed {seed}: {len(group)} trainings in turns of {settings.turn:g} s")
         train_group(group, scene, settings, say)
+        if settings.record is not None:
+            keep([run.folder for run in group], settings.record)
+    if settings.record is not None:
+        keep(unique, settings.record)
 
 
 def clear(folder: Path) -> None:
@@ -232,7 +275,8 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
         """Keeps why a training failed in place of its result."""
         message = str(error).removeprefix(f"{trainer.out}: ")
         say(f"{names[trainer.out]} failed: {message}")
-        write_text(trainer.out / "result.json", json.dumps({"failed": message, "psnr": None}, indent=1) + "\n")
+        row = {"failed": message, "psnr": None, "made_on": made_on()}
+        write_text(trainer.out / "result.json", json.dumps(row, indent=1) + "\n")
         del trainers[trainer.out]
 
     take_turns(
@@ -256,6 +300,9 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
             "lr": trainer.config.lr,
             "size": [cameras.height, cameras.width],
             "curve": curve(trainer),
+            "looks": paper_looks.numbers(folder),
+            "config": changed_settings(json.loads(trainer.config.to_json())),
+            "made_on": made_on(),
         }
         write_text(folder / "result.json", json.dumps(row, indent=1) + "\n")
 
@@ -274,12 +321,13 @@ def results(runs: Sequence[Run]) -> list[Row]:
     """The results of runs that were trained, each with its variant's name, its scene, its seed and its folder.
 
     Of several learning rates that with the best mean PSNR counts, for every scene and variant alike; "rates" has the
-    means of all. A rate at which a seed failed does not count.
+    means of all. A rate at which a seed failed does not count, nor does one at which a training is still missing that a
+    variant of the scene has at another: no side is searched further than the others.
     """
     tried: dict[tuple[str, str], dict[float, list[Row]]] = {}
+    searched = rates_of_all(runs)
     for run in runs:
-        path = run.folder / "result.json"
-        if not path.is_file():
+        if not run.result.is_file() or run.rate not in searched[run.scene]:
             continue
         row = {
             "variant": run.variant.name,
@@ -288,8 +336,7 @@ def results(runs: Sequence[Run]) -> list[Row]:
             "rate": run.rate,
             "changes": {key: list(v) if isinstance(v, tuple) else v for key, v in run.variant.changes.items()},
             "run": run.folder.name,
-            **json.loads(path.read_text()),
-            "looks": paper_looks.numbers(run.folder),
+            **read_result(run.folder),
         }
         tried.setdefault((row["scene"], row["variant"]), {}).setdefault(run.rate, []).append(row)
     found = []
@@ -306,12 +353,34 @@ def results(runs: Sequence[Run]) -> list[Row]:
     return found
 
 
+def rates_of_all(runs: Sequence[Run]) -> dict[str, list[float]]:
+    """By scene the learning rates at which every variant and seed was trained that was trained at any."""
+    found: dict[str, dict[float, set[tuple[str, int]]]] = {}
+    for run in runs:
+        made = found.setdefault(run.scene, {}).setdefault(run.rate, set())
+        if run.result.is_file():
+            made.add((run.variant.name, run.seed))
+    return {
+        scene: [rate for rate, made in rates.items() if made == set().union(*rates.values())]
+        for scene, rates in found.items()
+    }
+
+
+def still_missing(runs: Sequence[Run]) -> list[str]:
+    """Of trainings that were not made yet, a line a scene, variant and rate with its seeds."""
+    found: dict[str, list[str]] = {}
+    for run in runs:
+        if not run.result.is_file():
+            rate = f", rate x {run.rate:g}" if run.rate != 1 else ""
+            found.setdefault(f"{run.variant.name} on {Path(run.scene).name}{rate}", []).append(str(run.seed))
+    return [f"{name}, seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}" for name, seeds in found.items()]
+
+
 def failures(runs: Sequence[Run]) -> list[str]:
     """Of runs that failed, each training and why."""
     found = []
     for run in {run.folder: run for run in runs}.values():
-        path = run.folder / "result.json"
-        row = json.loads(path.read_text()) if path.is_file() else {}
+        row = json.loads(run.result.read_text()) if run.result.is_file() else {}
         if "failed" in row:
             rate = f", rate x {run.rate:g}" if run.rate != 1 else ""
             found.append(f"{run.variant.name} on {Path(run.scene).name}, seed {run.seed}{rate}: {row['failed']}")
