@@ -23,6 +23,8 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     from test_emulated_layers import BROAD, DENSE
 
     import voronerf
+    from voronerf import _native
+    from voronerf.reference.cell_sort import cell_sort as specified
 
     where = torch.device(device)
 
@@ -40,10 +42,13 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             )
         assert torch.equal(found, expected)
 
-    def sort(n: int, k: int) -> None:
-        cells = torch.randint(0, k, (n,), dtype=torch.int32, device=where)
-        found, expected = (voronerf.cell_sort(cells, k, backend=b) for b in ("native", "reference"))
-        assert all(torch.equal(a, b) for a, b in zip(found, expected))
+    def sort(n: int, k: int, way: str) -> None:
+        # Some cells that are none: they go to the ends.
+        cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32, device=where)
+        expected = specified(cells.cpu().clamp(-1, k) + 1, k + 2)
+        order, offsets = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)
+        _native.sort_cells(cells, order, offsets, "cell_sort", way)
+        assert torch.equal(order.cpu(), expected[0]) and torch.equal(offsets.cpu(), expected[1][1:-1])
 
     def close(run: Callable[..., Any], leaves: list[Any]) -> None:
         """Results and gradients against the reference in float64."""
@@ -96,7 +101,17 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             for k, d in ((17, torch.float32), (700, torch.float32), (17, torch.float64))
         ),
         ("locate_cell", functools.partial(lookup, "locate_cell", 300, 3, torch.float32)),
-        *((f"cell_sort {n} {k}", functools.partial(sort, n, k)) for n, k in ((5000, 3), (4200, 600), (20_000, 4096))),
+        *(
+            (f"cell_sort {n} {k} by {way}", functools.partial(sort, n, k, way))
+            for n, k, way in (
+                (5000, 3, "counting"),
+                (4200, 1022, "counting"),
+                (5000, 3, "radix"),
+                (20_000, 4096, "automatic"),
+                (300, 65_535, "automatic"),
+                (0, 4096, "automatic"),
+            )
+        ),
         (
             "frequency_encode",
             lambda: close(lambda x, b: voronerf.frequency_encode(x[0], 10, backend=b), [torch.rand(90, 3)]),

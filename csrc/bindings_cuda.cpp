@@ -42,11 +42,18 @@ void locate_cell_cuda(Address points, Address centres, Address weights, Address 
                              depth, at<void>(stream));
 }
 
-void cell_sort_cuda(Address cells, Address order, Address offsets, Address workspace, int64_t n, int64_t k, int device,
-                    Address stream) {
+// way: a number of CellSortWay.
+int64_t cell_sort_workspace_cuda(int64_t n, int64_t k, int way, int device) {
   const voronerf::CudaDevice current(device);
-  voronerf::cell_sort_cuda(at<const int32_t>(cells), at<int32_t>(order), at<int32_t>(offsets), at<int32_t>(workspace),
-                           n, k, at<void>(stream));
+  return voronerf::cell_sort_workspace_cuda(n, k, static_cast<voronerf::CellSortWay>(way));
+}
+
+void cell_sort_cuda(Address cells, Address order, Address offsets, Address workspace, int64_t n, int64_t k, int way,
+                    int device, Address stream) {
+  const voronerf::CudaDevice current(device);
+  voronerf::cell_sort_cuda(at<const int32_t>(cells), at<int32_t>(order), at<int32_t>(offsets),
+                           at<unsigned char>(workspace), n, k, static_cast<voronerf::CellSortWay>(way),
+                           at<void>(stream));
 }
 
 using Addresses = std::vector<Address>;
@@ -182,6 +189,7 @@ void bind_cuda(py::module_& module) {
   module.def("nearest_centre_cuda_float64", &nearest_centre_cuda<double>, no_gil);
   module.def("locate_cell_cuda_float32", &locate_cell_cuda<float>, no_gil);
   module.def("locate_cell_cuda_float64", &locate_cell_cuda<double>, no_gil);
+  module.def("cell_sort_workspace_cuda", &cell_sort_workspace_cuda);
   module.def("cell_sort_cuda", &cell_sort_cuda, no_gil);
   module.def("composite_cuda", &composite_cuda, no_gil);
   module.def("composite_backward_cuda", &composite_backward_cuda, no_gil);

@@ -1,15 +1,23 @@
-// Stable counting sort on CUDA, in the same chunks as on the CPU. One warp owns a chunk, so that no counter is shared:
+// Stable sort by cell on CUDA. Bucket 0 is for cells below 0 and bucket k + 1 for cells from k on. Few cells are
+// counted, in the same chunks as on the CPU. One warp owns a chunk, so that no counter is shared:
 //
 //   1. cell_sort_count    the chunk's histogram, counts[bucket][chunk]
 //   2. scan_*             exclusive scan of counts in that order: the first place of each bucket's rows of each chunk
 //   3. cell_sort_scatter  the rows go to their places, in order
 //
 // A warp takes 32 rows at a time; rows with the same bucket find each other with __match_any_sync, are ranked by lane,
-// and their first lane moves the counter. There are no atomics, and every row has one possible place: the result is
-// that of the CPU, bit for bit. Bucket 0 is for cells below 0 and bucket k + 1 for cells from k on.
+// and their first lane moves the counter, in shared memory. There are no atomics.
+//
+// More cells than a warp has counters for go through the toolkit's radix sort, by just the bits that buckets have: in
+// global memory every 32 rows would wait for a counter, and the few chunks that so many counters allow would leave the
+// device idle (256 warps for 4,096 cells of 4 M rows, 16 for 65,536). cell_sort_keys writes buckets and row numbers
+// for it, and cell_sort_offsets finds each cell's first row in what comes out.
+//
+// Either way every row has one possible place: the result is that of the CPU, bit for bit.
 #include "cell_sort.h"
 #include "cuda_wrappers.h"
 #include "launchers.h"
+#include "radix_sort.h"
 
 namespace voronerf {
 
@@ -17,25 +25,23 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kWarps = kThreads / 32;
-constexpr int kAhead = 4;             // steps of 32 rows that are read before they are counted
-constexpr int kSharedBuckets = 1024;  // of a warp: 32 KiB of a block
+constexpr int kAhead = 4;  // steps of 32 rows that are read before they are counted
 constexpr int kScanThreads = 1024;
+constexpr int64_t kScanTile = kCellSortScanTile;
 constexpr int kScanItems = static_cast<int>(kScanTile) / kScanThreads;
-constexpr unsigned kAll = 0xffffffffu;
 
 __device__ int64_t bucket_of(int32_t cell, int64_t k) {
   return cell < 0 ? 0 : cell >= k ? k + 1 : cell + 1;
 }
 
 // Calls place(row, position) for every row of the warp's chunk, where position is the value of the row's counter before
-// it; the counter of bucket b is counters[b * stride]. Counters belong to this warp alone; __syncwarp makes the write
-// of one lane visible to the lane that reads next. Cells are read some steps ahead.
+// it. Counters belong to this warp alone; __syncwarp makes the write of one lane visible to the lane that reads next.
+// Cells are read some steps ahead.
 template <typename Place>
-__device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t stride, int64_t chunk, int64_t rows,
-                           int64_t n, int64_t k, Place place) {
+__device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t begin, int64_t end, int64_t k,
+                           Place place) {
   const int lane = threadIdx.x % 32;
-  const int64_t end = (chunk + 1) * rows < n ? (chunk + 1) * rows : n;
-  for (int64_t start = chunk * rows; start < end; start += 32 * kAhead) {
+  for (int64_t start = begin; start < end; start += 32 * kAhead) {
     int32_t ahead[kAhead];
 #pragma unroll
     for (int step = 0; step < kAhead; ++step) {
@@ -47,56 +53,42 @@ __device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t stri
       const int64_t row = start + 32 * step + lane;
       const bool active = row < end;
       // Lanes past the end form a group of their own, which counts nothing.
-      const int64_t bucket = active ? bucket_of(ahead[step], k) : -1;
-      const unsigned peers = __match_any_sync(kAll, static_cast<int>(bucket));
+      const int bucket = active ? static_cast<int>(bucket_of(ahead[step], k)) : -1;
+      const unsigned peers = __match_any_sync(kAllLanes, bucket);
       const int leader = __ffs(static_cast<int>(peers)) - 1;
       int32_t before = 0;
       if (active && lane == leader) {
-        int32_t* counter = counters + bucket * stride;
-        before = *counter;
-        *counter = before + __popc(peers);
+        before = counters[bucket];
+        counters[bucket] = before + __popc(peers);
       }
-      before = __shfl_sync(kAll, before, leader);
+      before = __shfl_sync(kAllLanes, before, leader);
       if (active) place(row, before + __popc(peers & ((1u << lane) - 1u)));
       __syncwarp();
     }
   }
 }
 
-// The same with the chunk's counters in shared memory, where they fit: a warp waits for one at every step.
-template <bool kShared, bool kWriteBack, typename Place>
-__device__ void count_chunk(const int32_t* cells, int32_t* counts, int64_t chunks, int64_t rows, int64_t n, int64_t k,
-                            Place place) {
+// The chunk of a warp, with its counters in shared memory: histograms (kScatter false), or the rows to their places.
+template <bool kScatter>
+__global__ void __launch_bounds__(kThreads)
+    cell_sort_chunk(const int32_t* __restrict__ cells, int32_t* counts, int32_t* __restrict__ order, int64_t chunks,
+                    int64_t rows, int64_t n, int64_t k) {
+  VN_SHARED(counters, int32_t[kWarps][kCellSortBuckets]);
   const int64_t chunk = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
   if (chunk >= chunks) return;  // whole warps leave; there is no barrier of the block
-  if constexpr (kShared) {
-    VN_SHARED(counters, int32_t[kWarps][kSharedBuckets]);
-    int32_t* own = counters[threadIdx.x / 32];
-    for (int64_t bucket = threadIdx.x % 32; bucket < k + 2; bucket += 32) own[bucket] = counts[bucket * chunks + chunk];
-    __syncwarp();
-    count_rows(cells, own, 1, chunk, rows, n, k, place);
-    if constexpr (kWriteBack) {
-      for (int64_t bucket = threadIdx.x % 32; bucket < k + 2; bucket += 32) {
-        counts[bucket * chunks + chunk] = own[bucket];
-      }
-    }
+  const int lane = threadIdx.x % 32;
+  int32_t* own = counters[threadIdx.x / 32];
+  for (int64_t bucket = lane; bucket < k + 2; bucket += 32)
+    own[bucket] = kScatter ? counts[bucket * chunks + chunk] : 0;
+  __syncwarp();
+  const int64_t begin = chunk * rows, end = begin + rows < n ? begin + rows : n;
+  if constexpr (kScatter) {
+    count_rows(cells, own, begin, end, k,
+               [order](int64_t row, int32_t position) { order[position] = static_cast<int32_t>(row); });
   } else {
-    count_rows(cells, counts + chunk, chunks, chunk, rows, n, k, place);
+    count_rows(cells, own, begin, end, k, [](int64_t, int32_t) {});
+    for (int64_t bucket = lane; bucket < k + 2; bucket += 32) counts[bucket * chunks + chunk] = own[bucket];
   }
-}
-
-template <bool kShared>
-__global__ void __launch_bounds__(kThreads) cell_sort_count(const int32_t* __restrict__ cells, int32_t* counts,
-                                                            int64_t chunks, int64_t rows, int64_t n, int64_t k) {
-  count_chunk<kShared, true>(cells, counts, chunks, rows, n, k, [](int64_t, int32_t) {});
-}
-
-template <bool kShared>
-__global__ void __launch_bounds__(kThreads)
-    cell_sort_scatter(const int32_t* __restrict__ cells, int32_t* counts, int32_t* __restrict__ order, int64_t chunks,
-                      int64_t rows, int64_t n, int64_t k) {
-  count_chunk<kShared, false>(cells, counts, chunks, rows, n, k,
-                              [order](int64_t row, int32_t position) { order[position] = static_cast<int32_t>(row); });
 }
 
 // Exclusive scan over the threads of a block of kScanThreads; `total` is the sum of all. `warp_sums` is shared scratch.
@@ -104,7 +96,7 @@ __device__ int32_t scan_block(int32_t value, int32_t* warp_sums, int32_t& total)
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
   int32_t inclusive = value;
   for (int step = 1; step < 32; step *= 2) {
-    const int32_t other = __shfl_up_sync(kAll, inclusive, step);
+    const int32_t other = __shfl_up_sync(kAllLanes, inclusive, step);
     if (lane >= step) inclusive += other;
   }
   if (lane == 31) warp_sums[warp] = inclusive;
@@ -112,7 +104,7 @@ __device__ int32_t scan_block(int32_t value, int32_t* warp_sums, int32_t& total)
   if (warp == 0) {
     int32_t sum = warp_sums[lane];
     for (int step = 1; step < 32; step *= 2) {
-      const int32_t other = __shfl_up_sync(kAll, sum, step);
+      const int32_t other = __shfl_up_sync(kAllLanes, sum, step);
       if (lane >= step) sum += other;
     }
     warp_sums[lane] = sum;
@@ -170,35 +162,87 @@ __global__ void __launch_bounds__(kScanThreads)
   }
 }
 
+template <typename Key>
+__global__ void __launch_bounds__(kThreads) cell_sort_keys(const int32_t* __restrict__ cells, Key* __restrict__ keys,
+                                                           int32_t* __restrict__ rows, int64_t n, int64_t k) {
+  const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (row >= n) return;
+  keys[row] = static_cast<Key>(bucket_of(cells[row], k));
+  rows[row] = static_cast<int32_t>(row);
+}
+
+// A thread a cell looks for its first row by bisection: a few steps, from cache, however the rows are shared out.
+template <typename Key>
+__global__ void __launch_bounds__(kThreads)
+    cell_sort_offsets(const Key* __restrict__ sorted, int32_t* __restrict__ offsets, int64_t n, int64_t k) {
+  const int64_t cell = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (cell > k) return;
+  int64_t low = 0, high = n;
+  while (low < high) {
+    const int64_t middle = (low + high) / 2;
+    if (static_cast<int64_t>(sorted[middle]) <= cell) {  // the bucket of cell c is c + 1
+      low = middle + 1;
+    } else {
+      high = middle;
+    }
+  }
+  offsets[cell] = static_cast<int32_t>(low);
+}
+
+unsigned blocks_of(int64_t threads) {
+  return static_cast<unsigned>(ceil_div<int64_t>(threads, kThreads));
+}
+
+// The plan for the current device.
+CellSortPlan plan_of(int64_t n, int64_t k, CellSortWay way) {
+  CellSortPlan plan = cell_sort_plan(n, k, way, 0);
+  if (!plan.radix || n == 0) return plan;
+  const bool narrow = plan.key_bytes == 2;
+  return cell_sort_plan(n, k, way,
+                        narrow ? radix_sort_bytes<uint16_t>(n, plan.bits) : radix_sort_bytes<uint32_t>(n, plan.bits));
+}
+
+void sort_by_counting(const CellSortPlan& plan, const int32_t* cells, int32_t* order, int32_t* offsets,
+                      unsigned char* workspace, int64_t n, int64_t k, void* stream) {
+  const int64_t rows = plan.chunk_rows, chunks = plan.chunks, size = chunks * plan.buckets;
+  const unsigned tiles = static_cast<unsigned>(plan.tiles);
+  const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(chunks, kWarps));
+  auto* counts = reinterpret_cast<int32_t*>(workspace + plan.counts);
+  auto* tile_sums = reinterpret_cast<int32_t*>(workspace + plan.tile_sums);
+  VN_LAUNCH(cell_sort_chunk<false>, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);
+  VN_LAUNCH(scan_sums, tiles, kScanThreads, 0, stream, counts, tile_sums, size);
+  VN_LAUNCH(scan_tiles, 1, kScanThreads, 0, stream, tile_sums, plan.tiles);
+  VN_LAUNCH(scan_places, tiles, kScanThreads, 0, stream, counts, tile_sums, offsets, size, chunks);
+  VN_LAUNCH(cell_sort_chunk<true>, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);
+}
+
+template <typename Key>
+void sort_by_radix(const CellSortPlan& plan, const int32_t* cells, int32_t* order, int32_t* offsets,
+                   unsigned char* workspace, int64_t n, int64_t k, void* stream) {
+  auto* keys = reinterpret_cast<Key*>(workspace + plan.keys);
+  auto* sorted = reinterpret_cast<Key*>(workspace + plan.sorted);
+  auto* rows = reinterpret_cast<int32_t*>(workspace + plan.rows);
+  VN_LAUNCH((cell_sort_keys<Key>), blocks_of(n), kThreads, 0, stream, cells, keys, rows, n, k);
+  radix_sort(workspace + plan.temporary, plan.bytes - plan.temporary, keys, sorted, rows, order, n, plan.bits, stream);
+  VN_LAUNCH((cell_sort_offsets<Key>), blocks_of(k + 1), kThreads, 0, stream, sorted, offsets, n, k);
+}
+
 }  // namespace
 
-void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
-                    void* stream_pointer) {
-  const cudaStream_t stream = static_cast<cudaStream_t>(stream_pointer);
+int64_t cell_sort_workspace_cuda(int64_t n, int64_t k, CellSortWay way) {
+  return plan_of(n, k, way).bytes;
+}
+
+void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, unsigned char* workspace, int64_t n,
+                    int64_t k, CellSortWay way, void* stream) {
+  const CellSortPlan plan = plan_of(n, k, way);
   if (n == 0) {
-    VN_CUDA_CHECK(cudaMemsetAsync(offsets, 0, sizeof(int32_t) * (k + 1), stream));
+    VN_CUDA_CHECK(cudaMemsetAsync(offsets, 0, sizeof(int32_t) * (k + 1), static_cast<cudaStream_t>(stream)));
     return;
   }
-  const int64_t rows = cell_sort_chunk_rows(k), chunks = cell_sort_chunks(n, k), size = chunks * (k + 2);
-  const unsigned tiles = static_cast<unsigned>(ceil_div(size, kScanTile));
-  const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(chunks, kWarps));
-  int32_t* counts = workspace;
-  int32_t* tile_sums = workspace + size;
-  VN_CUDA_CHECK(cudaMemsetAsync(counts, 0, sizeof(int32_t) * size, stream));
-  const bool shared = k + 2 <= kSharedBuckets;
-  if (shared) {
-    VN_LAUNCH(cell_sort_count<true>, blocks, kThreads, 0, stream, cells, counts, chunks, rows, n, k);
-  } else {
-    VN_LAUNCH(cell_sort_count<false>, blocks, kThreads, 0, stream, cells, counts, chunks, rows, n, k);
-  }
-  VN_LAUNCH(scan_sums, tiles, kScanThreads, 0, stream, counts, tile_sums, size);
-  VN_LAUNCH(scan_tiles, 1, kScanThreads, 0, stream, tile_sums, tiles);
-  VN_LAUNCH(scan_places, tiles, kScanThreads, 0, stream, counts, tile_sums, offsets, size, chunks);
-  if (shared) {
-    VN_LAUNCH(cell_sort_scatter<true>, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);
-  } else {
-    VN_LAUNCH(cell_sort_scatter<false>, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);
-  }
+  if (!plan.radix) return sort_by_counting(plan, cells, order, offsets, workspace, n, k, stream);
+  if (plan.key_bytes == 2) return sort_by_radix<uint16_t>(plan, cells, order, offsets, workspace, n, k, stream);
+  sort_by_radix<uint32_t>(plan, cells, order, offsets, workspace, n, k, stream);
 }
 
 }  // namespace voronerf

@@ -1,7 +1,7 @@
-// Stable counting sort by cell: cells [n] -> order [n], offsets [k+1].
+// Stable sort by cell: cells [n] -> order [n], offsets [k+1].
 //
-// The rows are cut into chunks of cell_sort_chunk_rows(k), each with its own histogram in the workspace
-// [cell_sort_workspace(n, k)]; a chunk has many more rows than there are cells, so the histograms stay a fraction of n.
+// By counting, the rows are cut into chunks of cell_sort_chunk_rows(k), each with its own histogram in the workspace; a
+// chunk has many more rows than there are cells, so the histograms stay a fraction of n.
 #pragma once
 
 #include <cstdint>
@@ -19,15 +19,36 @@ inline int64_t cell_sort_chunks(int64_t n, int64_t k) {
   return ceil_div(n, cell_sort_chunk_rows(k));
 }
 
-// int32 elements of workspace: the histograms and, for CUDA's scan, the sums of its tiles.
-constexpr int64_t kScanTile = 4096;
+// int32 elements of the CPU's workspace: the histograms.
 inline int64_t cell_sort_workspace(int64_t n, int64_t k) {
-  const int64_t counts = cell_sort_chunks(n, k) * (k + 2);
-  return counts + ceil_div(counts, kScanTile);
+  return cell_sort_chunks(n, k) * k;
 }
 
 // False if a cell lies outside 0..k-1; `order` and `offsets` are then undefined.
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
                    int threads);
+
+// How CUDA sorts: by counting where a warp's counters fit shared memory, else by the toolkit's radix sort. By counting
+// bytes, for 4 M rows on an H200, the two cost the same at some 1,000 cells (docs/cuda.md); the limit is that of shared
+// memory.
+enum class CellSortWay : int { automatic = 0, counting, radix };
+constexpr int64_t kCellSortBuckets = 1024;  // of a warp: 32 KiB of a block of eight
+constexpr int64_t kCellSortScanTile = 4096;
+
+// Sizes and the bytes of workspace in front of each part, a pure function. Buckets are the cells and the two ends.
+struct CellSortPlan {
+  bool radix;
+  int64_t buckets;
+  // By counting: counts[bucket][chunk] and the sums of the tiles of their scan, int32 both.
+  int64_t chunk_rows, chunks, tiles, counts, tile_sums;
+  // By radix: every row's bucket, by `bits` of which is sorted; the same sorted; the rows' numbers, int32; and what the
+  // sort itself takes, the last part.
+  int bits, key_bytes;
+  int64_t keys, sorted, rows, temporary;
+  int64_t bytes;
+};
+
+// `temporary`: bytes that the radix sort takes (radix_sort.h). Throws std::runtime_error where cells cannot be counted.
+CellSortPlan cell_sort_plan(int64_t n, int64_t k, CellSortWay way, int64_t temporary);
 
 }  // namespace voronerf

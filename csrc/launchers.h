@@ -4,6 +4,7 @@
 
 #include <cstdint>
 
+#include "cell_sort.h"
 #include "composite.h"
 
 namespace voronerf {
@@ -26,8 +27,10 @@ void nearest_centre_cuda(const T* points, const T* centres, const T* weights, in
                          void* stream);
 
 // A cell below 0 sorts before offsets[0], one from k on after offsets[k]: raising would need a host read.
-void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
-                    void* stream);
+// The workspace's size depends on the current device and is known to the host; aligned as torch's allocations are.
+int64_t cell_sort_workspace_cuda(int64_t n, int64_t k, CellSortWay way);
+void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, unsigned char* workspace, int64_t n,
+                    int64_t k, CellSortWay way, void* stream);
 
 // g diagrams. Unsound tables (locate_cell_fault) cannot be refused without a host read: a walk ends where they lead out
 // of them, nothing outside is read, and a point that has reached no leaf by then, or in `depth` levels, gets a negative

@@ -118,6 +118,24 @@ def test_cuda_check_fails_where_nothing_was_checked(
     assert capsys.readouterr().out.rstrip().endswith(outcome)
 
 
+def test_cuda_check_leaves_the_toolkits_own_kernels_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    check = cuda_check()
+    theirs = REPORT.replace("_Z6kernelv", "_ZN3cub18CUB_300001_SM_8000EmptyKernelIvEEvv").replace(
+        "0 bytes spill", "8 bytes spill"
+    )
+    (tmp_path / "report").write_text(REPORT.format("80") + theirs.format("80"))
+    nvcc = tmp_path / "nvcc"
+    nvcc.write_text(f"#!/bin/sh\ncat '{tmp_path}/report' >&2\n")
+    nvcc.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(check, "OUT", tmp_path / "out")
+    assert check.main(["80"]) == 0
+    said = capsys.readouterr().out
+    assert "cub" not in said and "kernels and 1 of the toolkit's compiled for sm_80" in said
+
+
 def test_cuda_check_compares_with_the_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     check = cuda_check()
     row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}

@@ -27,8 +27,10 @@ from voronerf.backends import BackendUnavailable
 
 ISAS = ("portable", "avx2", "avx512")
 # Number of csrc/bindings.cpp that this file and its companions are written for.
-INTERFACE = 11
+INTERFACE = 12
 
+# In the order of CellSortWay in csrc/cell_sort.h.
+SORTS = ("automatic", "counting", "radix")
 # In the order of csrc/measure_peak.h.
 _PEAKS = ("float32", "bfloat16", "copy")
 
@@ -196,15 +198,31 @@ def _locate_cell(
 def _cell_sort(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:
     cells = cells.contiguous()
     order, offsets = _allocate_sort(cells, k)
-    n = cells.shape[0]
-    workspace = cells.new_empty(_C.cell_sort_workspace(n, k))
-    addresses = _addresses(cells, order, offsets, workspace)
-    if on_cuda(cells):
-        _C.cell_sort_cuda(*addresses, n, k, *stream(cells))
-    elif not _C.cell_sort(*addresses, n, k, torch.get_num_threads()):
-        low, high = (int(bound) for bound in cells.aminmax())
-        raise ValueError(f"cell_sort: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
+    sort_cells(cells, order, offsets, "cell_sort")
     return order, offsets
+
+
+def sort_cells(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = "automatic") -> None:
+    """Fills the order and the offsets of contiguous cells.
+
+    Args:
+        cells: int32 [n].
+        order: int32 [n].
+        offsets: int32 [k + 1].
+        caller: the operation that errors name.
+        way: of sorting on CUDA, one of ``SORTS``, for measurements; automatic is by the number of cells.
+    """
+    n, k = cells.shape[0], offsets.shape[0] - 1
+    addresses = _addresses(cells, order, offsets)
+    if on_cuda(cells):
+        number, (device, current) = SORTS.index(way), stream(cells)
+        workspace = cells.new_empty(_C.cell_sort_workspace_cuda(n, k, number, device), dtype=torch.uint8)
+        _C.cell_sort_cuda(*addresses, workspace.data_ptr(), n, k, number, device, current)
+        return
+    workspace = cells.new_empty(_C.cell_sort_workspace(n, k))
+    if not _C.cell_sort(*addresses, workspace.data_ptr(), n, k, torch.get_num_threads()):
+        low, high = (int(bound) for bound in cells.aminmax())
+        raise ValueError(f"{caller}: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
 
 
 @_nearest_centre.register_fake

@@ -84,7 +84,7 @@ def _forward(
         if centres is not None:
             assert coords is not None
             _locate(found, coords, centres, child_offsets, child, centre_weights, depth)
-        _sort(found if cells is None else cells.contiguous(), order, offsets)
+        _native.sort_cells(found if cells is None else cells.contiguous(), order, offsets, "routed_mlp")
     out = _native_mlp.run(
         positions, offsets, weights, biases, table, directions, direction_index, order if order.numel() else None
     )
@@ -124,17 +124,6 @@ def _locate(
     arguments = _native._addresses(coords, centres, centre_weights, child_offsets, child, cells, workspace)
     if not _native._entry("locate_cell", coords.dtype)(*arguments, n, m, depth, _native._ISA, threads):
         raise ValueError(f"routed_mlp: depth must be the number of levels of the tree, got {depth}, which is too few")
-
-
-def _sort(cells: Tensor, order: Tensor, offsets: Tensor) -> None:
-    n, k = cells.shape[0], offsets.shape[0] - 1
-    workspace = cells.new_empty(_native._C.cell_sort_workspace(n, k))
-    arguments = _native._addresses(cells, order, offsets, workspace)
-    if _native.on_cuda(cells):
-        _native._C.cell_sort_cuda(*arguments, n, k, *_native.stream(cells))
-    elif not _native._C.cell_sort(*arguments, n, k, torch.get_num_threads()):
-        low, high = (int(bound) for bound in cells.aminmax())
-        raise ValueError(f"routed_mlp: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
 
 
 def _allocate(positions: Tensor, k: int, cells: Tensor | None, centres: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:

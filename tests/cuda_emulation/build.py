@@ -23,8 +23,10 @@ SANITIZERS = {
 }
 PLAIN = {"emulation.cpp", "module.cpp", "bindings_cuda.cpp"}
 """Files with nothing to watch."""
-SHARED = ("grouped_mlp_cuda_plan.cpp", "grouped_mlp_cuda_layers_plan.cpp")
+SHARED = ("cell_sort_plan.cpp", "grouped_mlp_cuda_plan.cpp", "grouped_mlp_cuda_layers_plan.cpp")
 """What the launchers need of the C++ beside them."""
+REPLACED = {"radix_sort.cu"}
+"""What consists of the CUDA toolkit's headers: a file of the same name in this folder stands in."""
 
 
 def build(sanitizer: str = "none") -> Path:
@@ -40,7 +42,8 @@ def _build(out: Path, sanitizer: str) -> Path:
     import pybind11
 
     module = out / sanitizer / f"voronerf_emulation{sysconfig.get_config_var('EXT_SUFFIX')}"
-    sources = [*sorted((ROOT / "csrc").glob("*.cu")), *sorted(HERE.glob("*.cu")), *sorted(HERE.glob("*.cpp"))]
+    kernels = [source for source in sorted((ROOT / "csrc").glob("*.cu")) if source.name not in REPLACED]
+    sources = [*kernels, *sorted(HERE.glob("*.cu")), *sorted(HERE.glob("*.cpp"))]
     sources += [ROOT / "csrc" / name for name in ("bindings_cuda.cpp", *SHARED) if (ROOT / "csrc" / name).exists()]
     includes = [ROOT / "csrc", HERE, Path(pybind11.get_include()), Path(sysconfig.get_path("include"))]
     flags = ["-std=c++17", "-O1", "-g1", "-fPIC", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=hidden"]

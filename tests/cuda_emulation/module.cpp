@@ -4,6 +4,7 @@
 
 #include "bindings_cuda.h"
 #include "bindings_mlp_table.h"
+#include "cell_sort.h"
 #include "emulation.h"
 #include "grouped_mlp_cuda_layers.h"
 
@@ -43,6 +44,21 @@ PYBIND11_MODULE(voronerf_emulation, module) {
         plan["workspace"] = voronerf::mlp_layers_workspace(choice.layers, k, backward).bytes;
         return plan;
       });
+  module.def("cell_sort_plan", [](int64_t n, int64_t k, int way, int64_t temporary) {
+    const voronerf::CellSortPlan found =
+        voronerf::cell_sort_plan(n, k, static_cast<voronerf::CellSortWay>(way), temporary);
+    py::dict plan;
+    plan["radix"] = found.radix;
+    plan["chunks"] = found.chunks;
+    plan["chunk_rows"] = found.chunk_rows;
+    plan["tiles"] = found.tiles;
+    plan["bits"] = found.bits;
+    plan["key_bytes"] = found.key_bytes;
+    plan["parts"] = found.radix ? std::vector<int64_t>{found.keys, found.sorted, found.rows, found.temporary}
+                                : std::vector<int64_t>{found.counts, found.tile_sums};
+    plan["bytes"] = found.bytes;
+    return plan;
+  });
   module.def("seed", [](uint64_t seed) { vn_emulation::settings().seed = seed; });
   module.def("device", [](int capability, int compiled, int shared_bytes) {
     vn_emulation::settings().capability = capability;

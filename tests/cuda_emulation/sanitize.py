@@ -58,12 +58,12 @@ def locate_cell(module: ModuleType) -> None:
 
 
 def cell_sort(module: ModuleType) -> None:
-    for n, k in ((3000, 5), (9000, 2)):
+    # By counting and by radix, with keys of 2 and of 4 bytes.
+    for n, k, way in ((3000, 5, 0), (9000, 2, 1), (600, 3, 2), (300, 70_000, 0)):
         cells = RANDOM.integers(-1, k + 1, n).astype(np.int32)
         order, offsets = unwritten(n, dtype=np.int32), unwritten(k + 1, dtype=np.int32)
-        counts = -(-n // 2048) * (k + 2)
-        workspace = unwritten(counts + -(-counts // 4096), dtype=np.int32)
-        module.cell_sort_cuda(at(cells), at(order), at(offsets), at(workspace), n, k, *GPU)
+        workspace = np.full(module.cell_sort_workspace_cuda(n, k, way, GPU[0]), 255, np.uint8)
+        module.cell_sort_cuda(at(cells), at(order), at(offsets), at(workspace), n, k, way, *GPU)
         assert (np.sort(order) == np.arange(n)).all()
         written(offsets)
 

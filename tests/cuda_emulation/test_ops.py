@@ -12,7 +12,7 @@ import torch
 from emulated import emulated
 
 import voronerf
-from voronerf import VoronoiDiagram
+from voronerf import VoronoiDiagram, _native
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)
@@ -50,16 +50,39 @@ def test_locate_cell(dtype: torch.dtype) -> None:
     assert torch.equal(found, voronerf.locate_cell(*arguments, depth=diagram.depth, backend="reference"))
 
 
-@pytest.mark.parametrize(("n", "k"), [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600), (2100, 1022), (2100, 1023)])
-def test_cell_sort(n: int, k: int) -> None:
+SIZES = [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600), (2100, 1022), (2100, 1023), (300, 65_534), (300, 65_535)]
+
+
+def sorted_by(way: str, cells: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Into memory that is poisoned."""
+    order, offsets = torch.full_like(cells, -7), torch.full((k + 1,), -7, dtype=torch.int32)
+    _native.sort_cells(cells, order, offsets, "cell_sort", way)
+    return order, offsets
+
+
+@pytest.mark.parametrize("way", _native.SORTS)
+@pytest.mark.parametrize(("n", "k"), SIZES)
+def test_cell_sort(n: int, k: int, way: str) -> None:
+    if way == "counting" and k > 1022:
+        with pytest.raises(RuntimeError, match="cell_sort: too many cells to be counted in shared memory"):
+            sorted_by(way, torch.zeros(n, dtype=torch.int32), k)
+        return
     cells = torch.randint(0, k, (n,), dtype=torch.int32)
-    order, offsets = voronerf.cell_sort(cells, k, backend="native")
+    cells[::7] = k - 1
     expected = voronerf.cell_sort(cells, k, backend="reference")
-    assert torch.equal(order, expected[0]) and torch.equal(offsets, expected[1])
+    assert all(torch.equal(found, exact) for found, exact in zip(sorted_by(way, cells, k), expected))
+    if way == "automatic":
+        found = voronerf.cell_sort(cells, k, backend="native")
+        assert all(torch.equal(part, exact) for part, exact in zip(found, expected))
 
 
-def test_cell_sort_keeps_cells_that_are_none_at_the_ends() -> None:
-    cells = torch.tensor([2, -1, 0, 3, 1, -5, 9], dtype=torch.int32)
-    order, offsets = voronerf.cell_sort(cells, 3, backend="native")
-    assert order.tolist() == [1, 5, 2, 4, 0, 3, 6]
-    assert offsets.tolist() == [2, 3, 4, 5]
+@pytest.mark.parametrize("k", [3, 1022, 1023, 65_534, 65_535])
+@pytest.mark.parametrize("way", ["automatic", "radix"])
+def test_cell_sort_keeps_cells_that_are_none_at_the_ends(way: str, k: int) -> None:
+    low, high = -(2**31), 2**31 - 1
+    cells = torch.tensor([2, -1, 0, k, 1, low, high, k - 1, 65_536, -65_536, 1], dtype=torch.int32)
+    order, offsets = sorted_by(way, cells, k)
+    # A stray among the others is one that a key cut to 16 bits would put into a cell.
+    keys = cells.clamp(-1, k)
+    assert torch.equal(order.long(), keys.sort(stable=True).indices)
+    assert torch.equal(offsets, (keys[None] < torch.arange(k + 1)[:, None]).sum(1).int())

@@ -1,0 +1,48 @@
+"""How cell_sort runs on CUDA, as a pure function of the sizes."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+from emulated import module
+
+AUTOMATIC, COUNTING, RADIX = range(3)
+MOST = 2**31 - 1
+ROWS = (0, 1, 2047, 2048, 2049, 4_000_000, MOST)
+CELLS = (1, 2, 254, 255, 510, 511, 1022, 1023, 4096, 65_534, 65_535, 1 << 20, MOST - 2)
+
+
+@pytest.mark.parametrize("k", CELLS)
+def test_few_cells_are_counted_and_many_sorted_by_radix(k: int) -> None:
+    for n in ROWS:
+        assert module().cell_sort_plan(n, k, AUTOMATIC, 0)["radix"] == (k > 1022)
+        assert module().cell_sort_plan(n, k, RADIX, 0)["radix"]
+    if k > 1022:
+        with pytest.raises(RuntimeError, match="too many cells to be counted"):
+            module().cell_sort_plan(1, k, COUNTING, 0)
+
+
+@pytest.mark.parametrize("k", CELLS)
+def test_keys_have_exactly_the_bits_of_the_buckets(k: int) -> None:
+    plan = module().cell_sort_plan(100, k, RADIX, 0)
+    assert plan["bits"] == (k + 1).bit_length(), "the largest bucket is k + 1"
+    assert plan["key_bytes"] == (2 if plan["bits"] <= 16 else 4)
+
+
+@pytest.mark.parametrize(("way", "k"), [(AUTOMATIC, k) for k in CELLS] + [(RADIX, k) for k in CELLS])
+def test_parts_of_the_workspace_lie_side_by_side(way: int, k: int) -> None:
+    for n, temporary in itertools.product(ROWS, (0, 12_345)):
+        plan = module().cell_sort_plan(n, k, way, temporary)
+        if plan["radix"]:
+            sizes = [n * plan["key_bytes"], n * plan["key_bytes"], 4 * n, temporary]
+        else:
+            assert plan["chunks"] * plan["chunk_rows"] >= n > (plan["chunks"] - 1) * plan["chunk_rows"]
+            counts = plan["chunks"] * (k + 2)
+            assert 4096 * plan["tiles"] >= counts
+            sizes = [4 * counts, 4 * plan["tiles"]]
+            assert 4 * counts <= n + 4 * (k + 2), "histograms stay a fraction of the rows"
+        ends = [*plan["parts"][1:], plan["bytes"]]
+        for start, size, end in zip(plan["parts"], sizes, ends):
+            assert start % 256 == 0 and start + size <= end < start + size + 256
+        assert plan["bytes"] == ends[-2] + sizes[-1]
