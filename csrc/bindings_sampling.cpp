@@ -1,8 +1,9 @@
-// The encodings and resample for Python: addresses and sizes in, the GIL released while they run.
+// The encodings, resample and draw_cell for Python: addresses and sizes in, the GIL released while they run.
 #include "bindings_sampling.h"
 
 #include <cstdint>
 
+#include "draw_cell.h"
 #include "encode.h"
 #include "resample.h"
 
@@ -44,6 +45,15 @@ void resample(Address weights, Address edges, Address uniforms, Address depths, 
                          r, s, count, threads);
 }
 
+bool draw_cell(Address points, Address centres, Address weights, Address child_offsets, Address child, Address uniforms,
+               Address leaves, Address places, Address sums, int64_t n, int64_t m, int depth, double temperature,
+               int isa, int threads) {
+  return voronerf::draw_cell_cpu(at<const float>(points), at<const float>(centres), at<const float>(weights),
+                                 at<const int32_t>(child_offsets), at<const int32_t>(child), at<const float>(uniforms),
+                                 at<int32_t>(leaves), at<int32_t>(places), at<float>(sums), n, m, depth, temperature,
+                                 static_cast<voronerf::Isa>(isa), threads);
+}
+
 }  // namespace
 
 void bind_sampling(py::module_& module) {
@@ -52,4 +62,7 @@ void bind_sampling(py::module_& module) {
   module.def("encode", &encode, no_gil);
   module.def("encode_backward", &encode_backward, no_gil);
   module.def("resample", &resample, no_gil);
+  module.def("draw_cell", &draw_cell, no_gil);
+  module.def("draw_cell_places", &voronerf::draw_cell_places);
+  module.def("draw_cell_sums", &voronerf::draw_cell_sums);
 }

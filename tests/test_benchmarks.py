@@ -21,6 +21,7 @@ CPU = torch.device("cpu")
 OPS = {
     "nearest_centre",
     "locate_cell",
+    "draw_cell",
     "cell_sort",
     "grouped_linear",
     "grouped_mlp",
@@ -144,7 +145,7 @@ def test_every_operation_has_rows_in_both_modes(load: Callable[[str], Any]) -> N
         keys = [case.key for case in cases]
         assert len(set(keys)) == len(keys)
     both = {(case.op, case.direction) for case in throughput.chosen_cases(throughput.parse([]))}
-    differentiable = OPS - NOT_DIFFERENTIABLE - {"nearest_centre", "locate_cell", "cell_sort", "resample"}
+    differentiable = OPS - NOT_DIFFERENTIABLE - {"nearest_centre", "locate_cell", "draw_cell", "cell_sort", "resample"}
     assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 
@@ -210,6 +211,7 @@ def test_what_is_compared_is_right_in_every_small_case(load: Callable[[str], Any
     works = {
         "nearest_centre": lookup._nearest_work(500, 7, torch.float32, False, CPU),
         "locate_cell": lookup._locate_work(500, (4, 3), CPU),
+        "draw_cell": lookup._draw_work(500, 7, CPU),
         "cell_sort": lookup._sort_work(500, 7, CPU),
         "resample": sampling._resample_work(512, CPU),
         "march_rays": marching._march_work(1 << 13, False, CPU),

@@ -1,9 +1,10 @@
 """Drawing and encoding samples with the compiled module, as PyTorch ops: ``frequency_encode``, ``integrated_encode``,
-``resample``.
+``resample``, ``draw_cell``.
 
-n points, d features, L octaves, r rays, s bins of a ray. The ops are functional: they make inputs contiguous, allocate
-outputs and workspace, and pass addresses. The arithmetic is float32; half types are cast on the way in and out. Second
-derivatives come from the reference formulas. Shapes and dtypes have been validated by ``voronerf.ops``.
+n points, d features, L octaves, r rays, s bins of a ray, m centres of all diagrams of a tree. The ops are functional:
+they make inputs contiguous, allocate outputs and workspace, and pass addresses. The arithmetic is float32; half types
+are cast on the way in and out. Second derivatives come from the reference formulas. Shapes and dtypes have been
+validated by ``voronerf.ops``.
 """
 
 from __future__ import annotations
@@ -38,6 +39,22 @@ def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | N
         uniforms = uniforms.detach().float()
     depths: Tensor = _resample(weights.detach().float(), edges.detach().float(), count, uniforms)
     return depths.to(edges.dtype)
+
+
+def draw_cell(
+    points: Tensor,
+    centres: Tensor,
+    child_offsets: Tensor,
+    child: Tensor,
+    uniforms: Tensor,
+    *,
+    temperature: float,
+    depth: int,
+    weights: Tensor | None = None,
+) -> Tensor:
+    """A leaf for every point, drawn from its distances; see ``voronerf.ops.draw_cell``."""
+    leaves: Tensor = _draw_cell(points, centres, child_offsets, child, uniforms, temperature, depth, weights)
+    return leaves
 
 
 @torch.library.custom_op("voronerf::encode_native", mutates_args=(), device_types=("cpu", "cuda"))
@@ -83,6 +100,33 @@ def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | Non
     return depths
 
 
+@torch.library.custom_op("voronerf::draw_cell", mutates_args=(), device_types="cpu")
+def _draw_cell(
+    points: Tensor,
+    centres: Tensor,
+    child_offsets: Tensor,
+    child: Tensor,
+    uniforms: Tensor,
+    temperature: float,
+    depth: int,
+    weights: Tensor | None,
+) -> Tensor:
+    given = (points, centres, weights, child_offsets, child, uniforms)
+    kept = [None if tensor is None else tensor.contiguous() for tensor in given]
+    n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
+    fault = _native._C.locate_cell_fault(_address(kept[3]), _address(kept[4]), g, m)
+    if fault is not None:
+        raise ValueError(f"draw_cell: {fault}")
+    threads = torch.get_num_threads()
+    leaves = points.new_empty(n, dtype=torch.int32)
+    places = child.new_empty(_native._C.draw_cell_places(m, threads))
+    sums = points.new_empty(_native._C.draw_cell_sums(m, threads))
+    addresses = [_address(tensor) for tensor in (*kept, leaves, places, sums)]
+    if not _native._C.draw_cell(*addresses, n, m, depth, temperature, _native._ISA, threads):
+        raise ValueError(f"draw_cell: depth must be the number of levels of the tree, got {depth}, which is too few")
+    return leaves
+
+
 def _workspace(x: Tensor, octaves: int) -> Tensor:
     return x.new_empty(_native._C.encode_workspace(x.shape[1], octaves, torch.get_num_threads()))
 
@@ -121,6 +165,20 @@ def _(gradient: Tensor, x: Tensor, variances: Tensor | None, octaves: int, inclu
 @_resample.register_fake
 def _(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
     return _allocate_depths(edges, count)
+
+
+@_draw_cell.register_fake
+def _(
+    points: Tensor,
+    centres: Tensor,
+    child_offsets: Tensor,
+    child: Tensor,
+    uniforms: Tensor,
+    temperature: float,
+    depth: int,
+    weights: Tensor | None,
+) -> Tensor:
+    return points.new_empty(points.shape[0], dtype=torch.int32)
 
 
 _encode.register_autograd(encode_gradients(_encode_backward), setup_context=encode_setup)

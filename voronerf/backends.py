@@ -31,6 +31,7 @@ OPS = (
     "centre_grid",
     "nearest_centre_grid",
     "locate_cell",
+    "draw_cell",
     "cell_sort",
     "grouped_linear",
     "grouped_mlp",
@@ -108,6 +109,7 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
         "voronerf._native_grid:nearest_centre_grid", ("cpu",), _COORDINATES
     ),
     ("locate_cell", "native"): Implementation("voronerf._native:locate_cell", ("cpu", "cuda"), _COORDINATES),
+    ("draw_cell", "native"): Implementation("voronerf._native_sampling:draw_cell", ("cpu",), (torch.float32,)),
     ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
     ("grouped_linear", "native"): Implementation("voronerf._native_linear:grouped_linear", ("cpu", "cuda"), _FLOATS),
     ("grouped_mlp", "native"): Implementation("voronerf._native_mlp:grouped_mlp", ("cpu", "cuda"), _FLOATS),
@@ -127,6 +129,7 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("nearest_centre", "warp"): _warp("nearest_centre", dtypes=_COORDINATES),
     ("nearest_centre_grid", "warp"): _warp("nearest_centre_grid", dtypes=_COORDINATES),
     ("locate_cell", "warp"): _warp("locate_cell", dtypes=_COORDINATES),
+    ("draw_cell", "warp"): _warp("draw_cell", dtypes=(torch.float32,)),
     ("cell_sort", "warp"): _warp("cell_sort", dtypes=(torch.int32,)),
     ("composite", "warp"): _warp("composite"),
     ("frequency_encode", "warp"): _warp("frequency_encode", file="encode"),

@@ -24,7 +24,6 @@ from torch import Tensor, nn
 
 from voronerf import backends, ops
 
-_CHUNK_ELEMENTS = 1 << 22  # distances held at once by sample_cell: 16 MiB in float32
 # From this many centres on a grid answers sooner than a search of all, and once this many points have been asked about,
 # making it has cost less than going on without (see ops.centre_grid).
 _GRID_CENTRES = 384
@@ -32,7 +31,7 @@ _GRID_POINTS = 1 << 17
 
 
 class VoronoiDiagram(nn.Module):
-    """A Voronoi or power diagram of any depth, as flat tables that `ops.locate_cell` reads.
+    """A Voronoi or power diagram of any depth, as flat tables that `ops.locate_cell` and `ops.draw_cell` read.
 
     A diagram is never changed in place by its own methods: `refine` returns a new one. Its buffers stay float32
     whatever dtype a surrounding module is converted to, because rounding the centres would move samples to networks
@@ -53,7 +52,6 @@ class VoronoiDiagram(nn.Module):
     power: Tensor | None
     depth: int
     num_cells: int
-    _widest: int
     _grid: ops.CentreGrid | None = None
     _points_located: int = 0
 
@@ -85,8 +83,6 @@ class VoronoiDiagram(nn.Module):
 
     def _set_tables(self, centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None) -> None:
         self.depth, self.num_cells = _check_tree(centres, child_offsets, child, power)
-        # Kept as a number, so that drawing cells inside a training loop does not wait for the device.
-        self._widest = int(child_offsets.diff().max())
         self.register_buffer("centres", centres)
         self.register_buffer("child_offsets", child_offsets)
         self.register_buffer("child", child)
@@ -200,7 +196,14 @@ class VoronoiDiagram(nn.Module):
         """What is copied and pickled: all but the grid, which can be made again."""
         return {name: value for name, value in self.__dict__.items() if name not in ("_grid", "_points_located")}
 
-    def sample_cell(self, points: Tensor, *, temperature: float, generator: torch.Generator | None = None) -> Tensor:
+    def sample_cell(
+        self,
+        points: Tensor,
+        *,
+        temperature: float,
+        generator: torch.Generator | None = None,
+        backend: str = "auto",
+    ) -> Tensor:
         """Draws the leaf of each point at random, near centres being likelier (the paper's stochastic assignment).
 
         The paper draws the cell "from the vector of distances" and leaves the law open. Here, at each level of the
@@ -212,12 +215,13 @@ class VoronoiDiagram(nn.Module):
         length in scene units, about the width of the band along the borders in which cells mix. With power weights
         `d_i = sqrt(|x - v_i|^2 + max_j w_j - w_i)` over the siblings j, which is the plain distance when all weights
         are equal and does not depend on a constant added to them. The limit of temperature 0 is `locate`, which is what
-        0 gives.
+        0 gives. One number a point and level is drawn, uniform in 0 to 1 (`ops.draw_cell`).
 
         Args:
-            points: floating [..., 3].
+            points: floating [..., 3]; compared in float32.
             temperature: >= 0, in scene units.
             generator: on any device, what it draws is moved to that of `points`; None for torch's global one.
+            backend: see `voronerf.backends`.
 
         Returns:
             int32 [...] leaf numbers.
@@ -228,36 +232,22 @@ class VoronoiDiagram(nn.Module):
         if not 0.0 <= temperature < float("inf"):
             raise ValueError(f"sample_cell: temperature must be finite and at least 0, got {temperature}")
         if temperature == 0.0:
-            return self.locate(points)
+            return self.locate(points, backend=backend)
         flat = self._flatten("sample_cell", points).to(torch.float32)
-        pieces = flat.split(max(1, _CHUNK_ELEMENTS // (3 * self._widest)))
-        cells = [self._sample_piece(piece, temperature, generator) for piece in pieces]
-        return torch.cat(cells).reshape(points.shape[:-1]) if cells else flat.new_empty(0, dtype=torch.int32)
-
-    def _sample_piece(self, points: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
-        drawn_on = points.device if generator is None else generator.device
-        column = torch.arange(self._widest, device=points.device)
-        last = self.centres.shape[0] - 1
-        child = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
-        for _ in range(self.depth):
-            node = child.clamp(min=0)
-            first = self.child_offsets[node]
-            rows = (first[:, None] + column).clamp(max=last)
-            absent = first[:, None] + column >= self.child_offsets[node + 1][:, None]
-            squared = (points[:, None] - self.centres[rows]).square().sum(2)
-            if self.power is not None:
-                weights = self.power[rows].masked_fill(absent, -float("inf"))
-                squared = squared + weights.amax(1, keepdim=True) - self.power[rows]
-            # Gumbel-max: the argmax of logit - log(e), e exponential, is a draw from the softmax of the logits.
-            noise = (
-                torch.empty(squared.shape, dtype=squared.dtype, device=drawn_on).exponential_(generator=generator).log()
-            )
-            score = (-squared.clamp(min=0).sqrt() / temperature - noise.to(points.device)).nan_to_num(
-                nan=-1e30, neginf=-1e30
-            )
-            choice = score.masked_fill(absent, -float("inf")).argmax(1, keepdim=True)
-            child = torch.where(child < 0, child, self.child[rows.gather(1, choice).squeeze(1)])
-        return -1 - child
+        drawn_on = flat.device if generator is None else generator.device
+        uniforms = torch.rand(flat.shape[0], self.depth, generator=generator, device=drawn_on, dtype=torch.float32)
+        cells = ops.draw_cell(
+            flat,
+            self.centres,
+            self.child_offsets,
+            self.child,
+            uniforms.to(flat.device),
+            temperature=temperature,
+            depth=self.depth,
+            weights=self.power,
+            backend=backend,
+        )
+        return cells.reshape(points.shape[:-1])
 
     def refine(self, children: Mapping[int, "Tensor | VoronoiDiagram"]) -> tuple["VoronoiDiagram", Tensor]:
         """A new diagram in which the named leaves are refined; the other leaves stay as they are.

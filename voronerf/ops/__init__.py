@@ -12,6 +12,7 @@ from voronerf.ops.cast_solids import cast_solids
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
+from voronerf.ops.draw_cell import draw_cell
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
@@ -36,6 +37,7 @@ __all__ = [
     "cell_sort",
     "centre_grid",
     "composite",
+    "draw_cell",
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",

@@ -189,7 +189,9 @@ class VoronoiRouter(nn.Module):
     def assign(self, positions: Tensor) -> Tensor:
         """The cell that evaluates each position: positions [n, 3] -> int32 [n]."""
         if self.assignment == "stochastic" and self.training and self.num_cells > 1:
-            return self.diagram.sample_cell(positions, temperature=self.temperature, generator=self.generator)
+            return self.diagram.sample_cell(
+                positions, temperature=self.temperature, generator=self.generator, backend=self.backend
+            )
         return self.diagram.locate(positions, backend=self.backend)
 
     def forward(self, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:

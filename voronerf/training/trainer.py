@@ -96,7 +96,9 @@ class Trainer:
         # Every op of a step is looked up now: a backend that cannot train should say so before anything is written.
         marching = ("march_rays", "update_occupancy") if config.occupancy else ()
         drawing = () if config.sampling == "stratified" else ("resample",)
-        for op in ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", *marching, *drawing):
+        assigning = ("draw_cell",) if config.assignment == "stochastic" else ()
+        ops = ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite")
+        for op in (*ops, *marching, *drawing, *assigning):
             backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
         backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
         self.generator = torch.Generator().manual_seed(config.seed)

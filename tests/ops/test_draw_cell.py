@@ -1,0 +1,318 @@
+"""draw_cell: the law, level by level, the numbers that decide, every backend and instruction set."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from op_cases import refused, strided
+from torch import Tensor
+
+from voronerf import VoronoiDiagram, backends
+from voronerf.ops import draw_cell, nearest_centre
+
+pytestmark = pytest.mark.op("draw_cell")
+
+# Diagram 0 has three centres: the first a leaf, the second refined by diagram 1, the third by diagram 2, whose second
+# centre is refined by diagram 3. Leaves are numbered depth first.
+CHILD_OFFSETS = torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32)
+CHILD = torch.tensor([-1, 1, 2, -2, -3, -4, 3, -5, -6, -7], dtype=torch.int32)
+DEPTH = 3
+Tables = tuple[Tensor, Tensor]
+
+
+def flat(k: int, device: torch.device | str = "cpu") -> Tables:
+    """The tables of one diagram."""
+    return (
+        torch.tensor([0, k], dtype=torch.int32, device=device),
+        -torch.arange(k, dtype=torch.int32, device=device) - 1,
+    )
+
+
+def draw(points: Tensor, centres: Tensor, uniforms: Tensor, temperature: float, **options: object) -> Tensor:
+    """In one diagram, by a number for each point."""
+    tables = flat(centres.shape[0], centres.device)
+    return draw_cell(points, centres, *tables, uniforms[:, None], temperature=temperature, depth=1, **options)  # type: ignore[arg-type]
+
+
+def slow(
+    points: Tensor,
+    centres: Tensor,
+    tables: Tables,
+    uniforms: Tensor,
+    temperature: float,
+    depth: int,
+    weights: Tensor | None = None,
+) -> tuple[list[int], list[float]]:
+    """Leaves by the formula in float64, a point at a time, and how far each number is from where another is drawn."""
+    offsets, child = tables
+    leaves, margins = [], []
+    for point, own in zip(points.double(), uniforms.double()):
+        diagram, margin = 0, math.inf
+        for level in range(depth):
+            rows = slice(int(offsets[diagram]), int(offsets[diagram + 1]))
+            squared = (point - centres[rows].double()).square().sum(-1)
+            if weights is not None:
+                squared = squared + weights[rows].double().max() - weights[rows].double()
+            sums = torch.softmax(-squared.sqrt() / temperature, 0).cumsum(0)
+            drawn = min(int((sums < 1 - own[level]).sum()), len(sums) - 1)
+            margin = min([margin, *((sums[:-1] - (1 - own[level])).abs().tolist())])
+            diagram = int(child[rows][drawn])
+            if diagram < 0:
+                break
+        leaves.append(-diagram - 1)
+        margins.append(margin)
+    return leaves, margins
+
+
+def agree(leaves: Tensor, expected: list[int], margins: list[float], tolerance: float) -> None:
+    """Equal wherever the numbers are not within rounding of a border; nearly all are not."""
+    assert leaves.dtype == torch.int32
+    clear = [i for i, margin in enumerate(margins) if margin > tolerance]
+    assert len(clear) >= 0.95 * len(margins)
+    found = leaves.tolist()
+    assert [found[i] for i in clear] == [expected[i] for i in clear]
+
+
+def chi_square(counts: Tensor, probabilities: Tensor) -> float:
+    """Of classes that are expected at least five times; the others are one class."""
+    expected = probabilities.double() * counts.sum()
+    rare = expected < 5
+    pairs = [(float(c), float(e)) for c, e in zip(counts[~rare], expected[~rare])]
+    if bool(rare.any()):
+        pairs.append((float(counts[rare].sum()), float(expected[rare].sum())))
+    return sum((c - e) ** 2 / e for c, e in pairs if e >= 5) / max(1, len(pairs) - 1)
+
+
+@pytest.mark.parametrize("n", [0, 1, 257])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_uneven_tree_is_the_formula(device: torch.device, backend: str, n: int, weighted: bool) -> None:
+    points, centres, uniforms = torch.randn(n, 3), torch.randn(10, 3), torch.rand(n, DEPTH)
+    weights = torch.rand(10) if weighted else None
+    leaves = draw_cell(
+        *(tensor.to(device) for tensor in (points, centres, CHILD_OFFSETS, CHILD, uniforms)),
+        temperature=0.4,
+        depth=DEPTH,
+        weights=None if weights is None else weights.to(device),
+        backend=backend,
+    )
+    expected = slow(points, centres, (CHILD_OFFSETS, CHILD), uniforms, 0.4, DEPTH, weights)
+    agree(leaves.cpu(), *expected, tolerance=1e-5)
+
+
+@pytest.mark.parametrize("k", [1, 2, 15, 17, 1000])
+@pytest.mark.parametrize("temperature", [0.05, 2.0])
+def test_many_cells(device: torch.device, backend: str, k: int, temperature: float) -> None:
+    points, centres, uniforms = strided(torch.rand(301, 3)), torch.rand(k, 3), torch.rand(301)
+    leaves = draw(points.to(device), centres.to(device), uniforms.to(device), temperature, backend=backend)
+    expected = slow(points, centres, flat(k), uniforms[:, None], temperature, 1)
+    agree(leaves.cpu(), *expected, tolerance=1e-5)
+
+
+def test_frequencies_are_those_of_the_law(device: torch.device, backend: str) -> None:
+    """Chi square by degree of freedom, at each of some places: its mean is 1, and 3 is far beyond its spread."""
+    n, k, temperature = 20_000, 12, 0.3
+    centres, places = torch.rand(k, 3), torch.rand(4, 3)
+    for place in places:
+        leaves = draw(
+            place.expand(n, 3).to(device), centres.to(device), torch.rand(n).to(device), temperature, backend=backend
+        )
+        law = torch.softmax(-(place - centres).double().norm(dim=1) / temperature, 0)
+        assert chi_square(torch.bincount(leaves.cpu(), minlength=k), law) < 3.0
+        wrong = torch.softmax(-(place - centres).double().norm(dim=1) / (1.3 * temperature), 0)
+        assert chi_square(torch.bincount(leaves.cpu(), minlength=k), wrong) > 3.0
+
+
+def test_along_the_path_frequencies_multiply(device: torch.device, backend: str) -> None:
+    n, temperature = 30_000, 0.7
+    centres, place = torch.randn(10, 3), torch.randn(3)
+    tables = tuple(table.to(device) for table in (CHILD_OFFSETS, CHILD))
+    leaves = draw_cell(
+        place.expand(n, 3).to(device),
+        centres.to(device),
+        *tables,
+        torch.rand(n, DEPTH).to(device),
+        temperature=temperature,
+        depth=DEPTH,
+        backend=backend,
+    )
+    level = [
+        torch.softmax(-(place - centres[a:b]).double().norm(dim=1) / temperature, 0)
+        for a, b in zip(CHILD_OFFSETS[:-1].tolist(), CHILD_OFFSETS[1:].tolist())
+    ]
+    second = torch.cat([level[2][:1], level[2][1] * level[3]])
+    law = torch.cat([level[0][:1], level[0][1] * level[1], level[0][2] * second])
+    assert chi_square(torch.bincount(leaves.cpu(), minlength=7), law) < 3.0
+
+
+def test_numbers_at_and_beyond_the_ends(device: torch.device, backend: str) -> None:
+    """0 is the last centre with any mass, what is nearly 1 the first; never one without mass."""
+    centres = torch.tensor([[50.0, 0, 0], [0, 0, 0], [1, 0, 0], [60, 0, 0]], device=device)
+    uniforms = torch.tensor([0.0, -3.0, math.nan, 1 - 2**-24, 1.0, 7.0], device=device)
+    leaves = draw(torch.zeros(6, 3, device=device), centres, uniforms, 0.5, backend=backend)
+    assert leaves.tolist() == [2, 2, 2, 1, 1, 1]
+
+
+def test_the_coldest_is_the_nearest_and_the_hottest_is_even(device: torch.device, backend: str) -> None:
+    points, centres = 8 * torch.rand(500, 3, device=device), 8 * torch.rand(20, 3, device=device)
+    uniforms = torch.rand(500, device=device)
+    for temperature in (1e-30, 1e-44, 1e-6):
+        cold = draw(points, centres, uniforms, temperature, backend=backend)
+        assert int((cold != nearest_centre(points, centres)).sum()) <= 1
+    for temperature in (1e30, 1e300):
+        hot = draw(points, centres, uniforms, temperature, backend=backend)
+        even = ((1 - uniforms.double()) * 20).ceil().long() - 1
+        assert int((hot != even).sum()) <= 1
+    far = draw(points + 1e6, centres + 1e6, uniforms, 1e-3, backend=backend)  # the temperature is lost in rounding
+    assert bool(((far >= 0) & (far < 20)).all())
+
+
+def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device: torch.device, backend: str) -> None:
+    points = torch.tensor([[math.nan, 0, 0], [0, math.inf, 0], [1e30, 0, 0]], device=device)
+    centres, uniforms = torch.rand(10, 3, device=device), torch.tensor([0.0, 0.5, 0.9], device=device)
+    # Here the first centre of the root is refined too.
+    child = torch.tensor([1, -1, 2, -6, -3, -4, 3, -5, -2, -7], dtype=torch.int32, device=device)
+    leaves = draw_cell(
+        points,
+        centres,
+        CHILD_OFFSETS.to(device),
+        child,
+        uniforms[:, None].expand(3, DEPTH),
+        temperature=0.2,
+        depth=DEPTH,
+        backend=backend,
+    )
+    assert leaves.tolist() == [5, 5, 5]
+
+
+def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(device: torch.device, backend: str) -> None:
+    centres, n = torch.rand(10, 3, device=device), 30_000
+    points, uniforms = torch.rand(n, 3, device=device), torch.rand(n, DEPTH, device=device)
+    tables = (CHILD_OFFSETS.to(device), CHILD.to(device))
+
+    def run(rows: slice) -> Tensor:
+        return draw_cell(points[rows], centres, *tables, uniforms[rows], temperature=0.2, depth=DEPTH, backend=backend)
+
+    leaves = run(slice(None))
+    expected = slow(points[::97].cpu(), centres.cpu(), (CHILD_OFFSETS, CHILD), uniforms[::97].cpu(), 0.2, DEPTH)
+    agree(leaves[::97].cpu(), *expected, tolerance=1e-5)
+    if backend != "reference":  # whose sums may be taken in another order for other shapes
+        assert torch.equal(run(slice(5, 4242)), leaves[5:4242])
+
+
+def test_compiles(device: torch.device, backend: str) -> None:
+    points, centres = torch.rand(501, 3, device=device), torch.rand(10, 3, device=device)
+    offsets, child, uniforms = CHILD_OFFSETS.to(device), CHILD.to(device), torch.rand(501, DEPTH, device=device)
+
+    def run(points: Tensor) -> Tensor:
+        return draw_cell(points, centres, offsets, child, uniforms, temperature=0.3, depth=DEPTH, backend=backend)
+
+    assert torch.equal(torch.compile(run, fullgraph=True, backend="aot_eager")(points), run(points))
+
+
+def test_half_types_and_float64() -> None:
+    points, centres, uniforms = torch.rand(40, 3).half(), torch.rand(6, 3), torch.rand(40)
+    assert torch.equal(draw(points, centres, uniforms, 0.2), draw(points.float(), centres, uniforms, 0.2))
+    expected = slow(points, centres, flat(6), uniforms[:, None], 0.2, 1)
+    agree(draw(points.double(), centres.double(), uniforms.double(), 0.2), *expected, tolerance=1e-12)
+    with pytest.raises(backends.BackendUnavailable, match="takes 'float32', not float64"):
+        draw(points.double(), centres.double(), uniforms.double(), 0.2, backend="native")
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("isa", ["portable", "avx2", "avx512"])
+@pytest.mark.parametrize("shape", [(12,), (1000,), (4, 5)])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_every_instruction_set_and_number_of_threads(
+    isa: str, shape: tuple[int, ...], weighted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from voronerf import _native
+
+    if not _native._C.isa_supported(_native.ISAS.index(isa)):
+        pytest.skip(f"this processor has no {isa}")
+    monkeypatch.setattr(_native, "_ISA", _native.ISAS.index(isa))
+    diagram = VoronoiDiagram(torch.rand(shape[0], 3), weights=0.1 * torch.rand(shape[0]) if weighted else None)
+    for k in shape[1:]:
+        diagram, _ = diagram.refine(
+            {leaf: VoronoiDiagram(torch.rand(k, 3), weights=torch.rand(k) if weighted else None) for leaf in range(3)}
+        )
+    n = 2049 + 33
+    points, uniforms = torch.rand(n, 3), torch.rand(n, diagram.depth)
+    tables = (diagram.centres, diagram.child_offsets, diagram.child)
+    options = {"temperature": 0.1, "depth": diagram.depth, "weights": diagram.power}
+    leaves = draw_cell(points, *tables, uniforms, backend="native", **options)  # type: ignore[arg-type]
+    expected = slow(points[::5], tables[0], tables[1:], uniforms[::5], 0.1, diagram.depth, diagram.power)
+    agree(leaves[::5], *expected, tolerance=1e-5)
+    rows = torch.arange(n) % 7 != 0
+    thinned = draw_cell(points[rows], *tables, uniforms[rows], backend="native", **options)  # type: ignore[arg-type]
+    assert torch.equal(thinned, leaves[rows])
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        assert torch.equal(draw_cell(points, *tables, uniforms, backend="native", **options), leaves)  # type: ignore[arg-type]
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.native
+def test_native_refuses_unsound_tables_and_passes_opcheck() -> None:
+    points, centres, uniforms = torch.rand(40, 3), torch.rand(10, 3), torch.rand(40, DEPTH)
+
+    def run(offsets: Tensor, child: Tensor, depth: int) -> Tensor:
+        return draw_cell(
+            points, centres, offsets, child, uniforms[:, :depth], temperature=0.3, depth=depth, backend="native"
+        )
+
+    for offsets, child, depth, message in (
+        (CHILD_OFFSETS, CHILD, 1, "depth must be the number of levels of the tree, got 1, which is too few"),
+        (CHILD_OFFSETS, CHILD + 4, DEPTH, "child must name a diagram"),
+        (CHILD_OFFSETS.clamp(max=5), CHILD, DEPTH, "child_offsets must go from 0 to the number of centres"),
+    ):
+        with pytest.raises(ValueError, match=f"draw_cell: {message}"):
+            run(offsets, child, depth)
+    given = (points, centres, CHILD_OFFSETS, CHILD, uniforms, 0.3, DEPTH)
+    torch.library.opcheck(torch.ops.voronerf.draw_cell.default, (*given, None))
+    torch.library.opcheck(torch.ops.voronerf.draw_cell.default, (*given, torch.rand(10)))
+
+
+@pytest.mark.warp
+def test_warp_passes_opcheck_and_stays_inside_unsound_tables() -> None:
+    points, centres = torch.rand(7, 3), torch.rand(3, 3)
+    draw(points, centres, torch.rand(7), 0.3, backend="warp")
+    op = torch.ops.voronerf.draw_cell_warp.default
+    torch.library.opcheck(op, (points, centres, *flat(3), torch.rand(7, 1), 0.3, 1, torch.rand(3)))
+    for offsets, child, depth in (
+        ([0, 3], [5, 1_000_000_000, 9], 3),  # no such diagram
+        ([0, 0, 3], [1, 1, 1], 2),  # a diagram without centres
+        ([0, 1, 3], [1, 1, 0], 4),  # a walk that ends at no leaf
+    ):
+        tables = (torch.tensor(table, dtype=torch.int32) for table in (offsets, child))
+        assert bool((op(points, centres, *tables, torch.rand(7, depth), 0.3, depth, None) < 0).all())
+
+
+def test_errors() -> None:
+    points, centres, uniforms = torch.rand(4, 3), torch.rand(10, 3), torch.rand(4, 3)
+    tables = (CHILD_OFFSETS, CHILD)
+    good = {"temperature": 0.1, "depth": 3}
+    with refused(ValueError, "draw_cell: points must have shape [n, 3], got [3]"):
+        draw_cell(points[0], centres, *tables, uniforms, **good)  # type: ignore[arg-type]
+    with refused(ValueError, "draw_cell: centres must have shape [m, 3], got [10, 2]"):
+        draw_cell(points, centres[:, :2], *tables, uniforms, **good)  # type: ignore[arg-type]
+    with refused(ValueError, "draw_cell: uniforms must have shape [n, depth] with n = 4, depth = 3, got [4, 2]"):
+        draw_cell(points, centres, *tables, uniforms[:, :2], **good)  # type: ignore[arg-type]
+    with refused(ValueError, "draw_cell: child must have shape [m] with m = 9, got [10]"):
+        draw_cell(points, centres[:9], *tables, uniforms, **good)  # type: ignore[arg-type]
+    with refused(ValueError, "draw_cell: weights must have shape [m] with m = 10, got [1]"):
+        draw_cell(points, centres, *tables, uniforms, weights=torch.zeros(1), **good)  # type: ignore[arg-type]
+    with refused(ValueError, "draw_cell: depth must be at least 1, got 0"):
+        draw_cell(points, centres, *tables, uniforms[:, :0], temperature=0.1, depth=0)
+    for temperature in (0.0, -1.0, math.inf, math.nan):
+        with refused(ValueError, f"draw_cell: temperature must be positive and finite, got {temperature}"):
+            draw_cell(points, centres, *tables, uniforms, temperature=temperature, depth=3)
+    with refused(ValueError, "draw_cell: centres must hold ... got 0 centres in 4 diagrams"):
+        draw_cell(points, centres[:0], CHILD_OFFSETS, CHILD[:0], uniforms, **good)  # type: ignore[arg-type]
+    with refused(TypeError, "draw_cell: child must have dtype int32, got int64"):
+        draw_cell(points, centres, CHILD_OFFSETS, CHILD.long(), uniforms, **good)  # type: ignore[arg-type]
+    with refused(ValueError, "draw_cell: uniforms must be on the device of points, cpu, got meta"):
+        draw_cell(points, centres, *tables, uniforms.to("meta"), **good)  # type: ignore[arg-type]

@@ -1,0 +1,100 @@
+"""Leaves of a tree of Voronoi diagrams drawn by their distances. n points, m centres of all diagrams together, g
+diagrams."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
+
+_OP = "draw_cell"
+
+
+def draw_cell(
+    points: Tensor,
+    centres: Tensor,
+    child_offsets: Tensor,
+    child: Tensor,
+    uniforms: Tensor,
+    *,
+    temperature: float,
+    depth: int,
+    weights: Tensor | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """A leaf for every point, drawn level by level from the vector of its distances.
+
+    In the diagram reached so far, centre i is drawn with a probability in proportion to
+
+        exp(-d_i / temperature),    d_i = |x - c_i|,    with power weights d_i = sqrt(|x - c_i|^2 + max_j w_j - w_i),
+
+    by the inverse of the distribution: it is the first centre up to which the probabilities sum to at least 1 - u, u
+    being the point's number for that level. Equal numbers give equal leaves on all backends except where 1 - u lies
+    within rounding of such a sum. The arithmetic is that of the points' dtype, float32 at least; what is less likely
+    than the nearest centre by a factor of e^20 may count as impossible. A point that is not finite, or whose squared
+    distances overflow, takes the first centre at every level. Not differentiable.
+
+    What is said of unsound tables in `locate_cell` holds here.
+
+    Args:
+        points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are taken as float32.
+        centres: [m, 3] floating point, finite, m >= 1; every diagram has at least one.
+        child_offsets: int32 [g + 1], g >= 1, and
+        child: int32 [m]: the tree, as in `locate_cell`.
+        uniforms: [n, depth] floating point, in 0 to 1; others are clamped, what is not a number counts as 0.
+        temperature: above 0, finite, in scene units.
+        depth: levels of the tree, 1 for a flat diagram.
+        weights: [m] floating point or None: power diagrams (squared scene units), finite.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        leaf int32 [n].
+
+    Raises:
+        ValueError: shapes, devices, temperature, depth or an unknown backend; tables that are no tree, where they are
+            refused.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "points", points, ("n", 3), sizes)
+    check_shape(_OP, "centres", centres, ("m", 3), sizes)
+    check_shape(_OP, "child_offsets", child_offsets, ("g+1",), sizes)
+    check_shape(_OP, "child", child, ("m",), sizes)
+    check_integer(_OP, "depth", depth, 1)
+    check_shape(_OP, "uniforms", uniforms, ("n", "depth"), {**sizes, "depth": depth})
+    check_dtype(_OP, "points", points)
+    check_dtype(_OP, "centres", centres)
+    check_dtype(_OP, "child_offsets", child_offsets, INDEX)
+    check_dtype(_OP, "child", child, INDEX)
+    check_dtype(_OP, "uniforms", uniforms)
+    if weights is not None:
+        check_shape(_OP, "weights", weights, ("m",), sizes)
+        check_dtype(_OP, "weights", weights)
+    check_same_device(
+        _OP,
+        points=points,
+        centres=centres,
+        child_offsets=child_offsets,
+        child=child,
+        uniforms=uniforms,
+        weights=weights,
+    )
+    check_count(_OP, "points", sizes["n"])
+    if not 0.0 < temperature < float("inf"):
+        raise ValueError(f"{_OP}: temperature must be positive and finite, got {temperature}")
+    if sizes["m"] < 1 or sizes["g"] < 1:
+        count = f"{sizes['m']} centres in {sizes['g']} diagrams"
+        raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
+    dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
+    if weights is not None:
+        dtype = torch.promote_types(dtype, weights.dtype)
+        weights = weights.detach().to(dtype)
+    points, centres, uniforms = (tensor.detach().to(dtype) for tensor in (points, centres, uniforms))
+    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=dtype)
+    leaf: Tensor = run(
+        points, centres, child_offsets, child, uniforms, temperature=float(temperature), depth=depth, weights=weights
+    )
+    return leaf
