@@ -66,6 +66,7 @@ def small(out: Path, **settings: Any) -> TrainConfig:
     [
         {},
         {"precision": "bf16"},
+        {"precision": "fp16"},
         {"background": "white", "assignment": "stochastic"},
         {"sampling": "hierarchical"},
         {"sampling": "proposal"},
@@ -169,13 +170,50 @@ def test_a_learning_rate_in_a_tensor_is_changed_in_place() -> None:
     assert optimizer.param_groups[0]["lr"] == 0.5
 
 
-def test_bfloat16_learns_with_parameters_in_float32(tmp_path: Path, scene: Scene) -> None:
+def test_half_types_learn_with_parameters_in_float32(tmp_path: Path, scene: Scene) -> None:
     psnr = {}
-    for precision in ("fp32", "bf16"):
+    for precision in ("fp32", "bf16", "fp16"):
         trainer = Trainer(small(tmp_path / precision, precision=precision, steps=150), scene)
         psnr[precision] = trainer.run()["psnr"]
         assert all(parameter.dtype == torch.float32 for parameter in trainer.router.parameters())
-    assert psnr["bf16"] != psnr["fp32"] and psnr["bf16"] > psnr["fp32"] - 1.5 and psnr["bf16"] > 12
+        assert trainer.scaler.is_enabled() == (precision == "fp16")
+    for precision in ("bf16", "fp16"):
+        assert psnr[precision] != psnr["fp32"] and psnr[precision] > psnr["fp32"] - 1.5 and psnr[precision] > 12
+
+
+def test_a_step_that_overflows_is_left_out_and_the_scale_halved(tmp_path: Path, scene: Scene) -> None:
+    trainer = Trainer(small(tmp_path, precision="fp16"), scene)
+    for _ in range(2):
+        trainer._step()
+    scale = trainer.scaler.get_scale()
+    before = [parameter.detach().clone() for parameter in trainer.router.parameters()]
+    moments = [state["exp_avg"].clone() for state in trainer.optimizer.state.values()]
+    first = next(trainer.router.parameters())
+    first.register_hook(lambda gradient: gradient.fill_(torch.inf))
+    trainer._step()
+    assert trainer.scaler.get_scale() == scale / 2
+    assert all(torch.equal(a, b) for a, b in zip(before, trainer.router.parameters()))
+    assert all(torch.equal(a, state["exp_avg"]) for a, state in zip(moments, trainer.optimizer.state.values()))
+
+
+def test_a_resumed_run_goes_on_with_its_scale(tmp_path: Path, scene: Scene) -> None:
+    """Bit for bit, a scale that has been halved included."""
+    whole = Trainer(small(tmp_path / "whole", precision="fp16", steps=16), scene)
+    begun = Trainer(small(tmp_path / "parts", precision="fp16", steps=16), scene)
+    for trainer in (whole, begun):
+        trainer._step()
+        trainer.scaler.update(2.0**12)
+        trainer.step = 1
+    begun._step()
+    begun.step = 2
+    begun.save()
+    resumed = Trainer(small(tmp_path / "parts", precision="fp16", steps=16, resume=True), scene)
+    whole._step()
+    for trainer in (whole, resumed):
+        trainer.step = 2
+        trainer._step()
+        assert trainer.scaler.get_scale() == 2.0**12 and trainer.scaler._get_growth_tracker() == 3
+    assert all(torch.equal(a, b) for a, b in zip(whole.router.parameters(), resumed.router.parameters()))
 
 
 def test_graphs_need_a_gpu_and_no_grid() -> None:
@@ -186,7 +224,7 @@ def test_graphs_need_a_gpu_and_no_grid() -> None:
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("settings", [{}, {"sampling": "hierarchical", "precision": "bf16"}])
+@pytest.mark.parametrize("settings", [{}, {"sampling": "hierarchical", "precision": "bf16"}, {"precision": "fp16"}])
 def test_replayed_steps_are_the_steps_themselves(tmp_path: Path, scene: Scene, settings: dict[str, Any]) -> None:
     """The same seeds, the same draws: the losses of a graphed run and of a plain one agree."""
     losses = []

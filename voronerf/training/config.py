@@ -119,8 +119,9 @@ class TrainConfig:
     """Skip the samples in cells of space found empty, in training and in its pictures; needs a scene with a box."""
     occupancy_resolution: int = 64
     """Cells of that grid along each axis."""
-    precision: Literal["fp32", "bf16"] = "fp32"
-    """Products of the networks while training: float32, or bfloat16 with sums, parameters and moments in float32."""
+    precision: Literal["fp32", "bf16", "fp16"] = "fp32"
+    """Products of the networks while training: float32, or bfloat16, or float16 with a scaled loss (a CPU's are float32
+    then, and only what networks answer is rounded); sums, parameters and moments are float32."""
     cuda_graph: bool = False
     """On CUDA: capture a whole step in a graph and replay it, anew after each split; without --occupancy."""
     lr: float | None = None

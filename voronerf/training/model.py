@@ -23,6 +23,8 @@ from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig, default_learning_rate
 
+#: What the networks' products are rounded to, by the configuration's precision; float32 is left alone.
+HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 #: Channels, layers and frequencies of the proposal's density network: small, and asked about coarse intervals alone.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
 #: A sample that takes less of the light than this, were its cell that dense throughout, is not worth asking for: in

@@ -36,6 +36,7 @@ from voronerf.training.files import read_json_lines, write_text
 from voronerf.training.graphs import GraphedStep, set_learning_rate
 from voronerf.training.lpips import Lpips, find_lpips
 from voronerf.training.model import (
+    HALVES,
     OCCUPANCY_DECAY,
     checkpoint_path,
     make_grid,
@@ -114,6 +115,7 @@ class Trainer:
         for router in self.routers.values():
             router.generator = self.draws
         self.optimizer = make_optimizer(self.routers, config)
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=config.precision == "fp16")
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
         self.occupancy = make_grid(config, scene, self.device) if config.occupancy else None
         self.renderer = make_renderer(config, scene, self.routers, occupancy=self.occupancy)
@@ -249,7 +251,8 @@ class Trainer:
         if batch.alpha is not None and config.background == "random":
             drawn = torch.rand(config.rays, 3, generator=self.draws, device=self.draws.device)
             background = drawn.to(self.device)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=config.precision == "bf16", cache_enabled=False):
+        half = HALVES.get(config.precision)
+        with torch.autocast(self.device.type, half, enabled=half is not None, cache_enabled=False):
             passes = self.renderer.render(
                 batch.rays, batch.near, batch.far, background=background, jitter=True, generator=self.draws
             )
@@ -258,8 +261,10 @@ class Trainer:
         target = batch.target(background)
         loss = self.renderer.loss(passes, target)
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimizer.step()
+        # All on the device: the fused optimiser itself leaves out a step whose gradients have overflowed.
+        self.scaler.scale(loss).backward()
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
         if self.level >= len(self.plan):
             return loss.detach(), None, None
         # Importance of a sample: its weight in the image times its ray's error (section 3.1 of the paper).
@@ -381,6 +386,8 @@ class Trainer:
         }
         if self.occupancy is not None:
             parts["occupancy"] = self.occupancy.state_dict()
+        if self.scaler.is_enabled():
+            parts["scaler"] = self.scaler.state_dict()
         for prefix, group in parts.items():
             tensors |= {f"{prefix}.{name}": torch.as_tensor(value) for name, value in group.items()}
         values = {
@@ -402,6 +409,7 @@ class Trainer:
         restore_routers(self.routers, checkpoint)
         self.optimizer = make_optimizer(self.routers, self.config)
         load_optimizer_tensors(self.optimizer, checkpoint.group("optimizer"))
+        self.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
         self.reservoir.load_state_dict(checkpoint.group("reservoir"))
         occupancy = checkpoint.group("occupancy")
         if occupancy:

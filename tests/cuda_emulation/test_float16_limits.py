@@ -1,0 +1,99 @@
+"""Networks on CUDA whose values come near float16's largest, and pass it: no NaN where float32 has none.
+
+Every activation, fused and layer by layer. What a value exceeds is cut off (65,504), what a gradient exceeds is
+infinite, for a GradScaler to see; the other samples and cells are as exact as ever.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from emulated import emulated
+from emulated_networks import KIB
+from torch import Tensor
+
+import voronerf
+from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
+
+LARGEST = 65504.0
+WAYS = pytest.mark.parametrize("shared", [227, 1], ids=["fused", "by-layers"])
+ROWS, CELLS = 40, 2
+
+
+def network(activation: str) -> MLP:
+    """A layer of large values, one that reads them, and outputs of both."""
+    return MLP((Layer((POSITIONS,), 16, activation), Layer((0,), 16, activation), Layer((1,), 3)), (2, 0))
+
+
+def given(layers: MLP, size: float) -> list[Tensor]:
+    """Positions, weights and biases, numbers of float16. An eighth of the rows has a first layer of this size, positive
+    in half of the columns; the other rows have one of 1."""
+    torch.manual_seed(1)
+    positions = torch.ones(ROWS, 3) / 4
+    positions[::8, 0] = size
+    shapes = layers.weight_shapes(3, 0)
+    weights = [torch.randn(CELLS, o, i) / i**0.5 for o, i in shapes]
+    weights[0][:, :, 0] = torch.tensor([1.0, -1.0]).repeat(8)
+    # What comes after the large values is small again.
+    parameters = [weights[0], *(weight / 64 for weight in weights[1:]), *(torch.zeros(CELLS, o) for o, _ in shapes)]
+    return [positions, *(parameter.half().float() for parameter in parameters)]
+
+
+def outcome(layers: MLP, parts: list[Tensor], dtype: torch.dtype, backend: str, scale: float = 1.0) -> list[Tensor]:
+    """Output, gradients of positions, weights and biases, for a gradient of ``scale``; as in training, parameters are
+    in float32, and float16 is autocast's."""
+    leaves = [part.to(dtype).requires_grad_() for part in parts]
+    count, offsets = len(layers.layers), torch.tensor([0, 23, ROWS], dtype=torch.int32)
+    with torch.autocast("cpu", torch.float16, enabled=backend == "native"):
+        out = voronerf.grouped_mlp(
+            leaves[0], offsets, leaves[1 : 1 + count], leaves[1 + count :], layers=layers, backend=backend
+        )
+    return [out, *torch.autograd.grad(out, leaves, torch.full_like(out, scale))]
+
+
+def run(layers: MLP, parts: list[Tensor], shared: int, scale: float = 1.0) -> list[Tensor]:
+    with emulated(shared_bytes=shared * KIB):
+        return outcome(layers, parts, torch.float32, "native", scale)
+
+
+@WAYS
+@pytest.mark.parametrize("activation", [activation for activation in ACTIVATIONS if activation != "sine"])
+@pytest.mark.parametrize("size", [0.5 * LARGEST, LARGEST - 32])
+def test_values_below_the_limit_are_exact(activation: str, size: float, shared: int) -> None:
+    """But for the sine, of which the last digit of such an angle is all."""
+    layers = network(activation)
+    parts = given(layers, size)
+    for part, exact in zip(run(layers, parts, shared), outcome(layers, parts, torch.float64, "reference")):
+        assert part.isfinite().all()
+        assert (part.double() - exact).norm() <= 4e-3 * exact.norm() + 1e-5, list(part.shape)
+
+
+@WAYS
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("size", [LARGEST - 32, 65519.0, 65520.0, 2 * LARGEST, 1e6, 1e30])
+def test_values_beyond_the_limit_are_cut_off(activation: str, size: float, shared: int) -> None:
+    """From 65,520 on they would round to infinity. Nothing is a NaN, and what is not large is as it should be."""
+    layers = network(activation)
+    parts = given(layers, size)
+    exact = outcome(layers, parts, torch.float32, "reference")
+    found = run(layers, parts, shared)
+    for part, right in zip(found, exact):
+        assert right.isfinite().all() and not part.isnan().any(), list(part.shape)
+    usual = torch.arange(ROWS) % 8 != 0
+    torch.testing.assert_close(found[0][usual].float(), exact[0][usual], rtol=5e-3, atol=5e-3)
+    torch.testing.assert_close(found[1][usual], exact[1][usual], rtol=5e-3, atol=5e-3)
+
+
+@WAYS
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_gradients_of_a_scaled_loss(activation: str, shared: int) -> None:
+    """They are the same for a power of 2, up to where float16 ends; beyond, not finite, for a GradScaler to see."""
+    layers = network(activation)
+    parts = given(layers, 1.0)
+    plain = run(layers, parts, shared)[1:]
+    for scale in (2.0**-4, 2.0**10):
+        for part, unscaled in zip(run(layers, parts, shared, scale)[1:], plain):
+            torch.testing.assert_close(part / scale, unscaled, rtol=2e-3, atol=2e-3 * float(unscaled.abs().max()))
+    parts[3] = parts[3] * 2.0**12  # the weights of the last layer
+    overflowing = run(layers, parts, shared, 2.0**15)
+    assert any(not part.isfinite().all() for part in overflowing[1:])
