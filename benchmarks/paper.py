@@ -122,7 +122,7 @@ def fitted(settings: Settings) -> dict[str, Any]:
         outcome: dict[str, Any] = json.loads(path.read_text())
         if paper_nested.described(settings).items() <= outcome["metadata"].items():
             return outcome
-    return paper_nested.nested(settings, say)
+    return paper_nested.nested(settings, say) if settings.train else paper_nested.outcome_of([], settings)
 
 
 def table(name: tyro.conf.Positional[Table], settings: Settings) -> None:

@@ -7,15 +7,15 @@ width alone, by one rule for all (see ``voronerf train --lr``).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
+from paper_cells import cell_count_claims, cell_count_variants, early_late_claims, early_late_variants, levels_name
 from paper_claims import Claim, Rows, at_look, equal_claim, fewer_seams, gain_claim, growing_claim, order_claim
 from paper_published import CELLS, HIERARCHICAL, KILONERF, STRATIFIED, Scores
-from paper_runs import Run, Settings, Variant, default_scenes, make_run, open_scene
+from paper_runs import Run, Settings, Variant, default_scenes, make_run
 
 from voronerf.training.config import TrainConfig
-from voronerf.training.model import count_parameters, resolve_config
 
 FIELDS = {"nerf": "NeRF", "mipnerf": "mip-NeRF"}
 SAMPLINGS = ("stratified", "hierarchical")
@@ -29,7 +29,6 @@ KILO_START, KILO_LATE, KILO_CELLS = (
     "16 x 16 Voronoi cells",
 )
 KILO_FIRST_STEPS = 16
-SPLIT_TIMES = (0.05, 0.1, 0.2, 0.4, 0.6)
 NEVER, TOO_EARLY, USUAL, LATE = "never split", "split at 2 %", "split at 20 %", "split at 50 %"
 EARLY = ("after", "at-25", "at-50")
 SOLID, TRANSLUCENT = "builtin", "builtin-translucent"
@@ -247,30 +246,6 @@ def _split_kind_claims(rows: Rows, settings: Settings) -> list[Claim]:
     ]
 
 
-def _early_late_variants(settings: Settings, scene: str) -> list[Variant]:
-    usual = TrainConfig(cells=(settings.cells,)).splits
-    return [
-        Variant(
-            f"split at {100 * at:.0f} %", {"cells": (settings.cells,)} | ({} if (at,) == usual else {"split_at": (at,)})
-        )
-        for at in SPLIT_TIMES
-    ]
-
-
-def _cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
-    levels = [(4,), (8,), (12,), (16,), (32,), (4, 4), *([(16, 16)] if settings.large else [])]
-    reference = TrainConfig(data=scene, cells=(12,))
-    total = count_parameters(resolve_config(reference, open_scene(scene, replace(settings, seeds=1))))
-    own = [Variant(_levels(cells), {"cells": cells}) for cells in levels]
-    # 12 cells are what the others are matched with: one training is both
-    matched = [{"cells": cells} | ({} if cells == (12,) else {"parameters": total}) for cells in levels]
-    return own + [Variant(f"{_levels(cells)}, matched", changes) for cells, changes in zip(levels, matched)]
-
-
-def _levels(cells: tuple[int, ...]) -> str:
-    return f"{' x '.join(map(str, cells))} cells"
-
-
 def _seam_variants(settings: Settings, scene: str) -> list[Variant]:
     cells = {"cells": (settings.cells,)}
     return [Variant(NEAREST, cells), Variant(STOCHASTIC, {**cells, "assignment": "stochastic"})]
@@ -322,7 +297,7 @@ def _limit_claims(rows: Rows, settings: Settings) -> list[Claim]:
 
 
 def _title_variants(settings: Settings, scene: str) -> list[Variant]:
-    return [Variant(_levels(cells), {"cells": cells}) for cells in ((settings.cells,), (4, 4))]
+    return [Variant(levels_name(cells), {"cells": cells}) for cells in ((settings.cells,), (4, 4))]
 
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -368,11 +343,14 @@ EXPERIMENTS: dict[str, Experiment] = {
         _split_kind_variants,
         _split_kind_claims,
     ),
-    "early-late": Experiment("figure", "The time of the split, as a share of the run.", _early_late_variants),
+    "early-late": Experiment(
+        "figure", "The time of the split, as a share of the run.", early_late_variants, early_late_claims
+    ),
     "cell-count": Experiment(
         "figure",
         "The number of cells, with networks of width 64, and with the parameters of 12 such networks in total.",
-        _cell_count_variants,
+        cell_count_variants,
+        cell_count_claims,
     ),
     "ghosting": Experiment(
         "figure",

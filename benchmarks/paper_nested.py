@@ -232,17 +232,23 @@ def nested(settings: Settings, say: Callable[[str], None] = print) -> dict[str, 
         results.append(row)
         say(f"{variant:34} seed {seed}  {row['cells']:4d} cells  {row['steps']:6d} steps  psnr {row['psnr']:.2f}")
     save_picture(settings.out / "nested-2d-pictures.png", drawn(image, {v: fits[v, 0] for v in widths}))
+    outcome = outcome_of(results, settings, size=list(image.shape[:2]))
+    write_text(settings.out / "nested-2d.json", json.dumps(outcome, indent=1) + "\n")
+    return outcome
+
+
+def outcome_of(results: list[dict[str, Any]], settings: Settings, **more: Any) -> dict[str, Any]:
+    """{metadata, results, claims} of fits; of none, that they are missing."""
     rows = Rows(results)
     claims = [
         gain_claim(f"a picture: nested cells beat {other}", "-", rows.gains(NESTED, other)) for other in (ONE, MATCHED)
     ]
-    outcome = {
-        "metadata": metadata(**described(settings), size=list(image.shape[:2])),
+    missing = [] if results else ["the fit of a picture"]
+    return {
+        "metadata": metadata(**described(settings), **more, missing=missing),
         "results": results,
         "claims": [claim.to_dict() for claim in claims],
     }
-    write_text(settings.out / "nested-2d.json", json.dumps(outcome, indent=1) + "\n")
-    return outcome
 
 
 def described(settings: Settings) -> dict[str, Any]:

@@ -106,8 +106,10 @@ def write_record(record: Path, results: Mapping[str, Row]) -> None:
         "about": "result.json of trainings of benchmarks/paper.py, by the names of their run directories",
         "machines": sorted({machine_name(row["made_on"]) for row in results.values() if "made_on" in row}),
     }
-    outcome = {"metadata": description, "results": dict(sorted(results.items()))}
-    write_text(record, json.dumps(outcome, indent=1) + "\n")
+    # a line a training: a file that is committed shows in its differences which are new
+    lines = ",\n".join(f"  {json.dumps(name)}: {json.dumps(row)}" for name, row in sorted(results.items()))
+    text = f'{{\n "metadata": {json.dumps(description)},\n "results": {{\n{lines}\n }}\n}}\n'
+    write_text(record, text)
 
 
 def keep(folders: Iterable[Path], record: Path) -> tuple[int, int]:

@@ -352,11 +352,12 @@ def test_matched_parameters(load: Load, settings: Any) -> None:
     model = importlib.import_module("voronerf.training.model")
     scene = load("paper_runs").open_scene("builtin", settings)
     counts = {}
-    for name in ("12 cells", "12 cells, matched", "4 cells, matched", "32 cells, matched"):
+    for name in ("12 cells", "12 cells, matched", "4 cells, matched", "32 cells, matched", "one network, matched"):
         variant = load("paper_runs").Variant(name, variants[name])
         counts[name] = model.count_parameters(model.resolve_config(run(variant, "builtin", 0, settings).config, scene))
     total = counts["12 cells"]
     assert counts["12 cells, matched"] == total and all(0.9 * total < count <= total for count in counts.values())
+    assert variants["one network"] == {"cells": ()}
 
 
 # --- tables, plots, the page -----------------------------------------------------------------------------------------
@@ -406,6 +407,10 @@ def test_balance_and_a_nested_picture(load: Load, settings: Any, out: Path, monk
         raise AssertionError("fitted again")
 
     monkeypatch.setattr(nested, "nested", refuse)
+    assert load("paper").experiment("nested-2d", replace(small, train=False))["results"] == outcome["results"]
+    absent = load("paper").experiment("nested-2d", replace(small, train=False, budget=0.5))
+    assert absent["results"] == [] and absent["metadata"]["missing"] == ["the fit of a picture"]
+    assert {claim["verdict"] for claim in absent["claims"]} == {"not measured"}
     assert load("paper").experiment("nested-2d", small)["results"] == outcome["results"]
     for name, value in (("WIDTH", 8), ("SPLITS", (0.5,)), ("RATE", 0.02)):
         with monkeypatch.context() as patched, pytest.raises(AssertionError, match="fitted again"):

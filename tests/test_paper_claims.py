@@ -179,6 +179,54 @@ def test_balanced_over_random_over_uniform(load: Load, settings: Any) -> None:
     assert "-1.00 dB" in other.here and "+3.00 dB" in other.here
 
 
+def test_early_and_late_splits_cost(load: Load, settings: Any) -> None:
+    experiments, claims = load("paper_experiments"), load("paper_claims")
+    experiment = experiments.EXPERIMENTS["early-late"]
+    usual = load("paper_cells").SPLIT_TIMES.index(load("paper_cells").TYPICAL)
+    names = [variant.name for variant in experiment.variants(settings, "builtin")]
+    assert (names[0], names[usual], names[-1]) == ("split at 5 %", "split at 20 %", "split at 60 %")
+
+    def judged(early: float, late: float) -> list[tuple[str, str]]:
+        scores = {0: early, usual: 30.0, len(names) - 1: late}
+        rows = claims.Rows(synthetic(experiment, settings, lambda i: scores.get(i, 99.0)))
+        return [(claim.here.split(" (")[0], claim.verdict) for claim in experiment.claims(rows, settings)]
+
+    holds, fails = "holds for every seed", "does not hold"
+    assert judged(28.0, 29.0) == [("+2.00 dB", holds), ("+1.00 dB", holds)]
+    assert judged(28.0, 31.0) == [("+2.00 dB", holds), ("-1.00 dB", fails)]
+    assert judged(33.0, 29.0) == [("-3.00 dB", fails), ("+1.00 dB", holds)]
+
+
+def test_more_cells_at_one_width_and_at_matched_parameters(load: Load, settings: Any) -> None:
+    experiments, claims = load("paper_experiments"), load("paper_claims")
+    experiment = experiments.EXPERIMENTS["cell-count"]
+    names = [variant.name for variant in experiment.variants(settings, "builtin")]
+
+    def judged(**scores: float) -> list[Any]:
+        known = {name.replace("_", " ").replace("matched", ", matched"): value for name, value in scores.items()}
+        assert known.keys() <= set(names)
+        rows = claims.Rows(synthetic(experiment, settings, lambda i: known.get(names[i], 0.0)))
+        return list(experiment.claims(rows, settings))
+
+    def cells(*scores: float) -> dict[str, float]:
+        return {f"{count}_cells": score for count, score in zip(load("paper_cells").COUNTS, scores)}
+
+    matched = {"12_cellsmatched": 27.0, "one_networkmatched": 26.0, "32_cellsmatched": 25.0, "4_cellsmatched": 28.0}
+    most, steps, alone, least = judged(**cells(20, 21, 22, 23, 24), **matched)
+    assert [claim.verdict for claim in (most, steps, alone, least)] == [
+        "holds for every seed",
+        "holds for every seed",
+        "holds for every seed",
+        "does not hold",
+    ]
+    assert [claim.here[:8] for claim in (most, alone, least)] == ["+4.00 dB", "+1.00 dB", "-3.00 dB"]
+    assert "32 cells beat 4 cells" in most.claim and "12 cells beat one network" in alone.claim
+    assert {most.published, steps.published, alone.published} == {"-"}
+    most, steps, *_ = judged(**cells(20, 21, 19, 23, 24), **matched)
+    assert most.verdict == "holds for every seed"
+    assert "12 cells over 8 cells: does not hold" in steps.verdict and "8 cells over 4 cells: holds" in steps.verdict
+
+
 @pytest.mark.parametrize(
     ("before", "after", "start"),
     [(0.2, 0.0017, "holds"), (0.5, 0.003, "the factor holds: 167"), (0.2, 0.02, "evener by a factor of 10"),

@@ -57,6 +57,13 @@ def test_names_of_runs_stay(load: Load, tmp_path: Path, monkeypatch: pytest.Monk
         assert names["NeRF, stratified: one network, width 256"] == "lego-0-0e0d08c58b73"
         assert names["NeRF, stratified: one network, width 64"] == "lego-0-e591eb1cb98a"
         assert names["NeRF, stratified: 12 Voronoi cells, width 64"] == "lego-0-5173d9c5022a"
+    small = runs.Settings(
+        scene=("lego",), downscale=8, budget=16, rays=512, samples=48, evaluations=6, eval_views=4, final_views=10
+    )
+    committed = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "paper_16s.json"
+    for name in ("sampling", "kilonerf", "seams", "early-late", "split-kinds", "initialisation"):
+        made = {run.folder.name for run in experiments.EXPERIMENTS[name].runs(small)}
+        assert made <= load("paper_records").read_record(committed).keys(), name
 
 
 def test_a_table_is_made_in_parts(
