@@ -36,6 +36,8 @@ from voronerf.training.trainer import Trainer, TrainingError
 
 Row = dict[str, Any]
 PUBLISHED_SIZE = 400
+#: Settings that came after results were kept: at their defaults they are left out of a training's name.
+LATER = {"proposal_rounds": 1, "distortion": 0.0}
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device"}
 
@@ -213,6 +215,7 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: 
         assert usual is not None
         config = replace(config, lr=rate * usual)
     known = {k: v for k, v in json.loads(config.to_json()).items() if k not in (*NOT_IDENTITY, "lpips")}
+    known = {name: value for name, value in known.items() if name not in LATER or value != LATER[name]}
     if float(known["budget"]).is_integer():
         known["budget"] = int(known["budget"])  # 480 and 480.0 are one
     text = json.dumps({**known, "scene": short, "looks": paper_looks.VERSION}, sort_keys=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -13,7 +14,9 @@ from voronerf.rendering import Contraction, OccupancyGrid, Rays, Renderer, rende
 from voronerf.rendering.sampling import (
     PADDING,
     blurred_weights,
+    distortion_loss,
     interlevel_loss,
+    normalised,
     strata_uniforms,
     stratified_edges,
     union_depths,
@@ -154,6 +157,70 @@ def test_a_proposal_that_bounds_the_weights_costs_nothing() -> None:
     ) == pytest.approx(0, abs=1e-9)
 
 
+def test_distortion_loss_against_slow_loop() -> None:
+    generator = torch.Generator().manual_seed(0)
+    edges = torch.rand(6, 8, generator=generator).sort(dim=1).values
+    weights = torch.rand(6, 7, generator=generator).requires_grad_()
+    expected = 0.0
+    for r in range(6):
+        w, e = weights[r].tolist(), edges[r].tolist()
+        middles = [(a + b) / 2 for a, b in itertools.pairwise(e)]
+        expected += sum(w[i] * w[j] * abs(middles[i] - middles[j]) for i in range(7) for j in range(7)) / 6
+        expected += sum(w[i] ** 2 * (e[i + 1] - e[i]) / 3 for i in range(7)) / 6
+    loss = distortion_loss(edges, weights)
+    assert float(loss.detach()) == pytest.approx(expected, rel=1e-5)
+    loss.backward()
+    assert weights.grad is not None and bool((weights.grad > 0).all())
+    exact = weights.detach().double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda w: distortion_loss(edges.double(), w), exact)
+    # the integral that it stands for, of a density that is constant in each interval
+    u = torch.linspace(0, 1, 2001, dtype=torch.float64)[:-1] + 1 / 4000
+    ends, mass = torch.tensor([0.0, 0.3, 0.5, 1.0]), torch.tensor([0.2, 0.7, 0.1])
+    density = (mass / ends.diff()).double()[torch.bucketize(u, ends[1:-1].double())]
+    integral = float((density[:, None] * density * (u[:, None] - u).abs()).mean())
+    assert float(distortion_loss(ends[None], mass[None])) == pytest.approx(integral, rel=1e-3)
+
+
+def test_distances_as_fractions() -> None:
+    near, far = torch.tensor([1.0, 2.0, 3.0, 0.0]), torch.tensor([4.0, 2.0, 30.0, 5.0])
+    for spacing in ("linear", "disparity"):
+        edges = stratified_edges(near, far, 5, jitter=False, spacing=spacing)
+        found = normalised(edges, near, far, spacing)
+        even = torch.linspace(0, 1, 6)
+        torch.testing.assert_close(found[0], even)
+        torch.testing.assert_close(found[2], even)
+        assert torch.equal(found[1], torch.zeros(6)) and bool(((found[3] >= 0) & (found[3] <= 1)).all())
+
+
+def test_a_spread_along_the_ray_costs_by_its_factor() -> None:
+    target, fog = torch.rand(3, 3), Slab(-0.6, 0.8, density=1.0)
+    for spacing, fields in (("linear", {"field": fog}), ("disparity", {"field": fog, "proposal": fog})):
+        options: dict[str, Any] = {"samples": 6, "fine_samples": 5 * (len(fields) - 1), "spacing": spacing}
+        passes = Renderer(fields, **options).render(rays(), 1.0, 4.0)
+        plain, with_it = (Renderer(fields, distortion=d, **options).loss(passes, target) for d in (0.0, 0.5))
+        last = passes[-1]
+        spread = distortion_loss(normalised(last.edges, torch.ones(3), 4 * torch.ones(3), spacing), last.weights)
+        torch.testing.assert_close(with_it - plain, 0.5 * spread)
+        assert float(spread) > 0
+
+
+def test_a_proposal_is_asked_in_rounds() -> None:
+    field, proposal = Slab(), Slab()
+    renderer = Renderer({"field": field, "proposal": proposal}, samples=8, fine_samples=4, rounds=3)
+    passes = renderer.render(rays(), 0.0, 4.0, jitter=True, generator=torch.Generator().manual_seed(0))
+    assert [list(p.shape) for p in proposal.asked] == [[3 * 8, 3]] * 3
+    assert [list(p.shape) for p in field.asked] == [[3 * 4, 3]] and len(passes) == 4
+    # each round looks closer at what the one before has found
+    inside = [float(((p[:, 2] > -0.3) & (p[:, 2] < 0.3)).float().mean()) for p in (*proposal.asked, *field.asked)]
+    assert inside[0] < inside[1] < inside[2] and inside[3] > inside[0]
+    target = torch.rand(3, 3)
+    last = passes[-1]
+    expected = (last.colour - target).square().mean()
+    for one in passes[:-1]:
+        expected = expected + interlevel_loss(last.edges, last.weights, one.edges, one.weights)
+    torch.testing.assert_close(renderer.loss(passes, target), expected)
+
+
 def test_losses() -> None:
     target = torch.rand(3, 3)
     for fields, share in (({"field": Slab()}, 0.1), ({"field": Slab(), "coarse": Slab(0.2, 0.8)}, 1.0)):
@@ -220,6 +287,13 @@ def test_refusals() -> None:
         Renderer({"field": Slab(), "coarse": Slab()}, samples=3)
     with pytest.raises(ValueError, match="samples must be >= 1 and fine_samples >= 0, got 0 and 0"):
         Renderer({"field": Slab()}, samples=0)
+    for rounds, fields in ((0, {"field": Slab(), "proposal": Slab()}), (2, {"field": Slab(), "coarse": Slab()})):
+        with pytest.raises(ValueError, match=f"rounds must be >= 1, and 1 without a proposal, got {rounds}"):
+            Renderer(fields, samples=3, fine_samples=3, rounds=rounds)
+    with pytest.raises(ValueError, match="distortion must be >= 0 and finite, got -1"):
+        Renderer({"field": Slab()}, samples=3, distortion=-1)
     grid = OccupancyGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), 2, threshold=1.0)
+    with pytest.raises(ValueError, match="without contraction and distortion"):
+        Renderer({"field": Slab()}, samples=3, distortion=0.1, occupancy=grid)
     with pytest.raises(ValueError, match="occupancy must come with a single pass over points"):
         Renderer({"field": Slab()}, samples=3, fine_samples=3, occupancy=grid)

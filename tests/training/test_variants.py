@@ -37,6 +37,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "mipnerf split proposal": {"field": "mipnerf", "sampling": "proposal", "split_proposal": True},
     "nerf contraction": {"contraction": "sphere", "sampling": "hierarchical"},
     "mipnerf contraction": {"contraction": "sphere", "field": "mipnerf"},
+    "mipnerf 360": {
+        "field": "mipnerf",
+        "sampling": "proposal",
+        "proposal_rounds": 2,
+        "contraction": "sphere",
+        "distortion": 0.01,
+    },
 }
 CELLS: dict[str, dict[str, Any]] = {
     "alone": {"cells": ()},
@@ -155,6 +162,7 @@ FLOORS = {
     "mipnerf split proposal": 19.0,
     "nerf contraction": 19.5,
     "mipnerf contraction": 19.0,
+    "mipnerf 360": 19.5,
 }
 
 

@@ -20,7 +20,9 @@ from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.sampling import (
     blurred_weights,
+    distortion_loss,
     interlevel_loss,
+    normalised,
     strata_uniforms,
     stratified_depths,
     stratified_edges,
@@ -55,8 +57,8 @@ class Renderer:
     - "field" alone, no fine samples: one pass over stratified samples.
     - "field" alone with fine samples: it is asked twice (mip-NeRF, section 3.2).
     - "coarse" and "field": the first pass is the coarse field's (NeRF, section 5.2).
-    - "proposal" and "field": the first pass is that of a field whose colours do not count, and which learns to be where
-      the second finds something (mip-NeRF 360, section 3).
+    - "proposal" and "field": before the last pass come those of a field whose colours do not count, and which learns to
+      be where the last finds something, in one or more rounds (mip-NeRF 360, section 3).
 
     The second pass asks about points of both passes, or for cones and after a proposal about new intervals alone.
 
@@ -72,11 +74,13 @@ class Renderer:
         contraction: of the space that the fields live in.
         spacing: of the strata, "linear" or "disparity".
         occupancy: for a single pass over points.
+        rounds: how often a proposal is asked, each time about new intervals where it has found something.
+        distortion: factor of the last pass's `distortion_loss`; 0 is without.
         backend: of the ops.
 
     Raises:
-        ValueError: fields of other names, a second field without fine samples, or occupancy with several passes, cones
-            or a contraction.
+        ValueError: fields of other names, a second field without fine samples, several rounds without a proposal, a
+            negative distortion, or occupancy with several passes, cones, a contraction or distortion.
     """
 
     def __init__(
@@ -89,6 +93,8 @@ class Renderer:
         contraction: Contraction | None = None,
         spacing: str = "linear",
         occupancy: OccupancyGrid | None = None,
+        rounds: int = 1,
+        distortion: float = 0.0,
         backend: str = "auto",
     ) -> None:
         if set(fields) not in ({"field"}, {"field", "coarse"}, {"field", "proposal"}):
@@ -97,11 +103,18 @@ class Renderer:
             raise ValueError(f"Renderer: samples must be >= 1 and fine_samples >= 0, got {samples} and {fine_samples}")
         if len(fields) > 1 and fine_samples < 1:
             raise ValueError("Renderer: fine_samples must be >= 1 with two fields, got 0")
-        if occupancy is not None and (fine_samples or cones or contraction is not None):
-            raise ValueError("Renderer: occupancy must come with a single pass over points, without contraction")
+        if rounds < 1 or (rounds > 1 and "proposal" not in fields):
+            raise ValueError(f"Renderer: rounds must be >= 1, and 1 without a proposal, got {rounds}")
+        if not 0 <= distortion < float("inf"):
+            raise ValueError(f"Renderer: distortion must be >= 0 and finite, got {distortion}")
+        if occupancy is not None and (fine_samples or cones or contraction is not None or distortion):
+            raise ValueError(
+                "Renderer: occupancy must come with a single pass over points, without contraction and distortion"
+            )
         self.fields = dict(fields)
         self.samples, self.fine_samples, self.cones = samples, fine_samples, cones
         self.contraction, self.spacing, self.backend = contraction, spacing, backend
+        self.rounds, self.distortion = rounds, distortion
         self.occupancy = occupancy
 
     @property
@@ -166,19 +179,21 @@ class Renderer:
             depths, _, edges = stratified_depths(
                 near, far, self.samples, jitter=jitter, spacing=self.spacing, generator=generator
             )
-        first = self._ask(
-            self.fields.get("coarse", self.fields.get("proposal", self.field)), rays, depths, edges, background
-        )
+        asked = self.fields.get("coarse", self.fields.get("proposal", self.field))
+        passes = [self._ask(asked, rays, depths, edges, background)]
         if not self.fine_samples:
-            return (first,)
-        weights = first.weights.detach()
+            return tuple(passes)
+        for _ in range(self.rounds - 1):
+            depths, edges = self._intervals(passes[-1], self.samples, jitter, generator)
+            passes.append(self._ask(asked, rays, depths, edges, background))
         if self.cones or "proposal" in self.fields:
-            depths, edges = self._intervals(edges, weights, jitter, generator)
+            depths, edges = self._intervals(passes[-1], self.fine_samples, jitter, generator)
         else:
+            weights, count = passes[-1].weights.detach(), self.fine_samples
             depths, edges = union_depths(
-                depths, edges, weights, self.fine_samples, jitter=jitter, generator=generator, backend=self.backend
+                depths, edges, weights, count, jitter=jitter, generator=generator, backend=self.backend
             )
-        return first, self._ask(self.field, rays, depths, edges, background)
+        return (*passes, self._ask(self.field, rays, depths, edges, background))
 
     def _ask(self, field: Field, rays: Rays, depths: Tensor, edges: Tensor, background: Tensor | None) -> Rendered:
         return render_samples(
@@ -193,12 +208,12 @@ class Renderer:
         )
 
     def _intervals(
-        self, edges: Tensor, weights: Tensor, jitter: bool, generator: torch.Generator | None
+        self, before: Rendered, count: int, jitter: bool, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """New intervals where the first pass found something, and a sample in each."""
-        r, count = len(edges), self.fine_samples
-        uniforms = strata_uniforms(r, count + 1, edges, jitter, generator)
-        edges = resample(blurred_weights(weights), edges, count + 1, uniforms=uniforms, backend=self.backend)
+        """So many new intervals where the pass before found something, and a sample in each."""
+        r, weights = len(before.edges), blurred_weights(before.weights.detach())
+        uniforms = strata_uniforms(r, count + 1, before.edges, jitter, generator)
+        edges = resample(weights, before.edges, count + 1, uniforms=uniforms, backend=self.backend)
         if self.cones or not jitter:
             return (edges[:, 1:] + edges[:, :-1]) / 2, edges
         device = edges.device if generator is None else generator.device
@@ -208,22 +223,28 @@ class Renderer:
     def loss(self, passes: tuple[Rendered | Marched, ...], target: Tensor) -> Tensor:
         """What training minimises: the mean squared error of every pass's colours (NeRF, equation 6).
 
-        The first pass of a field that is asked twice counts a tenth (mip-NeRF, section 3.2); a proposal is measured by
-        `interlevel_loss` instead.
+        The first pass of a field that is asked twice counts a tenth (mip-NeRF, section 3.2); a proposal's passes are
+        measured by `interlevel_loss` instead, and the last pass by `distortion_loss` too where that has a factor.
 
         Args:
             passes: what :meth:`render` returned.
             target: [r, 3].
         """
-        loss = (passes[-1].colour - target).square().mean()
-        if len(passes) == 1:
-            return loss
-        first, last = passes
-        if "proposal" in self.fields:
-            assert isinstance(first, Rendered) and isinstance(last, Rendered)
-            return loss + interlevel_loss(last.edges, last.weights, first.edges, first.weights)
-        share = 1.0 if "coarse" in self.fields else COARSE_SHARE
-        return loss + share * (first.colour - target).square().mean()
+        *before, last = passes
+        loss = (last.colour - target).square().mean()
+        if self.distortion:
+            assert isinstance(passes[0], Rendered) and isinstance(last, Rendered)
+            near, far = passes[0].edges[:, 0], passes[0].edges[:, -1]
+            spread = distortion_loss(normalised(last.edges, near, far, self.spacing), last.weights)
+            loss = loss + self.distortion * spread
+        for first in before:
+            if "proposal" in self.fields:
+                assert isinstance(first, Rendered) and isinstance(last, Rendered)
+                loss = loss + interlevel_loss(last.edges, last.weights, first.edges, first.weights)
+            else:
+                share = 1.0 if "coarse" in self.fields else COARSE_SHARE
+                loss = loss + share * (first.colour - target).square().mean()
+        return loss
 
     @torch.no_grad()
     def image(

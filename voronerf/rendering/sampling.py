@@ -174,6 +174,42 @@ def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tenso
     return (missed.square() / (weights + 1e-7)).sum(dim=1).mean()
 
 
+def normalised(edges: Tensor, near: Tensor, far: Tensor, spacing: str) -> Tensor:
+    """Distances as fractions of the way from near to far, in the spacing of the strata (mip-NeRF 360, equation 11).
+
+    Args:
+        edges: [r, s].
+        near: [r].
+        far: [r]; a ray that ends where it begins has fractions of 0.
+        spacing: "linear" or "disparity".
+    """
+    tiny = torch.finfo(edges.dtype).tiny
+    near, far = near[:, None], far[:, None]
+    fraction = (edges - near) / (far - near).clamp_min(tiny)
+    if spacing == "disparity":
+        fraction = fraction * far / edges.clamp_min(tiny)
+    return fraction.clamp(0, 1)
+
+
+def distortion_loss(edges: Tensor, weights: Tensor) -> Tensor:
+    """How far a ray's weights are spread (Barron et al. 2022, "Mip-NeRF 360", equation 15), the mean over rays.
+
+    The integral of ``w(u) w(v) |u - v|`` over both: ``sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 (s_i+1 - s_i) / 3``. It
+    is small for weights in one place and for none at all, and pulls what floats in front of a surface into it.
+
+    Args:
+        edges: [r, s + 1] ascending, fractions of the way; no gradient.
+        weights: [r, s].
+    """
+    edges = edges.detach()
+    middles, widths = (edges[:, 1:] + edges[:, :-1]) / 2, edges.diff(dim=1)
+    # Middles ascend: of each pair the later one is the larger, and sums over the earlier ones do for all.
+    mass = weights * middles
+    earlier, moment = weights.cumsum(1) - weights, mass.cumsum(1) - mass
+    between = 2 * (weights * (middles * earlier - moment)).sum(1)
+    return (between + (weights.square() * widths).sum(1) / 3).mean()
+
+
 def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:
     """Distance at a fraction of the way, exact at both ends."""
     if spacing == "linear":

@@ -113,6 +113,10 @@ class TrainConfig:
     """Samples per ray of the second pass; nerf's fine network is asked about those of the first as well."""
     split_proposal: bool = False
     """Whether the proposal's density network has cells as well, or stays one for the whole scene."""
+    proposal_rounds: int = 1
+    """How often the proposal's network is asked, each time where it has found something (published: 2)."""
+    distortion: float = 0.0
+    """Factor of a loss on weights spread along a ray (mip-NeRF 360; published: 0.01); 0 is without."""
     contraction: Literal["none", "sphere"] = "none"
     """Space as the networks see it: as it is, or all that is outside of a sphere drawn into one of twice its radius."""
     occupancy: bool = False
@@ -252,6 +256,7 @@ def check_config(config: TrainConfig) -> None:
         "rays",
         "samples",
         "fine_samples",
+        "proposal_rounds",
         "depth",
         "reservoir",
         "reservoir_batches",
@@ -284,6 +289,9 @@ def check_config(config: TrainConfig) -> None:
     need(plain or not config.occupancy, "occupancy", OCCUPANCY_RULE)
     proposes = config.sampling == "proposal"
     need(proposes or not config.split_proposal, "split_proposal", "come with --sampling proposal")
+    need(proposes or config.proposal_rounds == 1, "proposal_rounds", "be 1 without --sampling proposal")
+    need(0 <= config.distortion < float("inf"), "distortion", "be a factor of 0 or more")
+    need(not (config.distortion and config.occupancy), "distortion", "be 0 with --occupancy")
 
 
 def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -> None:

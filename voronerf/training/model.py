@@ -177,6 +177,8 @@ def make_renderer(
         contraction=None if config.contraction == "none" else make_contraction(scene, device),
         spacing=scene.spacing,
         occupancy=occupancy,
+        rounds=config.proposal_rounds,
+        distortion=config.distortion,
         backend=config.backend if backend is None else backend,
     )
 
