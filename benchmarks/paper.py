@@ -37,7 +37,8 @@ from paper_claims import Rows
 from paper_experiments import EXPERIMENTS
 from paper_records import keep, machine_name
 from paper_report import ORDER, claims_text, write_experiment, write_report
-from paper_runs import Run, Settings, default_scenes, failures, results, still_missing, train_missing
+from paper_runs import Run, default_scenes, failures, results, still_missing, train_missing
+from paper_settings import Settings
 
 from voronerf.cli.main import EXPECTED
 from voronerf.training.files import write_text
@@ -105,6 +106,7 @@ def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]
             eval_views=settings.eval_views,
             final_views=settings.final_views,
             backend=settings.backend,
+            options=list(settings.options),
             failed=failures(runs),
             missing=still_missing(runs),
             machines=list(dict.fromkeys(machine_name(row["made_on"]) for row in rows if "made_on" in row)),

@@ -13,7 +13,8 @@ from balance import load_samples, separate_objects
 from harness import metadata
 from paper_claims import NOT_MEASURED, Claim
 from paper_published import BALANCE
-from paper_runs import Run, Settings, Variant, default_scenes, make_run
+from paper_runs import Run, Variant, default_scenes, make_run
+from paper_settings import Settings
 from torch import Tensor
 
 from voronerf.balance import balance

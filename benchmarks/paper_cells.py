@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from paper_claims import Claim, Rows, gain_claim, order_claim
-from paper_runs import Settings, Variant, open_scene
+from paper_runs import Variant, open_scene
+from paper_settings import Settings
 
 from voronerf.training.config import TrainConfig
 from voronerf.training.model import count_parameters, resolve_config

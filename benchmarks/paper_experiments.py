@@ -13,9 +13,10 @@ from typing import Any
 from paper_cells import cell_count_claims, cell_count_variants, early_late_claims, early_late_variants, levels_name
 from paper_claims import Claim, Rows, at_look, equal_claim, fewer_seams, gain_claim, growing_claim, order_claim
 from paper_published import CELLS, HIERARCHICAL, KILONERF, STRATIFIED, Scores
-from paper_runs import Run, Settings, Variant, default_scenes, make_run
+from paper_runs import Run, Variant, default_scenes, make_run
+from paper_settings import Settings
 
-from voronerf.training.config import TrainConfig
+from voronerf.training.config import ConfigError, TrainConfig
 
 FIELDS = {"nerf": "NeRF", "mipnerf": "mip-NeRF"}
 SAMPLINGS = ("stratified", "hierarchical")
@@ -56,7 +57,16 @@ class Experiment:
     published: Callable[[str, str], Scores | None] = lambda variant, scene: None
 
     def runs(self, settings: Settings) -> list[Run]:
-        """Its trainings."""
+        """Its trainings.
+
+        Raises:
+            ConfigError: When --options has what the variants differ in.
+        """
+        for scene in settings.scene or self.scenes():
+            compared = {name for variant in self.variants(settings, scene) for name in variant.changes}
+            if compared & settings.further.keys():
+                names = ", ".join(sorted(compared & settings.further.keys()))
+                raise ConfigError(f"--options must not name what the experiment compares, got {names}")
         return [
             make_run(variant, scene, seed, settings, rate)
             for scene in settings.scene or self.scenes()

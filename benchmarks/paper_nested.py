@@ -19,7 +19,8 @@ import torch
 from harness import metadata
 from paper_claims import Rows, gain_claim
 from paper_looks import held_out_view
-from paper_runs import Settings, default_scenes, open_scene
+from paper_runs import default_scenes, open_scene
+from paper_settings import Settings
 from torch import Tensor, nn
 from turns import take_turns
 

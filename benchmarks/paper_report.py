@@ -75,6 +75,7 @@ def conditions(described: Mapping[str, Any]) -> str:
         f"{described['seeds']} seeds" if described["seeds"] > 1 else "one seed",
         f"{described['rays']} rays x {described['samples']} samples" if "rays" in described else "",
         f"the best of {len(described['rates'])} learning rates for each" if len(described.get("rates", [])) > 1 else "",
+        *(described.get("options") or []),
         *(described.get("machines") or [f"{described['threads']} threads", described["machine"]]),
         *(f"failed: {failure}" for failure in described.get("failed", [])),
     ]

@@ -24,6 +24,7 @@ from typing import Any
 
 import paper_looks
 from paper_records import changed_settings, forget, keep, made_on, read_result, restore
+from paper_settings import Settings
 from turns import take_turns
 
 from voronerf.data import BUILTIN, BUILTIN_SIZE, Scene, load_scene
@@ -37,81 +38,9 @@ from voronerf.training.trainer import Trainer, TrainingError
 Row = dict[str, Any]
 PUBLISHED_SIZE = 400
 #: Settings that came after results were kept: at their defaults they are left out of a training's name.
-LATER = {"proposal_rounds": 1, "distortion": 0.0}
+LATER = {"proposal_rounds": 1, "distortion": 0.0, "lr_split": 1.0}
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device"}
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How large an experiment is."""
-
-    scene: tuple[str, ...] = ()
-    """Scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), or built-in ones; default: lego
-    where it is there, else builtin, and for the tables by sampling and architecture also ship. Results are kept by a
-    scene's name: another scene of that name, or other images in its folder, need another --out, or --again."""
-    downscale: int = 4
-    """Factor on a scene's own images, 400 x 400 as published; the built-in scenes have 100 x 100 at 4. Results are kept
-    by the factor, not by the size that comes out."""
-    budget: float = 480.0
-    """Training seconds of every variant."""
-    seeds: int = 2
-    """Runs of every variant, seeds 0, 1, ..."""
-    out: Path = Path("runs/paper")
-    """Folder for runs, JSON, tables and pictures."""
-    again: bool = False
-    """Make trainings again that are in --out already: their results are deleted before the first one starts. What is
-    interrupted goes on without --again; with it, all begins anew."""
-    turn: float = 5.0
-    """Seconds that a variant trains before the next one has its turn, of those that are trained in one go."""
-    rays: int = 1024
-    """Rays per step."""
-    samples: int = 64
-    """Samples per ray; with two passes half of them in each."""
-    evaluations: int = 8
-    """Evaluations during the budget."""
-    eval_views: int = 10
-    """Test views of an evaluation during training."""
-    final_views: int | None = None
-    """Test views of the final evaluation; default all."""
-    cells: int = 12
-    """Cells of the paper's comparison with one network."""
-    rates: tuple[float, ...] = (1.0,)
-    """Factors on the learning rate: every variant is trained with each of them, and its best mean PSNR counts."""
-    large: bool = False
-    """Also what takes a larger machine: 16 x 16 cells among the numbers of cells."""
-    backend: str = "auto"
-    """Backend of the operations."""
-    variants: str = ""
-    """Train now only variants in whose name this regular expression is found. Tables show what is there of all
-    variants, and say what is missing."""
-    only_seeds: tuple[int, ...] = ()
-    """Train now only these of the seeds."""
-    train: bool = True
-    """With --no-train nothing is trained: tables are made of what is there."""
-    record: Path | None = None
-    """A file of results, to be kept where --out is not: trainings that it knows are not made again, and those made are
-    added to it."""
-
-    def __post_init__(self) -> None:
-        try:
-            re.compile(self.variants)
-        except re.error as error:
-            raise ConfigError(f"--variants must be a regular expression, got {self.variants!r}: {error}") from None
-        if not set(self.only_seeds) <= set(range(self.seeds)):
-            raise ConfigError(f"--only-seeds must be below --seeds {self.seeds}, got {self.only_seeds}")
-        for name in ("downscale", "seeds", "rays", "evaluations", "eval_views"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
-        if self.samples < 2:
-            raise ConfigError(f"--samples must be at least 2, one in each of two passes, got {self.samples}")
-        if self.cells < 2:
-            raise ConfigError(f"--cells must be at least 2, got {self.cells}")
-        if not self.rates or not all(0 < rate < float("inf") for rate in self.rates):
-            raise ConfigError(f"--rates must be positive factors, got {self.rates}")
-        for name in ("budget", "turn"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"--{name} must be a positive number of seconds, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -194,22 +123,27 @@ def _loaded(source: str, downscale: int) -> Scene:
 def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: float = 1.0) -> Run:
     """The training that a variant stands for, with the directory that its settings and the scene's name give it."""
     short = Path(scene).name
-    config = TrainConfig(
-        **{
-            "data": scene_source(scene),
-            "downscale": factor(scene, settings),
-            "seed": seed,
-            "budget": settings.budget,
-            "evaluations": settings.evaluations,
-            "eval_views": settings.eval_views,
-            "final_views": settings.final_views,
-            "rays": settings.rays,
-            "samples": settings.samples,
-            "backend": settings.backend,
-            "checkpoint_every": 1e9,
-            **variant.changes,
-        }
-    )
+    values = {
+        "data": scene_source(scene),
+        "downscale": factor(scene, settings),
+        "seed": seed,
+        "budget": settings.budget,
+        "evaluations": settings.evaluations,
+        "eval_views": settings.eval_views,
+        "final_views": settings.final_views,
+        "rays": settings.rays,
+        "samples": settings.samples,
+        "backend": settings.backend,
+        "checkpoint_every": 1e9,
+        **settings.further,
+        **variant.changes,
+    }
+    try:
+        config = TrainConfig(**values)
+    except TypeError as error:  # an option of another type
+        raise ConfigError(
+            f"--options must have values that their settings take, got {settings.options}: {error}"
+        ) from None
     if rate != 1.0:
         usual = resolve_config(config, open_scene(scene, settings)).lr
         assert usual is not None

@@ -140,6 +140,34 @@ def test_what_is_asked_for_now_is_checked(load: Load) -> None:
         settings(seeds=2, only_seeds=(2,))
 
 
+def test_options_are_those_of_all_variants(load: Load, settings: Any) -> None:
+    experiments = load("paper_experiments").EXPERIMENTS
+    given = replace(settings, options=("lr_split=0.5", "split_at=[0.3]", "balance=transport"))
+    plain, made = (experiments["split-kinds"].runs(s) for s in (settings, given))
+    for before, run in zip(plain, made, strict=True):
+        assert (run.config.lr_split, run.config.split_at, run.config.balance) == (0.5, (0.3,), "transport")
+        assert run.config.cells == before.config.cells and run.folder != before.folder
+    assert load("paper").experiment("split-kinds", replace(given, train=False))["metadata"]["options"] == list(
+        given.options
+    )
+    assert "; lr_split=0.5; split_at=[0.3]; balance=transport; " in (settings.out / "split-kinds.md").read_text()
+    for name, compared in (("early-late", "split_at"), ("limits", "cells, split_at"), ("seams", "assignment")):
+        wrong = tuple(f"{option}=[3]" for option in compared.split(", "))
+        with pytest.raises(ConfigError, match=f"--options must not name what the experiment compares, got {compared}"):
+            experiments[name].runs(replace(settings, options=wrong))
+    for wrong, message in (
+        ("lr", "must be NAME=VALUE, got 'lr'"),
+        ("lr=0.1", "must name settings of `voronerf train` that have no option here, got lr"),
+        ("colour=3", "must name settings of `voronerf train` that have no option here, got colour"),
+    ):
+        with pytest.raises(ConfigError, match=f"--options {message}"):
+            replace(settings, options=(wrong,))
+    with pytest.raises(ConfigError, match="--options must have values that their settings take, got"):
+        experiments["split-kinds"].runs(replace(settings, options=("lr_split=much",)))
+    with pytest.raises(ConfigError, match="--lr-split must be a positive factor, got -1"):
+        experiments["split-kinds"].runs(replace(settings, options=("lr_split=-1",)))
+
+
 def test_a_record_holds_results_and_nothing_of_the_machine_s_folders(
     load: Load, settings: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -70,6 +70,7 @@ def test_json_of_something_else(text: str) -> None:
         ({"blend": -1.0}, "--blend must be a distance of 0 or more, got -1.0"),
         ({"fine_samples": 0}, "--fine-samples must be at least 1, got 0"),
         ({"split_proposal": True}, "--split-proposal must come with --sampling proposal, got True"),
+        ({"lr_split": 0.0}, "--lr-split must be a positive factor, got 0.0"),
         ({"proposal_rounds": 0, "sampling": "proposal"}, "--proposal-rounds must be at least 1, got 0"),
         ({"proposal_rounds": 2}, "--proposal-rounds must be 1 without --sampling proposal, got 2"),
         ({"distortion": -0.1}, "--distortion must be a factor of 0 or more, got -0.1"),

@@ -236,6 +236,22 @@ def test_worst_cell_first_until_there_are_enough(tmp_path: Path, scene: Scene) -
     assert summary["cells"] == trainer.config.final_cells == 11
 
 
+def test_the_learning_rate_changes_at_each_split(tmp_path: Path, scene: Scene) -> None:
+    plain, slower = (
+        Trainer(small(tmp_path / name, cells=(3, 2), lr_split=factor), scene)
+        for name, factor in (("a", 1.0), ("b", 0.5))
+    )
+    rates = []
+    for trainer in (plain, slower):
+        seen: list[tuple[int, float]] = []
+        trainer.on_step = lambda p, trainer=trainer, seen=seen: seen.append((trainer.level, trainer.learning_rate()))
+        trainer.advance()
+        rates.append(seen)
+    assert [level for level, _ in rates[0]] == [level for level, _ in rates[1]] and rates[0][-1][0] == 2
+    for (level, usual), (_, rate) in zip(*rates):
+        assert rate == pytest.approx(0.5**level * usual)
+
+
 @pytest.mark.parametrize("field", ["nerf", "kilonerf"])
 def test_parameters_decide_the_width(tmp_path: Path, scene: Scene, field: str) -> None:
     trainer = Trainer(small(tmp_path, width=None, depth=None, field=field, parameters=30_000), scene)

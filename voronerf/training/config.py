@@ -132,6 +132,8 @@ class TrainConfig:
     """Learning rate of Adam at the start; default: 0.02 up to width 64, beyond in inverse proportion to the width."""
     lr_final: float = 0.05
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
+    lr_split: float = 1.0
+    """Factor on the learning rate at each split, after which a cell's gradients come from fewer samples."""
     warmup: float = 0.02
     """Fraction of the run over which the learning rate rises from a hundredth of --lr."""
     background: Literal["random", "white"] = "random"
@@ -275,6 +277,7 @@ def check_config(config: TrainConfig) -> None:
     need(config.final_views is None or config.final_views >= 1, "final_views", "be at least 1")
     need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
     need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
+    need(0 < config.lr_split < float("inf"), "lr_split", "be a positive factor")
     need(0 <= config.warmup < 1, "warmup", "lie in [0, 1)")
     need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
     need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")

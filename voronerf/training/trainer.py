@@ -156,11 +156,12 @@ class Trainer:
         return len(self.stages) - 1
 
     def learning_rate(self) -> float:
-        """Exponential decay from ``lr`` to ``lr * lr_final``, after a linear rise over the warm-up."""
+        """Exponential decay from ``lr`` to ``lr * lr_final``, after a linear rise over the warm-up; ``lr_split`` of it
+        for each split that was made."""
         config, done = self.config, self.fraction
         assert config.lr is not None
         rise = 1.0 if done >= config.warmup else 0.01 + 0.99 * done / config.warmup
-        return config.lr * rise * math.exp(math.log(config.lr_final) * done)
+        return config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**self.level
 
     def request_stop(self) -> None:
         """Ends training after the step in hand, with a checkpoint; what Ctrl-C does."""
