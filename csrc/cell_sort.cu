@@ -16,6 +16,7 @@
 // Either way every row has one possible place: the result is that of the CPU, bit for bit.
 #include "cell_sort.h"
 #include "cuda_wrappers.h"
+#include "index_maps.h"
 #include "launchers.h"
 #include "radix_sort.h"
 
@@ -29,10 +30,6 @@ constexpr int kAhead = 4;  // steps of 32 rows that are read before they are cou
 constexpr int kScanThreads = 1024;
 constexpr int64_t kScanTile = kCellSortScanTile;
 constexpr int kScanItems = static_cast<int>(kScanTile) / kScanThreads;
-
-__device__ int64_t bucket_of(int32_t cell, int64_t k) {
-  return cell < 0 ? 0 : cell >= k ? k + 1 : cell + 1;
-}
 
 // Calls place(row, position) for every row of the warp's chunk, where position is the value of the row's counter before
 // it. Counters belong to this warp alone; __syncwarp makes the write of one lane visible to the lane that reads next.
@@ -53,7 +50,7 @@ __device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t begi
       const int64_t row = start + 32 * step + lane;
       const bool active = row < end;
       // Lanes past the end form a group of their own, which counts nothing.
-      const int bucket = active ? static_cast<int>(bucket_of(ahead[step], k)) : -1;
+      const int bucket = active ? static_cast<int>(bucket_of_cell(ahead[step], k)) : -1;
       const unsigned peers = __match_any_sync(kAllLanes, bucket);
       const int leader = __ffs(static_cast<int>(peers)) - 1;
       int32_t before = 0;
@@ -167,7 +164,7 @@ __global__ void __launch_bounds__(kThreads) cell_sort_keys(const int32_t* __rest
                                                            int32_t* __restrict__ rows, int64_t n, int64_t k) {
   const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (row >= n) return;
-  keys[row] = static_cast<Key>(bucket_of(cells[row], k));
+  keys[row] = static_cast<Key>(bucket_of_cell(cells[row], k));
   rows[row] = static_cast<int32_t>(row);
 }
 
@@ -177,16 +174,7 @@ __global__ void __launch_bounds__(kThreads)
     cell_sort_offsets(const Key* __restrict__ sorted, int32_t* __restrict__ offsets, int64_t n, int64_t k) {
   const int64_t cell = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (cell > k) return;
-  int64_t low = 0, high = n;
-  while (low < high) {
-    const int64_t middle = (low + high) / 2;
-    if (static_cast<int64_t>(sorted[middle]) <= cell) {  // the bucket of cell c is c + 1
-      low = middle + 1;
-    } else {
-      high = middle;
-    }
-  }
-  offsets[cell] = static_cast<int32_t>(low);
+  offsets[cell] = static_cast<int32_t>(first_above(sorted, n, cell));  // the bucket of cell c is c + 1
 }
 
 unsigned blocks_of(int64_t threads) {

@@ -28,17 +28,6 @@ PackedSources packed_sources(const MlpLayersLayer& layer) {
   return sources;
 }
 
-// The caller's column of a packed one, -1 where there is none.
-__device__ int64_t column_of(const PackedSources& sources, int64_t packed) {
-  int64_t column = 0;
-  for (int s = 0; s < sources.count; ++s) {
-    if (packed < sources.padded[s]) return packed < sources.width[s] ? column + packed : -1;
-    packed -= sources.padded[s];
-    column += sources.width[s];
-  }
-  return -1;
-}
-
 // [k][width][inputs] rounded into [k][padded][stride], what is between cleared.
 template <typename Products>
 __global__ void __launch_bounds__(kThreads)
@@ -49,7 +38,8 @@ __global__ void __launch_bounds__(kThreads)
     const int64_t line = 2 * i / stride, cell = line / padded, row = line - cell * padded;
     float values[2] = {0.0f, 0.0f};
     for (int part = 0; part < 2; ++part) {
-      const int64_t column = column_of(sources, 2 * i - line * stride + part);
+      const int64_t column =
+          column_of_packed(sources.width, sources.padded, sources.count, 2 * i - line * stride + part);
       if (row < width && column >= 0) values[part] = weight[(cell * width + row) * inputs + column];
     }
     Products::store(to + 2 * i, values[0], values[1]);
@@ -177,12 +167,7 @@ __global__ void __launch_bounds__(kThreads)
     const int64_t line = i / columns, column = i - line * columns, cell = line / width, row = line - cell * width;
     int64_t at = padded * stride + row;  // of a bias
     if (column < inputs) {
-      int64_t before = 0, packed = 0;
-      for (int s = 0; s < sources.count && column >= before + sources.width[s]; ++s) {
-        before += sources.width[s];
-        packed += sources.padded[s];
-      }
-      at = row * stride + packed + column - before;
+      at = row * stride + packed_of_column(sources.width, sources.padded, sources.count, column);
     }
     float sum = 0.0f;
     for (int split = 0; split < splits; ++split) sum += partials[(split * k + cell) * partial + at];
@@ -368,8 +353,7 @@ class Call {
       to.cell = plan_.partial;
       to.splits = plan_.splits;
       to.first = slab_.first == 0;
-      const int64_t tiles =
-          ceil_div<int64_t>(to.inputs, kLayersColumns) * ceil_div<int64_t>(to.outputs, kLayersRows) * data_.k;
+      const int64_t tiles = gradient_tiles(to.outputs, to.inputs, kLayersRows, kLayersColumns) * data_.k;
       VN_LAUNCH((mlp_weight_gradient_kernel<Products>), dim3(static_cast<unsigned>(tiles), plan_.splits),
                 kLayersThreads, MlpChunk<Element>::kBytes, stream_, slab_, to);
     }

@@ -4,6 +4,7 @@
 
 #include "grouped_mlp_cuda_layers.h"
 #include "grouped_mlp_cuda_tile.h"
+#include "index_maps.h"
 
 namespace voronerf {
 
@@ -26,17 +27,7 @@ __device__ inline MlpRows mlp_slab_rows(const MlpSlab& slab, int64_t cell) {
 
 // The cell of tile number `tile` of the slab; -1 where there are fewer.
 __device__ inline int64_t mlp_slab_cell(const MlpSlab& slab, int64_t tile) {
-  if (tile >= slab.first_task[slab.k]) return -1;
-  int64_t low = 0, high = slab.k;
-  while (high - low > 1) {
-    const int64_t middle = (low + high) / 2;
-    if (slab.first_task[middle] <= tile) {
-      low = middle;
-    } else {
-      high = middle;
-    }
-  }
-  return low;
+  return tile >= slab.first_task[slab.k] ? -1 : last_not_above(slab.first_task, slab.k, tile);
 }
 
 // One of the products that are summed: a [rows of the slab][depth], and a cell's b, [columns][depth], or transposed
@@ -76,41 +67,29 @@ __device__ __forceinline__ void mlp_fetch(void* to, int to_stride, const void* f
                                           int64_t bytes) {
   constexpr int kWords = kBytes / 16;
   static_assert(kRows * kWords % kLayersThreads == 0, "no thread is left over");
+  const int height = rows < kRows ? static_cast<int>(rows) : kRows;
+  const int width = bytes < kBytes ? static_cast<int>(bytes) : kBytes;
 #pragma unroll
   for (int i = 0; i < kRows * kWords / kLayersThreads; ++i) {
-    const int number = i * kLayersThreads + threadIdx.x, row = number / kWords, word = number - row * kWords;
-    const bool there = row < rows && 16 * word < bytes;
+    const auto [row, word] = fetched_word(threadIdx.x, i, kLayersThreads, kWords);
+    const bool there = row < height && 16 * word < width;
     const auto* source = static_cast<const unsigned char*>(from) + (there ? row * from_stride + 16 * word : 0);
     copy_async(static_cast<unsigned char*>(to) + row * to_stride + 16 * word, source, there);
   }
 }
 
-// Where a warp's sums are: two warps by rows, two by columns, 32 x 64 each.
-__device__ inline int mlp_warp_row() {
-  return threadIdx.x / 32 % 2 * 32;
-}
-__device__ inline int mlp_warp_column() {
-  return threadIdx.x / 64 * 64;
-}
-// 8-column tiles of a warp, of a block's `columns`.
-__device__ inline int mlp_warp_tiles(int64_t columns) {
-  const int64_t mine = columns - mlp_warp_column();
-  return mine <= 0 ? 0 : mine >= 64 ? kMlpTiles : static_cast<int>(mine / 8);
-}
-
 // visit(row, column, x, y) for every pair of a warp's sums, row and column within the block.
 template <typename Visit>
 __device__ __forceinline__ void mlp_visit(const MlpSums<2, kMlpTiles>& sums, int tiles, const Visit& visit) {
-  const int lane = threadIdx.x % 32;
 #pragma unroll
   for (int r = 0; r < 2; ++r) {
 #pragma unroll
     for (int t = 0; t < kMlpTiles; ++t) {
       if (t >= tiles) continue;
 #pragma unroll
-      for (int half = 0; half < 2; ++half) {
-        visit(mlp_warp_row() + 16 * r + lane / 4 + 8 * half, mlp_warp_column() + 8 * t + 2 * (lane % 4),
-              sums[r][t][2 * half], sums[r][t][2 * half + 1]);
+      for (int i = 0; i < 4; i += 2) {
+        const MapPlace place = product_place(threadIdx.x, r, t, i);
+        visit(place.row, place.column, sums[r][t][i], sums[r][t][i + 1]);
       }
     }
   }
@@ -140,7 +119,7 @@ __global__ void __launch_bounds__(kLayersThreads, 3)
   const MlpRows of_cell = mlp_slab_rows(slab, cell);
   const int64_t row = of_cell.begin + (blockIdx.x - slab.first_task[cell]) * kLayersRows, rows = of_cell.end - row;
   const int64_t column = static_cast<int64_t>(blockIdx.y) * kLayersColumns, columns = parts.columns - column;
-  const int tiles = mlp_warp_tiles(columns);
+  const int tiles = product_warp_tiles(threadIdx.x, columns);
   constexpr int kSize = static_cast<int>(sizeof(Element));
 
   // The chunks of all parts one after another; one cursor fetches, another one multiplies.
@@ -183,12 +162,13 @@ __global__ void __launch_bounds__(kLayersThreads, 3)
       const Element* right = left + Chunk::kLeft;
       const int64_t there = parts.parts[p].depth - at;
       const int take = there < Chunk::kDepth ? static_cast<int>(there) : Chunk::kDepth;
-      const Element* a = left + mlp_warp_row() * Chunk::kStride;
+      const Element* a = left + product_warp_place(threadIdx.x).row * Chunk::kStride;
       if constexpr (kTransposed) {
-        Products::template multiply<false, true>(sums, a, Chunk::kStride, right + mlp_warp_column(), Chunk::kWide, take,
-                                                 tiles);
+        Products::template multiply<false, true>(
+            sums, a, Chunk::kStride, right + product_warp_place(threadIdx.x).column, Chunk::kWide, take, tiles);
       } else {
-        Products::template multiply<false, false>(sums, a, Chunk::kStride, right + mlp_warp_column() * Chunk::kStride,
+        Products::template multiply<false, false>(sums, a, Chunk::kStride,
+                                                  right + product_warp_place(threadIdx.x).column * Chunk::kStride,
                                                   Chunk::kStride, take, tiles);
       }
       multiplied = multiplied == kLayersStages - 1 ? 0 : multiplied + 1;
@@ -234,20 +214,16 @@ __global__ void __launch_bounds__(kLayersThreads, 3)
   using Chunk = MlpChunk<Element>;
   VN_DYN_SHARED(Element, shared);
   constexpr int kSize = static_cast<int>(sizeof(Element));
-  const int64_t across = ceil_div<int64_t>(to.inputs, kLayersColumns);
-  const int64_t down = ceil_div<int64_t>(to.outputs, kLayersRows);
-  const int64_t cell = blockIdx.x / (across * down), tile = blockIdx.x - cell * across * down;
-  const int64_t output = tile / across * kLayersRows, input = tile % across * kLayersColumns;
+  const GradientTile tile = gradient_tile(blockIdx.x, to.outputs, to.inputs, kLayersRows, kLayersColumns);
+  const int64_t cell = tile.cell, output = tile.output, input = tile.input;
   const MlpRows of_cell = mlp_slab_rows(slab, cell);
   // Whole chunks for every part but the last.
-  const int64_t share =
-      ceil_div(ceil_div<int64_t>(of_cell.end - of_cell.begin, to.splits), int64_t{Chunk::kDepth}) * Chunk::kDepth;
-  const int64_t begin = of_cell.begin + blockIdx.y * share;
-  const int64_t end = begin + share < of_cell.end ? begin + share : of_cell.end;
+  const RowRange part = part_of_rows(of_cell.begin, of_cell.end, blockIdx.y, to.splits, Chunk::kDepth);
+  const int64_t begin = part.begin, end = part.end;
   // Most cells have no rows in a slab; there is nothing to add then, and to begin with zero.
   if (begin >= end && !to.first) return;  // the whole block
   const int64_t outputs = to.outputs - output, inputs = to.inputs - input;
-  const int tiles = mlp_warp_row() < outputs ? mlp_warp_tiles(inputs) : 0;
+  const int tiles = product_warp_place(threadIdx.x).row < outputs ? product_warp_tiles(threadIdx.x, inputs) : 0;
 
   int64_t fetched = begin;
   int stage = 0;
@@ -279,8 +255,9 @@ __global__ void __launch_bounds__(kLayersThreads, 3)
     fetch();
     const Element* left = shared + multiplied * Chunk::kStage;
     const Element* right = left + Chunk::kLeft;
-    Products::template multiply<true, true>(sums, left + mlp_warp_row(), Chunk::kTall, right + mlp_warp_column(),
-                                            Chunk::kWide, Chunk::kDepth, tiles);
+    Products::template multiply<true, true>(sums, left + product_warp_place(threadIdx.x).row, Chunk::kTall,
+                                            right + product_warp_place(threadIdx.x).column, Chunk::kWide, Chunk::kDepth,
+                                            tiles);
     if (biased) {
       for (int row = 0; row < Chunk::kDepth; ++row) bias += Products::load(left + row * Chunk::kTall + column);
     }

@@ -21,7 +21,7 @@ SANITIZERS = {
     "address": ["-fsanitize=address"],
     "thread": ["-fsanitize=thread"],
 }
-PLAIN = {"emulation.cpp", "module.cpp", "bindings_cuda.cpp"}
+PLAIN = {"emulation.cpp", "module.cpp", "index_maps.cpp", "plans.cpp", "bindings_cuda.cpp"}
 """Files with nothing to watch."""
 SHARED = ("cell_sort_plan.cpp", "grouped_mlp_cuda_plan.cpp", "grouped_mlp_cuda_layers_plan.cpp")
 """What the launchers need of the C++ beside them."""

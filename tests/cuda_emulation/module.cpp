@@ -10,10 +10,14 @@
 
 namespace py = pybind11;
 
+void bind_index_maps(py::module_& module);
+void bind_plans(py::module_& module);
 void planted(const float* values, float* out, int* counter, int blocks, int threads, int bug);
 
 PYBIND11_MODULE(voronerf_emulation, module) {
   bind_cuda(module);
+  bind_index_maps(module);
+  bind_plans(module);
   module.def("planted",
              [](std::uintptr_t values, std::uintptr_t out, std::uintptr_t counter, int blocks, int threads, int bug) {
                planted(reinterpret_cast<const float*>(values), reinterpret_cast<float*>(out),
