@@ -6,21 +6,22 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-STEPS: dict[str, tuple[int, str, bool]] = {
-    "fused": (64, "float32", False),
-    "fused, bfloat16": (64, "bfloat16", False),
-    "fused, directions by an index": (64, "float32", True),
-    "by layers": (300, "float32", False),
-    "by layers, bfloat16, directions by an index": (300, "bfloat16", True),
+STEPS: dict[str, tuple[int, str, bool, int]] = {
+    "fused": (64, "float32", False, 8),
+    "fused, bfloat16": (64, "bfloat16", False, 8),
+    "fused, directions by an index": (64, "float32", True, 8),
+    "by layers": (300, "float32", False, 8),
+    "by layers, bfloat16, directions by an index": (300, "bfloat16", True, 8),
+    "many cells, sorted by radix": (16, "float32", False, 1030),
 }
-"""Steps to capture: the width, beyond 256 layer by layer, the type of the weights, and whether there are directions."""
+"""Steps to capture: the width, beyond 256 layer by layer, the type of the weights, whether there are directions, and
+the number of cells."""
 
 
 def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     """Names and checks, which raise."""
     import torch
-    from emulated_networks import ALLOWED, BRANCHED, GAUSSIANS, WIDE, check
-    from test_emulated_layers import BROAD, DENSE
+    from emulated_networks import ALLOWED, BRANCHED, BROAD, DENSE, GAUSSIANS, WIDE, check
 
     import voronerf
     from voronerf import _native
@@ -141,13 +142,13 @@ def captured_steps(device: str, n: int = 4096) -> list[tuple[str, Callable[..., 
     return [(name, _step(*settings, device, n)) for name, settings in STEPS.items()]
 
 
-def _step(width: int, dtype: str, directed: bool, device: str, n: int) -> Callable[..., list[Any]]:
+def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -> Callable[..., list[Any]]:
     import torch
 
     import voronerf
     from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
-    kind, k = getattr(torch, dtype), 8
+    kind = getattr(torch, dtype)
     last = Layer((1, DIRECTIONS) if directed else (1,), 4)
     layers = MLP((Layer((POSITIONS,), width, "relu"), Layer((0,), width, "relu"), last), (2,), 10, 4)
     shapes = layers.weight_shapes(3, 3 if directed else 0)

@@ -16,13 +16,15 @@ some of them, ``--data DIR`` is a Blender scene for the training.
     racecheck  the same for races in shared memory
     benchmark  benchmarks/throughput.py --quick
 
-DIR gets summary.json and what each part said. The last lines printed are the summary; the exit status counts failures.
+DIR gets summary.json, with the outcome of every part and all that it has found (each case, timing, training and file of
+tests), and what each part said, as text. The last lines printed are the summary; the exit status counts failures.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
 import json
 import os
 import shutil
@@ -45,11 +47,12 @@ SHORTEST = 10.0
 
 @dataclass(frozen=True)
 class Part:
-    """One part: its command, or why it is left out, and the seconds it may take."""
+    """One part: its command, or why it is left out, the seconds it may take, and the JSON that it leaves."""
 
     command: list[str] | str
     seconds: int
     environment: tuple[tuple[str, str], ...] = ()
+    found: Path | None = None
 
 
 def main(arguments: list[str]) -> int:
@@ -89,26 +92,31 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
     apart = (("PYTORCH_NO_CUDA_MEMORY_CACHING", "1"),)
     benchmark = [PYTHON, str(ROOT / "benchmarks" / "throughput.py"), "--device", "cuda", "--quick", "--json"]
 
-    def part(command: list[str], seconds: int, environment: tuple[tuple[str, str], ...] = ()) -> Part:
-        return Part(command, seconds, environment) if architecture else Part("torch sees no GPU", 0)
+    def part(
+        command: list[str], seconds: int, environment: tuple[tuple[str, str], ...] = (), found: Path | None = None
+    ) -> Part:
+        return Part(command, seconds, environment, found) if architecture else Part("torch sees no GPU", 0)
 
     def sanitized(tool: str, environment: tuple[tuple[str, str], ...] = ()) -> Part:
         if sanitizer is None:
             return Part("no compute-sanitizer", 0)
         command = [sanitizer, "--error-exitcode", "9", "--target-processes", "all", "--tool", tool, *own, "small"]
-        return part([*command, "--case-seconds", "30"], 60, environment)
+        found = out / tool
+        return part([*command, str(found), "--case-seconds", "30"], 60, environment, found / "small.json")
 
+    tested = part([*own, "tests", str(out / "tests")], 100, (), out / "tests" / "tests.json")
+    trained, scene = out / "training", "builtin" if data is None else str(data)
     return {
-        "machine": Part([*own, "machine"], 30),
+        "machine": Part([*own, "machine", str(out)], 30, (), out / "machine.json"),
         "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 180, built),
-        "small": part([*own, "small"], 60),
-        "captured": part([*own, "captured"], 45),
-        "roofs": part([*own, "roofs", str(out)], 60),
-        "training": part([*own, "training", str(out / "training"), "builtin" if data is None else str(data)], 75),
-        "tests": part([*own, "tests", str(out / "tests")], 100),
+        "small": part([*own, "small", str(out)], 60, (), out / "small.json"),
+        "captured": part([*own, "captured", str(out)], 45, (), out / "captured.json"),
+        "roofs": part([*own, "roofs", str(out)], 60, (), out / "roofs.json"),
+        "training": part([*own, "training", str(trained), scene], 80, (), trained / "training.json"),
+        "tests": tested if importlib.util.find_spec("pytest") else Part("no pytest", 0),
         "memcheck": sanitized("memcheck", apart),
         "racecheck": sanitized("racecheck"),
-        "benchmark": part([*benchmark, str(out / "throughput.json")], 60),
+        "benchmark": part([*benchmark, str(out / "throughput.json")], 60, (), out / "throughput.json"),
     }
 
 
@@ -121,6 +129,8 @@ def run(name: str, part: Part, out: Path, left: float) -> dict[str, object]:
         return {"outcome": "left out", "seconds": 0.0, "last": "no time left"}
     paths = os.pathsep.join(path for path in (str(ROOT), os.environ.get("PYTHONPATH")) if path)
     environment = {**os.environ, **dict(part.environment), "PYTHONPATH": paths}
+    if part.found is not None:
+        part.found.unlink(missing_ok=True)  # an earlier run's
     begin = time.perf_counter()
     with (out / f"{name}.txt").open("w+", errors="replace") as log:
         try:
@@ -136,7 +146,18 @@ def run(name: str, part: Part, out: Path, left: float) -> dict[str, object]:
         "outcome": "passed" if status == 0 else "failed",
         "seconds": time.perf_counter() - begin,
         "last": last if isinstance(status, int) else f"{status}; {last}",
+        "found": read(part.found),
     }
+
+
+def read(path: Path | None) -> object:
+    """What a part has left as JSON; the reason where that cannot be read, as after an end in the middle of a line."""
+    if path is None or not path.exists():
+        return None
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        return f"{path.name}: {error}"
 
 
 def run_group(command: list[str], environment: dict[str, str], log: TextIO, limit: float) -> int | str:

@@ -7,6 +7,8 @@
     roofs      the kernels at full size, beside the machine's own copy and products
     training   a short training, and one whose steps are replayed from a CUDA graph
 
+Each leaves what it has found in OUT/PART.json as well, after every case, and ``gpu_check.py`` takes it from there.
+
 A CUDA error of a kernel ends all that its process could still do, and so does a kernel that does not end: ``small``,
 ``captured`` and ``roofs`` then start themselves anew with the case after it.
 """
@@ -43,19 +45,46 @@ CASE_SECONDS = 10.0
 """For one case, after which it is said to hang."""
 FILE_SECONDS = 60.0
 """For one file of the tests."""
+OTHER_TESTS = ("training/test_graphs.py", "training/test_trainer.py", "rendering/test_rays_and_sampling.py")
+"""Of tests/, beside those of the operations."""
 
 
-def machine() -> int:
+class Journal:
+    """What a part has found so far, kept in OUT/PART.json; a process that goes on finds it there."""
+
+    def __init__(self, out: Path, part: str, *, begun: bool = False) -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        self.path = out / f"{part}.json"
+        self.found: dict[str, Any] = json.loads(self.path.read_text()) if begun and self.path.exists() else {}
+
+    def add(self, kind: str, row: dict[str, Any]) -> None:
+        """One more row of a kind."""
+        self.put(kind, [*self.found.get(kind, []), row])
+
+    def put(self, kind: str, value: Any) -> None:
+        """A value in the place of the one that was there."""
+        self.found[kind] = value
+        self.path.write_text(json.dumps(self.found, indent=1) + "\n")
+
+
+def machine(out: Path) -> int:
     """Versions, and what is missing with what needs it."""
     import torch
+
+    journal = Journal(out, "machine")
 
     needed = {"setuptools": "the build", "pytest": "the tests", "numpy": "everything", "PIL": "the data"}
     needed |= {"safetensors": "checkpoints", "matplotlib": "curves", "scipy": "some tests"}
     print(f"python {sys.version.split()[0]}, torch {torch.__version__}, CUDA {torch.version.cuda}")
+    journal.put("python", sys.version.split()[0])
+    journal.put("torch", torch.__version__)
+    journal.put("cuda", torch.version.cuda)
+    journal.put("cores", os.cpu_count())
     missing = []
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)
         print(f"{properties.name}: sm_{properties.major}{properties.minor}, {properties.multi_processor_count} SMs")
+        journal.put("device", str(properties))
     else:
         missing.append("a GPU that torch sees (everything)")
     for name, use in needed.items():
@@ -80,8 +109,11 @@ def machine() -> int:
             missing.append(f"{program} ({'the sanitizer' if 'sanitizer' in program else 'the build'})")
             continue
         said = subprocess.run([found, "--version"], capture_output=True, text=True).stdout.splitlines()
-        print(f"{found}: {next((line for line in said if re.search('[0-9][.][0-9]', line)), '')}")
+        version = next((line for line in said if re.search("[0-9][.][0-9]", line)), "")
+        print(f"{found}: {version}")
+        journal.put(program, version)
     print(f"missing: {'; '.join(missing) or 'nothing'}")
+    journal.put("missing", missing)
     return int(any("build" in name or "GPU" in name for name in missing))
 
 
@@ -107,27 +139,38 @@ Case = tuple[str, Callable[[], "str | None"]]
 """A name, and what raises, or says something to be told."""
 
 
-def one_by_one(cases: list[Case], again: Again, settle: Callable[[], None]) -> int:
+def one_by_one(cases: list[Case], again: Again, settle: Callable[[], None], journal: Journal) -> int:
     """Every case for itself; after one that leaves the device unusable, or does not end, the rest in a new process.
 
     ``settle()`` waits for the device, and raises where that is of no use any more.
     """
     settle()  # makes the context, in the time of no case
     failed = again.failed
+
+    def keep(name: str, right: bool, said: str) -> None:
+        journal.add("cases", {"name": name, "right": right, "said": said, "seconds": time.perf_counter() - begin})
+
+    def hangs(name: str, number: int) -> None:
+        said = f"hangs, stopped after {again.case_seconds:g} s"
+        keep(name, False, said)
+        again.go_on(number + 1, failed + 1, f"WRONG  {name}: {said}")
+
     for number in range(again.start, len(cases)):
         name, run = cases[number]
-        said = f"WRONG  {name}: hangs, stopped after {again.case_seconds:g} s"
-        watch = threading.Timer(again.case_seconds, again.go_on, (number + 1, failed + 1, said))
+        begin = time.perf_counter()
+        watch = threading.Timer(again.case_seconds, hangs, (name, number))
         watch.daemon = True
         watch.start()
         try:
             result = run()
             settle()
             print(f"right  {name}{f': {result}' if result else ''}", flush=True)
+            keep(name, True, result or "")
         except Exception as error:
             failed += 1
-            reason = str(error).splitlines()[0] if str(error) else ""
-            print(f"WRONG  {name}: {type(error).__name__}: {reason}", flush=True)
+            reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+            print(f"WRONG  {name}: {reason}", flush=True)
+            keep(name, False, reason)
             traceback.print_exc(file=sys.stdout)
             sys.stdout.flush()
             try:
@@ -148,7 +191,7 @@ def settling(device: str) -> Callable[[], None]:
     return torch.cuda.synchronize if device == "cuda" else lambda: None
 
 
-def small(again: Again) -> int:
+def small(again: Again, journal: Journal) -> int:
     """Every operation, forward and backward."""
     import torch
 
@@ -157,13 +200,13 @@ def small(again: Again) -> int:
         run()
 
     cases: list[Case] = [(name, functools.partial(seeded, run)) for name, run in small_cases("cuda")]
-    return one_by_one(cases, again, settling("cuda"))
+    return one_by_one(cases, again, settling("cuda"), journal)
 
 
-def captured(again: Again) -> int:
+def captured(again: Again, journal: Journal) -> int:
     """Steps captured once and replayed: nearest centre, sort, networks and their gradients."""
     cases: list[Case] = [(name, functools.partial(capture, step)) for name, step in captured_steps("cuda")]
-    return one_by_one(cases, again, settling("cuda"))
+    return one_by_one(cases, again, settling("cuda"), journal)
 
 
 def capture(step: Callable[[], list[Any]]) -> None:
@@ -187,9 +230,13 @@ def capture(step: Callable[[], list[Any]]) -> None:
 
 
 def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECONDS) -> int:
-    """Every file of tests/ops in a process of its own, four at a time; its output goes to ``out``."""
-    out.mkdir(parents=True, exist_ok=True)
-    files = files or sorted((ROOT / "tests" / "ops").glob("test_*.py"))
+    """Every file of tests/ops, and what else has tests for CUDA, in a process of its own, four at a time; its output
+    goes to ``out``."""
+    journal = Journal(out, "tests")
+    files = files or [
+        *sorted((ROOT / "tests" / "ops").glob("test_*.py")),
+        *(ROOT / "tests" / name for name in OTHER_TESTS),
+    ]
     options = ["-q", "-p", "no:cacheprovider", "--tb=short", "-k", "cuda", "--require", "native,cuda"]
 
     def run(file: Path) -> tuple[Path, int | str, list[str]]:
@@ -212,9 +259,10 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
             failed += status not in (0, 5)
             said = "; ".join([status] * isinstance(status, str) + lines[-1:])
             print(f"{'passed' if status in (0, 5) else 'FAILED'}  {file.name}: {said}", flush=True)
-            for line in lines:
-                if line.startswith(("FAILED", "ERROR", "E  ")):
-                    print(f"    {line[:200]}", flush=True)
+            wrong = [line[:200] for line in lines if line.startswith(("FAILED", "ERROR", "E  "))]
+            for line in wrong:
+                print(f"    {line}", flush=True)
+            journal.add("files", {"name": file.name, "right": status in (0, 5), "said": said, "wrong": wrong})
     print(f"{len(files) - failed} of {len(files)} files passed")
     return failed
 
@@ -229,14 +277,12 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     import voronerf
     from voronerf import _native
 
-    where, path = torch.device(device), out / "roofs.json"
-    out.mkdir(parents=True, exist_ok=True)
-    if again.start:
-        kept = json.loads(path.read_text())
-    else:
-        kept = {"limits": {kind: _cuda_peak(kind, where) for kind in ("bfloat16", "float32", "copy")}, "rows": []}
-        path.write_text(json.dumps(kept, indent=1) + "\n")
-        print("limits: " + ", ".join(f"{k} {value / 1e12:.2f} T/s" for k, value in kept["limits"].items()), flush=True)
+    where = torch.device(device)
+    journal = Journal(out, "roofs", begun=again.start > 0)
+    if not again.start:
+        journal.put("limits", {kind: _cuda_peak(kind, where) for kind in ("bfloat16", "float32", "copy")})
+        told = (f"{kind} {value / 1e12:.2f} T/s" for kind, value in journal.found["limits"].items())
+        print("limits: " + ", ".join(told), flush=True)
     stopwatch = Stopwatch(where)
     cases: list[Case] = []
 
@@ -247,9 +293,8 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
             run = prepare()
             times = [stopwatch(lambda _: run(), 0, 1) for _ in range(repeats + 2)]
             seconds = sorted(times[2:])[repeats // 2]
-            share = work / seconds / kept["limits"][limit]
-            kept["rows"].append({"name": name, "seconds": seconds, "limit": limit, "share": share, "aim": aim})
-            path.write_text(json.dumps(kept, indent=1) + "\n")
+            share = work / seconds / journal.found["limits"][limit]
+            journal.add("rows", {"name": name, "seconds": seconds, "limit": limit, "share": share, "aim": aim})
             aimed = "" if aim is None else f", aimed at {100 * aim:.0f} %: {'reached' if share >= aim else 'MISSED'}"
             return f"{1e3 * seconds:.3f} ms, {100 * share:.1f} % of {limit}{aimed}"
 
@@ -295,15 +340,16 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         both_work, both_aim = (price.forward + price.backward) * n, 0.25 if name == "nerf64" else None
         row(f"{name} k={k} forward", forward, "bfloat16", price.forward * n, aims.get(name))
         row(f"{name} k={k} forward + backward", both, "bfloat16", both_work, both_aim)
-    return one_by_one(cases, again, settling(device))
+    return one_by_one(cases, again, settling(device), journal)
 
 
-def training(out: Path, data: str, device: str = "cuda", seconds: float = 15.0) -> int:
+def training(out: Path, data: str, device: str = "cuda", seconds: float = 12.0) -> int:
     """Steps and PSNR of short trainings of the same number of seconds."""
     from voronerf.data import load_scene
     from voronerf.training.config import TrainConfig
     from voronerf.training.trainer import Trainer
 
+    journal = Journal(out, "training")
     scene, failed = load_scene(data, downscale=1 if data == "builtin" else 2), 0
     common: dict[str, Any] = {"data": data, "device": device, "budget": seconds, "cells": (12,), "rays": 4096}
     common |= {"evaluations": 1, "eval_views": 2, "final_views": 5, "panels": 0}
@@ -320,10 +366,12 @@ def training(out: Path, data: str, device: str = "cuda", seconds: float = 15.0) 
                 f"{time.perf_counter() - begin:.0f} s in all",
                 flush=True,
             )
-        except Exception:
+            journal.add("trainings", {"name": name, "settings": options, "right": True, **summary})
+        except Exception as error:
             failed += 1
             print(f"FAILED {name}:")
             traceback.print_exc(file=sys.stdout)
+            journal.add("trainings", {"name": name, "settings": options, "right": False, "said": str(error)})
     return failed
 
 
@@ -331,6 +379,7 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "plain": {},
     "bf16": {"precision": "bf16"},
     "bf16 in a graph": {"precision": "bf16", "cuda_graph": True},
+    "fp16 in a graph": {"precision": "fp16", "cuda_graph": True},
 }
 """What each training sets."""
 
@@ -349,9 +398,9 @@ def main(arguments: list[str]) -> int:
     seconds = given.case_seconds or (2 * CASE_SECONDS if given.part == "roofs" else CASE_SECONDS)
     again = Again((given.part, str(given.out)), given.start, given.failed, seconds)
     runs: dict[str, Callable[[], int]] = {
-        "machine": machine,
-        "small": lambda: small(again),
-        "captured": lambda: captured(again),
+        "machine": lambda: machine(given.out),
+        "small": lambda: small(again, Journal(given.out, "small", begun=given.start > 0)),
+        "captured": lambda: captured(again, Journal(given.out, "captured", begun=given.start > 0)),
         "roofs": lambda: roofs(given.out, again),
         "training": lambda: training(given.out, given.data),
         "tests": lambda: tests(given.out),

@@ -30,6 +30,13 @@ BRANCHED = MLP(
 WIDE = MLP((Layer((POSITIONS,), 130, "sine"), Layer((0, POSITIONS), 70, "sigmoid"), Layer((1,), 4)), (2,))
 GAUSSIANS = MLP((Layer((POSITIONS,), 16, "sigmoid"), Layer((0,), 2)), (1,), 3, position_encoding="integrated")
 
+# Nineteen layers that all read the ones before: more than the fused kernel takes, of layers and of sources.
+DENSE = MLP(
+    (*(Layer((POSITIONS, *range(index)), 5 + index % 3, "softplus") for index in range(18)), Layer((17, 3), 2)),
+    (18, 4, 4),
+)
+BROAD = MLP((Layer((POSITIONS,), 270, "sigmoid"), Layer((0, POSITIONS), 300, "sine"), Layer((1,), 3)), (2,), 2)
+
 
 def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.float32) -> dict:
     """Arguments in float64, the values those of `dtype`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from emulated import emulated, module
-from emulated_networks import ALLOWED, BRANCHED, GAUSSIANS, KIB, WIDE, case, check, run
+from emulated_networks import ALLOWED, BRANCHED, BROAD, DENSE, GAUSSIANS, KIB, WIDE, case, check, run
 
 import voronerf
 from voronerf import _native_mlp
@@ -13,13 +13,6 @@ from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 SMALL = 1 * KIB
 """Shared memory that no fused network fits."""
-
-# Nineteen layers that all read the ones before: more than the fused kernel takes, of layers and of sources.
-DENSE = MLP(
-    (*(Layer((POSITIONS, *range(index)), 5 + index % 3, "softplus") for index in range(18)), Layer((17, 3), 2)),
-    (18, 4, 4),
-)
-BROAD = MLP((Layer((POSITIONS,), 270, "sigmoid"), Layer((0, POSITIONS), 300, "sine"), Layer((1,), 3)), (2,), 2)
 
 
 def plan(layers: MLP, n: int, k: int, *, precision: str = "bfloat16", backward: bool = True) -> dict:

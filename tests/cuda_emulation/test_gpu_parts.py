@@ -64,21 +64,26 @@ def test_steps_to_capture_are_right_on_the_emulated_device(parts: ModuleType, mo
                 difference = (found.double() - exact).norm()
                 assert difference <= allowed * exact.norm() + 1e-7, (name, list(found.shape))
             assert ways[-1] == ("by layers" in name), name
-    assert len(ways) == 5
+    assert len(ways) == len(parts.captured_steps("cpu", 1)) == 6
 
 
 def test_a_wrong_result_is_told(
-    parts: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    parts: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
     def wrong() -> None:
         raise ValueError("not what it should be")
 
     monkeypatch.setattr(parts, "small_cases", lambda device: [("fine", lambda: None), ("bad", wrong)])
     monkeypatch.setattr("torch.cuda.synchronize", lambda: None)
-    assert parts.main(["small"]) == 1
+    assert parts.main(["small", str(tmp_path)]) == 1
     said = capsys.readouterr().out
     assert "right  fine" in said and "WRONG  bad: ValueError: not what it should be" in said
     assert said.endswith("1 of 2 cases are right\n")
+    kept = json.loads((tmp_path / "small.json").read_text())["cases"]
+    assert [(row["name"], row["right"], row["said"]) for row in kept] == [
+        ("fine", True, ""),
+        ("bad", False, "ValueError: not what it should be"),
+    ]
 
 
 AFTER_FAULTS = """
@@ -109,7 +114,7 @@ sys.exit(gpu_parts.main(sys.argv[1:]))
 def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path: Path) -> None:
     """In processes that truly start themselves anew, with a device that stays broken."""
     (tmp_path / "faults.py").write_text(AFTER_FAULTS.format(ci=str(ROOT / ".ci")))
-    command = [sys.executable, "faults.py", "small", "--case-seconds", "0.5"]
+    command = [sys.executable, "faults.py", "small", "out", "--case-seconds", "0.5"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=50)
     told = [line for line in result.stdout.splitlines() if line.startswith(("right", "WRONG"))]
     assert told == [
@@ -120,6 +125,14 @@ def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path: Path
         "right  last",
     ]
     assert result.stdout.endswith("3 of 5 cases are right\n") and result.returncode == 2
+    kept = json.loads((tmp_path / "out" / "small.json").read_text())["cases"]
+    assert [(row["name"], row["right"]) for row in kept] == [
+        ("first", True),
+        ("breaks", False),
+        ("between", True),
+        ("hangs", False),
+        ("last", True),
+    ]
 
 
 @pytest.mark.native
@@ -147,11 +160,15 @@ def test_training(
     assert parts.training(tmp_path, "builtin", "cpu", 0.5) == 0
     ungraphed = [settings for settings in parts.TRAININGS.values() if "cuda_graph" not in settings]
     assert capsys.readouterr().out.count("PSNR") == len(ungraphed) == 2
+    kept = json.loads((tmp_path / "training.json").read_text())["trainings"]
+    assert [row["name"] for row in kept] == ["plain", "bf16"] and all(row["right"] and row["psnr"] > 0 for row in kept)
 
 
-def test_machine(parts: ModuleType, capsys: pytest.CaptureFixture) -> None:
-    parts.main(["machine"])
+def test_machine(parts: ModuleType, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
+    parts.main(["machine", str(tmp_path)])
     assert "missing: " in capsys.readouterr().out
+    kept = json.loads((tmp_path / "machine.json").read_text())
+    assert kept["torch"] == torch.__version__ and isinstance(kept["missing"], list)
 
 
 def test_a_file_of_tests_that_hangs_fails_alone(
@@ -176,6 +193,9 @@ def test_a_file_of_tests_that_hangs_fails_alone(
     assert outcomes["passes.py:"].startswith("passed") and "1 passed" in outcomes["passes.py:"]
     assert outcomes["wrong.py:"].startswith("FAILED") and outcomes["other.py:"].startswith("passed")
     assert said[-1] == "2 of 4 files passed"
+    kept = {row["name"]: row for row in json.loads((tmp_path / "out" / "tests.json").read_text())["files"]}
+    assert kept["test_planted_passes.py"]["right"] and not kept["test_planted_hangs.py"]["right"]
+    assert any(line.endswith("assert (1 + 1) == 3") for line in kept["test_planted_wrong.py"]["wrong"])
 
 
 def test_a_part_that_hangs_is_ended_with_all_that_it_started(
@@ -207,6 +227,48 @@ def test_what_a_part_says_is_kept_whatever_it_is(
     assert result["outcome"] == "passed" and result["last"].endswith(" not text")
     assert (tmp_path / "bytes.txt").read_bytes().startswith(f"{ROOT}{os.pathsep}/somewhere/else 1".encode())
     assert check.run("none", check.Part(["/not/there"], 20), tmp_path, 100.0)["outcome"] == "failed"
+
+
+def test_the_summary_has_all_that_a_part_has_found(
+    check: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """And nothing of an earlier run, nor less than it can where a part was ended in the middle of a line."""
+    (tmp_path / "old.json").write_text('{"cases": ["of an earlier run"]}')
+    write = "import sys; open(sys.argv[1], 'w').write(sys.argv[2]); print('done')"
+    known = {
+        "good": check.Part(
+            [sys.executable, "-c", write, str(tmp_path / "good.json"), '{"a": [1]}'], 20, (), tmp_path / "good.json"
+        ),
+        "torn": check.Part(
+            [sys.executable, "-c", write, str(tmp_path / "torn.json"), '{"a"'], 20, (), tmp_path / "torn.json"
+        ),
+        "old": check.Part([sys.executable, "-c", "pass"], 20, (), tmp_path / "old.json"),
+        "absent": check.Part("not here", 0),
+    }
+    monkeypatch.setattr(check, "parts", lambda out, data: known)
+    assert check.main(["--out", str(tmp_path), "--seconds", "400"]) == 0
+    kept = json.loads((tmp_path / "summary.json").read_text())["parts"]
+    assert kept["good"]["found"] == {"a": [1]} and kept["torn"]["found"].startswith("torn.json: ")
+    assert kept["old"]["found"] is None and kept["absent"]["outcome"] == "left out"
+
+
+def test_programs_of_a_bare_machine_import_what_it_has() -> None:
+    """torch, and what comes with Python: pytest, tyro, rich and warp may be absent until the tests themselves run."""
+    absent = ("pytest", "_pytest", "tyro", "rich", "warp", "scipy", "imageio_ffmpeg")
+    code = f"""
+import sys
+for name in {absent!r}:
+    sys.modules[name] = None
+sys.path[:0] = [{str(ROOT / ".ci")!r}]
+import gpu_parts, gpu_check
+gpu_parts.small_cases("cpu"), gpu_parts.captured_steps("cpu", 4)
+import harness, networks, case, throughput
+from voronerf.training.trainer import Trainer
+from voronerf.training.config import TrainConfig
+print("imported")
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert result.stdout.endswith("imported\n"), result.stderr
 
 
 def test_the_sanitizer_sees_every_allocation(
