@@ -90,7 +90,7 @@ def write_experiment(name: str, outcome: Mapping[str, Any], out: Path) -> list[P
 
 
 def write_report(out: Path, page: Path) -> None:
-    """Writes the page from all experiments in the output folder, and its pictures to images/paper beside it.
+    """Writes the page from all experiments in the output folder, and its pictures to images/NAME beside NAME.md.
 
     Raises:
         ValueError: When the folder holds no experiment.
@@ -108,7 +108,7 @@ def write_report(out: Path, page: Path) -> None:
         lines += [conditions(outcome["metadata"]) + ".", ""]
         lines += table_of(name, {**outcome, "claims": []})
         for picture in write_experiment(name, outcome, out):
-            small = page.parent / "images" / "paper" / picture.name
+            small = page.parent / "images" / page.stem / picture.name
             write_bytes(small, smaller(picture))
             lines += ["", f"![{picture.stem}]({small.relative_to(page.parent).as_posix()})"]
     write_text(page, "\n".join(lines) + "\n\n" + kept_notes(page))

@@ -358,6 +358,8 @@ def test_matched_parameters(load: Load, settings: Any) -> None:
     total = counts["12 cells"]
     assert counts["12 cells, matched"] == total and all(0.9 * total < count <= total for count in counts.values())
     assert variants["one network"] == {"cells": ()}
+    cones = {v.name: v.changes for v in experiment.variants(replace(settings, options=("field=mipnerf",)), "builtin")}
+    assert cones["4 cells, matched"]["parameters"] > variants["4 cells, matched"]["parameters"]
 
 
 # --- tables, plots, the page -----------------------------------------------------------------------------------------
@@ -459,6 +461,9 @@ def test_the_page_shows_what_came_out_and_keeps_notes(load: Load, settings: Any,
     page.write_text(text + "What was seen.\n")
     stored["claims"][0]["verdict"] = "changed"
     stored["metadata"] |= {"budget_seconds": 30.0, "seeds": 3, "failed": ["random parameters on builtin: nan"]}
+    report.write_report(out, page.parent / "long.md")
+    assert "(images/long/initialisation.png)" in (page.parent / "long.md").read_text()
+    assert (page.parent / "images" / "long" / "initialisation.png").is_file()
     other = tmp_path / "other"
     other.mkdir()
     (other / "initialisation.json").write_text(json.dumps(stored))

@@ -142,6 +142,8 @@ def test_what_is_asked_for_now_is_checked(load: Load) -> None:
 
 def test_options_are_those_of_all_variants(load: Load, settings: Any) -> None:
     experiments = load("paper_experiments").EXPERIMENTS
+    cones = experiments["split-kinds"].runs(replace(settings, options=("field=mipnerf", "sampling=hierarchical")))
+    assert all((run.config.field, run.config.sampling) == ("mipnerf", "hierarchical") for run in cones)
     given = replace(settings, options=("lr_split=0.5", "split_at=[0.3]", "balance=transport"))
     plain, made = (experiments["split-kinds"].runs(s) for s in (settings, given))
     for before, run in zip(plain, made, strict=True):
@@ -151,8 +153,8 @@ def test_options_are_those_of_all_variants(load: Load, settings: Any) -> None:
         given.options
     )
     assert "; lr_split=0.5; split_at=[0.3]; balance=transport; " in (settings.out / "split-kinds.md").read_text()
-    for name, compared in (("early-late", "split_at"), ("limits", "cells, split_at"), ("seams", "assignment")):
-        wrong = tuple(f"{option}=[3]" for option in compared.split(", "))
+    for name, compared in (("early-late", "split_at"), ("limits", "cells, split_at"), ("sampling", "field")):
+        wrong = tuple(f"{option}={'kilonerf' if option == 'field' else '[3]'}" for option in compared.split(", "))
         with pytest.raises(ConfigError, match=f"--options must not name what the experiment compares, got {compared}"):
             experiments[name].runs(replace(settings, options=wrong))
     for wrong, message in (
