@@ -26,7 +26,7 @@ namespace {
 
 // Number of the interface between this module and voronerf/_native*.py, which refuses a module of another number. It
 // goes up with every change to the names, arguments or meaning of what is bound, in any bindings_*.cpp.
-constexpr int INTERFACE = 12;
+constexpr int INTERFACE = 13;
 
 using Address = std::uintptr_t;
 

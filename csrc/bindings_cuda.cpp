@@ -42,6 +42,15 @@ void locate_cell_cuda(Address points, Address centres, Address weights, Address 
                              depth, at<void>(stream));
 }
 
+void draw_cell_cuda(Address points, Address centres, Address weights, Address child_offsets, Address child,
+                    Address uniforms, Address leaves, int64_t n, int64_t m, int64_t g, int depth, double temperature,
+                    int device, Address stream) {
+  const voronerf::CudaDevice current(device);
+  voronerf::draw_cell_cuda(at<const float>(points), at<const float>(centres), at<const float>(weights),
+                           at<const int32_t>(child_offsets), at<const int32_t>(child), at<const float>(uniforms),
+                           at<int32_t>(leaves), n, m, g, depth, temperature, at<void>(stream));
+}
+
 // way: a number of CellSortWay.
 int64_t cell_sort_workspace_cuda(int64_t n, int64_t k, int way, int device) {
   const voronerf::CudaDevice current(device);
@@ -189,6 +198,7 @@ void bind_cuda(py::module_& module) {
   module.def("nearest_centre_cuda_float64", &nearest_centre_cuda<double>, no_gil);
   module.def("locate_cell_cuda_float32", &locate_cell_cuda<float>, no_gil);
   module.def("locate_cell_cuda_float64", &locate_cell_cuda<double>, no_gil);
+  module.def("draw_cell_cuda", &draw_cell_cuda, no_gil);
   module.def("cell_sort_workspace_cuda", &cell_sort_workspace_cuda);
   module.def("cell_sort_cuda", &cell_sort_cuda, no_gil);
   module.def("composite_cuda", &composite_cuda, no_gil);

@@ -39,6 +39,11 @@ template <typename T>
 void locate_cell_cuda(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
                       const int32_t* child, int32_t* leaves, int64_t n, int64_t m, int64_t g, int depth, void* stream);
 
+// uniforms [n,depth]. Of unsound tables what locate_cell_cuda says.
+void draw_cell_cuda(const float* points, const float* centres, const float* weights, const int32_t* child_offsets,
+                    const int32_t* child, const float* uniforms, int32_t* leaves, int64_t n, int64_t m, int64_t g,
+                    int depth, double temperature, void* stream);
+
 // Encodings (encode.h); variances and grad_variances are null for the plain one.
 void encode_cuda(const float* x, const float* variances, float* out, int64_t n, int64_t d, int64_t octaves,
                  bool include_input, void* stream);

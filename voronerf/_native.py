@@ -27,7 +27,7 @@ from voronerf.backends import BackendUnavailable
 
 ISAS = ("portable", "avx2", "avx512")
 # Number of csrc/bindings.cpp that this file and its companions are written for.
-INTERFACE = 12
+INTERFACE = 13
 
 # In the order of CellSortWay in csrc/cell_sort.h.
 SORTS = ("automatic", "counting", "radix")

@@ -100,7 +100,7 @@ def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | Non
     return depths
 
 
-@torch.library.custom_op("voronerf::draw_cell", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("voronerf::draw_cell", mutates_args=(), device_types=("cpu", "cuda"))
 def _draw_cell(
     points: Tensor,
     centres: Tensor,
@@ -114,11 +114,15 @@ def _draw_cell(
     given = (points, centres, weights, child_offsets, child, uniforms)
     kept = [None if tensor is None else tensor.contiguous() for tensor in given]
     n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
+    leaves = points.new_empty(n, dtype=torch.int32)
+    if _native.on_cuda(points):
+        addresses = [_address(tensor) for tensor in (*kept, leaves)]
+        _native._C.draw_cell_cuda(*addresses, n, m, g, depth, temperature, *_native.stream(points))
+        return leaves
     fault = _native._C.locate_cell_fault(_address(kept[3]), _address(kept[4]), g, m)
     if fault is not None:
         raise ValueError(f"draw_cell: {fault}")
     threads = torch.get_num_threads()
-    leaves = points.new_empty(n, dtype=torch.int32)
     places = child.new_empty(_native._C.draw_cell_places(m, threads))
     sums = points.new_empty(_native._C.draw_cell_sums(m, threads))
     addresses = [_address(tensor) for tensor in (*kept, leaves, places, sums)]

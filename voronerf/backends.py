@@ -109,7 +109,7 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
         "voronerf._native_grid:nearest_centre_grid", ("cpu",), _COORDINATES
     ),
     ("locate_cell", "native"): Implementation("voronerf._native:locate_cell", ("cpu", "cuda"), _COORDINATES),
-    ("draw_cell", "native"): Implementation("voronerf._native_sampling:draw_cell", ("cpu",), (torch.float32,)),
+    ("draw_cell", "native"): Implementation("voronerf._native_sampling:draw_cell", ("cpu", "cuda"), (torch.float32,)),
     ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
     ("grouped_linear", "native"): Implementation("voronerf._native_linear:grouped_linear", ("cpu", "cuda"), _FLOATS),
     ("grouped_mlp", "native"): Implementation("voronerf._native_mlp:grouped_mlp", ("cpu", "cuda"), _FLOATS),

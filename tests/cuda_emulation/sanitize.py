@@ -57,6 +57,16 @@ def locate_cell(module: ModuleType) -> None:
     written(leaves)
 
 
+def draw_cell(module: ModuleType) -> None:
+    points, centres, uniforms = floats(300, 3), floats(5, 3), floats(300, 2)
+    child_offsets, child = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
+    for weights in (None, floats(5)):
+        leaves = unwritten(300, dtype=np.int32)
+        addresses = at(points), at(centres), at(weights), at(child_offsets), at(child), at(uniforms), at(leaves)
+        module.draw_cell_cuda(*addresses, 300, 5, 2, 2, 0.3, *GPU)
+        written(leaves)
+
+
 def cell_sort(module: ModuleType) -> None:
     # By counting and by radix. Keys of 4 bytes would need 65,535 cells, each a thread: too many for a sanitizer.
     for n, k, way in ((3000, 5, 0), (9000, 2, 1), (600, 3, 2), (300, 1100, 0)):
@@ -145,7 +155,7 @@ def main(path: str) -> None:
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    for run in (nearest_centre, locate_cell, cell_sort, composite, encode, resample, grouped_mlp):
+    for run in (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, resample, grouped_mlp):
         run(module)
     print("clean")
 

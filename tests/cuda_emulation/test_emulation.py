@@ -15,6 +15,7 @@ OPERATIONS = [
     for op in (
         "nearest_centre",
         "locate_cell",
+        "draw_cell",
         "cell_sort",
         "composite",
         "frequency_encode",

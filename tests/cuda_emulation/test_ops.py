@@ -50,6 +50,37 @@ def test_locate_cell(dtype: torch.dtype) -> None:
     assert torch.equal(found, voronerf.locate_cell(*arguments, depth=diagram.depth, backend="reference"))
 
 
+@pytest.mark.parametrize("weighted", [False, True])
+def test_draw_cell(weighted: bool) -> None:
+    def weights(k: int) -> torch.Tensor | None:
+        return torch.rand(k) / 4 if weighted else None
+
+    diagram = VoronoiDiagram(torch.rand(4, 3), weights=weights(4))
+    diagram, _ = diagram.refine({leaf: VoronoiDiagram(torch.rand(3, 3), weights=weights(3)) for leaf in (1, 3)})
+    points, uniforms = torch.rand(300, 3), torch.rand(300, 2)
+    points[7], uniforms[8] = torch.nan, torch.nan
+    arguments = points, diagram.centres, diagram.child_offsets, diagram.child, uniforms
+    options = {"temperature": 0.2, "depth": 2, "weights": diagram.power}
+    found = voronerf.draw_cell(*arguments, backend="native", **options)
+    expected = voronerf.draw_cell(*arguments, backend="reference", **options)
+    # numbers within rounding of a border, of which there is one in 10,000
+    assert int((found != expected).sum()) <= 1 and found[7] == 0
+
+
+def test_draw_cell_stays_inside_unsound_tables() -> None:
+    points, centres = torch.rand(50, 3), torch.rand(3, 3)
+    for offsets, child, depth in (
+        ([0, 3], [5, 1_000_000_000, 9], 3),  # no such diagram
+        ([0, 2_000_000_000], [-1, -2, -3], 1),  # more centres than there are
+        ([0, 0, 3], [1, 1, 1], 2),  # a diagram without centres
+        ([0, 1, 3], [1, 1, 0], 4),  # a walk that ends at no leaf
+    ):
+        tables = (torch.tensor(table, dtype=torch.int32) for table in (offsets, child))
+        uniforms = torch.rand(50, depth)
+        leaves = voronerf.draw_cell(points, centres, *tables, uniforms, temperature=0.1, depth=depth, backend="native")
+        assert bool((leaves < 0).all())
+
+
 SIZES = [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600), (2100, 1022), (2100, 1023), (300, 65_534), (300, 65_535)]
 
 
