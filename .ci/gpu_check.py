@@ -34,7 +34,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 ROOT = Path(__file__).resolve().parent.parent
 PYTHON = sys.executable
@@ -76,6 +76,8 @@ def main(arguments: list[str]) -> int:
         # Kept after every part, should this be stopped from outside.
         (given.out / "summary.json").write_text(json.dumps({"device": device(), "parts": results}, indent=1) + "\n")
     print(f"\ngpu-check on {device()}:")
+    for line in highlights({name: result.get("found") for name, result in results.items()}):
+        print(f"  {line}")
     for name, result in results.items():
         print(f"  {name:10} {result['outcome']:8} {result['seconds']:6.1f} s  {result['last']}")
     return sum(result["outcome"] == "failed" for result in results.values())
@@ -120,7 +122,7 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
     }
 
 
-def run(name: str, part: Part, out: Path, left: float) -> dict[str, object]:
+def run(name: str, part: Part, out: Path, left: float) -> dict[str, Any]:
     """Outcome, seconds and the last line of one part, which has ``left`` at most; what it said goes to a file."""
     if isinstance(part.command, str):
         return {"outcome": "left out", "seconds": 0.0, "last": part.command}
@@ -158,6 +160,33 @@ def read(path: Path | None) -> object:
         return json.loads(path.read_text())
     except ValueError as error:
         return f"{path.name}: {error}"
+
+
+def highlights(found: dict[str, Any]) -> list[str]:
+    """What the parts have found, a line each: timings beside what was aimed at, trainings, and what is wrong."""
+
+    def rows(part: str, kind: str) -> list[dict[str, Any]]:
+        kept = found.get(part)
+        return kept.get(kind, []) if isinstance(kept, dict) else []
+
+    lines = []
+    for row in rows("roofs", "rows"):
+        aim = row["aim"]
+        verdict = "" if aim is None else f", {'reached' if row['share'] >= aim else 'MISSED'} {100 * aim:.0f} %"
+        share = f"{100 * row['share']:5.1f} % of {row['limit']}"
+        lines.append(f"{row['name']:32} {1e3 * row['seconds']:8.3f} ms {share}{verdict}")
+    times = {row["name"]: row["seconds"] for row in rows("roofs", "rows")}
+    for name, seconds in times.items():
+        radix = times.get(name.replace("by counting", "by radix"))
+        if name.endswith("by counting") and radix is not None:
+            lines.append(f"{name}: {seconds / radix:.2f} x the time of radix")
+    for row in rows("training", "trainings"):
+        said = f"PSNR {row['psnr']:.2f} after {row['steps']} steps" if row["right"] else f"FAILED: {row['said']}"
+        lines.append(f"training {row['name']}: {said}")
+    for part in ("small", "captured", "roofs", "memcheck", "racecheck"):
+        lines += [f"WRONG in {part}: {row['name']}: {row['said']}" for row in rows(part, "cases") if not row["right"]]
+    lines += [f"WRONG in tests: {row['name']}: {row['said']}" for row in rows("tests", "files") if not row["right"]]
+    return lines
 
 
 def run_group(command: list[str], environment: dict[str, str], log: TextIO, limit: float) -> int | str:

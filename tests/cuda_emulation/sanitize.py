@@ -1,4 +1,7 @@
-"""Every kernel once on a few blocks, for a process under a sanitizer: ``sanitize.py MODULE``.
+"""Every kernel once on a few blocks, for a process under a sanitizer: ``sanitize.py MODULE [hostile]``.
+
+``hostile``: instead what the host cannot refuse without reading it, offsets that fall or leave the batch, trees and
+cells that are none. Nothing outside of the tensors may be touched; results, and who writes them, are undefined.
 
 Without torch, which takes a sanitizer minutes. Results are test_ops.py's matter; here only memory and order count, and
 that every element of an output is written.
@@ -150,15 +153,81 @@ def grouped_mlp(module: ModuleType) -> None:
         written(out, *grad_weights, *grad_biases, grad_positions, grad_directions)
 
 
-def main(path: str) -> None:
+def hostile(module: ModuleType) -> None:
+    least, most = -(2**31), 2**31 - 1
+    cells = RANDOM.choice([least, -1, 0, 4, 5, 6, 65_536, most], 700).astype(np.int32)
+    for k, way in ((1, 1), (5, 1), (5, 2), (1100, 0)):
+        for n in (0, 1, 700):
+            order, offsets = unwritten(n, dtype=np.int32), unwritten(k + 1, dtype=np.int32)
+            workspace = np.full(module.cell_sort_workspace_cuda(n, k, way, 0), 255, np.uint8)
+            module.cell_sort_cuda(at(cells), at(order), at(offsets), at(workspace), n, k, way, *GPU)
+            assert (np.sort(order) == np.arange(n)).all() and (np.diff(offsets) >= 0).all()
+
+    points, centres = floats(300, 3), floats(5, 3)
+    points[::3] = np.array([np.nan, np.inf, 1e38])
+    trees = [([0, 3, 5], [-1, 1, 2, -2, most]), ([0, 3, 5], [0, 1, 1, 0, 1]), ([-4, 9, 5], [1] * 5)]
+    for child_offsets, child in [*trees, ([3, 3, 0], [-1] * 5), ([0, most, least], [1, 1, 1, 0, 0])]:
+        tables, leaves = [integers(*child_offsets), integers(*child)], unwritten(300, dtype=np.int32)
+        addresses = at(points), at(centres), 0, *(at(table) for table in tables), at(leaves)
+        module.locate_cell_cuda_float32(*addresses, 300, 5, 2, 3, *GPU)
+        written(leaves)
+
+    m, r, c = 180, 5, 3
+    for offsets in ([5, 3, -4, 500, 90, 7], [least, most, least, most, 0, 180], [180, 180, 181, 0, -1, most]):
+        inputs = floats(m), floats(m, c), floats(m), floats(m), integers(*offsets), floats(c)
+        inputs[0][::5], inputs[2][::7] = np.inf, np.nan
+        sizes, results = [r, 0, m, c, 0], [floats(r, c), floats(r), floats(r), floats(m)]
+        module.composite_cuda([at(x) for x in inputs], sizes, [at(x) for x in results], *GPU)
+        outgoing = [*(unwritten(*x.shape) for x in inputs[:4]), unwritten(c), unwritten(r)]
+        addresses = [at(x) for x in inputs], sizes, [at(x) for x in results], [at(x) for x in outgoing]
+        module.composite_backward_cuda(*addresses, *GPU)
+
+    weights, edges, depths = floats(6, 45), floats(6, 46), unwritten(6, 70)
+    weights[0], weights[1, ::2], weights[2], weights[3] = 0, np.nan, np.inf, -1
+    edges[4, 3], uniforms = np.nan, floats(6, 70)
+    uniforms[:, ::4], uniforms[:, 1::8] = np.nan, 1e30
+    workspace = unwritten(6, 45, dtype=np.float64)
+    module.resample_cuda(at(weights), at(edges), at(uniforms), at(depths), at(workspace), 6, 45, 70, *GPU)
+
+    n, k = 64, 4
+    for offsets in ([9, 3, -5, 200, 64], [least, most, least, most, 0], [64, 0, 64, 0, 64], [-7, -5, -3, -2, -1]):
+        for shared in (227, 1):
+            module.device(90, 120, shared * 1024)
+            given, sums = network(n, k, integers(*offsets))
+
+            sizes = [module.grouped_mlp_workspace_cuda(TABLE, 1, n, k, backward, True, 0) for backward in (False, True)]
+            memory = [np.full(size, 255, np.uint8) for size in sizes]
+            module.grouped_mlp_cuda(*given[:4], at(sums[0]), 1, at(memory[0]), *GPU)
+            addresses = at(sums[1]), *given[4:], at(sums[2]), at(sums[3]), 1, at(memory[1])
+            module.grouped_mlp_backward_cuda(*given[:4], *addresses, *GPU)
+
+
+KEPT: list[Any] = []
+"""What addresses have been taken of."""
+
+
+def network(n: int, k: int, offsets: np.ndarray) -> tuple[tuple[Any, ...], list[np.ndarray]]:
+    """Arguments up to the gradients of biases; output, its gradient, and those of positions and directions."""
+    positions, directions, index = floats(n, 3), floats(5, 3), RANDOM.integers(0, 5, n).astype(np.int32)
+    weights, biases = [floats(k, o, i) for o, i in SHAPES], [floats(k, o) for o, _ in SHAPES]
+    grad_weights, grad_biases = [unwritten(*x.shape) for x in weights], [unwritten(*x.shape) for x in biases]
+    order = RANDOM.permutation(n).astype(np.int32)
+    arguments = [at(positions), at(directions), at(index), at(offsets), at(order), n, 5, k]
+    KEPT.append((positions, directions, index, weights, biases, grad_weights, grad_biases, order, offsets))
+    lists = [[at(x) for x in part] for part in (weights, biases, grad_weights, grad_biases)]
+    return (TABLE, arguments, *lists), [unwritten(n, 38), floats(n, 38), unwritten(n, 3), unwritten(n, 3)]
+
+
+def main(path: str, kind: str = "usual") -> None:
     spec = importlib.util.spec_from_file_location("voronerf_emulation", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    for run in (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, resample, grouped_mlp):
+    usual = (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, resample, grouped_mlp)
+    for run in (hostile,) if kind == "hostile" else usual:
         run(module)
     print("clean")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

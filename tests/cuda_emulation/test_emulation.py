@@ -63,6 +63,11 @@ def test_kernels_are_clean(sanitizer: str) -> None:
     assert found.stdout.splitlines() == ["clean"], found.stdout
 
 
+def test_nothing_outside_is_touched_whatever_the_offsets_say() -> None:
+    found = run([sys.executable, str(HERE / "sanitize.py"), module("address"), "hostile"], "address")
+    assert found.stdout.splitlines() == ["clean"], found.stdout
+
+
 def test_operations_pass_their_tests_on_the_emulated_device() -> None:
     """The tests of the operations themselves; ``make emulate-cuda`` takes more seeds."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--emulate-cuda", "1"]

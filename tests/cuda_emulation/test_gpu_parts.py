@@ -252,6 +252,37 @@ def test_the_summary_has_all_that_a_part_has_found(
     assert kept["old"]["found"] is None and kept["absent"]["outcome"] == "left out"
 
 
+def test_the_summary_says_what_was_reached_and_what_is_wrong(check: ModuleType) -> None:
+    row = {"limit": "copy", "seconds": 2e-5, "share": 0.5, "aim": None}
+    timed = [{**row, "name": f"cell_sort k=16 by {way}"} for way in ("counting", "torch.sort")]
+    timed += [{**row, "name": "cell_sort k=16 by radix", "seconds": 4e-5}]
+    timed += [{**row, "name": "near", "aim": 0.6}, {**row, "name": "far", "aim": 0.4}]
+    found = {
+        "roofs": {"rows": timed, "cases": [{"name": "slow", "right": False, "said": "hangs"}]},
+        "training": {
+            "trainings": [
+                {"name": "plain", "right": True, "psnr": 21.5, "steps": 90},
+                {"name": "bf16", "right": False, "said": "no"},
+            ]
+        },
+        "small": {"cases": [{"name": "fine", "right": True, "said": ""}]},
+        "captured": "captured.json: torn",
+        "tests": {"files": [{"name": "test_a.py", "right": False, "said": "1 failed"}]},
+        "memcheck": None,
+    }
+    said = check.highlights(found)
+    assert len(said) == 10
+    assert said[3].endswith("0.020 ms  50.0 % of copy, MISSED 60 %") and said[4].endswith("copy, reached 40 %")
+    assert said[5:] == [
+        "cell_sort k=16 by counting: 0.50 x the time of radix",
+        "training plain: PSNR 21.50 after 90 steps",
+        "training bf16: FAILED: no",
+        "WRONG in roofs: slow: hangs",
+        "WRONG in tests: test_a.py: 1 failed",
+    ]
+    assert check.highlights({}) == []
+
+
 def test_programs_of_a_bare_machine_import_what_it_has() -> None:
     """torch, and what comes with Python: pytest, tyro, rich and warp may be absent until the tests themselves run."""
     absent = ("pytest", "_pytest", "tyro", "rich", "warp", "scipy", "imageio_ffmpeg")
