@@ -102,21 +102,28 @@ void resample_cuda(Address weights, Address edges, Address uniforms, Address dep
                           at<float>(depths), at<double>(workspace), r, s, count, at<void>(stream));
 }
 
-// precision: a number of MlpPrecision; the plan is made for the device that is current.
-const char* plan_of(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k, bool backward,
+// precision, way: numbers of MlpPrecision and MlpCudaWay; the plan is made for the device that is current.
+const char* plan_of(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k, bool backward, int way,
                     voronerf::MlpCudaChoice& choice) {
   return voronerf::mlp_cuda_choose(mlp_arguments::read_table(flat), static_cast<voronerf::MlpPrecision>(precision), n,
-                                   k, backward, voronerf::mlp_cuda_device(), choice);
+                                   k, backward, static_cast<voronerf::MlpCudaWay>(way), voronerf::mlp_cuda_device(),
+                                   choice);
 }
 
 // Bytes of workspace, or the rule that a table breaks for which there is no plan.
 py::object grouped_mlp_workspace_cuda(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k,
-                                      bool backward, bool parameters, int device) {
+                                      bool backward, bool parameters, int device, int way) {
   const voronerf::CudaDevice current(device);
   voronerf::MlpCudaChoice choice;
-  if (const char* fault = plan_of(flat, precision, n, k, backward, choice)) return py::str(fault);
-  return py::int_(choice.by_layers ? voronerf::mlp_layers_workspace(choice.layers, k, parameters).bytes
-                                   : voronerf::mlp_cuda_workspace(choice.fused, k, parameters).bytes);
+  if (const char* fault = plan_of(flat, precision, n, k, backward, way, choice)) return py::str(fault);
+  switch (choice.way) {
+    case voronerf::MlpCudaWay::chain:
+      return py::int_(voronerf::mlp_chain_workspace(choice.chain, k).bytes);
+    case voronerf::MlpCudaWay::tiles:
+      return py::int_(voronerf::mlp_cuda_workspace(choice.fused, k, parameters).bytes);
+    default:
+      return py::int_(voronerf::mlp_layers_workspace(choice.layers, k, parameters).bytes);
+  }
 }
 
 voronerf::MlpCudaData data_of(const voronerf::MlpInputs& in) {
@@ -147,35 +154,39 @@ voronerf::MlpCudaParameters parameters_of(const Addresses& weights, const Addres
 
 void grouped_mlp_cuda(const std::vector<int64_t>& flat, const Addresses& arguments, const Addresses& weights,
                       const Addresses& biases, Address out, int precision, Address workspace, int device,
-                      Address stream) {
+                      Address stream, int way) {
   const voronerf::CudaDevice current(device);
   voronerf::MlpCudaData data = data_of(mlp_arguments::read_inputs(arguments, {}, {}));
   data.out = at<float>(out);
   voronerf::MlpCudaChoice choice;
-  const char* fault = plan_of(flat, precision, data.n, data.k, false, choice);
+  const char* fault = plan_of(flat, precision, data.n, data.k, false, way, choice);
   VN_CHECK(fault == nullptr, fault);
   auto* memory = at<unsigned char>(workspace);
-  if (choice.by_layers) {
-    return voronerf::mlp_layers_cuda(choice.layers, data, layers_of(weights, biases), memory, at<void>(stream));
+  switch (choice.way) {
+    case voronerf::MlpCudaWay::chain:
+      return voronerf::mlp_chain_cuda(choice.chain, data, parameters_of(weights, biases), memory, at<void>(stream));
+    case voronerf::MlpCudaWay::tiles:
+      return voronerf::grouped_mlp_cuda(choice.fused, data, parameters_of(weights, biases), memory, at<void>(stream));
+    default:
+      return voronerf::mlp_layers_cuda(choice.layers, data, layers_of(weights, biases), memory, at<void>(stream));
   }
-  voronerf::grouped_mlp_cuda(choice.fused, data, parameters_of(weights, biases), memory, at<void>(stream));
 }
 
 // As on the CPU, except that gradients of directions are one row a sample.
 void grouped_mlp_backward_cuda(const std::vector<int64_t>& flat, const Addresses& arguments, const Addresses& weights,
                                const Addresses& biases, Address grad_out, const Addresses& grad_weights,
                                const Addresses& grad_biases, Address grad_positions, Address grad_directions,
-                               int precision, Address workspace, int device, Address stream) {
+                               int precision, Address workspace, int device, Address stream, int way) {
   const voronerf::CudaDevice current(device);
   voronerf::MlpCudaData data = data_of(mlp_arguments::read_inputs(arguments, {}, {}));
   data.grad_out = at<const float>(grad_out);
   data.grad_positions = at<float>(grad_positions);
   data.grad_directions = at<float>(grad_directions);
   voronerf::MlpCudaChoice choice;
-  const char* fault = plan_of(flat, precision, data.n, data.k, true, choice);
+  const char* fault = plan_of(flat, precision, data.n, data.k, true, way, choice);
   VN_CHECK(fault == nullptr, fault);
   auto* memory = at<unsigned char>(workspace);
-  if (choice.by_layers) {
+  if (choice.way == voronerf::MlpCudaWay::layers) {
     const voronerf::MlpLayersGradients results = {mlp_arguments::pointers<float>(grad_weights),
                                                   mlp_arguments::pointers<float>(grad_biases)};
     return voronerf::mlp_layers_backward_cuda(choice.layers, data, layers_of(weights, biases),

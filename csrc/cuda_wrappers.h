@@ -34,15 +34,48 @@ namespace voronerf {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
+// threadIdx.x, read where it is wanted: the compiler would keep what is made of it in registers that others need.
+__device__ __forceinline__ int thread_again() {
+#ifdef VN_EMULATE
+  return static_cast<int>(threadIdx.x);
+#else
+  int thread;
+  asm volatile("mov.u32 %0, %%tid.x;" : "=r"(thread));
+  return thread;
+#endif
+}
+
 // Largest value of float16: what is larger would become infinite, and infinities in a network soon are no numbers.
 constexpr float kLargestHalf = 65504.0f;
 
-// Two floats rounded to 16 bits each, the first in the low half. Gradients are not to be saturated: whoever scales a
-// loss looks for the infinite ones.
-template <bool kBfloat16, bool kSaturated = true>
+// Two floats, negative ones as zero if kRelu says so, rounded to 16 bits each, the first in the low half. Gradients are
+// not to be saturated: whoever scales a loss looks for the infinite ones. From sm_80 on all of it is one instruction;
+// what is no number stays that.
+template <bool kBfloat16, bool kSaturated = true, bool kRelu = false>
 __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
+#if !defined(VN_EMULATE) && __CUDA_ARCH__ >= 800
+  uint32_t bits;
+  if constexpr (kBfloat16 && kRelu) {
+    asm("cvt.rn.relu.bf16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
+  } else if constexpr (kBfloat16) {
+    asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
+  } else if constexpr (kRelu && kSaturated) {
+    asm("cvt.rn.relu.satfinite.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
+  } else if constexpr (kRelu) {
+    asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
+  } else if constexpr (kSaturated) {
+    asm("cvt.rn.satfinite.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
+  } else {
+    asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
+  }
+  return bits;
+#else
+  // Comparisons keep what is no number.
+  if constexpr (kRelu) {
+    x = x < 0.0f ? 0.0f : x;
+    y = y < 0.0f ? 0.0f : y;
+  }
   if constexpr (!kBfloat16 && kSaturated) {
-    // Comparisons keep what is no number.
     x = x > kLargestHalf ? kLargestHalf : x < -kLargestHalf ? -kLargestHalf : x;
     y = y > kLargestHalf ? kLargestHalf : y < -kLargestHalf ? -kLargestHalf : y;
   }
@@ -58,6 +91,7 @@ __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
     memcpy(&bits, &pair, sizeof bits);
   }
   return bits;
+#endif
 #endif
 }
 

@@ -28,6 +28,11 @@ struct MlpCudaParameterGradients {
   float *weights[kMlpCudaLayers], *biases[kMlpCudaLayers];
 };
 
+// Threads of a block of a kernel with blocks for each cell and layer, and how many blocks each of those should have:
+// few cells need several.
+constexpr int kMlpLayerThreads = 256;
+unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements);
+
 // Properties of the current device.
 MlpCudaDevice mlp_cuda_device();
 
@@ -39,6 +44,7 @@ void grouped_mlp_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const 
                                const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream);
 
 // Steps around the kernel of rows: weights packed and tasks mapped before it, rows of no cell cleared, partials summed.
+void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t tasks, void* stream);
 void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
                       void* stream);
 void mlp_cuda_zero_strays(const MlpCudaData& data, int width, float* rows, void* stream);

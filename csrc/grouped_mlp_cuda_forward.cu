@@ -9,7 +9,7 @@ template <typename Products, int kRowTiles>
 __global__ void __launch_bounds__(128, 3) mlp_forward_kernel(const MlpCudaPlan plan, const MlpCudaData data) {
   using Element = typename Products::Element;
   MlpTask task;
-  if (!mlp_find_task(plan, data, blockIdx.x, task)) return;  // the whole block
+  if (!mlp_find_task(data, plan.task_rows, blockIdx.x, task)) return;  // the whole block
   VN_DYN_SHARED(Element, shared);
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   constexpr int kRows = 16 * kRowTiles;

@@ -12,7 +12,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "grouped_mlp_cuda.h"
+#include "grouped_mlp_cuda_chain.h"
 
 namespace voronerf {
 
@@ -69,14 +69,19 @@ struct MlpLayersPlan {
 const char* mlp_layers_plan(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
                             const MlpCudaDevice& device, MlpLayersPlan& plan);
 
-// Which way a call goes: fused where that fits, except where it would move more than twice the memory.
+// The ways a call can go: fused with values in registers (grouped_mlp_cuda_chain.h), fused with values in shared memory
+// (grouped_mlp_cuda_plan.h), layer by layer. By itself the first that takes the table, except where fusing would move
+// more than twice the memory; to compare them one can be asked for, and then nothing else is taken.
+enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers };
+
 struct MlpCudaChoice {
-  bool by_layers;
+  MlpCudaWay way;  // not automatic
+  MlpChainPlan chain;
   MlpCudaPlan fused;
   MlpLayersPlan layers;
 };
 const char* mlp_cuda_choose(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
-                            const MlpCudaDevice& device, MlpCudaChoice& choice);
+                            MlpCudaWay wanted, const MlpCudaDevice& device, MlpCudaChoice& choice);
 
 // Bytes of workspace of a call, and where its parts begin.
 struct MlpLayersWorkspace {

@@ -100,14 +100,18 @@ int64_t widest(const MlpLayersPlan& plan) {
   return width;
 }
 
-// Whether going layer by layer moves less than half of the bytes that fusing does.
-bool moves_less(const MlpCudaPlan& fused, const MlpLayersPlan& layers) {
-  // Fused, a tile reads the weights unless they stay, backward twice, and reads and writes its partial gradients.
-  int64_t by_tile = fused.resident ? 0 : fused.packed_bytes;
-  if (fused.backward) by_tile = 2 * by_tile + 8 * int64_t{fused.partial};
+// Whether going layer by layer moves less than half of the bytes that fusing does, for each row.
+bool moves_less(int64_t fused, const MlpLayersPlan& layers, int rows) {
   // By layers, a value is written and read; backward its gradient replaces it and enters two products.
   const int64_t by_row = layers.columns * layers.element * (layers.backward ? 6 : 2);
-  return by_tile > 2 * by_row * fused.rows();
+  return fused > 2 * by_row * rows;
+}
+
+// Bytes that a block moves for a tile of rows: the weights unless they stay, backward twice, and its partial gradients,
+// which it reads and writes.
+int64_t bytes_of_tile(const MlpCudaPlan& fused) {
+  const int64_t weights = fused.resident ? 0 : fused.packed_bytes;
+  return fused.backward ? 2 * weights + 8 * int64_t{fused.partial} : weights;
 }
 
 }  // namespace
@@ -151,11 +155,29 @@ const char* mlp_layers_plan(const MlpTable& table, MlpPrecision precision, int64
 }
 
 const char* mlp_cuda_choose(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
-                            const MlpCudaDevice& device, MlpCudaChoice& choice) {
-  const bool fits = mlp_cuda_plan(table, precision, n, k, backward, device, choice.fused) == nullptr;
-  const char* fault = mlp_layers_plan(table, precision, n, k, backward, device, choice.layers);
-  choice.by_layers = !fits || (fault == nullptr && moves_less(choice.fused, choice.layers));
-  return fits ? nullptr : fault;
+                            MlpCudaWay wanted, const MlpCudaDevice& device, MlpCudaChoice& choice) {
+  choice = {};
+  // Gradients of what the chain computes are those of the tiles, which compute it again.
+  const char* chain =
+      backward ? "gradients take tiles or layers" : mlp_chain_plan(table, precision, n, k, device, choice.chain);
+  const char* tiles = mlp_cuda_plan(table, precision, n, k, backward, device, choice.fused);
+  const char* layers = mlp_layers_plan(table, precision, n, k, backward, device, choice.layers);
+  choice.way = wanted;
+  if (wanted == MlpCudaWay::chain && !backward) return chain;
+  if (wanted == MlpCudaWay::tiles) return tiles;
+  if (wanted == MlpCudaWay::layers) return layers;
+  const auto fits = [&](const char* fault, int64_t bytes, int rows) {
+    return fault == nullptr && (layers != nullptr || !moves_less(bytes, choice.layers, rows));
+  };
+  if (fits(chain, choice.chain.resident ? 0 : choice.chain.packed_bytes, choice.chain.rows())) {
+    choice.way = MlpCudaWay::chain;
+  } else if (fits(tiles, bytes_of_tile(choice.fused), choice.fused.rows())) {
+    choice.way = MlpCudaWay::tiles;
+  } else {
+    choice.way = MlpCudaWay::layers;
+    return layers;
+  }
+  return nullptr;
 }
 
 MlpLayersWorkspace mlp_layers_workspace(const MlpLayersPlan& plan, int64_t k, bool parameters) {

@@ -33,60 +33,6 @@ MlpCudaInput input_of(int64_t raw, int octaves, bool integrated) {
   return input;
 }
 
-const char* copy_table(const MlpTable& table, MlpCudaPlan& plan) {
-  if (table.layers.size() > kMlpCudaLayers) return "a table must have at most 16 layers";
-  if (table.outputs.size() > kMlpCudaOutputs) return "a table must have at most 8 outputs";
-  plan.positions = input_of(table.positions, table.position_octaves, table.integrated);
-  plan.directions = input_of(table.directions, table.direction_octaves, false);
-  plan.layer_count = static_cast<int>(table.layers.size());
-  for (int l = 0; l < plan.layer_count; ++l) {
-    const MlpTable::Layer& given = table.layers[l];
-    MlpCudaLayer& layer = plan.layers[l];
-    layer = {};
-    if (given.inputs.size() > kMlpCudaSources) return "a layer must have at most 4 sources";
-    if (given.width > kWidest) return "a layer must have at most 256 features";
-    layer.width = static_cast<int>(given.width);
-    layer.padded = pad(given.width);
-    layer.activation = static_cast<int>(given.activation);
-    layer.source_count = static_cast<int>(given.inputs.size());
-    int packed = 0;
-    for (int s = 0; s < layer.source_count; ++s) {
-      const int from = given.inputs[s];
-      MlpCudaSource& source = layer.sources[s];
-      source.from = from;
-      source.width = from >= 0                ? plan.layers[from].width
-                     : from == kFromPositions ? plan.positions.width
-                                              : plan.directions.width;
-      if (source.width < 1) return "a layer's sources must have features";
-      if (source.width > kWidest) return "a source must have at most 256 features";
-      source.padded = pad(source.width);
-      source.column = layer.inputs;
-      source.packed = packed;
-      layer.inputs += source.width;
-      packed += source.padded;
-    }
-    layer.weight_stride = packed;
-  }
-  plan.output_count = static_cast<int>(table.outputs.size());
-  for (int o = 0; o < plan.output_count; ++o) {
-    plan.outputs[o] = table.outputs[o];
-    plan.output_columns[o] = plan.out_features;
-    plan.out_features += plan.layers[table.outputs[o]].width;
-    plan.layers[table.outputs[o]].live = true;
-  }
-  for (int l = plan.layer_count; l-- > 0;) {
-    const MlpCudaLayer& layer = plan.layers[l];
-    if (!layer.live) continue;
-    for (int s = 0; s < layer.source_count; ++s) {
-      const int from = layer.sources[s].from;
-      if (from >= 0) plan.layers[from].live = true;
-      if (from == kFromPositions) plan.positions.used = true;
-      if (from == kFromDirections) plan.directions.used = true;
-    }
-  }
-  return nullptr;
-}
-
 // Strides of values and weights: 16 bytes more than a multiple of 32, so that eight rows lie in different banks.
 void place_weights(MlpCudaPlan& plan, int skew) {
   for (int l = 0; l < plan.layer_count; ++l) {
@@ -153,6 +99,60 @@ int slot_of(const MlpCudaPlan& plan, int skew) {
 
 }  // namespace
 
+const char* mlp_cuda_read_table(const MlpTable& table, MlpCudaPlan& plan) {
+  if (table.layers.size() > kMlpCudaLayers) return "a table must have at most 16 layers";
+  if (table.outputs.size() > kMlpCudaOutputs) return "a table must have at most 8 outputs";
+  plan.positions = input_of(table.positions, table.position_octaves, table.integrated);
+  plan.directions = input_of(table.directions, table.direction_octaves, false);
+  plan.layer_count = static_cast<int>(table.layers.size());
+  for (int l = 0; l < plan.layer_count; ++l) {
+    const MlpTable::Layer& given = table.layers[l];
+    MlpCudaLayer& layer = plan.layers[l];
+    layer = {};
+    if (given.inputs.size() > kMlpCudaSources) return "a layer must have at most 4 sources";
+    if (given.width > kWidest) return "a layer must have at most 256 features";
+    layer.width = static_cast<int>(given.width);
+    layer.padded = pad(given.width);
+    layer.activation = static_cast<int>(given.activation);
+    layer.source_count = static_cast<int>(given.inputs.size());
+    int packed = 0;
+    for (int s = 0; s < layer.source_count; ++s) {
+      const int from = given.inputs[s];
+      MlpCudaSource& source = layer.sources[s];
+      source.from = from;
+      source.width = from >= 0                ? plan.layers[from].width
+                     : from == kFromPositions ? plan.positions.width
+                                              : plan.directions.width;
+      if (source.width < 1) return "a layer's sources must have features";
+      if (source.width > kWidest) return "a source must have at most 256 features";
+      source.padded = pad(source.width);
+      source.column = layer.inputs;
+      source.packed = packed;
+      layer.inputs += source.width;
+      packed += source.padded;
+    }
+    layer.weight_stride = packed;
+  }
+  plan.output_count = static_cast<int>(table.outputs.size());
+  for (int o = 0; o < plan.output_count; ++o) {
+    plan.outputs[o] = table.outputs[o];
+    plan.output_columns[o] = plan.out_features;
+    plan.out_features += plan.layers[table.outputs[o]].width;
+    plan.layers[table.outputs[o]].live = true;
+  }
+  for (int l = plan.layer_count; l-- > 0;) {
+    const MlpCudaLayer& layer = plan.layers[l];
+    if (!layer.live) continue;
+    for (int s = 0; s < layer.source_count; ++s) {
+      const int from = layer.sources[s].from;
+      if (from >= 0) plan.layers[from].live = true;
+      if (from == kFromPositions) plan.positions.used = true;
+      if (from == kFromDirections) plan.directions.used = true;
+    }
+  }
+  return nullptr;
+}
+
 const char* mlp_cuda_plan(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
                           const MlpCudaDevice& device, MlpCudaPlan& plan) {
   plan = {};
@@ -160,7 +160,7 @@ const char* mlp_cuda_plan(const MlpTable& table, MlpPrecision precision, int64_t
   if (device.capability < 80 && precision != MlpPrecision::float16) precision = MlpPrecision::float32;
   plan.precision = precision;
   plan.backward = backward;
-  if (const char* fault = copy_table(table, plan)) return fault;
+  if (const char* fault = mlp_cuda_read_table(table, plan)) return fault;
   const int size = is_half(precision) ? 2 : 4, skew = 16 / size;
   place_weights(plan, skew);
   plan.packed_bytes = ceil_div<int64_t>(int64_t{plan.packed_weights} * size + int64_t{plan.packed_biases} * 4, 16) * 16;

@@ -77,6 +77,10 @@ struct MlpCudaDevice {
   int64_t cache_bytes;  // of the last level
 };
 
+// Fills in what of a plan the table alone says: layers, their sources and widths, which of them are live, inputs and
+// outputs. Null, or the rule that the table breaks.
+const char* mlp_cuda_read_table(const MlpTable& table, MlpCudaPlan& plan);
+
 // Null where the table fits, else the rule that it breaks. The plan of a table that does not fit is undefined.
 const char* mlp_cuda_plan(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
                           const MlpCudaDevice& device, MlpCudaPlan& plan);

@@ -11,16 +11,8 @@ namespace voronerf {
 
 namespace {
 
-constexpr int kThreads = 256;
+constexpr int kThreads = kMlpLayerThreads;
 constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels with blocks for each cell
-
-// Blocks for a cell and a layer: few cells need several for each.
-unsigned blocks_of_layer(const MlpCudaPlan& plan, int64_t k, int64_t elements) {
-  const int64_t blocks = kBlocksPerMultiprocessor * mlp_cuda_device().multiprocessors;
-  const int64_t wanted = ceil_div(blocks, std::max<int64_t>(1, k * plan.layer_count));
-  const int64_t useful = ceil_div(elements, int64_t{kThreads});
-  return static_cast<unsigned>(wanted < useful ? wanted : useful);
-}
 
 // Grid (k, layers, blocks of a layer).
 template <typename Products>
@@ -56,9 +48,10 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 // One block.
-__global__ void __launch_bounds__(kScanThreads) mlp_tasks_kernel(const MlpCudaPlan plan, const MlpCudaData data) {
-  number_tasks(data.k, plan.tasks, data.first_task,
-               [&](int64_t cell) { return static_cast<int32_t>(ceil_div(mlp_cell_rows(data, cell), plan.task_rows)); });
+__global__ void __launch_bounds__(kScanThreads)
+    mlp_tasks_kernel(const MlpCudaData data, int64_t task_rows, int64_t tasks) {
+  number_tasks(data.k, tasks, data.first_task,
+               [&](int64_t cell) { return static_cast<int32_t>(ceil_div(mlp_cell_rows(data, cell), task_rows)); });
 }
 
 __global__ void __launch_bounds__(kThreads) mlp_strays_kernel(const MlpCudaData data, int width, float* rows) {
@@ -104,12 +97,20 @@ void pack(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParamet
   for (int l = 0; l < plan.layer_count; ++l) {
     pairs = std::max(pairs, int64_t{plan.layers[l].padded} * plan.layers[l].weight_stride / 2);
   }
-  VN_LAUNCH((mlp_pack_kernel<Products>),
-            dim3(static_cast<unsigned>(data.k), plan.layer_count, blocks_of_layer(plan, data.k, pairs)), kThreads, 0,
-            stream, plan, data, parameters);
+  VN_LAUNCH(
+      (mlp_pack_kernel<Products>),
+      dim3(static_cast<unsigned>(data.k), plan.layer_count, mlp_cuda_layer_blocks(data.k, plan.layer_count, pairs)),
+      kThreads, 0, stream, plan, data, parameters);
 }
 
 }  // namespace
+
+unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements) {
+  const int64_t blocks = kBlocksPerMultiprocessor * mlp_cuda_device().multiprocessors;
+  const int64_t wanted = ceil_div(blocks, std::max<int64_t>(1, k * layers));
+  const int64_t useful = ceil_div(elements, int64_t{kThreads});
+  return static_cast<unsigned>(wanted < useful ? wanted : useful);
+}
 
 MlpCudaDevice mlp_cuda_device() {
   int device = 0, major = 0, minor = 0;
@@ -129,9 +130,13 @@ MlpCudaDevice mlp_cuda_device() {
   return found;
 }
 
+void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t tasks, void* stream) {
+  VN_LAUNCH(mlp_tasks_kernel, 1, kScanThreads, 0, stream, data, task_rows, tasks);
+}
+
 void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
                       void* stream) {
-  VN_LAUNCH(mlp_tasks_kernel, 1, kScanThreads, 0, stream, plan, data);
+  mlp_cuda_number_tasks(data, plan.task_rows, plan.tasks, stream);
   switch (plan.precision) {
     case MlpPrecision::bfloat16:
       return pack<HalfProducts<true>>(plan, data, parameters, stream);
@@ -166,9 +171,10 @@ void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const Mlp
       weights = std::max(weights, int64_t{plan.layers[l].width} * plan.layers[l].sources[s].width);
     }
   }
-  VN_LAUNCH(mlp_reduce_kernel,
-            dim3(static_cast<unsigned>(data.k), plan.layer_count, blocks_of_layer(plan, data.k, weights)), kThreads, 0,
-            stream, plan, data, gradients);
+  VN_LAUNCH(
+      mlp_reduce_kernel,
+      dim3(static_cast<unsigned>(data.k), plan.layer_count, mlp_cuda_layer_blocks(data.k, plan.layer_count, weights)),
+      kThreads, 0, stream, plan, data, gradients);
 }
 
 }  // namespace voronerf

@@ -186,7 +186,7 @@ __device__ inline int64_t mlp_cell_rows(const MlpCudaData& data, int64_t cell) {
 }
 
 // Task number `task`, found in the map that the device made; false where there are fewer.
-__device__ inline bool mlp_find_task(const MlpCudaPlan& plan, const MlpCudaData& data, int64_t task, MlpTask& found) {
+__device__ inline bool mlp_find_task(const MlpCudaData& data, int64_t task_rows, int64_t task, MlpTask& found) {
   int64_t low = 0, high = data.k;  // the last cell whose first task is not after this one
   if (task >= data.first_task[data.k]) return false;
   while (high - low > 1) {
@@ -199,8 +199,8 @@ __device__ inline bool mlp_find_task(const MlpCudaPlan& plan, const MlpCudaData&
   }
   const int64_t begin = mlp_cell_begin(data, low), end = begin + mlp_cell_rows(data, low);
   found.cell = static_cast<int>(low);
-  found.begin = begin + (task - data.first_task[low]) * plan.task_rows;
-  found.end = found.begin + plan.task_rows < end ? found.begin + plan.task_rows : end;
+  found.begin = begin + (task - data.first_task[low]) * task_rows;
+  found.end = found.begin + task_rows < end ? found.begin + task_rows : end;
   return true;
 }
 

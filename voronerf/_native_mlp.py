@@ -11,6 +11,7 @@ have been validated by ``voronerf.ops``.
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -31,6 +32,19 @@ _LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for
 CALLERS = ("grouped_mlp", "grouped_linear", "routed_mlp")
 # Types of products by the numbers of MlpPrecision in csrc/grouped_mlp_cuda_plan.h; the CPU has the first two.
 _OPERANDS = ("float32", "bfloat16", "float16", "tf32")
+# Ways through a network on CUDA, by the numbers of MlpCudaWay in csrc/grouped_mlp_cuda_layers.h.
+WAYS = ("auto", "chain", "tiles", "layers")
+
+
+def _choose_way() -> int:
+    """The way of VORONERF_CUDA_MLP, with which gpu-check and benchmarks compare what the kernels reach."""
+    wanted = os.environ.get("VORONERF_CUDA_MLP") or WAYS[0]
+    if wanted not in WAYS:
+        raise ValueError(f"VORONERF_CUDA_MLP must be one of {', '.join(WAYS)}, got {wanted!r}")
+    return WAYS.index(wanted)
+
+
+_WAY = _choose_way()
 
 
 def grouped_mlp(
@@ -265,11 +279,11 @@ class _Device:
         if precision == 0 and torch.backends.cuda.matmul.fp32_precision == "tf32":
             precision = _OPERANDS.index("tf32")
         sizes = kept.inputs[5], kept.inputs[7]
-        size = _native._C.grouped_mlp_workspace_cuda(numbers, precision, *sizes, backward, parameters, device)
+        size = _native._C.grouped_mlp_workspace_cuda(numbers, precision, *sizes, backward, parameters, device, _WAY)
         if isinstance(size, str):
             raise ValueError(f"{CALLERS[numbers[5]]}: {size} on CUDA; use backend='reference'")
         self.workspace = positions.new_empty(size, dtype=torch.uint8)
-        self.arguments = precision, self.workspace.data_ptr(), device, stream
+        self.arguments = precision, self.workspace.data_ptr(), device, stream, _WAY
 
 
 class _Arguments:

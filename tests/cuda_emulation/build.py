@@ -21,9 +21,14 @@ SANITIZERS = {
     "address": ["-fsanitize=address"],
     "thread": ["-fsanitize=thread"],
 }
-PLAIN = {"emulation.cpp", "module.cpp", "index_maps.cpp", "plans.cpp", "bindings_cuda.cpp"}
+PLAIN = {"emulation.cpp", "module.cpp", "index_maps.cpp", "chain_layout.cpp", "plans.cpp", "bindings_cuda.cpp"}
 """Files with nothing to watch."""
-SHARED = ("cell_sort_plan.cpp", "grouped_mlp_cuda_plan.cpp", "grouped_mlp_cuda_layers_plan.cpp")
+SHARED = (
+    "cell_sort_plan.cpp",
+    "grouped_mlp_cuda_plan.cpp",
+    "grouped_mlp_cuda_chain_plan.cpp",
+    "grouped_mlp_cuda_layers_plan.cpp",
+)
 """What the launchers need of the C++ beside them."""
 REPLACED = {"radix_sort.cu"}
 """What consists of the CUDA toolkit's headers: a file of the same name in this folder stands in."""

@@ -12,12 +12,14 @@ namespace py = pybind11;
 
 void bind_index_maps(py::module_& module);
 void bind_plans(py::module_& module);
+void bind_chain_layout(py::module_& module);
 void planted(const float* values, float* out, int* counter, int blocks, int threads, int bug);
 
 PYBIND11_MODULE(voronerf_emulation, module) {
   bind_cuda(module);
   bind_index_maps(module);
   bind_plans(module);
+  bind_chain_layout(module);
   module.def("planted",
              [](std::uintptr_t values, std::uintptr_t out, std::uintptr_t counter, int blocks, int threads, int bug) {
                planted(reinterpret_cast<const float*>(values), reinterpret_cast<float*>(out),
@@ -25,15 +27,18 @@ PYBIND11_MODULE(voronerf_emulation, module) {
              });
   // What a call's plan says.
   module.def(
-      "grouped_mlp_plan", [](const std::vector<int64_t>& table, int precision, int64_t n, int64_t k, bool backward) {
+      "grouped_mlp_plan",
+      [](const std::vector<int64_t>& table, int precision, int64_t n, int64_t k, bool backward, int way) {
         voronerf::MlpCudaChoice choice;
-        const char* fault =
-            voronerf::mlp_cuda_choose(mlp_arguments::read_table(table), static_cast<voronerf::MlpPrecision>(precision),
-                                      n, k, backward, voronerf::mlp_cuda_device(), choice);
+        const char* fault = voronerf::mlp_cuda_choose(
+            mlp_arguments::read_table(table), static_cast<voronerf::MlpPrecision>(precision), n, k, backward,
+            static_cast<voronerf::MlpCudaWay>(way), voronerf::mlp_cuda_device(), choice);
         VN_CHECK(fault == nullptr, fault);
         py::dict plan;
-        plan["by_layers"] = choice.by_layers;
-        plan["precision"] = static_cast<int>(choice.by_layers ? choice.layers.precision : choice.fused.precision);
+        const bool by_layers = choice.way == voronerf::MlpCudaWay::layers;
+        plan["way"] = static_cast<int>(choice.way);
+        plan["by_layers"] = by_layers;
+        plan["precision"] = static_cast<int>(by_layers ? choice.layers.precision : choice.fused.precision);
         plan["task_rows"] = choice.fused.task_rows;
         plan["tasks"] = choice.fused.tasks;
         plan["shared_bytes"] = choice.fused.shared_bytes;
@@ -47,7 +52,8 @@ PYBIND11_MODULE(voronerf_emulation, module) {
         plan["bytes_of_row"] = choice.layers.columns * choice.layers.element;
         plan["workspace"] = voronerf::mlp_layers_workspace(choice.layers, k, backward).bytes;
         return plan;
-      });
+      },
+      py::arg("table"), py::arg("precision"), py::arg("n"), py::arg("k"), py::arg("backward"), py::arg("way") = 0);
   module.def("cell_sort_plan", [](int64_t n, int64_t k, int way, int64_t temporary) {
     const voronerf::CellSortPlan found =
         voronerf::cell_sort_plan(n, k, static_cast<voronerf::CellSortWay>(way), temporary);

@@ -19,12 +19,28 @@ py::dict plan_for(const std::vector<int64_t>& flat, int precision, int64_t n, in
   const voronerf::MlpCudaDevice device{static_cast<int>(given[0]), static_cast<int>(given[1]),
                                        static_cast<int>(given[2]), given[3]};
   voronerf::MlpCudaChoice choice;
-  const char* fault = voronerf::mlp_cuda_choose(
-      mlp_arguments::read_table(flat), static_cast<voronerf::MlpPrecision>(precision), n, k, backward, device, choice);
+  const char* fault =
+      voronerf::mlp_cuda_choose(mlp_arguments::read_table(flat), static_cast<voronerf::MlpPrecision>(precision), n, k,
+                                backward, voronerf::MlpCudaWay::automatic, device, choice);
   if (fault != nullptr) throw std::runtime_error(fault);
   py::dict plan;
-  plan["by_layers"] = choice.by_layers;
-  if (!choice.by_layers) {
+  plan["by_layers"] = choice.way == voronerf::MlpCudaWay::layers;
+  plan["chained"] = choice.way == voronerf::MlpCudaWay::chain;
+  if (choice.way == voronerf::MlpCudaWay::chain) {
+    const voronerf::MlpChainPlan& chain = choice.chain;
+    const voronerf::MlpCudaWorkspace parts = voronerf::mlp_chain_workspace(chain, k);
+    plan["precision"] = static_cast<int>(chain.precision);
+    plan["shared_bytes"] = chain.shared_bytes;
+    plan["threads"] = 32 * chain.warps;
+    plan["task_rows"] = chain.task_rows;
+    plan["block_rows"] = chain.rows();
+    plan["grid"] = std::vector<int64_t>{chain.tasks, 1, 1};
+    plan["starts"] = std::vector<int64_t>{parts.packed, parts.first_task};
+    plan["sizes"] = std::vector<int64_t>{chain.packed_bytes * k, 4 * (k + 1)};
+    plan["bytes"] = parts.bytes;
+    return plan;
+  }
+  if (choice.way == voronerf::MlpCudaWay::tiles) {
     const voronerf::MlpCudaPlan& fused = choice.fused;
     const voronerf::MlpCudaWorkspace parts = voronerf::mlp_cuda_workspace(fused, k, backward);
     plan["precision"] = static_cast<int>(fused.precision);

@@ -135,21 +135,22 @@ def grouped_mlp(module: ModuleType) -> None:
     weights, biases = [floats(k, o, i) for o, i in SHAPES], [floats(k, o) for o, _ in SHAPES]
     arguments = [at(positions), at(directions), at(index), at(offsets), at(order), n, r, k]
     given = TABLE, arguments, [at(x) for x in weights], [at(x) for x in biases]
-    # The last one fits no fused network: layer by layer.
-    for precision, shared in ((0, 227), (1, 40), (3, 64), (1, 1)):
+    # Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; and what
+    # fits no fused network: layer by layer.
+    for precision, shared, way in ((0, 227, 0), (1, 40, 2), (3, 64, 0), (1, 227, 0), (2, 30, 0), (1, 1, 0)):
         module.device(90, 120, shared * 1024)
 
-        def workspace(backward: bool, precision: int = precision) -> np.ndarray:
-            size = module.grouped_mlp_workspace_cuda(TABLE, precision, n, k, backward, True, 0)
+        def workspace(backward: bool, precision: int = precision, way: int = way) -> np.ndarray:
+            size = module.grouped_mlp_workspace_cuda(TABLE, precision, n, k, backward, True, 0, way)
             assert isinstance(size, int), size
             return np.full(size, 255, np.uint8)
 
         out, memory = unwritten(n, 38), workspace(False)
-        module.grouped_mlp_cuda(*given, at(out), precision, at(memory), *GPU)
+        module.grouped_mlp_cuda(*given, at(out), precision, at(memory), *GPU, way)
         grad_weights, grad_biases = [unwritten(*x.shape) for x in weights], [unwritten(*x.shape) for x in biases]
         grad_positions, grad_directions, memory = unwritten(n, 3), unwritten(n, 3), workspace(True)
         results = [at(x) for x in grad_weights], [at(x) for x in grad_biases], at(grad_positions), at(grad_directions)
-        module.grouped_mlp_backward_cuda(*given, at(gradient), *results, precision, at(memory), *GPU)
+        module.grouped_mlp_backward_cuda(*given, at(gradient), *results, precision, at(memory), *GPU, way)
         written(out, *grad_weights, *grad_biases, grad_positions, grad_directions)
 
 

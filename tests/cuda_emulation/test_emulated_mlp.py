@@ -125,7 +125,7 @@ def test_cells_that_overlap_stay_inside_the_workspace(monkeypatch: pytest.Monkey
             return sizes[-1]
 
         def poisoned(*given: object) -> None:
-            ctypes.memset(given[-3], 0xFF, sizes[-1])
+            ctypes.memset(given[-4], 0xFF, sizes[-1])
             backward(*given)
 
         monkeypatch.setattr(loaded, "grouped_mlp_workspace_cuda", larger)
