@@ -38,7 +38,7 @@ both sides of each comparison for the same training time, on the same kernels, w
 
     python benchmarks/paper.py table sampling|architecture|kilonerf [--scene lego ship] [--budget SECONDS] [--seeds N]
     python benchmarks/paper.py figure convergence|initialisation|split-kinds|early-late|cell-count|ghosting|...
-    make paper        # all of it in small; this page is what came out
+    make paper        # all of it in small, which is docs/paper.md
 
 This page is written by `benchmarks/paper.py report`; its verdicts are computed from the figures. Published figures are
 those of 400 x 400 images after 24 h on an RTX 2080 Ti. Values are means over the seeds, with their range; a gain is
