@@ -21,7 +21,15 @@ SANITIZERS = {
     "address": ["-fsanitize=address"],
     "thread": ["-fsanitize=thread"],
 }
-PLAIN = {"emulation.cpp", "module.cpp", "index_maps.cpp", "chain_layout.cpp", "plans.cpp", "bindings_cuda.cpp"}
+PLAIN = {
+    "emulation.cpp",
+    "module.cpp",
+    "index_maps.cpp",
+    "chain_layout.cpp",
+    "group_bindings.cpp",
+    "plans.cpp",
+    "bindings_cuda.cpp",
+}
 """Files with nothing to watch."""
 SHARED = (
     "cell_sort_plan.cpp",

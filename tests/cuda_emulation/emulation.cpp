@@ -94,6 +94,13 @@ struct Fiber {
   State state = State::ready;
   unsigned index = 0;
   std::vector<std::vector<Copy>> copies;
+  GroupThread group;
+};
+
+// What the threads of a group of four warps have done, the first to come setting it down.
+struct GroupStep {
+  const char* operation;
+  uint64_t argument;
 };
 
 struct Warp {
@@ -107,16 +114,19 @@ struct Warp {
 struct Block {
   std::vector<Fiber> fibers;
   std::vector<Warp> warps;
+  std::vector<std::vector<GroupStep>> groups;
   unsigned waiting = 0, left = 0, generation = 0;
   char order[2];
   std::map<const void*, void*> shared;
   size_t shared_bytes = 0;
   void* dynamic = nullptr;
+  size_t dynamic_bytes = 0;
 
-  Block(size_t threads, size_t dynamic_bytes) : fibers(threads), warps(threads / 32) {
+  Block(size_t threads, size_t bytes)
+      : fibers(threads), warps(threads / 32), groups(threads / 128), dynamic_bytes(bytes) {
     for (unsigned i = 0; i < threads; ++i) fibers[i].index = i;
     // A buffer of exactly the size: AddressSanitizer knows its ends.
-    if (dynamic_bytes > 0) dynamic = poisoned(dynamic_bytes);
+    if (bytes > 0) dynamic = poisoned(bytes);
   }
   ~Block() {
     for (const auto& [key, memory] : shared) std::free(memory);
@@ -172,10 +182,6 @@ void switch_to(Fiber& from, Fiber& to, bool leaving) {
 
 void yield() {
   switch_to(*launching->current, launching->main, false);
-}
-
-[[noreturn]] void fail(const std::string& message) {
-  throw std::runtime_error(message);
 }
 
 void body() {
@@ -246,6 +252,12 @@ void run_block(Launch& it, Block& block, std::mt19937_64& random) {
                        : "an operation of a warp is not reached by all of its lanes";
     return;
   }
+  for (const Fiber& fiber : block.fibers) {
+    if (!fiber.group.products.empty()) it.error = "products of a group are not waited for";
+    if (fiber.group.steps > 0 && fiber.group.steps != block.groups[fiber.index / 128].size()) {
+      it.error = "an operation of a group is not reached by all of its warps";
+    }
+  }
 }
 
 }  // namespace
@@ -261,6 +273,41 @@ int lane() {
 
 std::vector<std::vector<Copy>>& copies() {
   return launching->current->copies;
+}
+
+const float kUnderWay = std::numeric_limits<float>::signaling_NaN();
+
+GroupThread& group_thread() {
+  return launching->current->group;
+}
+
+size_t dynamic_bytes() {
+  return launching->block->dynamic_bytes;
+}
+
+std::vector<const void*> unpublished() {
+  std::vector<const void*> all;
+  for (const Fiber& fiber : launching->block->fibers) {
+    all.insert(all.end(), fiber.group.unpublished.begin(), fiber.group.unpublished.end());
+  }
+  return all;
+}
+
+void agree(const char* operation, uint64_t argument) {
+  Block& block = *launching->block;
+  Fiber& fiber = *launching->current;
+  if (fiber.index / 128 >= block.groups.size()) fail(std::string(operation) + " in a group of fewer than four warps");
+  auto& steps = block.groups[fiber.index / 128];
+  const size_t step = fiber.group.steps++;
+  if (step == steps.size()) steps.push_back({operation, argument});
+  if (std::strcmp(steps[step].operation, operation) != 0) {
+    fail(std::string("warps of a group come to ") + steps[step].operation + " and to " + operation);
+  }
+  if (steps[step].argument != argument) fail(std::string("warps of a group do not agree on ") + operation);
+}
+
+void fail(const std::string& message) {
+  throw std::runtime_error(message);
 }
 
 void require_all(unsigned mask) {
@@ -333,7 +380,8 @@ void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t 
   if (threads == 0 || threads > 1024) fail("a block of " + std::to_string(threads) + " threads");
   if (threads % 32 != 0) fail("a block that is not of whole warps");
   // 48 KiB are there without being asked for, on every device.
-  if (dynamic_bytes > std::max<size_t>(kStaticShared, settings().shared)) fail("more shared memory than a block may have");
+  if (dynamic_bytes > std::max<size_t>(kStaticShared, settings().shared))
+    fail("more shared memory than a block may have");
   Launch it;
   it.run = run;
   it.context = context;

@@ -10,6 +10,7 @@
 
 namespace py = pybind11;
 
+void bind_groups(py::module_& module);
 void bind_index_maps(py::module_& module);
 void bind_plans(py::module_& module);
 void bind_chain_layout(py::module_& module);
@@ -17,6 +18,7 @@ void planted(const float* values, float* out, int* counter, int blocks, int thre
 
 PYBIND11_MODULE(voronerf_emulation, module) {
   bind_cuda(module);
+  bind_groups(module);
   bind_index_maps(module);
   bind_plans(module);
   bind_chain_layout(module);
