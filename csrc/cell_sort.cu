@@ -1,12 +1,13 @@
 // Stable sort by cell on CUDA. Bucket 0 is for cells below 0 and bucket k + 1 for cells from k on. Few cells are
-// counted, in the same chunks as on the CPU. One warp owns a chunk, so that no counter is shared:
+// counted, in chunks as on the CPU. One warp owns a chunk, so that no counter is shared:
 //
-//   1. cell_sort_count    the chunk's histogram, counts[bucket][chunk]
+//   1. cell_sort_chunk    the chunk's histogram, counts[bucket][chunk]
 //   2. scan_*             exclusive scan of counts in that order: the first place of each bucket's rows of each chunk
-//   3. cell_sort_scatter  the rows go to their places, in order
+//   3. cell_sort_chunk    the rows go to their places, in order
 //
 // A warp takes 32 rows at a time; rows with the same bucket find each other with __match_any_sync, are ranked by lane,
-// and their first lane moves the counter, in shared memory. There are no atomics.
+// and their first lane moves the counter, in shared memory. There are no atomics. Counters of a block's eight chunks
+// lie side by side in global memory, a sector of 32 bytes for a bucket, and pass between there and shared memory so.
 //
 // More cells than a warp has counters for go through the toolkit's radix sort, by just the bits that buckets have: in
 // global memory every 32 rows would wait for a counter, and the few chunks that so many counters allow would leave the
@@ -25,7 +26,8 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kWarps = kThreads / 32;
+constexpr unsigned kWarps = kThreads / 32;
+static_assert(kWarps == kCellSortBlock, "the plan has whole blocks of chunks");
 constexpr int kAhead = 4;  // steps of 32 rows that are read before they are counted
 constexpr int kScanThreads = 1024;
 constexpr int64_t kScanTile = kCellSortScanTile;
@@ -33,24 +35,28 @@ constexpr int kScanItems = static_cast<int>(kScanTile) / kScanThreads;
 
 // Calls place(row, position) for every row of the warp's chunk, where position is the value of the row's counter before
 // it. Counters belong to this warp alone; __syncwarp makes the write of one lane visible to the lane that reads next.
-// Cells are read some steps ahead.
+// While some steps of cells are counted, the next ones are on their way.
 template <typename Place>
 __device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t begin, int64_t end, int64_t k,
                            Place place) {
   const int lane = threadIdx.x % 32;
-  for (int64_t start = begin; start < end; start += 32 * kAhead) {
-    int32_t ahead[kAhead];
+  const auto read = [&](int64_t start, int32_t (&ahead)[kAhead]) {
 #pragma unroll
     for (int step = 0; step < kAhead; ++step) {
       const int64_t row = start + 32 * step + lane;
       ahead[step] = row < end ? cells[row] : 0;
     }
+  };
+  int32_t now[kAhead], next[kAhead];
+  read(begin, now);
+  for (int64_t start = begin; start < end; start += 32 * kAhead) {
+    read(start + 32 * kAhead, next);
 #pragma unroll
     for (int step = 0; step < kAhead; ++step) {
       const int64_t row = start + 32 * step + lane;
       const bool active = row < end;
       // Lanes past the end form a group of their own, which counts nothing.
-      const int bucket = active ? static_cast<int>(bucket_of_cell(ahead[step], k)) : -1;
+      const int bucket = active ? static_cast<int>(bucket_of_cell(now[step], k)) : -1;
       const unsigned peers = __match_any_sync(kAllLanes, bucket);
       const int leader = __ffs(static_cast<int>(peers)) - 1;
       int32_t before = 0;
@@ -61,30 +67,35 @@ __device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t begi
       before = __shfl_sync(kAllLanes, before, leader);
       if (active) place(row, before + __popc(peers & ((1u << lane) - 1u)));
       __syncwarp();
+      now[step] = next[step];
     }
   }
 }
 
-// The chunk of a warp, with its counters in shared memory: histograms (kScatter false), or the rows to their places.
+// The chunks of a block's warps, with their counters in shared memory: histograms (kScatter false), or the rows to
+// their places. The grid has whole blocks of chunks; the last ones may have no rows.
 template <bool kScatter>
 __global__ void __launch_bounds__(kThreads)
     cell_sort_chunk(const int32_t* __restrict__ cells, int32_t* counts, int32_t* __restrict__ order, int64_t chunks,
                     int64_t rows, int64_t n, int64_t k) {
-  VN_SHARED(counters, int32_t[kWarps][kCellSortBuckets]);
-  const int64_t chunk = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
-  if (chunk >= chunks) return;  // whole warps leave; there is no barrier of the block
-  const int lane = threadIdx.x % 32;
-  int32_t* own = counters[threadIdx.x / 32];
-  for (int64_t bucket = lane; bucket < k + 2; bucket += 32)
-    own[bucket] = kScatter ? counts[bucket * chunks + chunk] : 0;
-  __syncwarp();
-  const int64_t begin = chunk * rows, end = begin + rows < n ? begin + rows : n;
+  // Four more a warp: neighbouring threads have the counters of one bucket and eight warps, in different banks.
+  VN_SHARED(counters, int32_t[kWarps][kCellSortBuckets + 4]);
+  const unsigned warp = threadIdx.x / 32, size = static_cast<unsigned>(k + 2) * kWarps;
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kWarps;
+  for (unsigned i = threadIdx.x; i < size; i += kThreads) {
+    counters[i % kWarps][i / kWarps] = kScatter ? counts[i / kWarps * chunks + first + i % kWarps] : 0;
+  }
+  __syncthreads();
+  const int64_t begin = (first + warp) * rows, end = begin + rows < n ? begin + rows : n;
   if constexpr (kScatter) {
-    count_rows(cells, own, begin, end, k,
+    count_rows(cells, counters[warp], begin, end, k,
                [order](int64_t row, int32_t position) { order[position] = static_cast<int32_t>(row); });
   } else {
-    count_rows(cells, own, begin, end, k, [](int64_t, int32_t) {});
-    for (int64_t bucket = lane; bucket < k + 2; bucket += 32) counts[bucket * chunks + chunk] = own[bucket];
+    count_rows(cells, counters[warp], begin, end, k, [](int64_t, int32_t) {});
+    __syncthreads();
+    for (unsigned i = threadIdx.x; i < size; i += kThreads) {
+      counts[i / kWarps * chunks + first + i % kWarps] = counters[i % kWarps][i / kWarps];
+    }
   }
 }
 
@@ -194,7 +205,7 @@ void sort_by_counting(const CellSortPlan& plan, const int32_t* cells, int32_t* o
                       unsigned char* workspace, int64_t n, int64_t k, void* stream) {
   const int64_t rows = plan.chunk_rows, chunks = plan.chunks, size = chunks * plan.buckets;
   const unsigned tiles = static_cast<unsigned>(plan.tiles);
-  const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(chunks, kWarps));
+  const unsigned blocks = static_cast<unsigned>(chunks / kWarps);
   auto* counts = reinterpret_cast<int32_t*>(workspace + plan.counts);
   auto* tile_sums = reinterpret_cast<int32_t*>(workspace + plan.tile_sums);
   VN_LAUNCH(cell_sort_chunk<false>, blocks, kThreads, 0, stream, cells, counts, order, chunks, rows, n, k);

@@ -1,7 +1,7 @@
 // Stable sort by cell: cells [n] -> order [n], offsets [k+1].
 //
-// By counting, the rows are cut into chunks of cell_sort_chunk_rows(k), each with its own histogram in the workspace; a
-// chunk has many more rows than there are cells, so the histograms stay a fraction of n.
+// By counting, the rows are cut into chunks, each with its own histogram in the workspace; a chunk has more rows than
+// there are cells, so the histograms stay a fraction of n.
 #pragma once
 
 #include <cstdint>
@@ -10,10 +10,8 @@
 
 namespace voronerf {
 
-// Two counts more than cells: below 0 and from k on, which CUDA sorts to the ends (it cannot raise without a host
-// read).
 inline int64_t cell_sort_chunk_rows(int64_t k) {
-  return 4 * (k + 2) < 2048 ? 2048 : 4 * (k + 2);
+  return 4 * k < 2048 ? 2048 : 4 * k;
 }
 inline int64_t cell_sort_chunks(int64_t n, int64_t k) {
   return ceil_div(n, cell_sort_chunk_rows(k));
@@ -28,14 +26,15 @@ inline int64_t cell_sort_workspace(int64_t n, int64_t k) {
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
                    int threads);
 
-// How CUDA sorts: by counting where a warp's counters fit shared memory, else by the toolkit's radix sort. By counting
-// bytes, for 4 M rows on an H200, the two cost the same at some 1,000 cells (docs/cuda.md); the limit is that of shared
-// memory.
+// How CUDA sorts: by counting where a warp's counters fit shared memory, which by counting bytes is the better way as
+// long as it is possible (docs/cuda.md), else by the toolkit's radix sort. It has two buckets more than there are
+// cells, for those below 0 and from k on: it cannot raise without a host read.
 enum class CellSortWay : int { automatic = 0, counting, radix };
-constexpr int64_t kCellSortBuckets = 1024;  // of a warp: 32 KiB of a block of eight
+constexpr int64_t kCellSortBuckets = 1024;  // of a warp: 32 KiB of a block
+constexpr int64_t kCellSortBlock = 8;       // chunks of a block, and the counters of a bucket in 32 bytes
 constexpr int64_t kCellSortScanTile = 4096;
 
-// Sizes and the bytes of workspace in front of each part, a pure function. Buckets are the cells and the two ends.
+// Sizes and the bytes of workspace in front of each part, a pure function.
 struct CellSortPlan {
   bool radix;
   int64_t buckets;

@@ -18,8 +18,9 @@ CellSortPlan cell_sort_plan(int64_t n, int64_t k, CellSortWay way, int64_t tempo
   VN_CHECK(few || way != CellSortWay::counting, "cell_sort: too many cells to be counted in shared memory");
   plan.radix = way == CellSortWay::radix || !few;
   if (!plan.radix) {
-    plan.chunk_rows = cell_sort_chunk_rows(k);
-    plan.chunks = cell_sort_chunks(n, k);
+    // Short chunks keep many warps busy, and long ones have few counters: half as many as rows at most.
+    plan.chunk_rows = 2 * plan.buckets < 1024 ? 1024 : 2 * plan.buckets;
+    plan.chunks = ceil_div(ceil_div(n, plan.chunk_rows), kCellSortBlock) * kCellSortBlock;
     const int64_t size = plan.chunks * plan.buckets;
     plan.tiles = ceil_div(size, kCellSortScanTile);
     plan.tile_sums = aligned(4 * size);
