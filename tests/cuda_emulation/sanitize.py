@@ -172,6 +172,11 @@ def hostile(module: ModuleType) -> None:
         addresses = at(points), at(centres), 0, *(at(table) for table in tables), at(leaves)
         module.locate_cell_cuda_float32(*addresses, 300, 5, 2, 3, *GPU)
         written(leaves)
+        uniforms, leaves = floats(300, 3), unwritten(300, dtype=np.int32)
+        uniforms[::4] = np.array([np.nan, -1, 7])
+        addresses = at(points), at(centres), 0, *(at(table) for table in tables), at(uniforms), at(leaves)
+        module.draw_cell_cuda(*addresses, 300, 5, 2, 3, 0.1, *GPU)
+        written(leaves)
 
     m, r, c = 180, 5, 3
     for offsets in ([5, 3, -4, 500, 90, 7], [least, most, least, most, 0, 180], [180, 180, 181, 0, -1, most]):
@@ -192,15 +197,16 @@ def hostile(module: ModuleType) -> None:
 
     n, k = 64, 4
     for offsets in ([9, 3, -5, 200, 64], [least, most, least, most, 0], [64, 0, 64, 0, 64], [-7, -5, -3, -2, -1]):
-        for shared in (227, 1):
-            module.device(90, 120, shared * 1024)
+        # Chained forward, in tiles and layer by layer forward and backward.
+        for forward, backward in ((1, 2), (2, 2), (3, 3)):
+            module.device(90, 120, 227 * 1024)
             given, sums = network(n, k, integers(*offsets))
-
-            sizes = [module.grouped_mlp_workspace_cuda(TABLE, 1, n, k, backward, True, 0) for backward in (False, True)]
+            ways = ((False, forward), (True, backward))
+            sizes = [module.grouped_mlp_workspace_cuda(TABLE, 1, n, k, back, True, 0, way) for back, way in ways]
             memory = [np.full(size, 255, np.uint8) for size in sizes]
-            module.grouped_mlp_cuda(*given[:4], at(sums[0]), 1, at(memory[0]), *GPU)
+            module.grouped_mlp_cuda(*given[:4], at(sums[0]), 1, at(memory[0]), *GPU, forward)
             addresses = at(sums[1]), *given[4:], at(sums[2]), at(sums[3]), 1, at(memory[1])
-            module.grouped_mlp_backward_cuda(*given[:4], *addresses, *GPU)
+            module.grouped_mlp_backward_cuda(*given[:4], *addresses, *GPU, backward)
 
 
 KEPT: list[Any] = []
