@@ -98,7 +98,7 @@ def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]
             scenes=asked,
             size=rows[0]["size"] if rows else None,
             budget_seconds=settings.budget,
-            seeds=settings.seeds,
+            seeds=len({row["seed"] for row in rows}) or settings.seeds,
             rays=settings.rays,
             samples=settings.samples,
             rates=list(settings.rates),

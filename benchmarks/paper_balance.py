@@ -81,7 +81,7 @@ def measure(settings: Settings, say: Callable[[str], None] = print, *, diagrams:
             scenes=[Path(name).name for name in settings.scene or default_scenes()],
             diagrams=diagrams,
             cells=CELLS,
-            seeds=settings.seeds,
+            seeds=len({run.seed for run in runs(settings) if samples_path(run).is_file()}) or settings.seeds,
             budget_seconds=settings.budget,
             missing=without_samples(settings),
         ),

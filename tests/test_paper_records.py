@@ -85,7 +85,9 @@ def test_a_table_is_made_in_parts(
     assert trained[1:] == [["random parameters, 0"]]
     (claim,) = outcome["claims"]
     assert claim["verdict"] == "holds (one seed)" and claim["here"] == "+2.00 dB"
+    assert outcome["metadata"]["seeds"] == 1
     text = (settings.out / "initialisation.md").read_text()
+    assert "; one seed; " in text
     assert "Missing: inherited on builtin, seed 1; random parameters on builtin, seed 1." in text
     page = tmp_path / "paper.md"
     paper.report(settings.out, page)
@@ -100,6 +102,7 @@ def test_a_table_is_made_in_parts(
     finished = paper.experiment("initialisation", there)
     assert trained[2:] == [["inherited, 1", "random parameters, 1"]]
     assert finished["claims"][0]["verdict"] == "holds for every seed" and finished["metadata"]["missing"] == []
+    assert finished["metadata"]["seeds"] == 2
     assert "Missing" not in (there.out / "initialisation.md").read_text()
     assert len(load("paper_records").read_record(record)) == 4
 
