@@ -25,6 +25,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
 
     import voronerf
     from voronerf import _native
+    from voronerf.layers import MLP, POSITIONS, Layer
     from voronerf.reference.cell_sort import cell_sort as specified
 
     where = torch.device(device)
@@ -88,16 +89,49 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         # numbers within rounding of a border are few
         assert int((found.cpu() != voronerf.draw_cell(*given, **options, backend="reference")).sum()) <= 3
 
-    def route() -> None:
+    def shifted(tensor: Any) -> Any:
+        """The same numbers, beginning four bytes (eight in float64) into their memory: nothing wider is aligned."""
+        return torch.cat([tensor.new_zeros(1), tensor.flatten()])[1:].view(tensor.shape)
+
+    def route(view: Callable[[Any], Any] = lambda tensor: tensor) -> None:
         layers = WIDE
         shapes = layers.weight_shapes(3)
         centres = torch.rand(5, 3)
 
         def run(x: list[Any], backend: str) -> Any:
-            options: dict[str, Any] = {"centres": centres.to(where), "layers": layers, "backend": backend}
+            options: dict[str, Any] = {"centres": view(centres.to(where)), "layers": layers, "backend": backend}
+            x = [view(part) for part in x]
             return voronerf.routed_mlp(x[0], x[1:], [None] * len(shapes), **options)[0]
 
         close(run, [torch.rand(300, 3), *(torch.randn(5, o, i) / i**0.5 for o, i in shapes)])
+
+    def views() -> None:
+        """Of every other operation that takes floating-point numbers."""
+        close(lambda x, b: voronerf.frequency_encode(shifted(x[0]), 10, backend=b), [torch.rand(90, 3)])
+        close(
+            lambda x, b: tuple(voronerf.composite(*map(shifted, x), backend=b)),
+            [torch.rand(6, 30), torch.rand(6, 30, 3), torch.rand(6, 30).cumsum(1), torch.rand(6, 30)],
+        )
+        cells = shifted(torch.randint(0, 5, (300,), dtype=torch.int32, device=where))
+        found, expected = (voronerf.cell_sort(cells, 5, backend=b) for b in ("native", "reference"))
+        assert all(torch.equal(a, b) for a, b in zip(found, expected))
+
+    def beyond_float16() -> None:
+        """Values that layers read are cut off where float16 ends; gradients are not, for a GradScaler to see."""
+        layers = MLP((Layer((POSITIONS,), 16, "relu"), Layer((0,), 16, "relu"), Layer((1,), 3)), (2, 0))
+        sizes = layers.weight_shapes(3)
+        leaves = [torch.ones(40, 3), *(torch.randn(2, o, i) / (1 if i == 3 else 64) for o, i in sizes)]
+        leaves[0][::8] = 1e6
+        leaves[1][:, ::2] = leaves[1][:, ::2].abs()  # some sums are large, whatever the signs of the others
+        leaves = [leaf.to(where).requires_grad_() for leaf in leaves]
+        offsets = torch.tensor([0, 23, 40], dtype=torch.int32, device=where)
+        halves = [leaf.half() for leaf in leaves[1:]]
+        out = voronerf.grouped_mlp(leaves[0], offsets, halves, [None] * 3, layers=layers, backend="native")
+        assert not out.isnan().any() and out[:, 3:].isinf().any() and out[:, :3].isfinite().all()
+        gradients = torch.autograd.grad(out, leaves, torch.ones_like(out), retain_graph=True)
+        assert not any(gradient.isnan().any() for gradient in gradients)
+        overflowing = torch.autograd.grad(out, leaves, torch.full_like(out, 6e4))
+        assert not all(gradient.isfinite().all() for gradient in overflowing)
 
     def network(layers: Any, counts: list[int], d: int, precision: str) -> None:
         with where:
@@ -141,7 +175,10 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             for precision in ALLOWED
         ),
         ("grouped_mlp dense float32", functools.partial(network, DENSE, [37, 3], 3, "float32")),
+        ("grouped_mlp beyond float16", beyond_float16),
         ("routed_mlp", route),
+        ("routed_mlp of unaligned views", functools.partial(route, shifted)),
+        ("unaligned views", views),
     ]
     return cases
 
