@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import itertools
 import json
@@ -9,6 +10,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -133,6 +135,71 @@ def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path: Path
         ("hangs", False),
         ("last", True),
     ]
+
+
+@pytest.fixture
+def fake_cuda(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Graphs that keep what is called between the ends of a capture; a list of what was called outside of any."""
+    called, capturing = [], []
+
+    class Graph:
+        def __init__(self) -> None:
+            self.calls: list[str] = []
+
+        def replay(self) -> None:
+            called.extend(self.calls)
+
+    @contextlib.contextmanager
+    def graph(of: Graph) -> Iterator[None]:
+        capturing.append(of)
+        yield
+        capturing.pop()
+
+    def call() -> None:
+        (capturing[-1].calls if capturing else called).append("call")
+
+    called.append(call)
+    stream = SimpleNamespace(wait_stream=lambda other: None)
+    monkeypatch.setattr("torch.cuda.CUDAGraph", Graph)
+    monkeypatch.setattr("torch.cuda.graph", graph)
+    monkeypatch.setattr("torch.cuda.Stream", lambda: stream)
+    monkeypatch.setattr("torch.cuda.current_stream", lambda: stream)
+    monkeypatch.setattr("torch.cuda.stream", lambda stream: contextlib.nullcontext())
+    return called
+
+
+class Ticks:
+    """A stopwatch by which a call takes a millisecond, and what the host does another ten."""
+
+    cuda = True
+
+    def __init__(self, called: list[str]) -> None:
+        self.called = called
+
+    def __call__(self, run: Callable[[int], object], first: int, count: int) -> float:
+        before = len(self.called)
+        run(first)
+        return 0.010 + 0.001 * (len(self.called) - before)
+
+
+def test_kernels_are_timed_without_the_host(parts: ModuleType, fake_cuda: list) -> None:
+    call = fake_cuda.pop()
+    found = parts.clock(call, Ticks(fake_cuda))
+    assert found["graph"] == "captured" and found["launched"] == pytest.approx(0.011)
+    assert found["seconds"] == pytest.approx((0.010 + 0.001 * parts.CALLS) / parts.CALLS)
+
+
+def test_what_cannot_be_captured_is_timed_as_it_is(
+    parts: ModuleType, fake_cuda: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(graph: object) -> None:
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    monkeypatch.setattr("torch.cuda.graph", refused)
+    call = fake_cuda.pop()
+    found = parts.clock(call, Ticks(fake_cuda))
+    assert found["seconds"] == found["launched"] == pytest.approx(0.011)
+    assert found["graph"] == "RuntimeError: operation not permitted when stream is capturing"
 
 
 @pytest.mark.native
