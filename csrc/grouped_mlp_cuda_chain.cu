@@ -15,8 +15,9 @@ __device__ inline void chain_fetch(const MlpChainPlan& plan, int l, int chunk, c
   const int bytes = chain_piece_bytes(layer.steps, chain_pairs(chain_tiles(layer.width, chunk, layer.fresh)));
   // Of two chunks the first is whole.
   packed += layer.piece + chunk * chain_piece_bytes(layer.steps, chain_pairs(kChainChunk / 8));
-  for (int at = 16 * thread_again(); at < bytes; at += 16 * kChainRows * plan.warps)
+  for (int at = 16 * thread_again(); at < bytes; at += 16 * kChainRows * plan.warps) {
     copy_async(slot + at, packed + at, true);
+  }
   copy_commit();
 }
 

@@ -190,36 +190,44 @@ struct MlpChainRows {
   int count;
 };
 
-// A lane's rows in the caller's arrays, with an index those of its entries; -1: none. Looked up where they are wanted,
-// rather than kept in registers; numbers of rows are below 2^31.
+// A lane's rows in the caller's arrays, with an index those of its entries; -1: none of the warp's. Looked up where they
+// are wanted, rather than kept in registers; numbers of rows are below 2^31.
 __device__ __forceinline__ void chain_source_rows(const MlpCudaData& data, MlpChainRows rows, const int32_t* index,
                                                   int (&found)[4]) {
   const int lane = thread_again() % 32;
 #pragma unroll
   for (int i = 0; i < 4; ++i) {
     const int row = lane / 4 + 8 * i;
+    const bool there = row < rows.count;
     found[i] = -1;
-    if (row < rows.count) found[i] = static_cast<int>(mlp_source_row(data, rows.first + row));
-    if (row < rows.count && index != nullptr) found[i] = index[found[i]];
+    if (there) found[i] = static_cast<int>(mlp_source_row(data, rows.first + row));
+    if (there && index != nullptr) found[i] = index[found[i]];
   }
 }
+
+// 1 / 2 pi in two parts.
+constexpr float kTurnHigh = 0.159154937f, kTurnLow = 6.42063833e-9f;
 
 // The unit of an encoded input that a lane has in a step, moved on from step to step.
 struct MlpChainUnit {
   int unit, feature;
   float scale;  // of the octave of its first two columns
 };
-__device__ __forceinline__ MlpChainUnit chain_first_unit(const MlpChainInput& input) {
-  const int unit = thread_again() % 4;
-  return {unit, unit % input.features, octave_scale(2 * (unit / input.features))};
-}
-__device__ __forceinline__ void chain_next_unit(const MlpChainInput& input, MlpChainUnit& unit) {
-  unit.unit += 4;
-  unit.feature += 4;
+__device__ __forceinline__ void chain_wrap_unit(const MlpChainInput& input, MlpChainUnit& unit) {
   while (unit.feature >= input.features) {
     unit.feature -= input.features;
     unit.scale *= 4.0f;
   }
+}
+__device__ __forceinline__ MlpChainUnit chain_first_unit(const MlpChainInput& input) {
+  MlpChainUnit first = {thread_again() % 4, thread_again() % 4, 1.0f};
+  chain_wrap_unit(input, first);
+  return first;
+}
+__device__ __forceinline__ void chain_next_unit(const MlpChainInput& input, MlpChainUnit& unit) {
+  unit.unit += 4;
+  unit.feature += 4;
+  chain_wrap_unit(input, unit);
 }
 
 // Raw features of a row from a first one on; one multiplication, by what is known to have no sign.
@@ -227,7 +235,7 @@ __device__ __forceinline__ const float* chain_raw(const float* first, int row, i
   return first + static_cast<uint64_t>(static_cast<unsigned>(row)) * static_cast<unsigned>(raw);
 }
 
-// A lane's unit of an input in its four rows. rows: of the input, -1 past the end, which is encoded as 0.
+// A lane's unit of an input in its four rows of that input; those that are none (-1) are 0.
 //
 // One reduction and one sine and cosine serve two octaves, the second by the double angle, whose error of about 2e-6
 // is below what 16 bits keep; blurs likewise, by the fourth power.
@@ -236,22 +244,38 @@ __device__ __forceinline__ void chain_encode(const MlpChainInput& input, const f
                                              const MlpChainUnit& unit, MlpFragment& values) {
   if (unit.unit < input.units) {
     const bool second = unit.scale < input.last;
-    float x[4];
-#pragma unroll
-    for (int i = 0; i < 4; ++i) x[i] = rows[i] < 0 ? 0.0f : *chain_raw(from + unit.feature, rows[i], input.raw);
+    float angles[4], turns[4];
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
-      const MlpTurns turns = mlp_turns(x[i]);
-      const float whole = turns.high * unit.scale;
-      const float nearest = (whole + 12582912.0f) - 12582912.0f;
-      float fraction = fmaf(turns.low, unit.scale, whole - nearest);
-      if (!(fabsf(x[i] * unit.scale) <= kLargestDeviceAngle)) fraction = turns_of_large(x[i] * unit.scale);
-      const float angle = 6.28318531f * fraction;
+      angles[i] = (rows[i] < 0 ? 0.0f : *chain_raw(from + unit.feature, rows[i], input.raw)) * unit.scale;
+    }
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      // To the nearest whole turn; a fused multiplication leaves what is left exact.
+      const float nearest = fmaf(angles[i], kTurnHigh, 12582912.0f) - 12582912.0f;
+      turns[i] = fmaf(angles[i], kTurnLow, fmaf(angles[i], kTurnHigh, -nearest));
+    }
+    // The largest of those that are numbers; the others have become none already.
+    const float most = fmaxf(fmaxf(fabsf(angles[0]), fabsf(angles[1])), fmaxf(fabsf(angles[2]), fabsf(angles[3])));
+    if (most > kLargestDeviceAngle) {
+#pragma unroll 1
+      for (int i = 0; i < 4; ++i) {
+        const float angle = i == 0 ? angles[0] : i == 1 ? angles[1] : i == 2 ? angles[2] : angles[3];
+        if (!(fabsf(angle) > kLargestDeviceAngle)) continue;
+        const float exact = turns_of_large(angle);
+#pragma unroll
+        for (int j = 0; j < 4; ++j) turns[j] = i == j ? exact : turns[j];
+      }
+    }
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      const float angle = 6.28318531f * turns[i];
       const float sine = fast_sine(angle), cosine = fast_cosine(angle), twice = sine + sine;
       float pairs[4] = {sine, cosine, twice * cosine, fmaf(-twice, sine, 1.0f)};
       if (input.integrated) {
-        const float* variance = chain_raw(from + unit.feature + input.features, rows[i], input.raw);
-        const float blur = octave_blur(unit.scale, rows[i] < 0 ? 0.0f : *variance), square = blur * blur;
+        const float variance =
+            rows[i] < 0 ? 0.0f : *chain_raw(from + unit.feature + input.features, rows[i], input.raw);
+        const float blur = octave_blur(unit.scale, variance), square = blur * blur;
         pairs[0] *= blur, pairs[1] *= blur, pairs[2] *= square * square, pairs[3] *= square * square;
       }
       values[i / 2][i % 2] = pack_halves<kBfloat16>(pairs[0], pairs[1]);
@@ -263,7 +287,7 @@ __device__ __forceinline__ void chain_encode(const MlpChainInput& input, const f
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
       float four[4] = {0.0f, 0.0f, 0.0f, 0.0f};
-      if (rows[i] >= 0 && left > 0) {
+      if (left > 0 && rows[i] >= 0) {
         const float* raw = chain_raw(from + feature, rows[i], input.raw);
         if (whole) {
           const float4 all = *reinterpret_cast<const float4*>(raw);
