@@ -21,10 +21,11 @@ the number of cells."""
 def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     """Names and checks, which raise."""
     import torch
-    from emulated_networks import ALLOWED, BRANCHED, BROAD, DENSE, GAUSSIANS, WIDE, check
+    from emulated_networks import ALLOWED, BRANCHED, BROAD, DENSE, GAUSSIANS, SKIPS, THICK, WIDE, check, check_forward
 
     import voronerf
-    from voronerf import _native
+    from voronerf import _native, _native_mlp
+    from voronerf.fields import NeRF
     from voronerf.layers import MLP, POSITIONS, Layer
     from voronerf.reference.cell_sort import cell_sort as specified
 
@@ -133,9 +134,13 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         overflowing = torch.autograd.grad(out, leaves, torch.full_like(out, 6e4))
         assert not all(gradient.isfinite().all() for gradient in overflowing)
 
-    def network(layers: Any, counts: list[int], d: int, precision: str) -> None:
-        with where:
+    def network(layers: Any, counts: list[int], d: int, precision: str, way: str = "auto") -> None:
+        with where, _native_mlp.taking(way):
             check(layers, counts, d, precision)
+
+    def forward(layers: Any, precision: str, way: str) -> None:
+        with where, _native_mlp.taking(way):
+            check_forward(layers, [37, 0, 60], 3, precision)
 
     networks = {"branched": (BRANCHED, 3), "wide": (WIDE, 7), "gaussians": (GAUSSIANS, 6), "broad": (BROAD, 3)}
     cases: list[tuple[str, Callable[[], None]]] = [
@@ -173,6 +178,25 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             (f"grouped_mlp {name} {precision}", functools.partial(network, layers, [70, 0, 1, 40], d, precision))
             for name, (layers, d) in networks.items()
             for precision in ALLOWED
+        ),
+        # Chained where nothing else is said: beside it the other ways of the same networks.
+        *(
+            (
+                f"grouped_mlp {name} {precision} by {way}",
+                functools.partial(network, networks[name][0], [70, 0, 1, 40], networks[name][1], precision, way),
+            )
+            for name, way in (("branched", "tiles"), ("gaussians", "tiles"), ("branched", "layers"))
+            for precision in ("bfloat16", "float16")
+        ),
+        *(
+            (f"grouped_mlp {name} {precision} forward by {way}", functools.partial(forward, layers, precision, way))
+            for name, layers, precision, way in (
+                ("skips", SKIPS, "bfloat16", "chain"),
+                ("skips", SKIPS, "float16", "chain"),
+                ("skips", SKIPS, "float16", "tiles"),
+                ("nerf64", NeRF(width=64).layers, "bfloat16", "chain"),
+                ("thick", THICK, "bfloat16", "chain"),
+            )
         ),
         ("grouped_mlp dense float32", functools.partial(network, DENSE, [37, 3], 3, "float32")),
         ("grouped_mlp beyond float16", beyond_float16),

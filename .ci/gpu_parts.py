@@ -308,7 +308,7 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     from networks import NETS, cost, make_batch
 
     import voronerf
-    from voronerf import _native
+    from voronerf import _native, _native_mlp
 
     where = torch.device(device)
     journal = Journal(out, "roofs", begun=again.start > 0)
@@ -344,7 +344,7 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         order, offsets = torch.empty_like(cells), cells.new_empty(k + 1)
         return functools.partial(_native.sort_cells, cells, order, offsets, "cell_sort", way)
 
-    def network(name: str, k: int, backward: bool) -> Callable[[], Any]:
+    def network(name: str, k: int, backward: bool, way: str = "auto") -> Callable[[], Any]:
         if where.type == "cuda":
             torch.cuda.empty_cache()
         batch = make_batch(NETS[name], n, k, torch.bfloat16, BACKWARD, where)
@@ -352,7 +352,7 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         given = batch.positions[0], batch.offsets, batch.weights, batch.biases
 
         def run() -> None:
-            with torch.set_grad_enabled(backward):
+            with torch.set_grad_enabled(backward), _native_mlp.taking(way):
                 result = voronerf.grouped_mlp(*given, **options, backend="native")
                 if backward:
                     torch.autograd.grad(result, [*batch.weights, *batch.biases], batch.gradients[1])
@@ -371,6 +371,10 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         forward, both = (functools.partial(network, name, k, backward) for backward in (False, True))
         both_work, both_aim = (price.forward + price.backward) * n, 0.25 if name == "nerf64" else None
         row(f"{name} k={k} forward", forward, "bfloat16", price.forward * n, aims.get(name))
+        if name != "nerf256":
+            # Which is the faster: values in registers, as above, or in shared memory.
+            tiles = functools.partial(network, name, k, False, "tiles")
+            row(f"{name} k={k} forward by tiles", tiles, "bfloat16", price.forward * n, None)
         row(f"{name} k={k} forward + backward", both, "bfloat16", both_work, both_aim)
     return one_by_one(cases, again, settling(device), journal)
 

@@ -190,8 +190,8 @@ struct MlpChainRows {
   int count;
 };
 
-// A lane's rows in the caller's arrays, with an index those of its entries; -1: none of the warp's. Looked up where they
-// are wanted, rather than kept in registers; numbers of rows are below 2^31.
+// A lane's rows in the caller's arrays, with an index those of its entries; -1: none of the warp's. Looked up where
+// they are wanted, rather than kept in registers; numbers of rows are below 2^31.
 __device__ __forceinline__ void chain_source_rows(const MlpCudaData& data, MlpChainRows rows, const int32_t* index,
                                                   int (&found)[4]) {
   const int lane = thread_again() % 32;

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -45,6 +46,17 @@ def _choose_way() -> int:
 
 
 _WAY = _choose_way()
+
+
+@contextmanager
+def taking(way: str) -> Iterator[None]:
+    """For a while every network on CUDA goes this way, one of ``WAYS``, or is refused."""
+    global _WAY
+    before, _WAY = _WAY, WAYS.index(way)
+    try:
+        yield
+    finally:
+        _WAY = before
 
 
 def grouped_mlp(

@@ -37,6 +37,29 @@ DENSE = MLP(
 )
 BROAD = MLP((Layer((POSITIONS,), 270, "sigmoid"), Layer((0, POSITIONS), 300, "sine"), Layer((1,), 3)), (2,), 2)
 
+# ReLU on values that are read late, twice, side by side and when another one is held; two chunks of outputs, one of
+# them narrow; encodings that are read again; every kind of head.
+SKIPS = MLP(
+    (
+        Layer((POSITIONS,), 100, "relu"),
+        Layer((0,), 20, "sine"),
+        Layer((1, 0), 66, "relu"),
+        Layer((2, DIRECTIONS, 1, POSITIONS), 40, "softplus"),
+        Layer((3, 3), 7, "sigmoid"),
+        Layer((4, 0, DIRECTIONS), 9),
+    ),
+    (5, 2, 4, 5),
+    position_octaves=5,
+    direction_octaves=2,
+)
+
+# More weights than a block's shared memory holds, at 128 features, chained; for it they pass through.
+THICK = MLP(
+    (Layer((POSITIONS,), 128, "relu"), *(Layer((index,), 128, "relu") for index in range(7)), Layer((7, POSITIONS), 4)),
+    (8,),
+    position_octaves=10,
+)
+
 
 def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.float32) -> dict:
     """Arguments in float64, the values those of `dtype`."""
@@ -101,3 +124,12 @@ def check(layers: MLP, counts: list[int], d: int, precision: str) -> None:
         difference, scale = (part.double() - exact).norm().item(), exact.norm().item()
         assert part.isfinite().all()
         assert difference <= ALLOWED[precision] * max(scale, 1e-6), (list(part.shape), difference / max(scale, 1e-6))
+
+
+def check_forward(layers: MLP, counts: list[int], d: int, precision: str) -> None:
+    """The output alone: gradients of ReLU differ where a rounding moves a sample across its kink."""
+    dtype = getattr(torch, precision)
+    given = case(layers, counts, d, dtype)
+    out = run(given, layers, dtype, "native")[0].double()
+    exact = run(given, layers, torch.float64, "reference")[0]
+    assert (out - exact).norm() <= ALLOWED[precision] / 2 * exact.norm(), (out - exact).norm() / exact.norm()

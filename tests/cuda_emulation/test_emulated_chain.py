@@ -9,7 +9,7 @@ import random
 import pytest
 import torch
 from emulated import emulated, module
-from emulated_networks import ALLOWED, BRANCHED, GAUSSIANS, KIB, WIDE, case, check, run
+from emulated_networks import BRANCHED, GAUSSIANS, KIB, SKIPS, THICK, WIDE, case, check, check_forward, run
 from test_emulated_layers import nerf
 
 import voronerf
@@ -49,23 +49,6 @@ def plain(width: int, depth: int) -> MLP:
     """ReLU layers and a head of four outputs."""
     hidden = [Layer((index - 1,) if index else (POSITIONS,), width, "relu") for index in range(depth)]
     return MLP((*hidden, Layer((depth - 1,), 4)), (depth,), position_octaves=10)
-
-
-# Values that are read late, twice, side by side and when another one is held; two chunks of outputs, one of them
-# narrow; encodings that are read again; every kind of head.
-SKIPS = MLP(
-    (
-        Layer((POSITIONS,), 100, "relu"),
-        Layer((0,), 20, "sine"),
-        Layer((1, 0), 66, "relu"),
-        Layer((2, DIRECTIONS, 1, POSITIONS), 40, "softplus"),
-        Layer((3, 3), 7, "sigmoid"),
-        Layer((4, 0, DIRECTIONS), 9),
-    ),
-    (5, 2, 4, 5),
-    position_octaves=5,
-    direction_octaves=2,
-)
 
 
 @pytest.mark.parametrize("pairs", [1, 2, 4])
@@ -247,12 +230,8 @@ def test_branched_network(precision: str, shared: int) -> None:
 
 
 def right(layers: MLP, counts: list[int], d: int, precision: str) -> None:
-    """The forward pass alone: gradients of ReLU differ where a rounding moves a sample across its kink."""
     assert way(layers, precision, d=d) == "chain"
-    given = case(layers, counts, d, getattr(torch, precision))
-    out = run(given, layers, getattr(torch, precision), "native")[0].double()
-    exact = run(given, layers, torch.float64, "reference")[0]
-    assert (out - exact).norm() <= ALLOWED[precision] / 2 * exact.norm()
+    check_forward(layers, counts, d, precision)
 
 
 @pytest.mark.parametrize("precision", HALVES)
@@ -260,6 +239,12 @@ def right(layers: MLP, counts: list[int], d: int, precision: str) -> None:
 def test_skips(precision: str, shared: int) -> None:
     with emulated(seed=shared, shared_bytes=shared * KIB):
         right(SKIPS, [37, 290], 3, precision)
+
+
+def test_weights_that_pass_through() -> None:
+    with emulated():
+        assert not chain(THICK)["resident"]
+        right(THICK, [300], 3, "bfloat16")
 
 
 def test_before_ampere() -> None:
@@ -309,15 +294,17 @@ def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch: pytest.MonkeyP
     given = case(BRANCHED, [40, 5], 3, torch.bfloat16)
     results = []
     for name in ("chain", "tiles", "layers"):
-        monkeypatch.setattr(_native_mlp, "_WAY", _native_mlp.WAYS.index(name))
-        with emulated():
-            results.append(run(given, BRANCHED, torch.bfloat16, "native")[0])
+        with emulated(), _native_mlp.taking(name):
             assert way(BRANCHED, "bfloat16") == name
+            results.append(run(given, BRANCHED, torch.bfloat16, "native")[0])
     for other in results[1:]:
         torch.testing.assert_close(other, results[0], rtol=2e-2, atol=2e-2)
-    monkeypatch.setattr(_native_mlp, "_WAY", _native_mlp.WAYS.index("chain"))
-    with emulated(), pytest.raises(ValueError, match="grouped_mlp: a layer must have at most 128 features on CUDA"):
+    rule = "grouped_mlp: a layer must have at most 128 features on CUDA"
+    with emulated(), _native_mlp.taking("chain"), pytest.raises(ValueError, match=rule):
         run(case(WIDE, [4], 7, torch.bfloat16), WIDE, torch.bfloat16, "native")
+    assert _native_mlp.WAYS[_native_mlp._WAY] == "auto"
+    monkeypatch.setenv("VORONERF_CUDA_MLP", "tiles")
+    assert _native_mlp.WAYS[_native_mlp._choose_way()] == "tiles"
     monkeypatch.setenv("VORONERF_CUDA_MLP", "fast")
     with pytest.raises(ValueError, match="VORONERF_CUDA_MLP must be one of auto, chain, tiles, layers, got 'fast'"):
         _native_mlp._choose_way()

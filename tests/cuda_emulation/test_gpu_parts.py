@@ -211,11 +211,11 @@ def test_roofs(parts: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     again = parts.Again(("roofs",), case_seconds=60.0)
     assert parts.roofs(tmp_path, again, "cpu", 256) == 0
     rows = json.loads((tmp_path / "roofs.json").read_text())["rows"]
-    assert len(rows) == 25 and all(row["seconds"] > 0 and row["share"] > 0 for row in rows)
-    again = parts.Again(("roofs",), start=24, failed=1, case_seconds=60.0)
+    assert len(rows) == 29 and all(row["seconds"] > 0 and row["share"] > 0 for row in rows)
+    again = parts.Again(("roofs",), start=28, failed=1, case_seconds=60.0)
     assert parts.roofs(tmp_path, again, "cpu", 256) == 1
     after = json.loads((tmp_path / "roofs.json").read_text())["rows"]
-    assert after[:25] == rows and [row["name"] for row in after[25:]] == [rows[24]["name"]]
+    assert after[:29] == rows and [row["name"] for row in after[29:]] == [rows[28]["name"]]
 
 
 def test_training(
