@@ -180,6 +180,9 @@ def highlights(found: dict[str, Any]) -> list[str]:
         radix = times.get(name.replace("by counting", "by radix"))
         if name.endswith("by counting") and radix is not None:
             lines.append(f"{name}: {seconds / radix:.2f} x the time of radix")
+        tiles = times.get(f"{name} by tiles")
+        if tiles is not None:
+            lines.append(f"{name}: {seconds / tiles:.2f} x the time of tiles")
     for row in rows("training", "trainings"):
         said = f"PSNR {row['psnr']:.2f} after {row['steps']} steps" if row["right"] else f"FAILED: {row['said']}"
         lines.append(f"training {row['name']}: {said}")

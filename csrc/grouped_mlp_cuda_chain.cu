@@ -111,27 +111,22 @@ __device__ __forceinline__ void chain_run(const MlpChainPlan& plan, const MlpCud
     __syncwarp();
   }
   if (!layer.read) return;
+  if (layer.held && layer.width <= kChainChunk) {
+    // Into its place at once: copies would be as many instructions as the roundings.
+    chain_round<kBfloat16>(sums, relu, held);
+    if (layer.region >= 0) chain_store_steps<kPairs>(region + layer.region, held);
+    return;
+  }
   MlpFragment values[kPairs];
-  if (relu) {
-    chain_round<kBfloat16, true>(sums, values);
-  } else {
-    chain_round<kBfloat16, false>(sums, values);
+  chain_round<kBfloat16>(sums, relu, values);
+  if (kSteps > kChunkSteps && layer.held && chunk > 0) {
+    // The first chunk has waited in the region, since this one has read what was held before.
+    chain_load_steps<kChunkSteps>(region + layer.region, held);
+    chain_copy<kChunkSteps>(held, values);
   }
   if (layer.region >= 0) {
-#pragma unroll
-    for (int step = 0; step < kPairs; ++step) {
-      chain_store(region + layer.region, chunk * kChunkSteps + step, values[step]);
-    }
-  }
-  if (!layer.held) return;
-  if (layer.width <= kChainChunk) {
-    chain_copy<0>(held, values);
-  } else if (chunk > 0) {
-    if constexpr (kSteps > kChunkSteps) {
-#pragma unroll
-      for (int step = 0; step < kChunkSteps; ++step) chain_load(region + layer.region, step, held[step]);
-      chain_copy<kChunkSteps>(held, values);
-    }
+    unsigned char* to = region + layer.region + chunk * kChunkSteps * 2 * kChainQuad;
+    chain_store_steps<kPairs>(to, values);
   }
 }
 

@@ -60,12 +60,11 @@ __device__ __forceinline__ void chain_begin(MlpSums<2, kTiles>& sums, const floa
   }
 }
 
-// Fragments of the steps that the sums of a chunk are for the layers that read them.
-template <bool kBfloat16, bool kRelu, int kTiles>
-__device__ __forceinline__ void chain_round(const MlpSums<2, kTiles>& sums,
-                                            MlpFragment (&values)[chain_pairs(kTiles)]) {
+// Fragments of the steps that the sums of a chunk are for the layers that read them, the first of `values`.
+template <bool kBfloat16, bool kRelu, int kTiles, int kSteps>
+__device__ __forceinline__ void chain_round(const MlpSums<2, kTiles>& sums, MlpFragment (&values)[kSteps]) {
 #pragma unroll
-  for (int step = 0; step < chain_pairs(kTiles); ++step) {
+  for (int step = 0; step < chain_pairs(kTiles) && step < kSteps; ++step) {
 #pragma unroll
     for (int r = 0; r < 2; ++r) {
 #pragma unroll
@@ -80,6 +79,14 @@ __device__ __forceinline__ void chain_round(const MlpSums<2, kTiles>& sums,
         }
       }
     }
+  }
+}
+template <bool kBfloat16, int kTiles, int kSteps>
+__device__ __forceinline__ void chain_round(const MlpSums<2, kTiles>& sums, bool relu, MlpFragment (&values)[kSteps]) {
+  if (relu) {
+    chain_round<kBfloat16, true>(sums, values);
+  } else {
+    chain_round<kBfloat16, false>(sums, values);
   }
 }
 
@@ -150,19 +157,19 @@ __device__ __forceinline__ void chain_activate(MlpSums<2, kTiles>& sums, int act
 template <int kTiles>
 __device__ __forceinline__ void chain_write(MlpSums<2, kTiles>& sums, float* to, int64_t stride, int width,
                                             const int (&rows)[4]) {
-  const bool paired = stride % 2 == 0 && reinterpret_cast<uintptr_t>(to) % 8 == 0;
+  const bool paired = stride % 2 == 0 && width % 2 == 0 && reinterpret_cast<uintptr_t>(to) % 8 == 0;
   chain_for_each_tile(sums, [&](int tile, const MlpSums<2, 1>& each) {
     const int column = 8 * tile + 2 * (thread_again() % 4);
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
-      if (rows[i] < 0 || column >= width) continue;
-      float* pair = to + rows[i] * stride + column;
+      float* pair = to + static_cast<uint64_t>(static_cast<unsigned>(rows[i])) * static_cast<unsigned>(stride) + column;
       const float x = each[i / 2][0][i % 2 * 2], y = each[i / 2][0][i % 2 * 2 + 1];
-      if (paired && column + 1 < width) {
-        *reinterpret_cast<float2*>(pair) = make_float2(x, y);
+      const bool first = rows[i] >= 0 && column < width, second = rows[i] >= 0 && column + 1 < width;
+      if (paired) {
+        if (first) *reinterpret_cast<float2*>(pair) = make_float2(x, y);
       } else {
-        pair[0] = x;
-        if (column + 1 < width) pair[1] = y;
+        if (first) pair[0] = x;
+        if (second) pair[1] = y;
       }
     }
   });
@@ -182,6 +189,18 @@ __device__ __forceinline__ void chain_load(const unsigned char* region, int step
     const uint4 four = *reinterpret_cast<const uint4*>(region + (2 * step + r) * kChainQuad + threadIdx.x % 32 * 16);
     values[r][0] = four.x, values[r][1] = four.y, values[r][2] = four.z, values[r][3] = four.w;
   }
+}
+
+// The first kCount of `values`, and back.
+template <int kCount, int kSteps>
+__device__ __forceinline__ void chain_store_steps(unsigned char* region, const MlpFragment (&values)[kSteps]) {
+#pragma unroll
+  for (int step = 0; step < kCount && step < kSteps; ++step) chain_store(region, step, values[step]);
+}
+template <int kCount, int kSteps>
+__device__ __forceinline__ void chain_load_steps(const unsigned char* region, MlpFragment (&values)[kSteps]) {
+#pragma unroll
+  for (int step = 0; step < kCount && step < kSteps; ++step) chain_load(region, step, values[step]);
 }
 
 // Rows of a warp: from `first` on the first `count`, which may be less than 32 or none.
@@ -284,21 +303,27 @@ __device__ __forceinline__ void chain_encode(const MlpChainInput& input, const f
   } else {
     const int feature = 4 * (unit.unit - input.units), left = (input.integrated ? 0 : input.raw) - feature;
     const bool whole = input.raw % 4 == 0 && reinterpret_cast<uintptr_t>(from) % 16 == 0;
+    float four[4][4];
+    if (whole) {
+#pragma unroll
+      for (int i = 0; i < 4; ++i) {
+        float4 all = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        if (left > 0 && rows[i] >= 0)
+          all = *reinterpret_cast<const float4*>(chain_raw(from + feature, rows[i], input.raw));
+        four[i][0] = all.x, four[i][1] = all.y, four[i][2] = all.z, four[i][3] = all.w;
+      }
+    } else {
+#pragma unroll
+      for (int i = 0; i < 4; ++i) {
+        const float* raw = chain_raw(from + feature, rows[i], input.raw);
+#pragma unroll
+        for (int j = 0; j < 4; ++j) four[i][j] = rows[i] >= 0 && j < left ? raw[j] : 0.0f;
+      }
+    }
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
-      float four[4] = {0.0f, 0.0f, 0.0f, 0.0f};
-      if (left > 0 && rows[i] >= 0) {
-        const float* raw = chain_raw(from + feature, rows[i], input.raw);
-        if (whole) {
-          const float4 all = *reinterpret_cast<const float4*>(raw);
-          four[0] = all.x, four[1] = all.y, four[2] = all.z, four[3] = all.w;
-        } else {
-#pragma unroll
-          for (int j = 0; j < 4; ++j) four[j] = j < left ? raw[j] : 0.0f;
-        }
-      }
-      values[i / 2][i % 2] = pack_halves<kBfloat16>(four[0], four[1]);
-      values[i / 2][2 + i % 2] = pack_halves<kBfloat16>(four[2], four[3]);
+      values[i / 2][i % 2] = pack_halves<kBfloat16>(four[i][0], four[i][1]);
+      values[i / 2][2 + i % 2] = pack_halves<kBfloat16>(four[i][2], four[i][3]);
     }
   }
 }
