@@ -324,6 +324,7 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check: ModuleType) 
     timed = [{**row, "name": f"cell_sort k=16 by {way}"} for way in ("counting", "torch.sort")]
     timed += [{**row, "name": "cell_sort k=16 by radix", "seconds": 4e-5}]
     timed += [{**row, "name": "near", "aim": 0.6}, {**row, "name": "far", "aim": 0.4}]
+    timed += [{**row, "name": "far by tiles", "seconds": 8e-5}]
     found = {
         "roofs": {"rows": timed, "cases": [{"name": "slow", "right": False, "said": "hangs"}]},
         "training": {
@@ -338,10 +339,11 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check: ModuleType) 
         "memcheck": None,
     }
     said = check.highlights(found)
-    assert len(said) == 10
+    assert len(said) == 12
     assert said[3].endswith("0.020 ms  50.0 % of copy, MISSED 60 %") and said[4].endswith("copy, reached 40 %")
-    assert said[5:] == [
+    assert said[6:] == [
         "cell_sort k=16 by counting: 0.50 x the time of radix",
+        "far: 0.25 x the time of tiles",
         "training plain: PSNR 21.50 after 90 steps",
         "training bf16: FAILED: no",
         "WRONG in roofs: slow: hangs",
