@@ -25,10 +25,11 @@ __device__ float squared_distance(const float* point, const Diagram& in, int32_t
   return in.weights == nullptr ? squared : squared + (in.heaviest - in.weights[j]);
 }
 
-// 0 for what is infinite or no number, as of a point that is not finite.
+// 0 for what is no number, as of a point that is not finite. 1 at most, which the device's exponential may exceed by
+// its rounding.
 __device__ float mass_of(float nearest, float squared, float temperature) {
   const float mass = expf((nearest - sqrtf(squared)) / temperature);
-  return mass >= 0.0f && mass <= 1.0f ? mass : 0.0f;
+  return mass >= 0.0f ? fminf(mass, 1.0f) : 0.0f;
 }
 
 __device__ int32_t drawn_in(const float* point, const float* centres, const float* weights, int32_t k,

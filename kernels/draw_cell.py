@@ -35,9 +35,9 @@ def _squared(
 @wp.func
 def _mass(nearest: wp.float32, squared: wp.float32, temperature: wp.float32) -> wp.float32:
     mass = wp.exp((nearest - wp.sqrt(squared)) / temperature)
-    # Neither infinite nor no number, as that of a point that is not finite.
-    if mass >= 0.0 and mass <= 1.0:
-        return mass
+    # A number, unlike that of a point that is not finite; above 1 it is by rounding.
+    if mass >= 0.0:
+        return wp.min(mass, wp.float32(1.0))
     return wp.float32(0.0)
 
 

@@ -154,6 +154,31 @@ def test_numbers_at_and_beyond_the_ends(device: torch.device, backend: str) -> N
     assert leaves.tolist() == [2, 2, 2, 1, 1, 1]
 
 
+def test_the_reference_where_sums_do_not_rise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sums as a GPU takes them, in a tree: the last of all columns is above that of the last centre by rounding."""
+
+    def tree(values: Tensor, dim: int) -> Tensor:
+        step = 1
+        while step < values.shape[dim]:
+            values = values + torch.nn.functional.pad(values[:, :-step], (step, 0))
+            step *= 2
+        return values
+
+    monkeypatch.setattr(Tensor, "cumsum", tree)
+    points, centres = torch.rand(5000, 3), torch.rand(32, 3)
+    centres[:2] = torch.tensor([[0.0, 0, 0], [1000, 0, 0]])  # the second of which none is near
+    offsets = torch.tensor([0, 2, 9, 32], dtype=torch.int32)
+    child = torch.cat([torch.tensor([1, 2]), -1 - torch.arange(30)]).to(torch.int32)
+    uniforms = torch.zeros(5000, 2)
+    mass = torch.softmax(-(points[:, None] - centres[2:9]).norm(dim=2), 1)
+    padded = torch.cat([torch.zeros(5000, 2), mass, torch.zeros(5000, 23)], 1)
+    sums = padded.cumsum(1)
+    assert bool((sums[:, -1] > sums[:, 8]).any())
+    leaves = draw_cell(points, centres, offsets, child, uniforms, temperature=1.0, depth=2, backend="reference")
+    # Of the seven the last, or by rounding the one before it.
+    assert int(leaves.min()) >= 5 and int(leaves.max()) == 6
+
+
 def test_the_coldest_is_the_nearest_and_the_hottest_is_even(device: torch.device, backend: str) -> None:
     points, centres = 8 * torch.rand(500, 3, device=device), 8 * torch.rand(20, 3, device=device)
     uniforms = torch.rand(500, device=device)

@@ -64,9 +64,11 @@ def _draw(
         nearest = distance.masked_fill(elsewhere, torch.inf).amin(1, keepdim=True)
         # What is infinite or no number has no mass.
         mass = ((nearest - distance) / temperature).exp().masked_fill(elsewhere, 0).nan_to_num(0.0)
-        sums = mass.cumsum(1)
-        total = sums[:, -1:]
-        drawn = (sums < wanted[:, level, None] * total).sum(1)
+        # A device sums as a tree, each place with roundings of its own: a sum may be below the one before it, and the
+        # last above that at the last centre with mass. Of those with mass the first counts that has enough.
+        sums = mass.cumsum(1).masked_fill(mass == 0, 0)
+        total = sums.amax(1, keepdim=True)
+        drawn = (sums >= wanted[:, level, None] * total).to(torch.uint8).argmax(1)
         drawn = torch.where(total[:, 0] > 0, drawn, child_offsets[state.clamp(min=0)])
         state = torch.where(state < 0, state, child[drawn])
     return -state - 1
