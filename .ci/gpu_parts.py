@@ -232,8 +232,8 @@ def capture(step: Callable[[], list[Any]]) -> None:
 
 
 def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECONDS) -> int:
-    """Every file of tests/ops, and what else has tests for CUDA, in a process of its own, four at a time; its output
-    goes to ``out``."""
+    """Every file of tests/ops, and what else has tests for CUDA, in a process of its own, several at a time; its
+    output goes to ``out``."""
     journal = Journal(out, "tests")
     files = files or [
         *sorted((ROOT / "tests" / "ops").glob("test_*.py")),
@@ -254,7 +254,8 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
             return file, status, log.read().splitlines()
 
     failed = 0
-    with ThreadPoolExecutor(4) as pool:
+    # Most of a file's time goes into imports and compilers.
+    with ThreadPoolExecutor(max(4, min(12, (os.cpu_count() or 4) // 2))) as pool:
         for done in as_completed([pool.submit(run, file) for file in files]):
             file, status, lines = done.result()
             # 5: no test of this file is for CUDA.
