@@ -8,6 +8,9 @@
 //   - A product is under way until it is waited for: until then neither its sums nor its left operand may be read or
 //     written, nor what the right one is in shared memory ("wgmma.wait_group").
 //   - Registers that were read or written since must pass a fence before a product takes them ("wgmma.fence").
+//   - The compiler takes sums to be there when a product has begun, and may do with them before the wait what is
+//   written
+//     behind it, unless they are settled in between (group_settle).
 //   - Products read shared memory by another way than threads write it, cp.async included: who wrote says so before
 //     the barrier that the others wait at ("Async Proxy").
 #pragma once
@@ -49,7 +52,8 @@ __device__ __forceinline__ void group_publish() {
 #endif
 }
 
-// Registers that the next fence is for: the compiler may not move across this what they are made of.
+// Registers that the next fence is for, or sums that have been waited for: the compiler may not move across this what
+// they are made of, nor what is made of them.
 template <int kRows, int kColumns>
 __device__ __forceinline__ void group_settle(float (&sums)[kRows][kColumns]) {
 #ifdef VN_EMULATE

@@ -89,6 +89,7 @@ __global__ void group_product_kernel(const GroupProductCase given) {
   } else if (bug != kNoWait) {
     group_wait<0>();
   }
+  if (bug == kRight) group_settle(sums);
   for (int i = 0; i < 4 * kTiles; ++i) {
     given.out[(row + 8 * (i / 2 % 2)) * 8 * kTiles + i / 4 * 8 + column + i % 2] = sums[i / 4][i % 4];
   }
