@@ -8,8 +8,7 @@
 //   - A product is under way until it is waited for: until then neither its sums nor its left operand may be read or
 //     written, nor what the right one is in shared memory ("wgmma.wait_group").
 //   - Registers that were read or written since must pass a fence before a product takes them ("wgmma.fence").
-//   - The compiler takes sums to be there when a product has begun, and may do with them before the wait what is
-//   written
+//   - The compiler takes sums to be there when a product has begun, and may do with them before the wait what comes
 //     behind it, unless they are settled in between (group_settle).
 //   - Products read shared memory by another way than threads write it, cp.async included: who wrote says so before
 //     the barrier that the others wait at ("Async Proxy").
