@@ -5,8 +5,8 @@ and compared with the table that is kept, .ci/cuda_resources.json: a spill that 
 nvcc that it was made by so are registers or shared memory above it. ``--update`` writes it anew. The last architecture
 is compiled to PTX as well. Kernels of the toolkit's own (CUB) are counted and not judged: their names change with its
 version, and nobody here could mend them. A kernel whose resources are not reported for every architecture is a
-failure, and so is no kernel at all: nothing was checked then. The last line says in one sentence what was compiled and
-whether it held.
+failure, and so is no kernel at all: nothing was checked then. So are products of four warps (wgmma) that ptxas
+serializes. The last line says in one sentence what was compiled and whether it held.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ KERNEL = re.compile(
     r"Used (?P<registers>\d+) registers(?P<rest>[^\n]*)",
     re.DOTALL,
 )
+SERIAL = "wgmma.mma_async instructions are serialized"
 
 
 def main(architectures: list[str]) -> int:
@@ -86,7 +87,9 @@ def main(architectures: list[str]) -> int:
         if f"sm_{arch}" not in found
     ]
     worse = [] if update else regressions(version, kernels)
-    for line in worse:
+    # ptxas tells of products of four warps that it does not run side by side, but calls it no warning.
+    serial = [line.strip() for result in results for line in result.stderr.splitlines() if SERIAL in line]
+    for line in [*worse, *serial]:
         print(line)
     if failed:
         outcome = f"failed in {', '.join(failed)}"
@@ -96,13 +99,15 @@ def main(architectures: list[str]) -> int:
         outcome = "failed: no kernel was reported"
     elif worse:
         outcome = f"failed: {len(worse)} regressions against {TABLE.relative_to(ROOT)}, listed above"
+    elif serial:
+        outcome = f"failed: ptxas serializes wgmma in {len(serial)} kernels, listed above"
     else:
         outcome = f"held without a warning, {spilling} spilling"
         if update:
             TABLE.write_text(as_text(version, kernels))
     toolkit = f" and {len(borrowed)} of the toolkit's" if borrowed else ""
     print(f"cuda-check: {len(sources)} files, {len(kernels)} kernels{toolkit} compiled for {targets} {outcome}.")
-    return 1 if failed or lacking or worse or not kernels else 0
+    return 1 if failed or lacking or worse or serial or not kernels else 0
 
 
 Kernels = dict[str, dict[str, dict[str, int]]]

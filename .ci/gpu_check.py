@@ -41,6 +41,8 @@ PYTHON = sys.executable
 TAIL = 40
 """Lines of a failure that are printed."""
 SPLIT = "--split-compile=0"
+TARGETS = {"90": "90a"}
+"""What to build for, where that is not the compute capability as it is: with wgmma, to compare it."""
 SHORTEST = 10.0
 """Seconds for which a part is not begun."""
 
@@ -88,7 +90,8 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
     sanitizer = shutil.which("compute-sanitizer", path=os.environ.get("PATH", "") + ":/usr/local/cuda/bin")
     architecture = capability()
     # nvcc optimises the kernels of a file in parallel, where it can.
-    built = (("VORONERF_CUDA", "1"), ("VORONERF_CUDA_ARCHITECTURES", architecture or ""), ("NVCC_APPEND_FLAGS", SPLIT))
+    target = TARGETS.get(architecture or "", architecture or "")
+    built = (("VORONERF_CUDA", "1"), ("VORONERF_CUDA_ARCHITECTURES", target), ("NVCC_APPEND_FLAGS", SPLIT))
     own = [PYTHON, str(ROOT / ".ci" / "gpu_parts.py")]
     # Each allocation for itself, so that what reads or writes beyond one leaves all of them.
     apart = (("PYTORCH_NO_CUDA_MEMORY_CACHING", "1"),)
@@ -180,9 +183,10 @@ def highlights(found: dict[str, Any]) -> list[str]:
         radix = times.get(name.replace("by counting", "by radix"))
         if name.endswith("by counting") and radix is not None:
             lines.append(f"{name}: {seconds / radix:.2f} x the time of radix")
-        tiles = times.get(f"{name} by tiles")
-        if tiles is not None:
-            lines.append(f"{name}: {seconds / tiles:.2f} x the time of tiles")
+        for way in ("tiles", "wgmma"):
+            other = times.get(f"{name} by {way}")
+            if other is not None:
+                lines.append(f"{name}: {seconds / other:.2f} x the time of {way}")
     for row in rows("training", "trainings"):
         said = f"PSNR {row['psnr']:.2f} after {row['steps']} steps" if row["right"] else f"FAILED: {row['said']}"
         lines.append(f"training {row['name']}: {said}")

@@ -37,7 +37,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in (".ci", "benchmarks", "tests/cuda_emulation"))]
 
-from gpu_cases import captured_steps, small_cases  # noqa: E402
+from gpu_cases import captured_steps, has_wgmma, small_cases  # noqa: E402
 
 N = 1 << 22
 """Samples of the timings, as the targets have them."""
@@ -373,9 +373,11 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         both_work, both_aim = (price.forward + price.backward) * n, 0.25 if name == "nerf64" else None
         row(f"{name} k={k} forward", forward, "bfloat16", price.forward * n, aims.get(name))
         if name != "nerf256":
-            # Which is the faster: values in registers, as above, or in shared memory.
-            tiles = functools.partial(network, name, k, False, "tiles")
-            row(f"{name} k={k} forward by tiles", tiles, "bfloat16", price.forward * n, None)
+            # Which is the fastest: values in registers, as above, in shared memory, or in registers with products of
+            # four warps, which are to become the way by themselves where this shows that they pay.
+            for way in ("tiles", "wgmma") if has_wgmma(device) else ("tiles",):
+                other = functools.partial(network, name, k, False, way)
+                row(f"{name} k={k} forward by {way}", other, "bfloat16", price.forward * n, None)
         row(f"{name} k={k} forward + backward", both, "bfloat16", both_work, both_aim)
     return one_by_one(cases, again, settling(device), journal)
 

@@ -105,9 +105,11 @@ void resample_cuda(Address weights, Address edges, Address uniforms, Address dep
 // precision, way: numbers of MlpPrecision and MlpCudaWay; the plan is made for the device that is current.
 const char* plan_of(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k, bool backward, int way,
                     voronerf::MlpCudaChoice& choice) {
+  const auto wanted = static_cast<voronerf::MlpCudaWay>(way);
+  voronerf::MlpCudaDevice known = voronerf::mlp_cuda_device();
+  known.groups = wanted == voronerf::MlpCudaWay::groups && voronerf::mlp_chain_groups_compiled();
   return voronerf::mlp_cuda_choose(mlp_arguments::read_table(flat), static_cast<voronerf::MlpPrecision>(precision), n,
-                                   k, backward, static_cast<voronerf::MlpCudaWay>(way), voronerf::mlp_cuda_device(),
-                                   choice);
+                                   k, backward, wanted, known, choice);
 }
 
 // Bytes of workspace, or the rule that a table breaks for which there is no plan.

@@ -60,23 +60,21 @@ __device__ __forceinline__ void chain_begin(MlpSums<2, kTiles>& sums, const floa
   }
 }
 
-// Fragments of the steps that the sums of a chunk are for the layers that read them, the first of `values`.
-template <bool kBfloat16, bool kRelu, int kTiles, int kSteps>
-__device__ __forceinline__ void chain_round(const MlpSums<2, kTiles>& sums, MlpFragment (&values)[kSteps]) {
+// Fragments of the steps that the sums of a chunk are for the layers that read them, the first of `values`: of one row
+// tile, and of both.
+template <bool kBfloat16, bool kRelu, int kRow, int kTiles, int kSteps>
+__device__ __forceinline__ void chain_round_row(const MlpSums<2, kTiles>& sums, MlpFragment (&values)[kSteps]) {
 #pragma unroll
   for (int step = 0; step < chain_pairs(kTiles) && step < kSteps; ++step) {
 #pragma unroll
-    for (int r = 0; r < 2; ++r) {
-#pragma unroll
-      for (int half = 0; half < 2; ++half) {
-        const float* left = sums[r][2 * step] + 2 * half;
-        values[step][r][half] = pack_halves<kBfloat16, true, kRelu>(left[0], left[1]);
-        if constexpr (kTiles > 1) {
-          const float* right = sums[r][2 * step + 1] + 2 * half;
-          values[step][r][2 + half] = pack_halves<kBfloat16, true, kRelu>(right[0], right[1]);
-        } else {
-          values[step][r][2 + half] = 0;
-        }
+    for (int half = 0; half < 2; ++half) {
+      const float* left = sums[kRow][2 * step] + 2 * half;
+      values[step][kRow][half] = pack_halves<kBfloat16, true, kRelu>(left[0], left[1]);
+      if constexpr (kTiles > 1) {
+        const float* right = sums[kRow][2 * step + 1] + 2 * half;
+        values[step][kRow][2 + half] = pack_halves<kBfloat16, true, kRelu>(right[0], right[1]);
+      } else {
+        values[step][kRow][2 + half] = 0;
       }
     }
   }
@@ -84,9 +82,11 @@ __device__ __forceinline__ void chain_round(const MlpSums<2, kTiles>& sums, MlpF
 template <bool kBfloat16, int kTiles, int kSteps>
 __device__ __forceinline__ void chain_round(const MlpSums<2, kTiles>& sums, bool relu, MlpFragment (&values)[kSteps]) {
   if (relu) {
-    chain_round<kBfloat16, true>(sums, values);
+    chain_round_row<kBfloat16, true, 0>(sums, values);
+    chain_round_row<kBfloat16, true, 1>(sums, values);
   } else {
-    chain_round<kBfloat16, false>(sums, values);
+    chain_round_row<kBfloat16, false, 0>(sums, values);
+    chain_round_row<kBfloat16, false, 1>(sums, values);
   }
 }
 

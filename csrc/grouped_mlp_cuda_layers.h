@@ -71,11 +71,12 @@ const char* mlp_layers_plan(const MlpTable& table, MlpPrecision precision, int64
 
 // The ways a call can go: fused with values in registers (grouped_mlp_cuda_chain.h), fused with values in shared memory
 // (grouped_mlp_cuda_plan.h), layer by layer. By itself the first that takes the table, except where fusing would move
-// more than twice the memory; to compare them one can be asked for, and then nothing else is taken.
-enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers };
+// more than twice the memory; to compare them one can be asked for, and then nothing else is taken. groups: the chain
+// with products of four warps, never by itself.
+enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers, groups };
 
 struct MlpCudaChoice {
-  MlpCudaWay way;  // not automatic
+  MlpCudaWay way;  // not automatic, nor groups, which is the chain's
   MlpChainPlan chain;
   MlpCudaPlan fused;
   MlpLayersPlan layers;

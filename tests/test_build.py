@@ -136,6 +136,27 @@ def test_cuda_check_leaves_the_toolkits_own_kernels_alone(
     assert "cub" not in said and "kernels and 1 of the toolkit's compiled for sm_80" in said
 
 
+def test_cuda_check_takes_no_serialized_products(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """ptxas's word for it, which -Werror does not reach."""
+    check = cuda_check()
+    told = (
+        "ptxas info    : (C7510) Potential Performance Loss: wgmma.mma_async instructions are serialized due to "
+        "insufficient register resources for the wgmma pipeline in the function '_Z6kernelv'\n"
+    )
+    (tmp_path / "report").write_text(told + REPORT.format("90a"))
+    nvcc = tmp_path / "nvcc"
+    nvcc.write_text(f"#!/bin/sh\ncat '{tmp_path}/report' >&2\n")
+    nvcc.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(check, "OUT", tmp_path / "out")
+    monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
+    assert check.main(["90a"]) == 1
+    said = capsys.readouterr().out
+    assert "(C7510)" in said and "failed: ptxas serializes wgmma in " in said
+
+
 def test_cuda_check_compares_with_the_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     check = cuda_check()
     row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}

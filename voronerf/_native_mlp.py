@@ -34,7 +34,7 @@ CALLERS = ("grouped_mlp", "grouped_linear", "routed_mlp")
 # Types of products by the numbers of MlpPrecision in csrc/grouped_mlp_cuda_plan.h; the CPU has the first two.
 _OPERANDS = ("float32", "bfloat16", "float16", "tf32")
 # Ways through a network on CUDA, by the numbers of MlpCudaWay in csrc/grouped_mlp_cuda_layers.h.
-WAYS = ("auto", "chain", "tiles", "layers")
+WAYS = ("auto", "chain", "tiles", "layers", "wgmma")
 
 
 def _choose_way() -> int:

@@ -60,6 +60,9 @@ THICK = MLP(
     position_octaves=10,
 )
 
+# 32 features: the kernel with the fewest registers.
+NARROW = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 32, "relu"), Layer((1,), 4, "sigmoid")), (2,), 10)
+
 
 def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.float32) -> dict:
     """Arguments in float64, the values those of `dtype`."""

@@ -76,7 +76,7 @@ inline cudaError_t cudaMemsetAsync(void* to, int value, size_t size, cudaStream_
 }
 constexpr cudaError_t cudaErrorInvalidValue = 1;
 struct cudaFuncAttributes {
-  int ptxVersion;
+  int ptxVersion, maxThreadsPerBlock;
 };
 
 namespace vn_emulation {
@@ -196,6 +196,7 @@ inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, 
 template <typename Kernel>
 cudaError_t cudaFuncGetAttributes(cudaFuncAttributes* attributes, Kernel) {
   attributes->ptxVersion = vn_emulation::settings().compiled;
+  attributes->maxThreadsPerBlock = 1024;
   return cudaSuccess;
 }
 // An error unless it is all that there is: host threads that set what they need themselves take it from each other.

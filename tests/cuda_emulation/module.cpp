@@ -32,13 +32,16 @@ PYBIND11_MODULE(voronerf_emulation, module) {
       "grouped_mlp_plan",
       [](const std::vector<int64_t>& table, int precision, int64_t n, int64_t k, bool backward, int way) {
         voronerf::MlpCudaChoice choice;
-        const char* fault = voronerf::mlp_cuda_choose(
-            mlp_arguments::read_table(table), static_cast<voronerf::MlpPrecision>(precision), n, k, backward,
-            static_cast<voronerf::MlpCudaWay>(way), voronerf::mlp_cuda_device(), choice);
+        voronerf::MlpCudaDevice device = voronerf::mlp_cuda_device();
+        device.groups = voronerf::mlp_chain_groups_compiled();
+        const char* fault =
+            voronerf::mlp_cuda_choose(mlp_arguments::read_table(table), static_cast<voronerf::MlpPrecision>(precision),
+                                      n, k, backward, static_cast<voronerf::MlpCudaWay>(way), device, choice);
         VN_CHECK(fault == nullptr, fault);
         py::dict plan;
         const bool by_layers = choice.way == voronerf::MlpCudaWay::layers;
         plan["way"] = static_cast<int>(choice.way);
+        plan["groups"] = choice.chain.groups;
         plan["by_layers"] = by_layers;
         plan["precision"] = static_cast<int>(by_layers ? choice.layers.precision : choice.fused.precision);
         plan["task_rows"] = choice.fused.task_rows;

@@ -31,11 +31,20 @@ def numbers(layers: MLP, d: int = 3, q: int = 3) -> list[int]:
 
 
 def chain(
-    layers: MLP, *, d: int = 3, precision: str = "bfloat16", n: int = 1 << 22, k: int = 16, **device: int
+    layers: MLP,
+    *,
+    d: int = 3,
+    precision: str = "bfloat16",
+    n: int = 1 << 22,
+    k: int = 16,
+    groups: bool = False,
+    compiled: bool = True,
+    **device: int,
 ) -> dict:
     """The plan, or the rule that the table breaks, on an H200 unless another device is given."""
     known = {"capability": 90, "shared_bytes": 227 * KIB, "multiprocessors": 132} | device
-    return module().chain_plan(numbers(layers, d), _native_mlp._OPERANDS.index(precision), n, k, *known.values())
+    operands = _native_mlp._OPERANDS.index(precision)
+    return module().chain_plan(numbers(layers, d), operands, n, k, *known.values(), groups, compiled)
 
 
 def way(layers: MLP, precision: str, *, n: int = 1 << 22, d: int = 3) -> str:
@@ -306,5 +315,5 @@ def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("VORONERF_CUDA_MLP", "tiles")
     assert _native_mlp.WAYS[_native_mlp._choose_way()] == "tiles"
     monkeypatch.setenv("VORONERF_CUDA_MLP", "fast")
-    with pytest.raises(ValueError, match="VORONERF_CUDA_MLP must be one of auto, chain, tiles, layers, got 'fast'"):
+    with pytest.raises(ValueError, match="must be one of auto, chain, tiles, layers, wgmma, got 'fast'"):
         _native_mlp._choose_way()

@@ -211,11 +211,11 @@ def test_roofs(parts: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     again = parts.Again(("roofs",), case_seconds=60.0)
     assert parts.roofs(tmp_path, again, "cpu", 256) == 0
     rows = json.loads((tmp_path / "roofs.json").read_text())["rows"]
-    assert len(rows) == 29 and all(row["seconds"] > 0 and row["share"] > 0 for row in rows)
-    again = parts.Again(("roofs",), start=28, failed=1, case_seconds=60.0)
+    assert len(rows) == 33 and all(row["seconds"] > 0 and row["share"] > 0 for row in rows)
+    again = parts.Again(("roofs",), start=32, failed=1, case_seconds=60.0)
     assert parts.roofs(tmp_path, again, "cpu", 256) == 1
     after = json.loads((tmp_path / "roofs.json").read_text())["rows"]
-    assert after[:29] == rows and [row["name"] for row in after[29:]] == [rows[28]["name"]]
+    assert after[:33] == rows and [row["name"] for row in after[33:]] == [rows[32]["name"]]
 
 
 def test_training(
@@ -324,7 +324,7 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check: ModuleType) 
     timed = [{**row, "name": f"cell_sort k=16 by {way}"} for way in ("counting", "torch.sort")]
     timed += [{**row, "name": "cell_sort k=16 by radix", "seconds": 4e-5}]
     timed += [{**row, "name": "near", "aim": 0.6}, {**row, "name": "far", "aim": 0.4}]
-    timed += [{**row, "name": "far by tiles", "seconds": 8e-5}]
+    timed += [{**row, "name": f"far by {way}", "seconds": time} for way, time in (("tiles", 8e-5), ("wgmma", 1e-5))]
     found = {
         "roofs": {"rows": timed, "cases": [{"name": "slow", "right": False, "said": "hangs"}]},
         "training": {
@@ -339,11 +339,12 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check: ModuleType) 
         "memcheck": None,
     }
     said = check.highlights(found)
-    assert len(said) == 12
+    assert len(said) == 14
     assert said[3].endswith("0.020 ms  50.0 % of copy, MISSED 60 %") and said[4].endswith("copy, reached 40 %")
-    assert said[6:] == [
+    assert said[7:] == [
         "cell_sort k=16 by counting: 0.50 x the time of radix",
         "far: 0.25 x the time of tiles",
+        "far: 2.00 x the time of wgmma",
         "training plain: PSNR 21.50 after 90 steps",
         "training bf16: FAILED: no",
         "WRONG in roofs: slow: hangs",
@@ -380,6 +381,7 @@ def test_the_sanitizer_sees_every_allocation(
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(check, "capability", lambda: "90")
     known = check.parts(tmp_path, None)
+    assert ("VORONERF_CUDA_ARCHITECTURES", "90a") in known["build"].environment
     assert dict(known["memcheck"].environment) == {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
     assert known["racecheck"].environment == () and known["racecheck"].command[0] == str(tool)
     monkeypatch.setattr(check, "capability", lambda: None)
