@@ -136,8 +136,11 @@ def grouped_mlp(module: ModuleType) -> None:
     arguments = [at(positions), at(directions), at(index), at(offsets), at(order), n, r, k]
     given = TABLE, arguments, [at(x) for x in weights], [at(x) for x in biases]
     # Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; and what
-    # fits no fused network: layer by layer.
-    for precision, shared, way in ((0, 227, 0), (1, 40, 2), (3, 64, 0), (1, 227, 0), (2, 30, 0), (1, 1, 0)):
+    # fits no fused network: layer by layer. Last, in registers with products of four warps.
+    for precision, shared, way in (
+        *((0, 227, 0), (1, 40, 2), (3, 64, 0), (1, 227, 0), (2, 30, 0), (1, 1, 0)),
+        *((1, 227, 4), (2, 40, 4)),
+    ):
         module.device(90, 120, shared * 1024)
 
         def workspace(backward: bool, precision: int = precision, way: int = way) -> np.ndarray:
@@ -197,8 +200,8 @@ def hostile(module: ModuleType) -> None:
 
     n, k = 64, 4
     for offsets in ([9, 3, -5, 200, 64], [least, most, least, most, 0], [64, 0, 64, 0, 64], [-7, -5, -3, -2, -1]):
-        # Chained forward, in tiles and layer by layer forward and backward.
-        for forward, backward in ((1, 2), (2, 2), (3, 3)):
+        # Chained forward, also by four warps, in tiles and layer by layer forward and backward.
+        for forward, backward in ((1, 2), (4, 2), (2, 2), (3, 3)):
             module.device(90, 120, 227 * 1024)
             given, sums = network(n, k, integers(*offsets))
             ways = ((False, forward), (True, backward))
