@@ -299,6 +299,37 @@ def test_numbers_that_are_none_stay_in_their_rows() -> None:
     assert out.isnan().any(1).nonzero().flatten().tolist() == [5, 9]
 
 
+def test_rows_are_gathered_and_scattered_and_every_order_of_threads_gives_the_same() -> None:
+    """routed_mlp: samples lie anywhere, directions belong to rays."""
+    layers = NeRF(width=32, depth=2).layers
+    given = case(layers, [60, 1, 39], 3, torch.bfloat16)
+    weights = [weight.bfloat16() for weight in given["weights"]]
+    biases = [None if bias is None else bias.bfloat16() for bias in given["biases"]]
+    options = {
+        "layers": layers,
+        "centres": torch.rand(3, 3),
+        "directions": given["directions"].float(),
+        "direction_index": given["direction_index"],
+    }
+    results = []
+    for seed in range(3):
+        with emulated(seed=seed):
+            assert way(layers, "bfloat16") == "chain"
+            results.append(
+                voronerf.routed_mlp(given["positions"].float(), weights, biases, backend="native", **options)
+            )
+    assert all(torch.equal(*parts) for other in results[1:] for parts in zip(results[0], other))
+    exact = voronerf.routed_mlp(
+        given["positions"],
+        [weight.double() for weight in weights],
+        [None if bias is None else bias.double() for bias in biases],
+        backend="reference",
+        **options | {"directions": given["directions"], "centres": options["centres"].double()},
+    )
+    assert torch.equal(results[0][1], exact[1])
+    assert (results[0][0].double() - exact[0]).norm() <= 1.2e-2 * exact[0].norm()
+
+
 def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     given = case(BRANCHED, [40, 5], 3, torch.bfloat16)
     results = []
