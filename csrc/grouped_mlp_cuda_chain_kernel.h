@@ -152,7 +152,8 @@ template <typename Products, int kWidth>
 __device__ __forceinline__ void chain_rows(const MlpChainPlan& plan, const MlpCudaData& data) {
   constexpr int kMost = kWidth < kChainChunk ? kWidth / 8 : kChainChunk / 8;  // tiles of a chunk
   MlpTask task;
-  if (!mlp_find_task(data, plan.task_rows, blockIdx.x, task)) return;  // the whole block
+  // The whole block; no rows are what offsets that fall can make.
+  if (!mlp_find_task(data, plan.task_rows, blockIdx.x, task) || task.begin >= task.end) return;
   VN_DYN_SHARED(unsigned char, shared);
   const unsigned char* packed = data.packed + static_cast<unsigned>(task.cell) * plan.packed_bytes;
   int slot = 0;
