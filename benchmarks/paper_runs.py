@@ -38,7 +38,13 @@ from voronerf.training.trainer import Trainer, TrainingError
 Row = dict[str, Any]
 PUBLISHED_SIZE = 400
 #: Settings that came after results were kept: at their defaults they are left out of a training's name.
-LATER = {"proposal_rounds": 1, "distortion": 0.0, "lr_split": 1.0}
+LATER = {
+    "proposal_rounds": 1,
+    "proposal_anneal": 0.0,
+    "distortion": 0.0,
+    "lr_split": 1.0,
+    "temperature_final": 1.0,
+}
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device"}
 

@@ -182,7 +182,7 @@ def test_the_reference_where_sums_do_not_rise(monkeypatch: pytest.MonkeyPatch) -
 def test_the_coldest_is_the_nearest_and_the_hottest_is_even(device: torch.device, backend: str) -> None:
     points, centres = 8 * torch.rand(500, 3, device=device), 8 * torch.rand(20, 3, device=device)
     uniforms = torch.rand(500, device=device)
-    for temperature in (1e-30, 1e-44, 1e-6):
+    for temperature in (1e-300, 1e-44, 1e-30, 1e-6):
         cold = draw(points, centres, uniforms, temperature, backend=backend)
         assert int((cold != nearest_centre(points, centres)).sum()) <= 1
     for temperature in (1e30, 1e300):

@@ -221,6 +221,27 @@ def test_a_proposal_is_asked_in_rounds() -> None:
     torch.testing.assert_close(renderer.loss(passes, target), expected)
 
 
+def test_a_proposal_sharpens() -> None:
+    """From even intervals to those of its weights, while training; pictures are made with its weights as they are."""
+    inside, edges = [], []
+    for sharpness in (0.0, 0.4, 1.0):
+        for jitter in (True, False):
+            field = Slab()
+            renderer = Renderer({"field": field, "proposal": Slab()}, samples=16, fine_samples=64)
+            renderer.sharpness = sharpness
+            last = renderer.render(rays(), 0.0, 4.0, jitter=jitter, generator=torch.Generator().manual_seed(0))[-1]
+            if jitter:
+                found = field.asked[0][:, 2]
+                inside.append(float(((found > -0.3) & (found < 0.3)).float().mean()))
+                widths = last.edges.diff(dim=1) if sharpness == 0 else None
+                # Two ends drawn in neighbouring strata are less than twice a stratum apart.
+                assert widths is None or float(widths.max()) < 2 * 4 / 64
+            else:
+                edges.append(last.edges)
+    assert inside[0] < inside[1] < inside[2]
+    assert torch.equal(edges[0], edges[2]) and torch.equal(edges[1], edges[2])
+
+
 def test_losses() -> None:
     target = torch.rand(3, 3)
     for fields, share in (({"field": Slab()}, 0.1), ({"field": Slab(), "coarse": Slab(0.2, 0.8)}, 1.0)):

@@ -252,6 +252,27 @@ def test_the_learning_rate_changes_at_each_split(tmp_path: Path, scene: Scene) -
         assert rate == pytest.approx(0.5**level * usual)
 
 
+def test_the_temperature_falls_to_its_last_value(tmp_path: Path, scene: Scene) -> None:
+    settings = {"cells": (3,), "assignment": "stochastic", "temperature": 0.2, "temperature_final": 0.01, "steps": 40}
+    trainer = Trainer(small(tmp_path, **settings, sampling="hierarchical"), scene)
+    seen: list[tuple[float, float]] = []
+    trainer.on_step = lambda p: seen.extend((p.step, router.temperature) for router in trainer.routers.values())
+    trainer.advance()
+    assert len(seen) == 2 * 40
+    for step, temperature in seen:
+        assert temperature == pytest.approx(0.2 * 0.01 ** ((step - 1) / 40))
+
+
+def test_a_proposal_is_annealed(tmp_path: Path, scene: Scene) -> None:
+    for slope in (0.0, 1.0, 10.0):
+        trainer = Trainer(small(tmp_path / f"{slope}", sampling="proposal", proposal_anneal=slope, steps=10), scene)
+        seen: list[float] = []
+        trainer.on_step = lambda p, trainer=trainer, seen=seen: seen.append(trainer.renderer.sharpness)
+        trainer.advance()
+        times = [step / 10 for step in range(10)]
+        assert seen == pytest.approx([slope * t / ((slope - 1) * t + 1) if slope else 1.0 for t in times])
+
+
 @pytest.mark.parametrize("field", ["nerf", "kilonerf"])
 def test_parameters_decide_the_width(tmp_path: Path, scene: Scene, field: str) -> None:
     trainer = Trainer(small(tmp_path, width=None, depth=None, field=field, parameters=30_000), scene)

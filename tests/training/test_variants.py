@@ -41,6 +41,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "field": "mipnerf",
         "sampling": "proposal",
         "proposal_rounds": 2,
+        "proposal_anneal": 10.0,
         "contraction": "sphere",
         "distortion": 0.01,
     },

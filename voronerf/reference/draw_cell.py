@@ -26,6 +26,8 @@ def draw_cell(
 
     Distances to all centres of the tree are taken once; at each level those of other diagrams have no mass.
     """
+    # Neither 0 nor infinite in float32: the nearest centre's mass is 1 at any temperature.
+    temperature = min(max(temperature, 1e-37), 3e38)
     rows = max(1, _PIECE.get(points.device.type, _LARGE_PIECE) // centres.shape[0])
     if torch.compiler.is_compiling() or points.shape[0] <= rows:
         return _draw(points, centres, child_offsets, child, uniforms, temperature, depth, weights)

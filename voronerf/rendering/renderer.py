@@ -65,6 +65,8 @@ class Renderer:
     Attributes:
         fields: by name.
         occupancy: what is empty, which a single pass over points may skip; may be set at any time.
+        sharpness: exponent of a proposal's weights where intervals are drawn from them with jitter, 0..1, and 1 at
+            first: below, the next pass looks more evenly along a ray (the annealing of mip-NeRF 360, section 3).
 
     Args:
         fields: by name, as above.
@@ -116,6 +118,7 @@ class Renderer:
         self.contraction, self.spacing, self.backend = contraction, spacing, backend
         self.rounds, self.distortion = rounds, distortion
         self.occupancy = occupancy
+        self.sharpness = 1.0
 
     @property
     def field(self) -> Field:
@@ -212,6 +215,8 @@ class Renderer:
     ) -> tuple[Tensor, Tensor]:
         """So many new intervals where the pass before found something, and a sample in each."""
         r, weights = len(before.edges), blurred_weights(before.weights.detach())
+        if jitter and "proposal" in self.fields and self.sharpness != 1.0:
+            weights = weights**self.sharpness
         uniforms = strata_uniforms(r, count + 1, before.edges, jitter, generator)
         edges = resample(weights, before.edges, count + 1, uniforms=uniforms, backend=self.backend)
         if self.cones or not jitter:

@@ -93,6 +93,8 @@ class TrainConfig:
     """Samples go to the nearest cell, or while training to one drawn from the distances."""
     temperature: float = 0.05
     """Temperature of the stochastic assignment, in scene units."""
+    temperature_final: float = 1.0
+    """The same at the end, as a fraction of --temperature; it falls exponentially over the run."""
     blend: float = 0.0
     """Margin in scene units within which neighbouring cells are blended in pictures made after training; 0 is off."""
     reservoir: int = 10_000
@@ -115,6 +117,9 @@ class TrainConfig:
     """Whether the proposal's density network has cells as well, or stays one for the whole scene."""
     proposal_rounds: int = 1
     """How often the proposal's network is asked, each time where it has found something (published: 2)."""
+    proposal_anneal: float = 0.0
+    """Slope b of the annealing of mip-NeRF 360 (published: 10): after a fraction t of the run intervals are drawn from
+    the proposal's weights to the power of b t / ((b - 1) t + 1), evenly at first; 0 is without."""
     distortion: float = 0.0
     """Factor of a loss on weights spread along a ray (mip-NeRF 360; published: 0.01); 0 is without."""
     contraction: Literal["none", "sphere"] = "none"
@@ -280,6 +285,8 @@ def check_config(config: TrainConfig) -> None:
     need(0 < config.lr_split < float("inf"), "lr_split", "be a positive factor")
     need(0 <= config.warmup < 1, "warmup", "lie in [0, 1)")
     need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
+    need(0 < config.temperature_final <= 1, "temperature_final", "lie in (0, 1]")
+    need(config.temperature_final == 1 or not config.cuda_graph, "temperature_final", "be 1 with --cuda-graph")
     need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
     largest = max(config.cells, default=0)
     need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
@@ -293,6 +300,10 @@ def check_config(config: TrainConfig) -> None:
     proposes = config.sampling == "proposal"
     need(proposes or not config.split_proposal, "split_proposal", "come with --sampling proposal")
     need(proposes or config.proposal_rounds == 1, "proposal_rounds", "be 1 without --sampling proposal")
+    need(proposes or config.proposal_anneal == 0, "proposal_anneal", "come with --sampling proposal")
+    anneal = config.proposal_anneal
+    need(anneal == 0 or 1 <= anneal < float("inf"), "proposal_anneal", "be 0, or a slope of at least 1")
+    need(anneal == 0 or not config.cuda_graph, "proposal_anneal", "be 0 with --cuda-graph")
     need(0 <= config.distortion < float("inf"), "distortion", "be a factor of 0 or more")
     need(not (config.distortion and config.occupancy), "distortion", "be 0 with --occupancy")
 

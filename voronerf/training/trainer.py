@@ -163,6 +163,15 @@ class Trainer:
         rise = 1.0 if done >= config.warmup else 0.01 + 0.99 * done / config.warmup
         return config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**self.level
 
+    def temperature(self) -> float:
+        """Of the stochastic assignment: exponential decay from ``temperature``, by ``temperature_final`` in all."""
+        return self.config.temperature * math.exp(math.log(self.config.temperature_final) * self.fraction)
+
+    def sharpness(self) -> float:
+        """Exponent of the proposal's weights (mip-NeRF 360, section 3): from 0 to 1 over the run, or 1."""
+        slope, done = self.config.proposal_anneal, self.fraction
+        return slope * done / ((slope - 1) * done + 1) if slope else 1.0
+
     def request_stop(self) -> None:
         """Ends training after the step in hand, with a checkpoint; what Ctrl-C does."""
         self.stopped = True
@@ -236,6 +245,9 @@ class Trainer:
     def _step(self) -> Tensor:
         """One step; returns its loss, which may not be computed yet."""
         set_learning_rate(self.optimizer, self.learning_rate())
+        for router in self.routers.values():
+            router.temperature = self.temperature()
+        self.renderer.sharpness = self.sharpness()
         if self.occupancy is not None and self.step % OCCUPANCY_EVERY == 0:
             self._look(self.occupancy)
         self.renderer.train()
