@@ -44,6 +44,7 @@ LATER = {
     "distortion": 0.0,
     "lr_split": 1.0,
     "temperature_final": 1.0,
+    "uniform_scale": 1.0,
 }
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device"}

@@ -12,6 +12,9 @@ from paper_results import TINY, Load
 
 from voronerf.training.config import ConfigError
 
+#: Came after benchmarks/results/paper_16s.json was made.
+LATER = "uniform centres, twice the box"
+
 
 @pytest.fixture
 def settings(load: Load, tmp_path: Path) -> Any:
@@ -62,7 +65,7 @@ def test_names_of_runs_stay(load: Load, tmp_path: Path, monkeypatch: pytest.Monk
     )
     committed = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "paper_16s.json"
     for name in ("sampling", "kilonerf", "seams", "early-late", "split-kinds", "initialisation"):
-        made = {run.folder.name for run in experiments.EXPERIMENTS[name].runs(small)}
+        made = {run.folder.name for run in experiments.EXPERIMENTS[name].runs(small) if run.variant.name != LATER}
         assert made <= load("paper_records").read_record(committed).keys(), name
 
 

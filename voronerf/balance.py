@@ -77,6 +77,7 @@ def balance(
     neighbours: int = 8,
     normalise: str = "neighbourhood",
     init: str | None = None,
+    uniform_scale: float = 1.0,
     generator: torch.Generator | None = None,
     backend: str = "auto",
 ) -> Balance:
@@ -102,6 +103,7 @@ def balance(
         init: the first centres. "random": distinct samples, all equally likely (the paper's, default of "published").
             "weighted": distinct samples drawn one by one with probability proportional to importance (default of
             "transport"). "uniform": `uniform_centres` over the bounding box of the samples.
+        uniform_scale: how many times as large along each axis, > 0, that box is made about its middle.
         generator: CPU generator of the draws; None for torch's global one.
         backend: of the ops, see `voronerf.backends`.
 
@@ -117,6 +119,8 @@ def balance(
     _check_choice("normalise", normalise, ("neighbourhood", "global"))
     if k < 1:
         raise ValueError(f"balance: k must be at least 1, got {k}")
+    if not 0 < uniform_scale < float("inf"):
+        raise ValueError(f"balance: uniform_scale must be positive and finite, got {uniform_scale}")
     if steps < 0 or neighbours < 1:
         raise ValueError(f"balance: steps must be >= 0 and neighbours >= 1, got {steps} and {neighbours}")
     total = float(importance.double().sum())
@@ -129,7 +133,8 @@ def balance(
     def weigh(centres: Tensor, power: Tensor | None = None) -> Tensor:
         return cell_weights(ops.nearest_centre(samples, centres, weights=power, backend=backend), masses, k)
 
-    centres, power = first_centres(samples, masses, k, init=init, generator=generator), None
+    centres = first_centres(samples, masses, k, init=init, generator=generator, uniform_scale=uniform_scale)
+    power = None
     before = after = weigh(centres)
     if method == "transport" and k > 1:
         centres, power = transport(samples, masses, centres, generator=generator)
@@ -156,13 +161,22 @@ def balance(
     )
 
 
-def first_centres(samples: Tensor, masses: Tensor, k: int, *, init: str, generator: torch.Generator | None) -> Tensor:
+def first_centres(
+    samples: Tensor,
+    masses: Tensor,
+    k: int,
+    *,
+    init: str,
+    generator: torch.Generator | None,
+    uniform_scale: float = 1.0,
+) -> Tensor:
     """float32 [k, 3] first centres from CPU samples float32 [m, 3] and masses [m]; see `init` of `balance`."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
         raise ValueError(f"balance: k must be at most the number of distinct samples, {distinct.shape[0]}, got {k}")
     if init == "uniform":
-        return uniform_centres(torch.stack([samples.amin(0), samples.amax(0)]), k)
+        box = torch.stack([samples.amin(0), samples.amax(0)])
+        return uniform_centres(box if uniform_scale == 1 else box.mean(0).lerp(box, uniform_scale), k)
     # Sorting exponential variates divided by the weights draws without replacement in proportion to the weights
     # (Efraimidis and Spirakis 2006). Of samples at one place only the first counts, as two centres at one place would
     # make an empty cell.

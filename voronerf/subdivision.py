@@ -40,6 +40,7 @@ def split_diagram(
     cells: str | Sequence[int] = "all",
     min_samples: int = 0,
     centres: str = "balanced",
+    uniform_scale: float = 1.0,
     generator: torch.Generator | None = None,
     backend: str = "auto",
     **options: Any,
@@ -60,6 +61,7 @@ def split_diagram(
         centres: "balanced", moved by `balance`; "random", samples drawn at random that are not moved; "uniform",
             `uniform_centres` over the bounding box of the samples in the cell, not moved (some may lie outside of the
             cell and stay without samples). The last two are the paper's ablations.
+        uniform_scale: how many times as large along each axis, > 0, the box of "uniform" is made about its middle.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.backends`.
         **options: passed on to `balance` where the centres are balanced: method, steps, alpha, neighbours, normalise,
@@ -94,7 +96,7 @@ def split_diagram(
         chosen = [max(chosen, key=lambda cell: float(accumulated[cell]))]
 
     if centres != "balanced":
-        options = {"method": "published", "steps": 0, "init": centres}
+        options = {"method": "published", "steps": 0, "init": centres, "uniform_scale": uniform_scale}
     balances: dict[int, Balance] = {}
     for cell in chosen if k > 1 else []:
         inside = leaves == cell

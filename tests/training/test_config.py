@@ -79,6 +79,8 @@ def test_json_of_something_else(text: str) -> None:
         ({"distortion": 0.1, "occupancy": True}, "--distortion must be 0 with --occupancy, got 0.1"),
         ({"backend": "fast"}, "--backend must be auto, .*got 'fast'"),
         ({"eval_views": 0}, "--eval-views must be at least 1, got 0"),
+        ({"uniform_scale": 2.0}, "--uniform-scale must be 1 without --centres uniform, got 2.0"),
+        ({"uniform_scale": 0.0, "centres": "uniform"}, "--uniform-scale must be positive and finite, got 0.0"),
         ({"temperature": -1.0}, "--temperature must be positive and finite, got -1.0"),
         ({"temperature_final": 0.0}, r"--temperature-final must lie in \(0, 1\], got 0.0"),
         ({"temperature": float("inf")}, "--temperature must be positive and finite, got inf"),

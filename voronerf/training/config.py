@@ -85,6 +85,8 @@ class TrainConfig:
     the first split (into the first number of --cells) and the last (the worst cell each time into the last number)."""
     centres: Literal["balanced", "random", "uniform"] = "balanced"
     """Centres of the new cells: balanced by importance, drawn from the samples, or a regular grid."""
+    uniform_scale: float = 1.0
+    """How many times as large as the box of the kept samples, along each axis, the grid of --centres uniform is."""
     balance: Literal["published", "transport"] = "published"
     """How centres are balanced: the paper's update, or power weights from optimal transport."""
     init: Literal["inherit", "random"] = "inherit"
@@ -287,6 +289,9 @@ def check_config(config: TrainConfig) -> None:
     need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
     need(0 < config.temperature_final <= 1, "temperature_final", "lie in (0, 1]")
     need(config.temperature_final == 1 or not config.cuda_graph, "temperature_final", "be 1 with --cuda-graph")
+    need(0 < config.uniform_scale < float("inf"), "uniform_scale", "be positive and finite")
+    uniform = config.centres == "uniform"
+    need(uniform or config.uniform_scale == 1, "uniform_scale", "be 1 without --centres uniform")
     need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
     largest = max(config.cells, default=0)
     need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")

@@ -39,6 +39,7 @@ def split_by_samples(
         k,
         cells=planned.cells,
         centres=config.centres,
+        uniform_scale=config.uniform_scale,
         method=config.balance,
         min_samples=0 if diagram.num_cells == 1 else config.min_cell_samples,
         generator=generator,
