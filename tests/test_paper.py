@@ -331,7 +331,7 @@ def test_sizes_and_scenes(load: Load, tmp_path: Path, monkeypatch: pytest.Monkey
 def test_both_sides_have_the_same_settings(load: Load, settings: Any) -> None:
     """Variants differ in what is compared: no side has rays, samples, a rate or a schedule of its own."""
     experiments, compared = load("paper_experiments"), {"cells", "width", "parameters", "centres", "init"}
-    compared |= {"assignment", "split_at", "split_at_steps"}
+    compared |= {"assignment", "split_at", "split_at_steps", "uniform_scale"}
     for name, experiment in experiments.EXPERIMENTS.items():
         groups: dict[str, set[str]] = {}
         for variant in experiment.variants(settings, "builtin"):
