@@ -45,8 +45,11 @@ def panes(count: int, width: float = 5.6, height: float = 3.8) -> tuple[Any, lis
     return figure, list(axes[0])
 
 
-def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]]) -> Any:
-    """The mean of several curves over the times that they share, and the band between lowest and highest."""
+def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]], number: int = 0) -> Any:
+    """The mean of several curves over the times that they share, and the band between lowest and highest.
+
+    Its number is its colour, the same in every pane, whatever other curves a pane lacks.
+    """
     curves = [curve for curve in curves if curve]
     if not curves:
         return None
@@ -54,7 +57,7 @@ def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]]) -> Any:
     marked = [t for t, _ in curves[0] if start <= t <= end]
     times = np.unique(np.concatenate((np.linspace(start, max(start, end), GRID), marked)))
     values = np.stack([np.interp(times, *zip(*curve)) for curve in curves])
-    line = axes.plot(times, values.mean(0), label=label)[0]
+    line = axes.plot(times, values.mean(0), label=label, color=f"C{number}")[0]
     if len(curves) > 1:
         axes.fill_between(times, values.min(0), values.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
     return line
@@ -73,13 +76,14 @@ def curves(path: Path, rows: Sequence[Row]) -> Path:
     table = Rows(rows)
     figure, axes = panes(len(table.scenes))
     for pane, scene in zip(axes, table.scenes):
-        for variant in table.variants:
+        for number, variant in enumerate(table.variants):
             group = table.of(variant, scene)
-            line = banded(pane, variant, [[shown(m) for m in row["curve"]] for row in group])
+            line = banded(pane, variant, [[shown(m) for m in row["curve"]] for row in group], number)
             for stage in (group[0].get("stages") or [])[1:] if group and line is not None else []:
                 pane.axvline(stage["started_at_second"], color=line.get_color(), linestyle=":", linewidth=1)
         pane.set(xlabel="training time [s]", ylabel="test PSNR [dB]", title=scene)
-    axes[0].legend(fontsize=8)
+        if pane.lines:
+            pane.legend(fontsize=8)
     return save(figure, path)
 
 
@@ -127,12 +131,12 @@ def seams(path: Path, rows: Sequence[Row]) -> Path:
     table = Rows(rows)
     figure, axes = panes(len(table.scenes))
     for pane, scene in zip(axes, table.scenes):
-        for variant in table.variants:
+        for number, variant in enumerate(table.variants):
             found = [
                 [(e["seconds"], e["seam"]) for e in row["looks"] if e.get("seam") is not None]
                 for row in table.of(variant, scene)
             ]
-            banded(pane, variant, found)
+            banded(pane, variant, found, number)
         pane.set(xlabel="training time [s]", ylabel="difference across cell borders", title=scene)
         if pane.lines:
             pane.legend(fontsize=8)

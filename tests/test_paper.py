@@ -376,6 +376,25 @@ def test_bands_hold_mean_and_range(load: Load) -> None:
     figures.pyplot.close(figure)
 
 
+def test_a_variant_has_one_colour_in_all_panes(
+    load: Load, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a scene has no results of the variants before it, as tables made in parts do."""
+    experiments, figures, made = load("paper_experiments"), load("paper_figures"), []
+    monkeypatch.setattr(figures, "save", lambda figure, path: made.append(figure) or path)
+    for name in ("convergence", "seams"):
+        rows = synthetic(experiments.EXPERIMENTS[name], settings, lambda i: 20.0 + i)
+        first = rows[0]["variant"]
+        rows += [{**row, "scene": "other"} for row in rows if row["variant"] != first]
+        figures.PLOTS[name](tmp_path / "x.png", rows)
+        panes = made.pop().axes
+        drawn = [dict(zip((text.get_text() for text in pane.get_legend().texts), pane.lines)) for pane in panes]
+        whole, part = ({label: line.get_color() for label, line in lines.items()} for lines in drawn)
+        assert first in whole and first not in part and part.items() <= whole.items() and part, name
+        assert len(set(whole.values())) == len(whole)
+    figures.pyplot.close("all")
+
+
 def test_every_plot_is_drawn(load: Load, settings: Any, tmp_path: Path) -> None:
     experiments, figures = load("paper_experiments"), load("paper_figures")
     drawn = set()
