@@ -61,6 +61,14 @@ def test_arithmetic_is_exact_whatever_flags_are_given(
     assert f"{given} -fno-fast-math -ffp-contract=off $flags " in command
 
 
+def test_every_module_lies_in_a_package() -> None:
+    """Folders without ``__init__.py`` work in a checkout and are left out of wheels."""
+    setuptools = pytest.importorskip("setuptools")
+    modules = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "voronerf").rglob("*.py")}
+    packages = setuptools.find_packages(str(ROOT), include=["voronerf", "voronerf.*"])
+    assert modules == {name.replace(".", "/") for name in packages} and "voronerf/training" in modules
+
+
 def test_one_word_and_none(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CXX", "ccache")
     assert build["host_compiler"]() == ["-ccbin", "ccache"]
