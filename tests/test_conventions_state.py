@@ -6,6 +6,7 @@ All have the shape that the fused kernels know, and leave it by an attribute, a 
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ from convention_listed import nerf_pytorch, uniform
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
+from voronerf.router.fusion import Plan
 
 
 class Net(nn.Module):
@@ -24,11 +26,12 @@ class Net(nn.Module):
     def __init__(self, beside: Callable[[Any, Tensor], Tensor] = lambda net, h: h) -> None:
         super().__init__()
         self.a, self.b, self.c = nn.Linear(15, 12), nn.Linear(12, 12), nn.Linear(12, 4)
-        self.beside, self.progress, self.calls = beside, 0.0, 0
+        self.beside, self.progress = beside, 0.0
         self.register_buffer("mask", torch.ones(12))
+        self.kept = torch.ones(12)
+        self.settings = SimpleNamespace(shift=0.0, deep={"scale": [1.0]})
 
     def forward(self, x: Tensor) -> Tensor:
-        self.calls += 1
         h = F.relu(self.b(F.relu(self.a(x))))
         return self.c(self.beside(self, h))
 
@@ -54,6 +57,10 @@ def pair() -> Callable[..., tuple[VoronoiRouter, Any]]:
     return make
 
 
+def plans_of(router: VoronoiRouter) -> list[Plan]:
+    return [plan for plan in router._memory.plans.values() if isinstance(plan, Plan)]
+
+
 def test_a_number_that_changes(pair: Any) -> None:
     """BARF and Nerfies open the frequencies of their encoding by a number that grows during training."""
     router, field = pair(Net(lambda net, h: h * net.progress if net.progress > 0 else h))
@@ -63,13 +70,114 @@ def test_a_number_that_changes(pair: Any) -> None:
 
 
 def test_a_buffer_that_changes(pair: Any) -> None:
-    router, field = pair(Net(lambda net, h: h * net.mask))
+    router, field = pair(Net(lambda net, h: h if bool((net.mask == 1).all()) else h * net.mask))
+    assert plans_of(router)
     for mask in (torch.rand(12), torch.zeros(12)):
         router.module.mask.copy_(mask)
         field.mask.copy_(mask)
         agree(router, field)
     router.module.mask, field.mask = torch.ones(12) * 3, torch.ones(12) * 3
     agree(router, field)
+
+
+def test_the_field_here_is_recognised(pair: Any) -> None:
+    """Else the tests around would say nothing of plans that outlive what they were made from."""
+    router, _ = pair(Net())
+    assert plans_of(router)
+
+
+def scaled_where_kept_is_not_one(net: Any, h: Tensor) -> Tensor:
+    mean = float(net.kept.mean())
+    return h if mean == 1 else h * mean
+
+
+def by_settings(net: Any, h: Tensor) -> Tensor:
+    scale, shift = net.settings.deep["scale"][0], net.settings.shift
+    return h if (scale, shift) == (1.0, 0.0) else h * scale + shift
+
+
+@pytest.mark.parametrize("numbers", [12, 100])
+def test_a_tensor_that_is_no_buffer_changes(pair: Any, numbers: int) -> None:
+    field = Net(scaled_where_kept_is_not_one)
+    field.kept = torch.ones(numbers)
+    router, field = pair(field)
+    assert plans_of(router)
+    for value in (2.0, -1.0):
+        for module in (router.module, field):
+            module.kept.fill_(value)
+        agree(router, field)
+        for module in (router.module, field):
+            module.kept = torch.full((numbers,), value + 3)
+        agree(router, field)
+
+
+def test_a_tensor_that_is_made_anew_at_every_step(pair: Any) -> None:
+    """The identity of one that is gone goes to another."""
+    router, field = pair(Net(scaled_where_kept_is_not_one))
+    x = encoded()
+    for step in range(40):
+        for module in (router.module, field):
+            module.kept = torch.tensor([1.0 if step < 9 else step / 9])
+        torch.testing.assert_close(router(x), field(x), rtol=1e-4, atol=1e-5)
+
+
+def test_a_buffer_written_through_data(pair: Any) -> None:
+    router, field = pair(Net(lambda net, h: h if bool((net.mask == 1).all()) else h * net.mask))
+    assert plans_of(router)
+    for value in (3.0, 0.5):
+        for module in (router.module, field):
+            module.mask.data.fill_(value)
+        agree(router, field)
+
+
+def test_settings_in_an_object(pair: Any) -> None:
+    router, field = pair(Net(by_settings))
+    assert plans_of(router)
+    for scale in (2.0, 0.5):
+        for module in (router.module, field):
+            module.settings.deep["scale"][0], module.settings.shift = scale, scale + 1
+        agree(router, field)
+
+
+def test_a_layer_of_a_sequence_is_replaced(pair: Any) -> None:
+    router, field = pair(nn.Sequential(nn.Linear(15, 8), nn.ReLU(), nn.Linear(8, 3)))
+    assert plans_of(router)
+    for module in (router.module, field):
+        module[1] = nn.Sigmoid()
+    agree(router, field)
+
+
+class Scaled(Net):
+    """One with an argument beside the samples."""
+
+    def forward(self, x: Tensor, w: Any, step: int = 0) -> Tensor:
+        scale = w["scale"] if isinstance(w, dict) else w
+        return super().forward(x) * scale
+
+
+@pytest.mark.parametrize("kind", ["one number", "shared", "in a dict"])
+def test_a_tensor_that_is_the_same_for_all_samples_changes(kind: str) -> None:
+    """The time of a dynamic scene, the window of an encoding."""
+    field, options = randomised(Scaled()), {} if kind == "one number" else {"shared": ["w"]}
+    router = VoronoiRouter(field, torch.rand(5, 3) * 2 - 1, coords="first3", **options)
+    x, same = encoded(), torch.rand(4)
+    for value in (torch.rand(4), torch.rand(4), same, same, same, same.clone()):
+        w = {"one number": value[:1], "shared": value, "in a dict": {"scale": value}}[kind]
+        for _ in range(4):
+            torch.testing.assert_close(router(x, w), field(x, w), rtol=1e-4, atol=1e-5)
+    same.mul_(-1)
+    w = {"one number": same[:1], "shared": same, "in a dict": {"scale": same}}[kind]
+    torch.testing.assert_close(router(x, w), field(x, w), rtol=1e-4, atol=1e-5)
+
+
+def test_numbers_among_the_arguments_fill_no_memory() -> None:
+    field = randomised(Scaled())
+    router = VoronoiRouter(field, torch.rand(5, 3) * 2 - 1, coords="first3", shared=["w"])
+    x, w = encoded(12).reshape(3, 4, 15), torch.rand(4)
+    for step in range(300):
+        torch.testing.assert_close(router(x, w, step=step), field(x, w), rtol=1e-4, atol=1e-5)
+    memory = router._memory
+    assert max(len(memory.plans), len(memory.flat), len(memory.recorded), len(memory.by_cell)) <= 256
 
 
 def test_a_function_that_is_replaced(pair: Any) -> None:
@@ -79,9 +187,19 @@ def test_a_function_that_is_replaced(pair: Any) -> None:
         agree(router, field)
 
 
+class Counting(Net):
+    """One that also counts its calls, and so is in no state twice."""
+
+    calls = 0
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.calls += 1
+        return super().forward(x)
+
+
 def test_a_forward_that_counts_its_calls(pair: Any) -> None:
     """Every call of the router is one of the module's, also where no Python of it would have to run."""
-    router, field = pair(Net(lambda net, h: h if net.calls % 2 else torch.sin(h)))
+    router, field = pair(Counting(lambda net, h: h if net.calls % 2 else torch.sin(h)))
     x = encoded()
     odd, even = (field.c(f(F.relu(field.b(F.relu(field.a(x)))))) for f in (lambda h: h, torch.sin))
     results = [router(x) for _ in range(4)]

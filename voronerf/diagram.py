@@ -161,6 +161,7 @@ class VoronoiDiagram(nn.Module):
 
         Raises:
             ValueError: the last dimension of points is not 3.
+            TypeError: points are not floating.
         """
         flat = self._flatten("locate", points)
         dtype = torch.float64 if flat.dtype == torch.float64 else torch.float32
@@ -228,6 +229,7 @@ class VoronoiDiagram(nn.Module):
 
         Raises:
             ValueError: the last dimension of points is not 3, or the temperature is negative or not finite.
+            TypeError: points are not floating.
         """
         if not 0.0 <= temperature < float("inf"):
             raise ValueError(f"sample_cell: temperature must be finite and at least 0, got {temperature}")

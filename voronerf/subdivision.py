@@ -61,7 +61,8 @@ def split_diagram(
         centres: "balanced", moved by `balance`; "random", samples drawn at random that are not moved; "uniform",
             `uniform_centres` over the bounding box of the samples in the cell, not moved (some may lie outside of the
             cell and stay without samples). The last two are the paper's ablations.
-        uniform_scale: how many times as large along each axis, > 0, the box of "uniform" is made about its middle.
+        uniform_scale: how many times as large along each axis, > 0, the box of "uniform", or of init="uniform", is made
+            about its middle.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.backends`.
         **options: passed on to `balance` where the centres are balanced: method, steps, alpha, neighbours, normalise,
@@ -73,6 +74,7 @@ def split_diagram(
     Raises:
         ValueError: samples that `balance` refuses, an unknown choice, a cell out of range or named twice, or more cells
             than samples (k exceeds the number of samples in all).
+        TypeError: points or importance are not floating.
     """
     check_samples("split_diagram", points, importance)
     if k < 1:
@@ -96,11 +98,19 @@ def split_diagram(
         chosen = [max(chosen, key=lambda cell: float(accumulated[cell]))]
 
     if centres != "balanced":
-        options = {"method": "published", "steps": 0, "init": centres, "uniform_scale": uniform_scale}
+        options = {"method": "published", "steps": 0, "init": centres}
     balances: dict[int, Balance] = {}
     for cell in chosen if k > 1 else []:
         inside = leaves == cell
-        balances[cell] = balance(points[inside], importance[inside], k, generator=generator, backend=backend, **options)
+        balances[cell] = balance(
+            points[inside],
+            importance[inside],
+            k,
+            generator=generator,
+            uniform_scale=uniform_scale,
+            backend=backend,
+            **options,
+        )
     refined, parents = diagram.refine({cell: result.diagram() for cell, result in balances.items()})
     return Split(refined if balances else diagram, parents, balances)
 

@@ -171,9 +171,12 @@ class Reordering:
             return self.tensor(name, value, nested)
         if isinstance(value, (list, tuple)) and not isinstance(value, torch.Size):
             items = [self.value(f"{name}.{i}", item, nested) for i, item in enumerate(value)]
+            if all(item is old for item, old in zip(items, value)):
+                return value
             return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
         if isinstance(value, dict):
-            return {key: self.value(f"{name}.{key}", item, nested) for key, item in value.items()}
+            changed = {key: self.value(f"{name}.{key}", item, nested) for key, item in value.items()}
+            return with_items(value, changed)
         if not _holds_attributes(value) or name.count(".") >= _DEEPEST:
             return value
         if is_batch(value):
@@ -227,6 +230,17 @@ class Reordering:
         return rebuilt
 
 
+def with_items(value: dict[Any, Any], items: dict[Any, Any]) -> dict[Any, Any]:
+    """A dict with other items under its keys, of its own class; itself where none differs."""
+    if all(items[key] is item for key, item in value.items()):
+        return value
+    if type(value) is dict:
+        return items
+    changed = copy.copy(value)
+    changed.update(items)
+    return changed
+
+
 def is_batch(value: Any) -> bool:
     """Whether an object has ``shape``, ``flatten()``, ``reshape(shape)`` and indexing of its own."""
     if isinstance(value, (Tensor, type)) or not isinstance(getattr(value, "shape", None), (tuple, torch.Size)):
@@ -259,7 +273,7 @@ def narrow(value: Any, rows: Callable[[Tensor], bool], first: int, last: int) ->
     if isinstance(value, Tensor):
         return value[first:last] if rows(value) else value
     if isinstance(value, dict):
-        return {key: narrow(item, rows, first, last) for key, item in value.items()}
+        return with_items(value, {key: narrow(item, rows, first, last) for key, item in value.items()})
     if isinstance(value, (list, tuple)) and not isinstance(value, torch.Size):
         items = [narrow(item, rows, first, last) for item in value]
         return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
@@ -295,17 +309,14 @@ def map_result(value: Any, change: Callable[[Any], Any], leaf: type | tuple[type
     if depth > _DEEPEST:
         return value
     new = {key: map_result(item, change, leaf, depth + 1) for key, item in old.items()}
+    if isinstance(value, dict):
+        return with_items(value, new)
     if all(new[key] is item for key, item in old.items()):
         return value
     if isinstance(value, (list, tuple)):
         parts = list(new.values())
         return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
-    if type(value) is dict:
-        return new
     changed = copy.copy(value)
-    if isinstance(value, dict):
-        changed.update(new)
-        return changed
     for key, item in new.items():
         object.__setattr__(changed, key, item)
     return changed

@@ -15,20 +15,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.router.arguments import Layout, Reordering, argument_names, map_result
+from voronerf.backends import BackendUnavailable
+from voronerf.router.arguments import SHARED, Layout, Reordering, argument_names, map_result, tensors_of
 from voronerf.router.checkpointing import rerun_in
 from voronerf.router.fusion import Plan, Unrecognised, agree
 from voronerf.router.grouping import Entries, Grouping, PerCell
 from voronerf.router.loop import run_cells
-from voronerf.router.memory import Memory
+from voronerf.router.memory import Memory, keep
 from voronerf.router.parameters import as_per_cell, in_place_of_parameters
 from voronerf.router.rays import flattens
 from voronerf.router.recording import Program, Recorder
 from voronerf.router.rows import RowMode, Ungroupable
-from voronerf.router.snapshot import Snapshot
+from voronerf.router.snapshot import Snapshot, tensor_key
 
 _OP = "VoronoiRouter"
 _STATES = 16  # of a module that calls of one kind are recorded in, before its state counts as one that never recurs
+_KINDS = 64  # that are recorded, where numbers or words among the arguments make ever new ones
 
 
 class Call:
@@ -42,17 +44,15 @@ class Call:
     """
 
     def __init__(
-        self,
-        method: str,
-        function: Callable[..., Any],
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-        memory: Memory,
+        self, method: str, module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], memory: Memory
     ) -> None:
-        self.method, self.function, self.args, self.kwargs = method, function, args, kwargs
+        bound = getattr(module, method)
+        # ``forward`` by way of the module, whose own hooks run then
+        self.function: Callable[..., Any] = module.__call__ if method == "forward" else bound
+        self.method, self.args, self.kwargs = method, args, kwargs
         names = memory.names.get((method, len(args)))
         if names is None:
-            names = memory.names[method, len(args)] = argument_names(function, len(args))
+            names = memory.names[method, len(args)] = argument_names(bound, len(args))
         self.names = names
 
     def locate(
@@ -115,20 +115,33 @@ class Call:
         args = [order.value(name, value) for name, value in zip(self.names, self.args, strict=True)]
         return args, {name: order.value(name, value) for name, value in self.kwargs.items()}
 
-    def kind(self, layout: Layout, training: bool) -> Any:
-        """What decides how calls are carried out: arguments without the number of samples."""
+    def kind(self, layout: Layout, training: bool, *, values: bool = True) -> Any:
+        """What decides how calls are carried out: arguments without the number of samples.
+
+        Args:
+            layout: of the arguments.
+            training: the module's mode.
+            values: whether numbers and words count by what they are, or by their type alone.
+        """
+        d = len(layout.lead)
 
         def describe(value: Any) -> Any:
             if isinstance(value, Tensor):
-                return tuple(value.shape[len(layout.lead) - 1 :][1:]), value.dim(), value.dtype
-            if isinstance(value, (bool, int, str, type(None))):
+                ones = tuple(size == 1 for size in value.shape[:d])
+                return tuple(value.shape[d - 1 :][1:]), value.dim(), value.dtype, ones
+            if isinstance(value, (bool, type(None))) or (values and isinstance(value, (int, str))):
                 return value
             return type(value)
 
         parts = [describe(value) for value in (*self.args, *self.kwargs.values())]
         return (self.method, training, len(layout.lead), tuple(self.kwargs), *parts)
 
-    def state(self, memory: Memory, module: nn.Module, kind: Any, device: torch.device) -> Any:
+    def same_for_all(self, layout: Layout) -> list[Tensor]:
+        """The tensors among the arguments, not those inside of others, that have no rows."""
+        given = [*zip(self.names, self.args, strict=True), *self.kwargs.items()]
+        return [v for name, v in given if isinstance(v, Tensor) and layout.kind(name, v, False) == SHARED]
+
+    def state(self, memory: Memory, module: nn.Module, kind: Any, layout: Layout, device: torch.device) -> Any:
         """All that the steps of a call may depend on beside the rows; None where it cannot be told."""
         if memory.snapshot is None:
             memory.snapshot = Snapshot(module)
@@ -142,7 +155,7 @@ class Call:
             numbers = [_constant(value) for value in values]
         except TypeError:
             return None
-        return (kind, autocast, *numbers, *state)
+        return (kind, autocast, *numbers, *map(tensor_key, self.same_for_all(layout)), *state)
 
 
 def _constant(value: Any, depth: int = 0) -> Any:
@@ -170,16 +183,17 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
         grouping: of the samples; of two rows where there are fewer samples.
         memory: of the router.
     """
-    kind = call.kind(layout, module.training)
-    if kind in memory.by_cell:
-        return _run_by_cell(module, call, layout, grouping, memory, kind)
+    kind, alike = (call.kind(layout, module.training, values=values) for values in (True, False))
+    if alike in memory.by_cell:
+        return _run_by_cell(module, call, layout, grouping, memory, alike)
     if len(layout.lead) > 1 and layout.lead[-1] > 1 and layout.n and kind not in memory.flat:
-        memory.flat[kind] = tuple(flattens(module, call, layout) or ())
+        keep(memory.flat, kind, tuple(flattens(module, call, layout) or ()))
     if memory.flat.get(kind):
         layout = replace(layout, flat=memory.flat[kind])
     state = None
-    if layout.n >= 2 and memory.recorded.get(kind, 0) < _STATES:
-        state = call.state(memory, module, kind, grouping.device)
+    known = kind in memory.recorded or len(memory.recorded) < _KINDS
+    if layout.n >= 2 and known and memory.recorded.get(kind, 0) < _STATES:
+        state = call.state(memory, module, kind, layout, grouping.device)
     plan = None if state is None else memory.plans.get(state)
     if isinstance(plan, Plan) and plan.fits(layout.n):
         return _run_plan(plan, call, layout, grouping)
@@ -194,15 +208,17 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
         return result
     except Ungroupable as error:
         reason, failure = str(error), None
+    except (BackendUnavailable, torch.OutOfMemoryError):
+        raise
     except Exception as error:
         if str(error).startswith(_OP):
             raise
         reason, failure = f"its forward fails on the samples of all cells ({error})", error
     try:
-        result = _run_by_cell(module, call, layout, grouping, memory, kind)
+        result = _run_by_cell(module, call, layout, grouping, memory, alike)
     except Exception as error:
         raise error from failure
-    memory.by_cell[kind] = reason
+    memory.by_cell[alike] = reason
     if grouping.k > 1:
         memory.say_once(
             f"{type(module).__name__}.{call.method}",
@@ -234,9 +250,9 @@ def run_entries(
         each = rows.shape[0] // entries.n
         return wrap(entries.unsort(rows.reshape(entries.n, each, *rows.shape[1:]) if each > 1 else rows))
 
-    kind = call.kind(layout, module.training)
-    if kind in memory.by_cell:
-        return _run_by_cell(module, call, layout, entries, memory, kind, place)
+    alike = call.kind(layout, module.training, values=False)
+    if alike in memory.by_cell:
+        return _run_by_cell(module, call, layout, entries, memory, alike, place)
     return _run_at_once(module, call, layout, entries, memory, None, place)
 
 
@@ -320,6 +336,10 @@ def _run_part(
             recorder.input(tensor)
 
     args, kwargs = call.arranged(Reordering(layout, part, mark))
+    if recorder is not None:
+        known = {id(tensor) for tensor in call.same_for_all(layout)}
+        if any(mode.mark_of(tensor) is None and id(tensor) not in known for tensor in tensors_of([args, kwargs])):
+            recorder.refuse("a tensor inside of an argument that is the same for all samples")
     stand_ins = as_per_cell(module)
 
     @contextlib.contextmanager

@@ -169,7 +169,9 @@ class Grouping:
     def expand(self, parameter: PerCell, m: int = 1) -> Tensor:
         """[n * m, ...]: each row with its cell's tensor."""
         stacked = parameter.stacked
-        if not stacked.is_floating_point() or stacked[0].numel() == 0:
+        # Copies under all settings: a product in TF32 would round them.
+        rounds = stacked.is_cuda and torch.backends.cuda.matmul.fp32_precision == "tf32"
+        if not stacked.is_floating_point() or stacked[0].numel() == 0 or rounds:
             rows = self.sorted_cells if m == 1 else self.sorted_cells.repeat_interleave(m)
             return stacked.index_select(0, rows)
         # A grouped layer without inputs: its backward sums over each cell's rows, where that of indexing would scatter.

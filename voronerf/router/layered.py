@@ -26,6 +26,27 @@ class LayeredField(Protocol):
         ...
 
 
+def told_by_table(field: nn.Module) -> bool:
+    """Whether a field's table, weights and ``activate`` say all of it.
+
+    They do not where a class derived from the one that has them has a ``forward`` of its own, or where hooks or
+    parametrisations, such as weight normalisation, change what layers take, give or are.
+    """
+    first = {}
+    for name in ("forward", "linears", "activate"):
+        first[name] = next((i for i, base in enumerate(type(field).__mro__) if name in vars(base)), 0)
+    if first["forward"] < min(first["linears"], first["activate"]) or "forward" in vars(field):
+        return False
+    return not any(
+        part._forward_hooks
+        or part._forward_pre_hooks
+        or part._backward_hooks
+        or part._backward_pre_hooks
+        or "parametrizations" in part._modules
+        for part in field.modules()
+    )
+
+
 class Mix(Protocol):
     """Further entries to evaluate, see :class:`voronerf.router.blended.Mixture`."""
 
@@ -98,6 +119,8 @@ def evaluate_table(
         raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
     if coords is not None and coords.shape != (positions.shape[0], 3):
         raise ValueError(f"VoronoiRouter: coords must have shape [{positions.shape[0]}, 3], got {list(coords.shape)}")
+    if coords is not None and not coords.is_floating_point():
+        raise TypeError(f"VoronoiRouter: coords must be floating-point, got {coords.dtype}")
     needs_directions = table.uses_directions
     if needs_directions and directions is None:
         raise ValueError("VoronoiRouter: directions must be given, since the field's colour depends on them")

@@ -247,7 +247,8 @@ def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | No
     """
     resets = [template] if hasattr(template, "reset_parameters") else list(_layers_with_reset(template))
     drawn: list[list[Tensor]] = []
-    with torch.random.fork_rng():  # of GPUs as well: manual_seed reaches them
+    # Of GPUs as well, which manual_seed reaches. Without a generator torch's own goes on.
+    with torch.random.fork_rng() if generator is not None else contextlib.nullcontext():
         if generator is not None:
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device=generator.device)))
         for _ in range(k):

@@ -1,24 +1,26 @@
 """VoronoiRouter: one network per Voronoi cell, evaluated for all cells in one pass.
 
-Letters: n samples, k cells, r rays. Positions are in scene units; index tensors are int32.
+Letters: n samples, k cells, r rays. Positions are in scene units; cells and rows are int32, parents int64.
 """
 
 from __future__ import annotations
 
 import copy
 import functools
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
 
+from voronerf.backends import BACKENDS
 from voronerf.diagram import VoronoiDiagram
 from voronerf.router.arguments import accepted_names
 from voronerf.router.blended import Mixture, mix_call
 from voronerf.router.calls import Call, run_grouped
 from voronerf.router.grouping import Grouping
-from voronerf.router.layered import LayeredField, evaluate_blended, evaluate_table
+from voronerf.router.layered import LayeredField, evaluate_blended, evaluate_table, told_by_table
 from voronerf.router.memory import Memory
 from voronerf.router.parameters import (
     check_module,
@@ -38,6 +40,8 @@ Assignment = Literal["nearest", "stochastic"]
 
 # Centres of a flat diagram beyond which it may look cells up by a grid of its own.
 _MANY = 256
+# A routed call puts stand-ins in the place of parameters; calls from several threads take turns.
+_ONE_AT_A_TIME = threading.RLock()
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
 
@@ -72,7 +76,8 @@ class VoronoiRouter(nn.Module):
         diagram: A VoronoiDiagram, or centres [k, 3].
         coords: Where the positions are: ``"first3"``, the first three features of the first tensor; a slice of its
             features; or a function of the call's arguments that returns positions [..., 3]. They may be given at the
-            call instead, ``router(x, coords=positions)``. A field with a layer table has them as its first argument.
+            call instead, ``router(x, coords=positions)``; not where the module has an argument of that name, which is
+            its own then. A field with a layer table has them as its first argument.
         per_ray: Names or numbers of the arguments that have one row for each ray. None tells by shapes, and refuses
             those that can be read in two ways.
         shared: Names or numbers of tensor arguments that are the same for all samples.
@@ -116,6 +121,8 @@ class VoronoiRouter(nn.Module):
             raise ValueError(f"VoronoiRouter: temperature must be positive, got {temperature}")
         if not 0 <= blend < float("inf"):
             raise ValueError(f"VoronoiRouter: blend must be finite and at least 0, got {blend}")
+        if backend not in ("auto", *BACKENDS):
+            raise ValueError(f"VoronoiRouter: backend must be auto, {', '.join(BACKENDS)}, got {backend!r}")
         if not (coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords)):
             raise ValueError(f"VoronoiRouter: coords must be 'first3', a slice or a function, got {coords!r}")
         for name, value in (("per_ray", per_ray), ("shared", shared), ("methods", methods)):
@@ -134,6 +141,9 @@ class VoronoiRouter(nn.Module):
                     f"{', '.join(known)}, got {item!r}"
                 )
         self.diagram = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
+        first = next(module.parameters(), None)
+        if first is not None and not first.is_meta:
+            self.diagram.to(first.device)
         self.assignment = assignment
         self.temperature = temperature
         self.backend = backend
@@ -144,6 +154,9 @@ class VoronoiRouter(nn.Module):
         self.shared = tuple(shared)
         self.methods = tuple(methods)
         self._layered = isinstance(module, LayeredField)
+        self._own_coords = frozenset(
+            name for name in ("forward", *methods) if "coords" in (accepted_names([getattr(module, name)]) or ())
+        )
         self._memory = Memory()
 
         self.module: nn.Module = clone_module(module)
@@ -213,12 +226,25 @@ class VoronoiRouter(nn.Module):
                 directions that the field needs and did not get.
             TypeError: When the module turns out to mix samples.
         """
-        if self._layered:
+        if self._layered and (torch.compiler.is_compiling() or told_by_table(self.module)):
+            coords = self._coords_of(args, kwargs) if coords is None else coords
             if self._blends:
                 at = self._mixture
                 return evaluate_blended(self.field, self._where, self.backend, at, *args, coords=coords, **kwargs)
             return evaluate_table(self.field, self._where, self.backend, *args, coords=coords, **kwargs)
-        return self._route("forward", args, kwargs, coords)
+        return self._call_method("forward", *args, coords=coords, **kwargs)
+
+    def _coords_of(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Tensor | None:
+        """By the router's rule the coords of a field with a layer table; None for its positions themselves."""
+        if self.coords is None or self.coords == "first3":
+            return None
+        if isinstance(self.coords, slice):
+            positions = args[0] if args else kwargs.get("positions")
+            return None if positions is None else cast(Tensor, positions[..., self.coords])
+        found = self.coords(*args, **kwargs)
+        if not isinstance(found, Tensor):
+            raise TypeError(f"VoronoiRouter: what coords returns must be a tensor, got {type(found).__name__}")
+        return found
 
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
@@ -227,13 +253,21 @@ class VoronoiRouter(nn.Module):
         return super().__getattr__(name)
 
     def _call_method(self, name: str, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
+        if name in self._own_coords and coords is not None:
+            kwargs, coords = {**kwargs, "coords": coords}, None
         return self._route(name, args, kwargs, coords)
 
     @torch.compiler.disable
     def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """One call of a method of the module. ``torch.compile`` leaves it as it is and goes on behind it."""
-        call = Call(method, getattr(self.module, method), args, kwargs, self._memory)
+        with _ONE_AT_A_TIME:
+            return self._routed(method, args, kwargs, coords)
+
+    def _routed(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
+        call = Call(method, self.module, args, kwargs, self._memory)
         rule = coords if coords is not None else self.coords
+        if rule is None and self._layered:
+            rule = "first3"
         layout, positions, source = call.locate(rule, self.per_ray, self.shared)
         grouping = self._memory.assignments.find(method, source, positions, self._assignment_key())
         if grouping is None:
@@ -266,8 +300,9 @@ class VoronoiRouter(nn.Module):
         return Grouping(cells, max(n, 2), k, positions.device, self.backend, tables)
 
     def _assignment_key(self) -> tuple[Any, ...]:
-        drawn = self.assignment == "stochastic" and self.training
-        return (id(self.diagram), self.diagram.centres._version, drawn, self.temperature, self.backend)
+        drawn, centres = self.assignment == "stochastic" and self.training, self.diagram.centres
+        version = object() if centres.is_inference() else centres._version  # of those changes are not told
+        return (id(self.diagram), version, drawn, self.temperature, self.backend)
 
     def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
         """What tells ``routed_mlp`` the cells: the diagram's tables, or the cells themselves.
@@ -343,6 +378,7 @@ class VoronoiRouter(nn.Module):
         Raises:
             ValueError: When ``parents`` does not fit, ``points`` or ``weights`` are missing, or the module cannot draw
                 fresh parameters.
+            TypeError: When ``diagram`` is neither a diagram nor a number, or ``parents`` are not int64.
         """
         if not isinstance(diagram, VoronoiDiagram):
             if isinstance(diagram, bool) or not isinstance(diagram, int):
@@ -355,12 +391,16 @@ class VoronoiRouter(nn.Module):
                     "VoronoiRouter.subdivide: a number of children needs points and weights, the samples and their "
                     "importance, and no parents"
                 )
+            generator = self.generator
+            if generator is not None and generator.device.type != "cpu":
+                seed = torch.randint(2**62, (), generator=generator, device=generator.device)
+                generator = torch.Generator().manual_seed(int(seed))
             result = split_diagram(
                 self.diagram,
                 points,
                 weights,
                 diagram,
-                **{"generator": self.generator, "backend": self.backend, **split},
+                **{"generator": generator, "backend": self.backend, **split},
             )
             diagram, parents = result.diagram, result.parents
         elif points is not None or weights is not None or split:

@@ -1,0 +1,281 @@
+"""Around a routed module: its own hooks, fields that say more than their table, odd arguments, threads, failures."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+import torch
+import torch.utils.checkpoint
+from torch import Tensor, nn
+
+from voronerf import NeRF, VoronoiDiagram, VoronoiRouter, split_diagram
+from voronerf.backends import BackendUnavailable
+from voronerf.router import rules
+
+
+def network() -> nn.Sequential:
+    return nn.Sequential(nn.Linear(5, 8), nn.ReLU(), nn.Linear(8, 3))
+
+
+def samples(n: int = 40) -> Tensor:
+    return torch.rand(n, 5, generator=torch.Generator().manual_seed(n)) * 2 - 1
+
+
+def centres(k: int = 4) -> Tensor:
+    return torch.rand(k, 3, generator=torch.Generator().manual_seed(k)) * 2 - 1
+
+
+def close(found: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+# Hooks ----------------------------------------------------------------------------------------------------------------
+
+
+def test_hooks_of_the_module_itself_run() -> None:
+    module = network()
+    router, x = VoronoiRouter(module, centres(), coords="first3"), samples()
+    for _ in range(3):
+        close(router(x), module(x))
+    handle = router.module.register_forward_hook(lambda m, given, out: 2 * out)
+    for _ in range(3):
+        close(router(x), 2 * module(x))
+    handle.remove()
+    router.module.register_forward_pre_hook(lambda m, given: (given[0] + 1,))
+    close(router(x), module(x + 1))
+
+
+@pytest.mark.parametrize("new", [False, True])
+@pytest.mark.filterwarnings("ignore:.*weight_norm.* is deprecated")
+def test_weight_norm_of_the_module_itself(new: bool) -> None:
+    norm = torch.nn.utils.parametrizations.weight_norm if new else torch.nn.utils.weight_norm
+    module = norm(nn.Linear(5, 2))
+    router, x = VoronoiRouter(module, centres(), coords="first3"), samples()
+    cells = router.diagram.locate(x[:, :3]).long()
+    (scale,) = [p for name, p in router.module.named_parameters() if p.numel() == 2 * 4 and "bias" not in name]
+    factors = torch.arange(1.0, 5.0)
+    with torch.no_grad():
+        scale.mul_(factors.reshape(-1, *[1] * (scale.dim() - 1)))
+    for _ in range(3):
+        bias = module.bias
+        close(router(x), (module(x) - bias) * factors[cells][:, None] + bias)
+    router(x).sum().backward()
+    assert scale.grad is not None and bool(scale.grad.abs().min() > 0)
+
+
+# Fields with a layer table --------------------------------------------------------------------------------------------
+
+
+class Moved(NeRF):
+    """Its forward does more than the table says."""
+
+    def forward(self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> Any:
+        return super().forward(positions * 2 + 0.1, directions, ray_index)
+
+
+def directions(n: int) -> Tensor:
+    return nn.functional.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+
+
+@pytest.mark.filterwarnings("ignore:.*runs cell by cell")
+def test_a_forward_that_a_derived_field_overrides() -> None:
+    field, x = Moved(width=16, depth=2), samples()[:, :3]
+    router = VoronoiRouter(field, centres())
+    for _ in range(3):
+        for found, expected in zip(router(x, directions(40)), field(x, directions(40)), strict=True):
+            close(found, expected)
+
+
+@pytest.mark.filterwarnings("ignore:.*runs cell by cell")
+def test_hooks_and_weight_norm_of_a_field_with_a_table() -> None:
+    field, x = NeRF(width=16, depth=2), samples()[:, :3]
+    router = VoronoiRouter(field, centres())
+    close(router(x, directions(40))[0], field(x, directions(40))[0])
+    for module in (router.module, field):
+        module.register_forward_hook(lambda m, given, out: (out[0] * 0.5, out[1]))
+    close(router(x, directions(40))[0], field(x, directions(40))[0])
+    field = NeRF(width=16, depth=2)
+    torch.nn.utils.parametrizations.weight_norm(field.trunk[1])
+    close(VoronoiRouter(field, centres())(x, directions(40))[0], field(x, directions(40))[0])
+
+
+@pytest.mark.parametrize("rule", ["function", "slice", "at the call"])
+def test_coords_of_a_field_with_a_table(rule: str) -> None:
+    """The cell is that of the position with its axes reversed."""
+    module = NeRF(width=16, depth=2, position_encoding="integrated") if rule == "slice" else NeRF(width=16, depth=2)
+    x = samples()[:, :3]
+    if rule == "slice":
+        x = torch.cat((x, x.abs() * 1e-2), 1)
+    where = {"function": lambda p, *_: p.flip(-1), "slice": slice(3, 6), "at the call": None}[rule]
+    router = VoronoiRouter(module, centres(), coords=where)
+    with torch.no_grad():
+        for parameter in router.module.parameters():
+            parameter += 0.2 * torch.randn_like(parameter)
+    at = x[:, 3:] if rule == "slice" else x.flip(-1)
+    found = router(x, directions(40), coords=at) if rule == "at the call" else router(x, directions(40))
+    cells = router.diagram.locate(at)
+    assert cells.unique().numel() > 1 or rule == "slice"
+    for cell in cells.unique().tolist():
+        rows = cells == cell
+        for part, expected in zip(found, router.cell(cell)(x[rows], directions(40)[rows]), strict=True):
+            close(part[rows], expected)
+
+
+# Arguments ------------------------------------------------------------------------------------------------------------
+
+
+class Options(dict):
+    """A dict whose items are attributes, as many codebases have them."""
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+
+class WithOptions(nn.Module):
+    """As BARF's field, which takes its options first."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = network()
+
+    def forward(self, options: Options, x: Tensor) -> Tensor:
+        return self.net(x) * options.scale.by + options.get("shift", 0.0)
+
+
+def test_options_stay_what_they_are() -> None:
+    module, x = WithOptions(), samples()
+    router = VoronoiRouter(module, centres(), coords="first3")
+    options = Options(scale=Options(by=2.0), names=["a", "b"])
+    for _ in range(3):
+        close(router(options, x), module(options, x))
+    rows = Options(scale=Options(by=3.0), shift=torch.rand(40, 1))
+    for _ in range(3):
+        close(router(rows, x), module(rows, x))
+
+
+class NamesCoords(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = network()
+
+    def forward(self, coords: Tensor) -> Tensor:
+        return self.net(coords)
+
+
+def test_an_argument_that_is_called_coords() -> None:
+    module, x = NamesCoords(), samples()
+    router = VoronoiRouter(module, centres(), coords="first3")
+    for _ in range(3):
+        close(router(coords=x), module(x))
+        close(router(x), module(x))
+    with pytest.raises(ValueError, match="coords must say where the positions are"):
+        VoronoiRouter(module, centres())(coords=x)
+
+
+# Failures -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_backend_that_is_not_there_is_no_reason_for_a_loop() -> None:
+    with pytest.raises(ValueError, match="backend must be auto, reference, native, warp, got 'nativ'"):
+        VoronoiRouter(network(), torch.zeros(1, 3), coords="first3", backend="nativ")
+    router = VoronoiRouter(network(), centres(), coords="first3", backend="warp")
+    with pytest.raises(BackendUnavailable, match="warp"):
+        router(samples())
+
+
+def test_memory_that_ran_out_once_is_no_reason_for_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    router, x = VoronoiRouter(network(), centres(), coords="first3"), samples()
+    expected = router(x)
+
+    def full(*_: Any, **__: Any) -> Tensor:
+        raise torch.OutOfMemoryError("out of memory")
+
+    router._memory.forget()
+    with monkeypatch.context() as patched:
+        patched.setattr(rules, "grouped_linear", full)
+        with pytest.raises(torch.OutOfMemoryError):
+            router(x)
+    assert not router._memory.by_cell
+    close(router(x), expected)
+
+
+def test_state_that_is_loaded_in_inference_mode() -> None:
+    router, x = VoronoiRouter(network(), centres(), coords="first3"), samples()
+    other = VoronoiRouter(network(), centres(6), coords="first3")
+    expected = other(x)
+    with torch.inference_mode():
+        router.load_state_dict(other.state_dict())
+        for _ in range(3):
+            close(router(x), expected)
+    with torch.no_grad():  # torch lets no gradient pass through what was made in inference mode
+        for _ in range(3):
+            close(router(x), expected)
+    with torch.inference_mode():
+        close(VoronoiRouter(other.cell(0), centres(), coords="first3")(x), other.cell(0)(x))
+
+
+def test_calls_from_several_threads() -> None:
+    """Another call begins while one is under way and ends after it; then all is as it was."""
+    inside, go_on = threading.Event(), threading.Event()
+
+    class Slow(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = network()
+
+        def forward(self, x: Tensor) -> Tensor:
+            inside.set()
+            go_on.wait(5)
+            return torch.utils.checkpoint.checkpoint(self.net, x, use_reentrant=False)
+
+    before = torch.utils.checkpoint.CheckpointFunction
+    slow, x = Slow(), samples()
+    routers = [VoronoiRouter(slow, centres(), coords="first3"), VoronoiRouter(slow, centres(3), coords="first3")]
+    found: dict[int, Tensor] = {}
+    threads = [threading.Thread(target=lambda i=i: found.update({i: routers[i](x)})) for i in range(2)]
+    threads[0].start()
+    assert inside.wait(5)
+    threads[1].start()
+    go_on.set()
+    for thread in threads:
+        thread.join(20)
+    assert torch.utils.checkpoint.CheckpointFunction is before
+    for i in range(2):
+        close(found[i], slow(x))
+        assert all(isinstance(p, nn.Parameter) for p in routers[i].module.net[0]._parameters.values())
+
+
+def test_centres_go_where_the_module_is(device: torch.device) -> None:
+    """They are given on the CPU, as is the first centre of a coarse stage, which needs no look-up."""
+    router, x = VoronoiRouter(network().to(device), torch.zeros(1, 3), coords="first3"), samples().to(device)
+    router.generator = torch.Generator(device).manual_seed(3)
+    coarse = router(x)
+    router.subdivide(3, points=x[:, :3], weights=torch.ones(40, device=device))
+    assert router.diagram.centres.device.type == device.type and router.num_cells == 3
+    close(router(x), coarse)
+
+
+# Splits ---------------------------------------------------------------------------------------------------------------
+
+
+def test_fresh_parameters_are_drawn_anew_each_time() -> None:
+    router = VoronoiRouter(network(), torch.zeros(1, 3), coords="first3")
+    found = []
+    for k in (3, 6):
+        diagram = VoronoiDiagram(centres(k))
+        router.subdivide(diagram, torch.arange(k) % router.num_cells, inherit=False)
+        found.append(router.module[0].weight.detach().clone())
+    assert not torch.equal(found[0], found[1][:3])
+
+
+def test_the_box_of_uniform_first_centres_is_scaled() -> None:
+    points, importance = torch.rand(200, 3), torch.ones(200)
+    near, far = (
+        split_diagram(
+            VoronoiDiagram(torch.zeros(1, 3)), points, importance, 8, init="uniform", steps=0, uniform_scale=scale
+        ).diagram.centres
+        for scale in (1.0, 2.0)
+    )
+    torch.testing.assert_close(far - far.mean(0), 2 * (near - near.mean(0)), rtol=1e-4, atol=1e-4)
