@@ -24,6 +24,7 @@ from harness import metadata
 from torch import Tensor
 
 from voronerf.balance import balance
+from voronerf.training.files import write_text
 from voronerf.transport import fair_share
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -133,8 +134,7 @@ def main(options: Options) -> None:
     print(f"{'cells':>5}  {'method':20} {'before':>7} {'after':>8} {'worst':>8} {'seconds':>8} {'heaviest':>9}")
     outcome = measure(options)
     if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(outcome, indent=1) + "\n")
+        write_text(options.json, json.dumps(outcome, indent=1) + "\n")
 
 
 if __name__ == "__main__":

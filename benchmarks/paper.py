@@ -11,7 +11,7 @@ an interrupted one goes on. Trainings made in one go take turns of a few seconds
 
 A long table is made in parts, over several sittings, with a file that can be committed:
 
-    python benchmarks/paper.py table sampling --record RECORD.json --variants 'NeRF, strat' --only-seeds 0
+    python benchmarks/paper.py table sampling --record RECORD.json --variants '^NeRF, strat' --only-seeds 0
     python benchmarks/paper.py table sampling --record RECORD.json               # what is missing still
     python benchmarks/paper.py table sampling --record RECORD.json --no-train    # the table as far as it goes
     python benchmarks/paper.py export RECORD.json --out runs/paper               # all trainings of a folder
@@ -22,6 +22,7 @@ Tables and pages show what is there and name what is missing. Gains are taken be
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -37,7 +38,7 @@ from paper_claims import Rows
 from paper_experiments import EXPERIMENTS
 from paper_records import keep, machine_name
 from paper_report import ORDER, claims_text, write_experiment, write_report
-from paper_runs import Run, default_scenes, failures, results, still_missing, train_missing
+from paper_runs import Run, data_folder, default_scenes, failures, results, still_missing, train_missing
 from paper_settings import Settings
 
 from voronerf.cli.main import EXPECTED
@@ -75,6 +76,8 @@ def trainings(name: str, settings: Settings) -> list[Run]:
 
 def experiment(name: str, settings: Settings) -> dict[str, Any]:
     """Runs what is missing of an experiment and writes its files; returns {metadata, results, claims}."""
+    if name == "nested-2d":
+        paper_nested.refuse_trainings(settings)
     runs = trainings(name, settings)
     if runs:
         train_missing(runs, settings, say)
@@ -148,7 +151,8 @@ def everything(settings: Settings, page: Path = PAGE, only: tuple[str, ...] = OR
 
     Args:
         settings: For all of them. The experiment on limits has its own two scenes; without --scene the table by
-            sampling has one, since that by architecture has more.
+            sampling has one, since that by architecture has more. The nested fit of a picture is no training of a
+            scene: --options, --rates, --variants, --only-seeds and --record are for the others.
         page: The page.
         only: Experiments to run, in this order; the page shows whatever is in --out.
     """
@@ -208,6 +212,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
+    # built-in scenes have no folder beside which weights for LPIPS would be found
+    os.environ.setdefault("VORONERF_DATA", str(data_folder()))
     try:
         main()
     except EXPECTED as error:

@@ -91,8 +91,8 @@ def one_or_cells(settings: Settings) -> list[Variant]:
     """One network of width 256, one of width 64, the cells."""
     return [
         Variant(WIDE, {"cells": (), "width": 256}),
-        Variant(NARROW, {"cells": ()}),
-        Variant(cells_name(settings.cells), {"cells": (settings.cells,)}),
+        Variant(NARROW, {"cells": (), "width": 64}),
+        Variant(cells_name(settings.cells), {"cells": (settings.cells,), "width": 64}),
     ]
 
 
@@ -117,7 +117,7 @@ def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant
             for sampling in samplings:
                 networks = one_or_cells(settings)
                 if sampling == "stratified":  # the published comparison with uniform cells
-                    changes = {"cells": (settings.cells,), "centres": "uniform"}
+                    changes = {"cells": (settings.cells,), "width": 64, "centres": "uniform"}
                     networks.append(Variant(uniform_name(settings.cells), changes))
                 extra = rendered(field, sampling, settings)
                 found += [Variant(row_name(field, sampling, v.name), {**v.changes, **extra}) for v in networks]
@@ -328,7 +328,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         "Hierarchical NeRF and mip-NeRF on several scenes: one network against cells.",
         _crossed(SAMPLINGS[1:]),
         _crossed_claims(SAMPLINGS[1:]),
-        scenes=lambda: default_scenes(2),
+        scenes=lambda: default_scenes(3),
         published=_published,
     ),
     "kilonerf": Experiment(
@@ -363,7 +363,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "cell-count": Experiment(
         "figure",
-        "The number of cells, with networks of width 64, and with the parameters of 12 such networks in total.",
+        "The number of cells, with networks of one width, and with the parameters of 12 such networks in total.",
         cell_count_variants,
         cell_count_claims,
     ),

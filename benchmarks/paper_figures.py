@@ -110,8 +110,10 @@ def counts(path: Path, rows: Sequence[Row]) -> Path:
     table = Rows(rows)
     figure, axes = panes(len(table.scenes))
     for pane, scene in zip(axes, table.scenes):
-        for label, matched in (("width 64", False), ("parameters of 12 cells in total", True)):
+        for matched in (False, True):
             names = [name for name in table.variants if name.endswith("matched") == matched]
+            widths = sorted({row["width"] for name in names for row in table.of(name, scene)})
+            label = "parameters of 12 cells in total" if matched else f"width {', '.join(map(str, widths))}"
             points = []
             for name in names:
                 values = table.values(name, scene)
@@ -196,10 +198,14 @@ def sheet(
             lines.append(contact_sheet(pictures))
     if not lines:
         return None
-    width = max(line.shape[1] for line in lines)
-    lines = [torch.nn.functional.pad(line, (0, 0, 0, width - line.shape[1]), value=255) for line in lines]
-    save_picture(path, torch.cat(lines))
+    save_picture(path, stacked(lines))
     return path
+
+
+def stacked(pictures: Sequence[Tensor]) -> Tensor:
+    """Pictures uint8 [h, w, 3] below each other, the narrower ones with white beside them."""
+    width = max(picture.shape[1] for picture in pictures)
+    return torch.cat([torch.nn.functional.pad(p, (0, 0, 0, width - p.shape[1]), value=255) for p in pictures])
 
 
 def ghosting(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:

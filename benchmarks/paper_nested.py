@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from harness import metadata
 from paper_claims import Rows, gain_claim
+from paper_figures import stacked
 from paper_looks import held_out_view
 from paper_runs import default_scenes, open_scene
 from paper_settings import Settings
@@ -25,7 +26,7 @@ from torch import Tensor, nn
 from turns import take_turns
 
 from voronerf import SampleReservoir, VoronoiDiagram, VoronoiRouter, frequency_encode, split_diagram
-from voronerf.training.config import default_learning_rate
+from voronerf.training.config import ConfigError, default_learning_rate
 from voronerf.training.files import write_text
 from voronerf.training.panels import contact_sheet, palette, picture_of_colour, picture_of_error, save_picture
 
@@ -191,8 +192,23 @@ def octaves_of(image: Tensor) -> int:
 
 
 def nested(settings: Settings, say: Callable[[str], None] = print) -> dict[str, Any]:
-    """Fits a held-out view of the scene by the three contenders and draws the cells; returns {metadata, results}."""
-    name = (settings.scene or default_scenes())[0]
+    """Fits a held-out view of each scene by the three contenders, draws the cells; returns {metadata, results}."""
+    results, pictures, sizes = [], [], []
+    for name in settings.scene or default_scenes():
+        rows, picture, size = fitted_view(name, settings, say)
+        results += rows
+        pictures.append(picture)
+        sizes.append(size)
+    save_picture(settings.out / "nested-2d-pictures.png", stacked(pictures))
+    outcome = outcome_of(results, settings, size=sizes[0])
+    write_text(settings.out / "nested-2d.json", json.dumps(outcome, indent=1) + "\n")
+    return outcome
+
+
+def fitted_view(
+    name: str, settings: Settings, say: Callable[[str], None]
+) -> tuple[list[dict[str, Any]], Tensor, list[int]]:
+    """The fits of one scene's view: a row a contender and seed, the sheet of pictures of seed 0, the view's size."""
     # one picture is little to learn: it is taken four times as large as the scene's
     scene = open_scene(name, replace(settings, downscale=max(1, settings.downscale // 4)))
     image = scene.test.truth(held_out_view(scene), torch.ones(3))
@@ -232,17 +248,16 @@ def nested(settings: Settings, say: Callable[[str], None] = print) -> dict[str, 
         }
         results.append(row)
         say(f"{variant:34} seed {seed}  {row['cells']:4d} cells  {row['steps']:6d} steps  psnr {row['psnr']:.2f}")
-    save_picture(settings.out / "nested-2d-pictures.png", drawn(image, {v: fits[v, 0] for v in widths}))
-    outcome = outcome_of(results, settings, size=list(image.shape[:2]))
-    write_text(settings.out / "nested-2d.json", json.dumps(outcome, indent=1) + "\n")
-    return outcome
+    return results, drawn(image, {variant: fits[variant, 0] for variant in widths}), list(image.shape[:2])
 
 
 def outcome_of(results: list[dict[str, Any]], settings: Settings, **more: Any) -> dict[str, Any]:
     """{metadata, results, claims} of fits; of none, that they are missing."""
     rows = Rows(results)
     claims = [
-        gain_claim(f"a picture: nested cells beat {other}", "-", rows.gains(NESTED, other)) for other in (ONE, MATCHED)
+        gain_claim(f"a picture of {scene}: nested cells beat {other}", "-", rows.gains(NESTED, other, scene))
+        for scene in described(settings)["scenes"]
+        for other in (ONE, MATCHED)
     ]
     missing = [] if results else ["the fit of a picture"]
     return {
@@ -252,13 +267,22 @@ def outcome_of(results: list[dict[str, Any]], settings: Settings, **more: Any) -
     }
 
 
+def refuse_trainings(settings: Settings) -> None:
+    """Raises ConfigError for settings that only trainings of scenes follow."""
+    usual = Settings()
+    for name in ("options", "rates", "variants", "only_seeds", "record"):
+        if getattr(settings, name) != getattr(usual, name):
+            option = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{option} must be left out for nested-2d, a fit, got {getattr(settings, name)!r}")
+
+
 def described(settings: Settings) -> dict[str, Any]:
     """What the experiment's result depends on, for its metadata."""
     return {
         "benchmark": "paper",
         "experiment": "nested-2d",
         "kind": "figure",
-        "scenes": [Path((settings.scene or default_scenes())[0]).name],
+        "scenes": [Path(name).name for name in settings.scene or default_scenes()],
         "downscale": settings.downscale,
         "budget_seconds": settings.budget,
         "seeds": settings.seeds,

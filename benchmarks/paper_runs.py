@@ -45,9 +45,10 @@ LATER = {
     "lr_split": 1.0,
     "temperature_final": 1.0,
     "uniform_scale": 1.0,
+    "blend": 0.0,
 }
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
-NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device"}
+NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device", "blend"}
 
 
 @dataclass(frozen=True)
@@ -213,6 +214,8 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
         config = replace(run.config, resume=resume)
         trainer = Trainer(config, scene, on_event=lambda line, name=names[run.folder]: say(f"{name} {line}"))
         trainers[run.folder] = trainer
+        if trainer.lpips is None and len(trainers) == 1:
+            say(trainer.lpips_source)
         paper_looks.forget_later(trainer)
 
     def failed(trainer: Trainer, error: TrainingError) -> None:

@@ -23,7 +23,8 @@ class Settings:
 
     scene: tuple[str, ...] = ()
     """Scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), or built-in ones; default: lego
-    where it is there, else builtin, and for the tables by sampling and architecture also ship. Results are kept by a
+    where it is there, else builtin, and for the tables by sampling and architecture also ship, for the latter drums.
+    Results are kept by a
     scene's name: another scene of that name, or other images in its folder, need another --out, or --again."""
     downscale: int = 4
     """Factor on a scene's own images, 400 x 400 as published; the built-in scenes have 100 x 100 at 4. Results are kept

@@ -60,18 +60,19 @@ def _range(values: Sequence[int | None]) -> str:
 
 def nested_table(rows: Sequence[Row]) -> list[str]:
     """The table of the nested fit of a picture."""
-    groups: dict[str, list[Row]] = {}
+    groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
-        groups.setdefault(row["variant"], []).append(row)
+        groups.setdefault((row["scene"], row["variant"]), []).append(row)
     lines = [
         [
+            scene,
             variant,
             score([row["psnr"] for row in group], 2),
             *(_range([row[name] for row in group]) for name in ("cells", "width", "parameters", "steps")),
         ]
-        for variant, group in groups.items()
+        for (scene, variant), group in groups.items()
     ]
-    return grid(("variant", "PSNR", "cells", "width", "parameters", "steps"), lines)
+    return grid(("scene", "variant", "PSNR", "cells", "width", "parameters", "steps"), lines)
 
 
 def balance_table(rows: Sequence[Row]) -> list[str]:

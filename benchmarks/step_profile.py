@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
 from harness import metadata
 from torch.profiler import ProfilerActivity, profile
@@ -105,6 +104,7 @@ def measure(options: Options) -> dict[str, Any]:
             rays=options.rays,
             samples=options.samples,
             backend=options.backend,
+            precision="bf16" if options.bfloat16 else "fp32",
             checkpoint_every=float("inf"),
         )
         trainer = Trainer(config, load_scene(options.data, downscale=options.downscale))
@@ -115,19 +115,18 @@ def measure(options: Options) -> dict[str, Any]:
             trainer.stopped = False
             trainer.advance()
 
-        with torch.autocast("cpu", torch.bfloat16, enabled=options.bfloat16):
-            for _ in range(warm):
-                step()
-            times = []
+        for _ in range(warm):
+            step()
+        times = []
+        for _ in range(options.steps):
+            start = time.perf_counter()
+            step()
+            times.append(1e3 * (time.perf_counter() - start))
+        with profile(activities=[ProfilerActivity.CPU]) as profiled:
+            start = time.perf_counter()
             for _ in range(options.steps):
-                start = time.perf_counter()
                 step()
-                times.append(1e3 * (time.perf_counter() - start))
-            with profile(activities=[ProfilerActivity.CPU]) as profiled:
-                start = time.perf_counter()
-                for _ in range(options.steps):
-                    step()
-                profiled_ms = 1e3 * (time.perf_counter() - start) / options.steps
+            profiled_ms = 1e3 * (time.perf_counter() - start) / options.steps
     operators = [
         {
             "operator": event.key,

@@ -179,6 +179,8 @@ class Bench:
         """Calls a contender for the first time: error, seconds."""
         start = time.perf_counter()
         result = contender.run(0)
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
         seconds = time.perf_counter() - start
         return work.error(contender.adapt(result)), seconds
 

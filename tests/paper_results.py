@@ -36,5 +36,5 @@ def synthetic(
             ]
             curve = [{"seconds": t, "psnr": value * t / 10} for t in (5.0, 10.0)]
             row = {"variant": variant.name, "scene": scene, "seed": seed, "psnr": value, "ssim": 0.5, "lpips": None}
-            found.append({**row, "curve": curve, "looks": looks, "cells": 4, "steps": 10, "run": "none"})
+            found.append({**row, "curve": curve, "looks": looks, "cells": 4, "width": 64, "steps": 10, "run": "none"})
     return found

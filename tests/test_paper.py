@@ -232,6 +232,7 @@ def test_looks_of_steps_that_are_made_again_are_not_kept(
     found = {entry["look"]: entry["step"] for entry in looks.numbers(made.folder)}
     assert list(found) == ["at-50", "at-75", "end"] and found["at-50"] < lost
     assert any("no look 'at-25': its time had passed" in line for line in said)
+    assert sum(line.startswith("LPIPS is not computed, images of 20 x 20 are below") for line in said) == 1
 
 
 def test_a_curve_is_of_the_same_views_throughout(load: Load, settings: Any, tmp_path: Path) -> None:
@@ -423,6 +424,9 @@ def test_balance_and_a_nested_picture(load: Load, settings: Any, out: Path, monk
     assert (out / "nested-2d.png").is_file() and (out / "nested-2d-pictures.png").is_file()
     again = load("paper").experiment("nested-2d", small)
     assert again["results"] == outcome["results"]
+    for option, value in (("options", ("width=8",)), ("rates", (1.0, 2.0)), ("record", out / "record.json")):
+        with pytest.raises(ConfigError, match=f"--{option} must be left out for nested-2d, a fit, got"):
+            load("paper").experiment("nested-2d", replace(small, **{option: value}))
 
     def refuse(*_: Any) -> None:
         raise AssertionError("fitted again")
@@ -437,6 +441,22 @@ def test_balance_and_a_nested_picture(load: Load, settings: Any, out: Path, monk
         with monkeypatch.context() as patched, pytest.raises(AssertionError, match="fitted again"):
             patched.setattr(nested, name, value)
             load("paper").experiment("nested-2d", small)
+
+
+def test_nested_pictures_of_several_scenes(load: Load, settings: Any, tmp_path: Path) -> None:
+    nested, scenes = load("paper_nested"), ("builtin", "builtin-translucent")
+    size = {"budget": 0.2, "downscale": 4 * settings.downscale}
+    outcome = load("paper").experiment("nested-2d", replace(settings, scene=scenes, out=tmp_path, **size))
+    variants = (nested.ONE, nested.MATCHED, nested.NESTED)
+    assert [(row["scene"], row["variant"]) for row in outcome["results"]] == [(s, v) for s in scenes for v in variants]
+    claims = [claim["claim"].split(":")[0] for claim in outcome["claims"]]
+    assert claims == [f"a picture of {scene}" for scene in scenes for _ in range(2)]
+    assert outcome["metadata"]["scenes"] == list(scenes)
+    both = Image.open(tmp_path / "nested-2d-pictures.png").height
+    load("paper").experiment("nested-2d", replace(settings, out=tmp_path / "one", **size))
+    assert both == 2 * Image.open(tmp_path / "one" / "nested-2d-pictures.png").height
+    text = (tmp_path / "nested-2d.md").read_text()
+    assert all(f"| {scene} | {nested.NESTED} |" in text for scene in scenes)
 
 
 def test_nested_fit_inherits_and_stays_in_the_plane(load: Load) -> None:

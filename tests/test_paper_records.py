@@ -159,7 +159,8 @@ def test_options_are_those_of_all_variants(load: Load, settings: Any) -> None:
         given.options
     )
     assert "; lr_split=0.5; split_at=[0.3]; balance=transport; " in (settings.out / "split-kinds.md").read_text()
-    for name, compared in (("early-late", "split_at"), ("limits", "cells, split_at"), ("sampling", "field")):
+    names = {"early-late": "split_at", "limits": "cells, split_at", "sampling": "field", "cell-count": "cells"}
+    for name, compared in names.items():
         wrong = tuple(f"{option}={'kilonerf' if option == 'field' else '[3]'}" for option in compared.split(", "))
         with pytest.raises(ConfigError, match=f"--options must not name what the experiment compares, got {compared}"):
             experiments[name].runs(replace(settings, options=wrong))
@@ -174,6 +175,25 @@ def test_options_are_those_of_all_variants(load: Load, settings: Any) -> None:
         experiments["split-kinds"].runs(replace(settings, options=("lr_split=much",)))
     with pytest.raises(ConfigError, match="--lr-split must be a positive factor, got -1"):
         experiments["split-kinds"].runs(replace(settings, options=("lr_split=-1",)))
+    with pytest.raises(ConfigError, match="--init must be inherit or random, got 'inherited'"):
+        experiments["split-kinds"].runs(replace(settings, options=("init=inherited",)))
+
+
+def test_widths_that_names_tell_are_widths_trained(load: Load, settings: Any) -> None:
+    experiments = load("paper_experiments").EXPERIMENTS
+    small = replace(settings, options=("field=kilonerf",))
+    for run in experiments["convergence"].runs(small):
+        assert run.config.field == "kilonerf" and run.variant.name.endswith(f"width {run.config.width}")
+    assert {run.config.width for run in experiments["split-kinds"].runs(small)} == {32}
+
+
+def test_blended_scores_are_other_results(load: Load, settings: Any) -> None:
+    experiment = load("paper_experiments").EXPERIMENTS["initialisation"]
+    plain, none, blended = (
+        [run.folder for run in experiment.runs(replace(settings, options=options))]
+        for options in ((), ("blend=0.0",), ("blend=0.1",))
+    )
+    assert plain == none and not set(plain) & set(blended)
 
 
 def test_a_record_holds_results_and_nothing_of_the_machine_s_folders(

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig, check_device, differences
+from voronerf.training.config import CHOICES, RESUMABLE, ConfigError, TrainConfig, check_device, differences
 
 
 def test_defaults_are_usable() -> None:
@@ -77,6 +77,10 @@ def test_json_of_something_else(text: str) -> None:
         ({"proposal_anneal": 0.5, "sampling": "proposal"}, "--proposal-anneal must be 0, or a slope of at least 1"),
         ({"distortion": -0.1}, "--distortion must be a factor of 0 or more, got -0.1"),
         ({"distortion": 0.1, "occupancy": True}, "--distortion must be 0 with --occupancy, got 0.1"),
+        ({"field": "mip-nerf"}, "--field must be nerf, mipnerf or kilonerf, got 'mip-nerf'"),
+        ({"sampling": "hierachical"}, "--sampling must be stratified, hierarchical or proposal, got 'hierachical'"),
+        ({"init": "inherited"}, "--init must be inherit or random, got 'inherited'"),
+        ({"background": None}, "--background must be random or white, got None"),
         ({"backend": "fast"}, "--backend must be auto, .*got 'fast'"),
         ({"eval_views": 0}, "--eval-views must be at least 1, got 0"),
         ({"uniform_scale": 2.0}, "--uniform-scale must be 1 without --centres uniform, got 2.0"),
@@ -91,6 +95,14 @@ def test_json_of_something_else(text: str) -> None:
 def test_bad_settings(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         TrainConfig(**settings)
+
+
+def test_every_choice_of_words_is_checked() -> None:
+    names = "field sampling split centres balance init assignment contraction precision background"
+    assert set(CHOICES) == set(names.split())
+    for name in CHOICES:
+        with pytest.raises(ConfigError, match=f"--{name} must be .* or .*, got 'nonsense'"):
+            TrainConfig(**{name: "nonsense"})
 
 
 @pytest.mark.parametrize("name", ["gpu7", "meta", "cuda:99"])

@@ -20,7 +20,7 @@ from voronerf.rendering.renderer import Renderer
 from voronerf.training.batches import Batch
 from voronerf.training.checkpoint import CheckpointError, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.evaluation import evaluate, render_view
+from voronerf.training.evaluation import evaluate, mean_scores, render_view
 from voronerf.training.model import (
     checkpoint_path,
     count_parameters,
@@ -123,6 +123,30 @@ def test_nested_levels_and_cells_too_small(tmp_path: Path, scene: Scene) -> None
     summary = Trainer(small(tmp_path / "b", cells=(3, 3), split_at=(0.5, 0.9), min_cell_samples=300), scene).run()
     assert [s["cells"] for s in summary["stages"]] == [1, 3, 3]
     assert summary["stages"][2]["balance_after"] is None
+
+
+def test_splits_that_never_come_are_told(tmp_path: Path, scene: Scene) -> None:
+    lines: list[str] = []
+    config = small(tmp_path, cells=(2, 2), split_at=None, split_at_steps=(12, 1000), steps=None, budget=0.2)
+    trainer = Trainer(config, scene, on_event=lines.append)
+    trainer.on_step = lambda p: setattr(trainer, "seconds", p.step / 100)
+    summary = trainer.run()
+    assert summary["complete"] and summary["cells"] == 2 and summary["splits_left"] == 1
+    assert "1 of 2 planned splits not made: the run ended before" in lines
+
+
+def test_the_final_scores_are_blended_as_the_pictures_are(tmp_path: Path, scene: Scene) -> None:
+    plain = Trainer(small(tmp_path / "plain"), scene).run()
+    trainer = Trainer(small(tmp_path / "blended", blend=0.3), scene)
+    blended = trainer.run()
+    assert plain["steps"] == blended["steps"] and plain["psnr"] != blended["psnr"]
+    assert blended["psnr"] == mean_scores(evaluate(trainer.renderer, scene, views=2))["psnr"]
+    config, routers = load_run(tmp_path / "blended")
+    assert config.blend == 0.3
+    for router in routers.values():
+        router.blend = 0.0
+    unblended = mean_scores(evaluate(make_renderer(config, scene, routers), scene, views=2))
+    assert unblended["psnr"] == plain["psnr"]
 
 
 def after_the_split(tmp_path: Path, scene: Scene, **settings: Any) -> Trainer:

@@ -67,8 +67,6 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
         console.print(f"stopped; continue with: voronerf train --resume --out {config.out}", highlight=False)
         return summary
     if config.panels:
-        for router in trainer.routers.values():
-            router.blend = config.blend
         write_panels(trainer.renderer, scene, config.out / "images", views=config.panels)
     write_curve(config.out)
     console.print(f"wrote {config.out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/", highlight=False)

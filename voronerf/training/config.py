@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 
@@ -98,7 +98,8 @@ class TrainConfig:
     temperature_final: float = 1.0
     """The same at the end, as a fraction of --temperature; it falls exponentially over the run."""
     blend: float = 0.0
-    """Margin in scene units within which neighbouring cells are blended in pictures made after training; 0 is off."""
+    """Margin in scene units within which neighbouring cells are blended after training, in the final scores and
+    pictures; 0 is off."""
     reservoir: int = 10_000
     """Importance samples kept for the next split."""
     reservoir_batches: int = 500
@@ -225,6 +226,10 @@ class TrainConfig:
             raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
 
 
+#: Settings that are one of a few words, and these.
+CHOICES: dict[str, tuple[str, ...]] = {
+    name: get_args(kind) for name, kind in get_type_hints(TrainConfig).items() if get_origin(kind) is Literal
+}
 #: With what the occupancy grid works: it is asked about points of a single pass.
 OCCUPANCY_RULE = "come with --field nerf or kilonerf, --sampling stratified and --contraction none"
 #: Settings that JSON has as lists and as text.
@@ -258,6 +263,8 @@ def check_config(config: TrainConfig) -> None:
 
     if config.budget is not None and config.steps is not None:
         raise ConfigError("give --budget SECONDS or --steps N, not both")
+    for name, words in CHOICES.items():
+        need(getattr(config, name) in words, name, f"be {', '.join(words[:-1])} or {words[-1]}")
     need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
     need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
     for name in (

@@ -188,6 +188,11 @@ class Trainer:
         self.advance()
         self.save()
         if not self.stopped:
+            left = len(self.plan) - self.level
+            if left:
+                self._say(f"{left} of {len(self.plan)} planned splits not made: the run ended before")
+            for router in self.routers.values():
+                router.blend = self.config.blend
             self._evaluate(self.config.final_views, self.lpips)
         return self._summarise()
 
@@ -382,6 +387,7 @@ class Trainer:
             "rays_per_second": self.step * self.config.rays / max(self.seconds, 1e-9),
             "parameters": sum(p.numel() for router in self.routers.values() for p in router.parameters()),
             "cells": self.router.num_cells,
+            "splits_left": len(self.plan) - self.level,
             "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
         }
