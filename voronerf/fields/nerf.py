@@ -170,7 +170,7 @@ class NeRF(nn.Module):
         """Evaluates the field.
 
         Args:
-            positions: [n, 3] in scene units.
+            positions: [n, 3] in scene units; with the integrated encoding Gaussians [n, 6].
             directions: Unit vectors [n, 3], or [r, 3] together with ``ray_index``; not needed without view directions.
             ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
 

@@ -32,9 +32,10 @@ def draw_cell(
 
     by the inverse of the distribution: it is the first centre up to which the probabilities sum to at least 1 - u, u
     being the point's number for that level. Equal numbers give equal leaves on all backends except where 1 - u lies
-    within rounding of such a sum. The arithmetic is that of the points' dtype, float32 at least; what is less likely
-    than the nearest centre by a factor of e^20 may count as impossible. A point that is not finite, or whose squared
-    distances overflow, takes the first centre at every level. Not differentiable.
+    within rounding of such a sum. The arithmetic is float64 where points, centres or weights are, else float32,
+    and "native" and "warp" take float32 alone; what is less likely than the nearest centre by a factor of e^20 may
+    count as impossible. A point that is not finite, or whose squared distances overflow, takes the first centre at
+    every level. Not differentiable.
 
     What is said of unsound tables in `locate_cell` holds here.
 

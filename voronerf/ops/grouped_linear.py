@@ -41,7 +41,7 @@ def grouped_linear(
         weight: [k, o, i], o >= 1, the dtype of x.
         bias: [k, o] or None.
         activation: "none", "relu", "softplus", "sigmoid" or "sine".
-        backend: "auto", "reference", "native" or "warp".
+        backend: "auto", "reference" or "native".
 
     Returns:
         [n, o] in the dtype of x (of autocast, where it is on).

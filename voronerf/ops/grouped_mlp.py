@@ -44,7 +44,7 @@ def grouped_mlp(
         directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample. A direction is then
             encoded once a ray rather than once a sample.
-        backend: "auto", "reference", "native" or "warp".
+        backend: "auto", "reference" or "native".
 
     Returns:
         [n, layers.out_features] in the dtype of the weights (of autocast, where it is on).

@@ -30,7 +30,7 @@ def nearest_centre(
         centres: [k, 3] floating point, finite, k >= 1.
         weights: [k] floating point or None: a power diagram, larger weights have larger cells (squared scene units).
         grid: made by ``centre_grid`` from these centres and weights, or None. Same answers, sooner where there are
-            hundreds of centres; see there. Not with "warp".
+            hundreds of centres; see there. With a grid "native" is for the CPU alone.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

@@ -60,8 +60,8 @@ def routed_mlp(
         coords: [n, 3] floating point, where the samples are; None takes the first three features of the positions.
         directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
-        backend: "auto", "reference", "native" or "warp". Where there is no fused implementation, "auto" is the
-            separate operations, each on the backend it chooses.
+        backend: "auto", "reference" or "native". Where there is no fused implementation, "auto" is the separate
+            operations, each on the backend it chooses.
 
     Returns:
         The output [n, layers.out_features] in the dtype of the weights (of autocast, where it is on), and cells int32
