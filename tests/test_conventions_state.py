@@ -170,6 +170,20 @@ def test_a_tensor_that_is_the_same_for_all_samples_changes(kind: str) -> None:
     torch.testing.assert_close(router(x, w), field(x, w), rtol=1e-4, atol=1e-5)
 
 
+UNSEEN = {"scale": 1.0}
+
+
+def test_a_change_out_of_sight_is_found_after_a_while(pair: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    router, field = pair(Net(lambda net, h: h if UNSEEN["scale"] == 1 else h * UNSEEN["scale"]))
+    monkeypatch.setitem(UNSEEN, "scale", 3.0)
+    x = encoded()
+    with pytest.warns(UserWarning, match="Net.forward gives other results than when it was recognised"):
+        for _ in range(512):
+            found = router(x)
+    torch.testing.assert_close(found, field(x), rtol=1e-4, atol=1e-5)
+    agree(router, field)
+
+
 def test_numbers_among_the_arguments_fill_no_memory() -> None:
     field = randomised(Scaled())
     router = VoronoiRouter(field, torch.rand(5, 3) * 2 - 1, coords="first3", shared=["w"])

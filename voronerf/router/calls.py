@@ -30,6 +30,7 @@ from voronerf.router.snapshot import Snapshot, tensor_key
 
 _OP = "VoronoiRouter"
 _STATES = 16  # of a module that calls of one kind are recorded in, before its state counts as one that never recurs
+_CHECK_EVERY = 512  # uses of a plan, beside the module's own forward: what it depends on may be out of sight
 _KINDS = 64  # that are recorded, where numbers or words among the arguments make ever new ones
 
 
@@ -196,7 +197,17 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
         state = call.state(memory, module, kind, layout, grouping.device)
     plan = None if state is None else memory.plans.get(state)
     if isinstance(plan, Plan) and plan.fits(layout.n):
-        return _run_plan(plan, call, layout, grouping)
+        result = _run_plan(plan, call, layout, grouping)
+        plan.uses += 1
+        if plan.uses % _CHECK_EVERY or _still_right(result, module, call, layout, grouping, memory):
+            return result
+        plan = memory.plans[state] = "its results have changed"
+        name = f"{type(module).__name__}.{call.method}"
+        memory.say_once(
+            f"{name} changes",
+            f"{_OP}: {name} gives other results than when it was recognised, by what cannot be seen of it (a global or "
+            "a closure?), and runs its own forward again; router.to(device) makes a router forget what it recognised",
+        )
     try:
         if state is None or isinstance(plan, (Plan, str)):
             return _run_at_once(module, call, layout, grouping, memory, None)
@@ -274,6 +285,15 @@ def _next_plan(
     except Unrecognised as error:
         return str(error)
     return plan if agree(found, result) else "its results differ"
+
+
+def _still_right(found: Any, module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory) -> bool:
+    """Whether a plan's results are still those of the module's own forward."""
+    if grouping.device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+        return True  # nothing can be looked at
+    with torch.no_grad():
+        own = _run_at_once(module, call, layout, grouping, memory, None)
+    return agree(found, own)
 
 
 def _run_plan(plan: Plan, call: Call, layout: Layout, grouping: Grouping) -> Any:

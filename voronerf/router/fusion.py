@@ -49,6 +49,9 @@ def activation_of(step: Step) -> str | None:
 class Plan:
     """A layer table with the steps before and behind it.
 
+    Attributes:
+        uses: how often it was run, for its owner to count.
+
     Args:
         program: a recorded call.
 
@@ -58,6 +61,7 @@ class Plan:
 
     def __init__(self, program: Program) -> None:
         self.program = program
+        self.uses = 0
         self._columns: dict[int, Columns] = {}
         self._layers: list[tuple[tuple[Slot, Slot | None], Columns, int]] = []
         self._activations: dict[int, list[tuple[int, int, str]]] = {}
