@@ -79,7 +79,7 @@ def find_cuda() -> Cuda:
     if wish == "0":
         return Cuda("built without CUDA: VORONERF_CUDA=0")
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
-    places = [home + "/bin"] if home else [*os.environ.get("PATH", "").split(os.pathsep), "/usr/local/cuda/bin"]
+    places = [*([home + "/bin"] if home else []), *os.environ.get("PATH", "").split(os.pathsep), "/usr/local/cuda/bin"]
     found = shutil.which("nvcc", path=os.pathsep.join(places))
     if found is None:
         if wish == "1":
@@ -125,6 +125,11 @@ def isas() -> dict[str, list[str]]:
 def build_info(cuda: Cuda) -> str:
     """A header that records the build."""
     version = subprocess.run([*compiler(), "--version"], check=True, capture_output=True, text=True).stdout
+    if "clang" in version and sys.platform.startswith("linux"):
+        raise SystemExit(
+            f"voronerf: on Linux the extension runs on torch's OpenMP, GCC's, and needs that compiler: set CXX=g++ "
+            f"(got {version.splitlines()[0]})"
+        )
     values = {
         "VN_COMPILER": f'"{version.splitlines()[0]}"',
         "VN_OPENMP": str(int(sys.platform != "darwin")),

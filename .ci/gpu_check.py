@@ -65,6 +65,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, help="a Blender scene for the training, else the built-in one")
     parser.add_argument("--seconds", type=float, default=470, help="for all parts together")
     given = parser.parse_args(arguments)
+    given.out = given.out.resolve()  # the parts run elsewhere
+    given.data = given.data and given.data.resolve()
     known = parts(given.out, given.data)
     chosen = given.parts or list(known)
     if unknown := [name for name in chosen if name not in known]:

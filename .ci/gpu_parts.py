@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import functools
 import importlib.util
+import itertools
 import json
 import os
 import re
@@ -42,6 +43,8 @@ from gpu_cases import captured_steps, has_wgmma, small_cases  # noqa: E402
 N = 1 << 22
 """Samples of the timings, as the targets have them."""
 CALLS = 8
+#: Of the inputs of look-ups and sorts, together beyond what the caches of a GPU hold.
+SETS = 4
 """Of a timing, in one graph."""
 CASE_SECONDS = 10.0
 """For one case, after which it is said to hang."""
@@ -334,16 +337,19 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         cases.append((name, case))
 
     def find(k: int) -> Callable[[], Any]:
-        points, centres = torch.rand(n, 3, device=where), torch.rand(k, 3, device=where)
-        return functools.partial(voronerf.nearest_centre, points, centres, backend="native")
+        centres = torch.rand(k, 3, device=where)
+        sets = itertools.cycle([torch.rand(n, 3, device=where) for _ in range(SETS)])
+        return lambda: voronerf.nearest_centre(next(sets), centres, backend="native")
 
     def sort(k: int, way: str) -> Callable[[], Any]:
-        cells = torch.randint(0, k, (n,), dtype=torch.int32, device=where)
+        sets = [torch.randint(0, k, (n,), dtype=torch.int32, device=where) for _ in range(4 * SETS)]
         if way == "torch.sort":
             kind = torch.uint8 if k <= 256 else torch.int16 if k <= 1 << 15 else torch.int32
-            return functools.partial(torch.sort, cells.to(kind), stable=True)
-        order, offsets = torch.empty_like(cells), cells.new_empty(k + 1)
-        return functools.partial(_native.sort_cells, cells, order, offsets, "cell_sort", way)
+            keys = itertools.cycle([cells.to(kind) for cells in sets])
+            return lambda: torch.sort(next(keys), stable=True)
+        order, offsets = torch.empty_like(sets[0]), sets[0].new_empty(k + 1)
+        given = itertools.cycle(sets)
+        return lambda: _native.sort_cells(next(given), order, offsets, "cell_sort", way)
 
     def network(name: str, k: int, backward: bool, way: str = "auto") -> Callable[[], Any]:
         if where.type == "cuda":

@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import os
 import runpy
+import subprocess
+import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -67,6 +69,35 @@ def test_every_module_lies_in_a_package() -> None:
     modules = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "voronerf").rglob("*.py")}
     packages = setuptools.find_packages(str(ROOT), include=["voronerf", "voronerf.*"])
     assert modules == {name.replace(".", "/") for name in packages} and "voronerf/training" in modules
+
+
+def test_clang_on_linux_is_refused_before_it_builds(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would link, and then ask torch's OpenMP for what GCC's has not."""
+    answer = SimpleNamespace(stdout="Ubuntu clang version 18.1.3\nTarget: x86_64")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(SystemExit, match=r"set CXX=g\+\+ \(got Ubuntu clang version 18.1.3\)"):
+        build["build_info"](build["Cuda"]("none"))
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert "clang version 18.1.3" in build["build_info"](build["Cuda"]("none"))
+
+
+def test_nvcc_is_found_where_cuda_home_has_none(
+    build: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("home/bin", "path"):
+        (tmp_path / name).mkdir(parents=True)
+    nvcc = tmp_path / "path" / "nvcc"
+    nvcc.write_text("#!/bin/sh\n")
+    nvcc.chmod(0o755)
+    for name, value in (("VORONERF_CUDA", "auto"), ("VORONERF_CUDA_ARCHITECTURES", "80"), ("CUDA_HOME", "home")):
+        monkeypatch.setenv(name, str(tmp_path / value) if name == "CUDA_HOME" else value)
+    monkeypatch.setenv("PATH", str(tmp_path / "path"))
+    assert build["find_cuda"]().nvcc == nvcc
+    own = tmp_path / "home" / "bin" / "nvcc"
+    own.write_bytes(nvcc.read_bytes())
+    own.chmod(0o755)
+    assert build["find_cuda"]().nvcc == own
 
 
 def test_one_word_and_none(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,6 +127,21 @@ def test_resume_needs_no_setting_again(run: Path, tmp_path: Path) -> None:
     assert json.loads((copy / "config.json").read_text())["width"] == 8
     assert main(["train", f"--out={copy}", "--resume", "--steps", "22"]) == 0
     assert json.loads((copy / "summary.json").read_text())["steps"] == 22
+    # from a number of steps to a time, and back
+    assert main(["train", f"--out={copy}", "--resume", "--budget=0.001"]) == 0
+    config = json.loads((copy / "config.json").read_text())
+    assert (config["budget"], config["steps"]) == (0.001, None)
+    assert main(["train", f"--out={copy}", "--resume", "--steps", "24"]) == 0
+    assert json.loads((copy / "summary.json").read_text())["steps"] == 24
+
+
+def test_folders_with_brackets_and_spaces_are_told_as_they_are(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "toys[old] 2"
+    shutil.copytree(run, copy)
+    assert main(["eval", str(copy), "--views", "1", "--panels", "0"]) == 0
+    assert f"wrote {copy / 'eval.json'}" in capsys.readouterr().out
 
 
 def test_demo_compares_two_runs(
@@ -144,6 +159,9 @@ def test_demo_compares_two_runs(
     for result in results.values():
         assert f"{result['psnr']:.2f}" in output
     assert (tmp_path / "psnr.png").stat().st_size > 1000
+    config = json.loads((tmp_path / "voronoi" / "config.json").read_text())
+    assert (config["data"], config["downscale"]) == ("builtin", 6)  # 100 // 6 = 16, for who resumes or scores it
+    assert "--size must be 100 over a whole number" in error_of(capsys, "demo", "--size", "60")
     assert "--cells must be at least 2" in error_of(capsys, "demo", "--out", str(tmp_path / "x"), "--cells", "1")
     assert not (tmp_path / "x").exists()
 
@@ -171,6 +189,7 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.Capture
     assert "--resume needs --out" in error_of(capsys, "train", "--resume")
     assert "there is no checkpoint" in error_of(capsys, "eval", str(tmp_path))
     assert "--frames must be at least 1, got 0" in error_of(capsys, "render", str(run), "--frames", "0")
+    assert "a video must end in" in error_of(capsys, "render", str(run), "--out", str(tmp_path / "turn"))
     assert "--views must be at least 1, got 0" in error_of(capsys, "eval", str(run), "--views", "0")
     assert "--samples must be at least 1, got 0" in error_of(capsys, "eval", str(run), "--samples", "0")
     assert "--panels must not be negative" in error_of(capsys, "eval", str(run), "--panels", "-1")

@@ -210,8 +210,13 @@ def test_blender(tmp_path: Path) -> None:
     contents = json.loads((tmp_path / "transforms.json").read_text())
     (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
     fails(tmp_path, "neither transforms_test.json nor transforms_val.json")
-    (tmp_path / "transforms_test.json").write_text(json.dumps(contents))
+    del contents["fl_x"]
+    for name in ("train", "test"):
+        (tmp_path / f"transforms_{name}.json").write_text(json.dumps(contents))
     fails(tmp_path, "transforms_train.json: camera_angle_x must be an angle between 0 and pi, got None")
     for name in ("train", "test"):
         (tmp_path / f"transforms_{name}.json").write_text(json.dumps({**contents, "camera_angle_x": 0.7, "near": 9}))
     fails(tmp_path, "near must be below far, got 9.0 and 6.0")
+    for name in ("train", "test"):
+        (tmp_path / f"transforms_{name}.json").write_text(json.dumps({**contents, "fl_x": 9.0, "k4": 0.1}))
+    fails(tmp_path, "lens distortion k4 is not supported")

@@ -80,6 +80,54 @@ def test_blender_without_alpha_has_no_box(tmp_path: Path) -> None:
     assert torch.equal(scene.train.truth(0, torch.ones(3)), scene.train.images[0] / 255)
 
 
+def test_a_capture_that_others_split(tmp_path: Path) -> None:
+    """As torch-ngp's scripts write it: Blender's files, but with a principal point and distortion."""
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=4)
+    lens = {"camera_angle_x": 0.9, "fl_x": 20.0, "fl_y": 21.0, "cx": 5.0, "cy": 5.5, "k1": 0.02, "w": 12, "h": 10}
+    for folder in (whole, parts):
+        write_capture(folder, rig, **lens)
+    path = parts / "transforms.json"
+    contents = json.loads(path.read_text())
+    contents["frames"].sort(key=lambda frame: frame["file_path"])
+    path.unlink()
+    held = [0, 8]
+    for name, chosen in (("train", [i for i in range(9) if i not in held]), ("test", held)):
+        frames = [contents["frames"][i] for i in chosen]
+        (parts / f"transforms_{name}.json").write_text(json.dumps({**contents, "frames": frames}))
+    ours, theirs = load_scene(whole), load_scene(parts)
+    assert (ours.near, ours.far, ours.spacing, ours.background) == (
+        theirs.near,
+        theirs.far,
+        theirs.spacing,
+        theirs.background,
+    )
+    for split in ("train", "test"):
+        a, b = getattr(ours, split), getattr(theirs, split)
+        assert a.names == b.names and torch.equal(a.images, b.images)
+        torch.testing.assert_close(a.cameras.poses, b.cameras.poses)
+        torch.testing.assert_close(a.cameras.intrinsics, b.cameras.intrinsics)
+        assert b.cameras.distortion is not None and float(b.cameras.distortion[0, 0]) == pytest.approx(0.02)
+
+
+def test_files_from_elsewhere(tmp_path: Path) -> None:
+    """Names with the separators of Windows, a byte order mark, stems that come twice, suffixes in capitals."""
+    original = builtin_scene(16, train_views=4, test_views=1)
+    write_blender(tmp_path, original, 0.6911112)
+    path = tmp_path / "transforms_train.json"
+    contents = json.loads(path.read_text())
+    for index, frame in enumerate(contents["frames"]):
+        folder = tmp_path / f"cam{index % 2}"
+        folder.mkdir(exist_ok=True)
+        picture = Image.open(tmp_path / f"{frame['file_path']}.png").convert("RGB")
+        picture.save(folder / f"{index // 2}.JPEG")
+        frame["file_path"] = f".\\cam{index % 2}\\{index // 2}"
+    path.write_text(json.dumps(contents), encoding="utf-8-sig")
+    (tmp_path / "test" / "r_0.png").unlink()
+    Image.fromarray(original.test.images[0, ..., :3].numpy()).save(tmp_path / "test" / "r_0.png")
+    assert load_scene(tmp_path).train.names == ("cam0_0", "cam1_0", "cam0_1", "cam1_1")
+
+
 def test_val_stands_in_for_test(tmp_path: Path) -> None:
     write_blender(tmp_path, builtin_scene(8, train_views=4, test_views=3), 0.69)
     (tmp_path / "transforms_test.json").rename(tmp_path / "transforms_val.json")

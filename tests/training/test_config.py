@@ -105,7 +105,13 @@ def test_every_choice_of_words_is_checked() -> None:
             TrainConfig(**{name: "nonsense"})
 
 
-@pytest.mark.parametrize("name", ["gpu7", "meta", "cuda:99"])
+@pytest.mark.parametrize("name", ["meta", "mps"])
+def test_a_device_that_nothing_here_runs_on(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"--device must be cpu or cuda, got '{name}'"):
+        check_device(name)
+
+
+@pytest.mark.parametrize("name", ["gpu7", "cuda:99"])
 def test_a_device_that_is_not_there(name: str) -> None:
     with pytest.raises(ConfigError, match=f"--device must name a device that is present, got '{name}'"):
         check_device(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from PIL import Image
 
 from voronerf.training import panels
-from voronerf.training.video import write_video
+from voronerf.training.video import check_video, write_video
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 16, 256, 5000])
@@ -68,6 +69,59 @@ def test_panel_file(tmp_path: Path) -> None:
     assert pixels[6 + 18, 6].tolist() == truth[0, 0].tolist()
     with pytest.raises(ValueError, match="one size"):
         panels.contact_sheet({"a": truth, "b": truth[1:]})
+
+
+def test_depths_of_more_pixels_than_torch_takes_quantiles_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    quantile, most = torch.Tensor.quantile, 2**20
+
+    def limited(values: torch.Tensor, q: float) -> torch.Tensor:
+        assert values.numel() <= most, "quantile() input tensor is too large"
+        return quantile(values, q)
+
+    monkeypatch.setattr(torch.Tensor, "quantile", limited)
+    depth = torch.rand(1100, 1000)
+    assert panels.picture_of_depth(depth, torch.ones_like(depth)).shape == (1100, 1000, 3)
+
+
+def test_a_video_that_ffmpeg_did_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    frames = (torch.rand(3, 16, 16, 3) * 255).to(torch.uint8)
+    path = tmp_path / "turn.mp4"
+    write_video(path, frames, 10)
+    before = path.read_bytes()
+    write_frames = imageio_ffmpeg.write_frames
+
+    def broken(name: str, *args: object, **kwargs: object) -> Iterator[object]:
+        writer = write_frames(name, *args, **kwargs)
+        yield writer.send(None)
+        try:
+            while True:
+                writer.send((yield))
+        finally:
+            writer.close()
+            Path(name).write_bytes(Path(name).read_bytes()[:200])
+
+    monkeypatch.setattr(imageio_ffmpeg, "write_frames", broken)
+    with pytest.raises(OSError, match="ffmpeg could not write it, 0 of 3 frames"):
+        write_video(path, frames, 10)
+    assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_what_no_video_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    with pytest.raises(ValueError, match=r"turn: a video must end in \.mp4, \.m4v"):
+        check_video(tmp_path / "turn")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        check_video(tmp_path / "file" / "turn.mp4")
+
+    def missing() -> str:
+        raise RuntimeError("No ffmpeg exe could be found")
+
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
+    with pytest.raises(ImportError, match="imageio-ffmpeg and its ffmpeg"):
+        check_video(tmp_path / "turn.mp4")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 
 def test_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

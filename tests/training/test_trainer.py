@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from voronerf.training.model import (
     restore_routers,
     solve_width,
 )
+from voronerf.training.runs import choose_directory, held
 from voronerf.training.trainer import Trainer, TrainingError
 
 
@@ -133,6 +135,40 @@ def test_splits_that_never_come_are_told(tmp_path: Path, scene: Scene) -> None:
     summary = trainer.run()
     assert summary["complete"] and summary["cells"] == 2 and summary["splits_left"] == 1
     assert "1 of 2 planned splits not made: the run ended before" in lines
+
+
+def test_a_stop_in_the_last_step_leaves_nothing_out(tmp_path: Path, scene: Scene) -> None:
+    trainer = Trainer(small(tmp_path, evaluations=1), scene)
+    trainer.on_step = lambda p: trainer.request_stop() if p.step == 24 else None
+    summary = trainer.run()
+    assert summary["complete"] and summary["views"] == 2 and summary["psnr"] > 0
+
+
+def test_a_panorama_from_one_place_trains(tmp_path: Path, scene: Scene) -> None:
+    cameras = scene.train.cameras
+    poses = cameras.poses.clone()
+    poses[:, :3, 3] = 0
+    train = replace(scene.train, cameras=replace(cameras, poses=poses))
+    panorama = replace(scene, train=train, box=None, near=0.05)
+    assert 4 <= octaves_for(panorama) <= 14
+
+
+def test_a_run_directory_has_one_run(tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = replace(small(tmp_path), out=None)
+    names = [str(choose_directory(config, scene).out) for _ in range(3)]
+    assert names == [f"runs/{scene.name}{end}" for end in ("", "-2", "-3")]
+    with held(Path("runs/other")):
+        if sys.platform != "win32":
+            with (
+                pytest.raises(ConfigError, match="--out must not be in use by another run, got runs/other"),
+                held(Path("runs/other")),
+            ):
+                raise AssertionError("two hold it")
+        Path("runs/other/config.json").write_text("")
+    with held(Path("runs/other")), held(Path("runs/empty")):
+        pass
+    assert Path("runs/other").is_dir() and not Path("runs/empty").exists()
 
 
 def test_the_final_scores_are_blended_as_the_pictures_are(tmp_path: Path, scene: Scene) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import json
+import shlex
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +23,19 @@ from voronerf.data import Scene, load_scene
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.renderer import Renderer
 from voronerf.training.config import ConfigError, TrainConfig, check_device
+from voronerf.training.files import write_text
 from voronerf.training.lpips import find_lpips
 from voronerf.training.model import load_grid, load_run, make_renderer
-from voronerf.training.runs import choose_directory, score_views, write_curve, write_panels
+from voronerf.training.runs import choose_directory, held, score_views, write_curve, write_panels
 from voronerf.training.trainer import Trainer
-from voronerf.training.video import write_video
+from voronerf.training.video import check_video, write_video
 
 console = Console(soft_wrap=True)
+
+
+def say(line: str) -> None:
+    """Prints a line as it is."""
+    console.print(line, highlight=False, markup=False)
 
 
 def train(config: TrainConfig) -> int:
@@ -48,7 +56,7 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
     second Ctrl-C ends the process at once.
     """
     assert config.out is not None
-    with TrainingDisplay(console, scene.name) as display:
+    with held(config.out), TrainingDisplay(console, scene.name) as display:
         trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
         if trainer.lpips is None:
             display.on_event(trainer.lpips_source)
@@ -58,18 +66,19 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
             trainer.request_stop()
             signal.signal(signal.SIGINT, before)
 
-        signal.signal(signal.SIGINT, stop)
+        if before is not signal.SIG_IGN:  # as where a shell started it in the background
+            signal.signal(signal.SIGINT, stop)
         try:
             summary = trainer.run()
         finally:
             signal.signal(signal.SIGINT, before)
     if not summary["complete"]:
-        console.print(f"stopped; continue with: voronerf train --resume --out {config.out}", highlight=False)
+        say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(config.out))}")
         return summary
     if config.panels:
         write_panels(trainer.renderer, scene, config.out / "images", views=config.panels)
     write_curve(config.out)
-    console.print(f"wrote {config.out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/", highlight=False)
+    say(f"wrote {config.out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
     return summary
 
 
@@ -113,18 +122,19 @@ def evaluate_run(
     size = (scene.test.cameras.height, scene.test.cameras.width)
     perceived, source = find_lpips(lpips or config.lpips, config.data, size)
     if perceived is None:
-        console.print(source, highlight=False, markup=False)
-    result = score_views(renderer, scene, views=views, path=run / "eval.json", lpips=perceived)
+        say(source)
+    result = score_views(renderer, scene, views=views, lpips=perceived)
     table = Table("view", "psnr [dB]", "ssim", "lpips")
     for view in result["views"]:
-        table.add_row(view["name"], *_figures(view))
+        table.add_row(escape(view["name"]), *_figures(view))
     table.add_section()
     table.add_row("mean", *_figures(result))
     console.print(table)
-    console.print(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB", highlight=False)
+    say(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB")
+    write_text(run / "eval.json", json.dumps(result, indent=2) + "\n")
     if panels:
         write_panels(renderer, scene, run / "images", views=panels)
-    console.print(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""), highlight=False)
+    say(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""))
     return 0
 
 
@@ -161,6 +171,8 @@ def render(
         backend: Backend of the operations.
     """
     check_counts(frames=frames, fps=fps, samples=samples, fine_samples=fine_samples, downscale=downscale)
+    path = out or run / "turntable.mp4"
+    check_video(path)
     _, renderer, scene = _load(run, data, downscale, samples, fine_samples, occupancy, blend, device, backend)
     cameras = turntable_cameras(scene.train.cameras, frames).to(device)
     pictures = []
@@ -175,9 +187,8 @@ def render(
             heaviest=False,
         )
         pictures.append((image.colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu())
-    path = out or run / "turntable.mp4"
     write_video(path, torch.stack(pictures), fps)
-    console.print(f"wrote {path}", highlight=False)
+    say(f"wrote {path}")
     return 0
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from rich.table import Table
 
-from voronerf.cli.commands import console, run_training
-from voronerf.data import Scene, builtin_scene
+from voronerf.cli.commands import console, run_training, say
+from voronerf.data import BUILTIN_SIZE, Scene, load_scene
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.plots import plot_curves
 from voronerf.training.runs import read_metrics
@@ -28,19 +28,27 @@ def demo(
         out: Folder for the two runs; `single` and `voronoi` inside it are replaced.
         budget: Training seconds of each run.
         cells: Voronoi cells.
-        size: Pixels along the side of the images, at most 100.
+        size: Pixels along the side of the images, 100 over a whole number.
         seed: Seed of both runs.
         backend: Backend of the operations.
     """
-    if not 1 <= size <= 100:
-        raise ConfigError(f"--size must lie in 1..100, got {size}")
+    downscale = BUILTIN_SIZE // size if 1 <= size <= BUILTIN_SIZE else 0
+    if not downscale or BUILTIN_SIZE // downscale != size:
+        raise ConfigError(f"--size must be {BUILTIN_SIZE} over a whole number, 50, 33, 25, 20, 16, ..., got {size}")
     configs = {
         name: TrainConfig(
-            out=out / name, budget=budget, cells=levels, seed=seed, backend=backend, evaluations=6, eval_views=5
+            downscale=downscale,
+            out=out / name,
+            budget=budget,
+            cells=levels,
+            seed=seed,
+            backend=backend,
+            evaluations=6,
+            eval_views=5,
         )
         for name, levels in (("single", ()), ("voronoi", (cells,)))
     }
-    scene = builtin_scene(size)
+    scene = load_scene("builtin", downscale=downscale)
     results: dict[str, dict[str, Any]] = {}
     for name, config in configs.items():
         _remove_run(out / name)
@@ -70,8 +78,8 @@ def _report(out: Path, scene: Scene, results: dict[str, dict[str, Any]]) -> None
         )
     console.print()
     console.print(table)
-    console.print(f"pictures: {out / 'voronoi' / 'images'} (truth, render, error, depth, cells)", highlight=False)
-    console.print(f"curves:   {out / 'psnr.png'}", highlight=False)
+    say(f"pictures: {out / 'voronoi' / 'images'} (truth, render, error, depth, cells)")
+    say(f"curves:   {out / 'psnr.png'}")
 
 
 def _remove_run(run: Path) -> None:

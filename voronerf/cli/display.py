@@ -6,6 +6,7 @@ import math
 from types import TracebackType
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
@@ -43,7 +44,7 @@ class TrainingDisplay:
             disable=not console.is_terminal,
             refresh_per_second=4,
         )
-        self.task = self.progress.add_task(label, total=1.0, step=0, stage="", speed=0.0, loss=0.0, psnr="")
+        self.task = self.progress.add_task(escape(label), total=1.0, step=0, stage="", speed=0.0, loss=0.0, psnr="")
         self.loss = math.nan  # until the first is read
 
     def __enter__(self) -> TrainingDisplay:

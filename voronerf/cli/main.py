@@ -7,6 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -20,7 +21,10 @@ from voronerf.training.progress import TrainingError
 from voronerf.training.runs import stored_config
 
 #: What a user can cause, told in one line. ValueError includes the project's own SceneError and CheckpointError.
-EXPECTED = (ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError, torch.OutOfMemoryError)
+EXPECTED = (
+    *(ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError),
+    *(MemoryError, torch.OutOfMemoryError),
+)
 
 
 def main(args: list[str] | None = None) -> int:
@@ -69,6 +73,12 @@ def _train_command(args: list[str]) -> Callable[..., int]:
     stored = None if out is None else stored_config(Path(out))
     if stored is None:
         return commands.train
+    # One of the two replaces the other; its own value is read behind this.
+    given = {name for name in ("budget", "steps") if any(w == f"--{name}" or w.startswith(f"--{name}=") for w in args)}
+    if given == {"steps"} and stored.budget is not None:
+        stored = replace(stored, budget=None, steps=sys.maxsize)
+    elif given == {"budget"} and stored.steps is not None:
+        stored = replace(stored, budget=sys.float_info.max, steps=None)
 
     def train(config: TrainConfig = stored) -> int:
         return commands.train(config)

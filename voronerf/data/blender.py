@@ -11,10 +11,11 @@ from typing import Any
 
 import torch
 
+from voronerf.data.capture import Listed, capture_scene, has_lens
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images
 from voronerf.data.scene import Scene, SceneError, Split
-from voronerf.data.transforms import Frame, number, read_transforms
+from voronerf.data.transforms import Frame, distinct_names, number, read_transforms
 from voronerf.rendering.cameras import Cameras
 
 NEAR, FAR = 2.0, 6.0
@@ -23,7 +24,9 @@ NEAR, FAR = 2.0, 6.0
 def load_blender(folder: Path, downscale: int) -> Scene:
     """Loads a Blender synthetic scene.
 
-    The test views are those of `transforms_test.json`, or of `transforms_val.json` where there is none.
+    The test views are those of `transforms_test.json`, or of `transforms_val.json` where there is none. Files that say
+    more of their cameras than Blender's, such as `fl_x`, `cx` or `k1`, are those of a capture that was split by others:
+    they are loaded as `load_capture` loads its own, but for which images are held out.
 
     Args:
         folder: holds `transforms_train.json`.
@@ -45,6 +48,11 @@ def load_blender(folder: Path, downscale: int) -> Scene:
         )
     entries, train_frames = read_transforms(train_file)
     test_entries, test_frames = read_transforms(test_file)
+
+    if has_lens(entries, train_frames) or has_lens(test_entries, test_frames):
+        files = ((train_file, entries, train_frames), (test_file, test_entries, test_frames))
+        listed = [Listed(path, of_file, frame) for path, of_file, frames in files for frame in frames]
+        return capture_scene(folder, listed, torch.arange(len(listed)) >= len(train_frames), downscale)
 
     near = number(entries, "near", train_file, positive=True) or NEAR
     far = number(entries, "far", train_file, positive=True) or FAR
@@ -76,4 +84,4 @@ def _split(
     intrinsics = torch.tensor((focal, focal, width / 2, height / 2)).repeat(len(frames), 1)
     poses = torch.stack([frame.pose for frame in frames]).float()
     cameras = Cameras(poses, intrinsics, width, height).downscaled(downscale)
-    return Split(cameras, images, tuple(frame.path.stem for frame in frames))
+    return Split(cameras, images, tuple(distinct_names([frame.path for frame in frames], path.parent)))

@@ -7,9 +7,9 @@ origin, their mean up direction the z axis, and the farthest camera is at distan
 from __future__ import annotations
 
 import math
-import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torch import Tensor
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images
 from voronerf.data.scene import Scene, SceneError, Split
-from voronerf.data.transforms import Frame, number, read_transforms
+from voronerf.data.transforms import Frame, distinct_names, number, read_transforms
 from voronerf.rendering.cameras import Cameras, distort, focus_point, undistort
 
 HOLD_OUT = 8
@@ -27,6 +27,7 @@ NEAR = 0.35
 NEAREST = 0.05
 FAR = 4.0
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
+LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")
 UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 
 
@@ -51,14 +52,45 @@ def load_capture(folder: Path, downscale: int) -> Scene:
     frames = sorted(frames, key=lambda frame: frame.path.as_posix())
     if len(frames) < 2:
         raise SceneError(f"{path}: one image is too few, one is held out for testing")
+    held_out = torch.arange(len(frames)) % HOLD_OUT == 0
+    return capture_scene(folder, [Listed(path, entries, frame) for frame in frames], held_out, downscale)
+
+
+class Listed(NamedTuple):
+    """A frame with the file that lists it, and that file's own entries, over which the frame's go."""
+
+    path: Path
+    entries: dict[str, Any]
+    frame: Frame
+
+
+def has_lens(entries: dict[str, Any], frames: Sequence[Frame]) -> bool:
+    """Whether a transforms file tells of its cameras what Blender's files do not: that of a capture."""
+    return any(given.get(key) is not None for given in (entries, *(f.entries for f in frames)) for key in LENS)
+
+
+def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, downscale: int) -> Scene:
+    """The scene of a capture's images, as :func:`load_capture` says.
+
+    Args:
+        folder: of the scene.
+        listed: its c images.
+        held_out: bool [c], those for testing.
+        downscale: factor by which images are made smaller.
+
+    Raises:
+        SceneError: as :func:`load_capture`.
+    """
+    frames = [entry.frame for entry in listed]
     images, size = read_images([frame.path for frame in frames], downscale)
 
     intrinsics, distortion = [], []
-    for frame in frames:
+    for path, entries, frame in listed:
         values = {**entries, **frame.entries}
         _check_lens_model(values, path)
         intrinsics.append(_intrinsics(values, size, path, frame))
         distortion.append([number(values, key, path) or 0.0 for key in ("k1", "k2", "p1", "p2")])
+    path = listed[0].path
     bent = torch.tensor(distortion)
     cameras = Cameras(
         normalise_poses(torch.stack([frame.pose for frame in frames])).float(),
@@ -79,8 +111,7 @@ def load_capture(folder: Path, downscale: int) -> Scene:
     else:
         images = images[..., :3]
 
-    names = _names([frame.path for frame in frames], folder)
-    held_out = torch.arange(len(frames)) % HOLD_OUT == 0
+    names = distinct_names([frame.path for frame in frames], folder)
     return Scene(
         folder.resolve().name,
         _split(cameras, images, names, ~held_out),
@@ -117,21 +148,6 @@ def normalise_poses(poses: Tensor) -> Tensor:
     extent = float(result[:, :3, 3].norm(dim=-1).max())
     result[:, :3, 3] /= extent if extent > 0 else 1.0
     return result
-
-
-def _names(paths: list[Path], folder: Path) -> list[str]:
-    """A name for each image that no other has, since pictures are stored under it: the shortest of three that will do.
-
-    The stem; the path inside the scene's folder, a/00.png becoming a_00; or that behind the image's number, for a file
-    that is listed twice.
-    """
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        inside = [Path(os.path.relpath(path, folder)).with_suffix("") for path in paths]
-        names = ["_".join(part for part in path.parts if part != "..") for path in inside]
-    if len(set(names)) < len(names):
-        names = [f"{position:04d}_{name}" for position, name in enumerate(names)]
-    return names
 
 
 def _split(cameras: Cameras, images: Tensor, names: list[str], chosen: Tensor) -> Split:

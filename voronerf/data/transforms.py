@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from voronerf.data.scene import SceneError
 
 log = logging.getLogger(__name__)
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 ORTHONORMAL = 2e-3
 LARGEST = float(np.finfo(np.float32).max)  # what cameras can hold
 
@@ -46,7 +47,7 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
         SceneError: the file does not parse, has no frames, no image of any frame exists, or a matrix is no pose.
     """
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        entries = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:  # ValueError: of the syntax, the encoding, or an integer's digits
         raise SceneError(f"{path}: is no JSON: {error}") from None
     except OSError as error:
@@ -61,7 +62,7 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
         if not isinstance(name, str) or "\0" in name:
             raise SceneError(f"{path}: frame {position} has no file_path")
         pose = _pose(frame.get("transform_matrix"), f"{path}: frame {position} ({name})")
-        image = _image_path(path.parent / name)
+        image = _image_path(path.parent, name)
         if image is not None:
             found.append(Frame(image, pose, frame))
     if not found:
@@ -91,11 +92,29 @@ def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = Fa
     return float(value)
 
 
-def _image_path(path: Path) -> Path | None:
-    """The file itself, or with the suffix that Blender's files leave out."""
+def distinct_names(paths: list[Path], folder: Path) -> list[str]:
+    """A name for each image that no other has, since pictures are stored under it: the shortest of three that will do.
+
+    The stem; the path inside the scene's folder, a/00.png becoming a_00; or that behind the image's number, for a file
+    that is listed twice.
+    """
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        inside = [Path(os.path.relpath(path, folder)).with_suffix("") for path in paths]
+        names = ["_".join(part for part in path.parts if part != "..") for path in inside]
+    if len(set(names)) < len(names):
+        names = [f"{position:04d}_{name}" for position, name in enumerate(names)]
+    return names
+
+
+def _image_path(folder: Path, name: str) -> Path | None:
+    """The file itself, or with the suffix that Blender's files leave out, or with the separators of Windows."""
+    path = folder / name
     if path.is_file():
         return path
-    return next((named for suffix in SUFFIXES if (named := path.with_name(path.name + suffix)).is_file()), None)
+    named = (path.with_name(path.name + suffix) for suffix in SUFFIXES if path.name)
+    found = next((candidate for candidate in named if candidate.is_file()), None)
+    return _image_path(folder, name.replace("\\", "/")) if found is None and "\\" in name else found
 
 
 def _pose(matrix: object, where: str) -> Tensor:

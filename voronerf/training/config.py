@@ -351,6 +351,8 @@ def default_learning_rate(width: int) -> float:
 def check_device(name: str) -> None:
     """Raises ConfigError unless ``name`` is a torch device that is present."""
     try:
+        if torch.device(name).type not in ("cpu", "cuda"):
+            raise ConfigError(f"--device must be cpu or cuda, got {name!r}")
         float(torch.zeros((), device=name))
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]

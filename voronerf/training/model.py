@@ -48,7 +48,7 @@ def octaves_for(scene: Scene) -> int:
     """
     cameras = scene.train.cameras
     centre = torch.zeros(3) if scene.box is None else scene.box.mean(0)
-    distance = float((cameras.origins - centre).norm(dim=-1).mean())
+    distance = float((cameras.origins - centre).norm(dim=-1).mean()) or scene.near  # of a panorama from one place
     pixel = distance / float(cameras.intrinsics[:, :2].mean())
     return min(max(1 + math.ceil(math.log2(math.pi / pixel)), 4), 14)
 

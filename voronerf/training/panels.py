@@ -55,6 +55,7 @@ def picture_of_error(colour: Tensor, truth: Tensor) -> Tensor:
 def picture_of_depth(depth: Tensor, opacity: Tensor) -> Tensor:
     """Depth [h, w], near (yellow) to far (dark blue) over the range of what is opaque, white where nothing is."""
     solid = depth[opacity > SOLID]
+    solid = solid[:: 1 + solid.numel() // 2**20]  # torch takes no quantile of more than 2^24
     low, high = (solid.quantile(0.01), solid.quantile(0.99)) if solid.numel() else (depth.min(), depth.max())
     near_to_far = (depth - low) / (high - low).clamp_min(1e-6)
     return _on_white(_mapped(1 - near_to_far, "viridis"), opacity)

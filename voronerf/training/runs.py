@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +15,7 @@ from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.evaluation import evaluate, mean_scores, render_view, view_numbers
-from voronerf.training.files import read_json_lines, write_text
+from voronerf.training.files import read_json_lines
 from voronerf.training.lpips import Lpips
 from voronerf.training.model import checkpoint_path
 from voronerf.training.panels import save_panel
@@ -29,14 +32,50 @@ def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
     if out is None:
         if config.resume:
             raise ConfigError("--resume needs --out, the run directory to continue")
-        root = Path("runs")
-        names = [scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000))]
-        out = next(root / name for name in names if not (root / name).exists())
+        names = (scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000)))
+        out = next(folder for name in names if _made(folder := Path("runs") / name))
     elif not config.resume and checkpoint_path(out).exists():
         raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
     elif config.resume and not checkpoint_path(out).is_file():
         raise ConfigError(f"--resume needs a checkpoint in --out, got {out}")
     return replace(config, out=out)
+
+
+def _made(folder: Path) -> bool:
+    """Whether a folder was made now, rather than being there already, if only since another run began."""
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keeps a run directory from being written by two processes, where the file system has locks.
+
+    Raises:
+        ConfigError: When another process holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"--out must not be in use by another run, got {folder}") from None
+        except OSError:
+            pass  # no locks here
+        yield
+    finally:
+        os.close(number)
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # where nothing was written
 
 
 def stored_config(run: Path) -> TrainConfig | None:
@@ -90,12 +129,7 @@ def write_curve(run: Path) -> Path | None:
     return path
 
 
-def score_views(
-    renderer: Renderer, scene: Scene, *, views: int | None, path: Path | None = None, lpips: Lpips | None = None
-) -> dict[str, Any]:
-    """Scores of test views, one by one and in the mean; written to ``path`` as JSON when given."""
+def score_views(renderer: Renderer, scene: Scene, *, views: int | None, lpips: Lpips | None = None) -> dict[str, Any]:
+    """Scores of test views, one by one and in the mean."""
     scores = evaluate(renderer, scene, views=views, lpips=lpips)
-    result = {**mean_scores(scores), "views": [asdict(score) for score in scores]}
-    if path is not None:
-        write_text(path, json.dumps(result, indent=2) + "\n")
-    return result
+    return {**mean_scores(scores), "views": [asdict(score) for score in scores]}

@@ -187,7 +187,7 @@ class Trainer:
         """
         self.advance()
         self.save()
-        if not self.stopped:
+        if not self.stopped or self.fraction >= 1:
             left = len(self.plan) - self.level
             if left:
                 self._say(f"{left} of {len(self.plan)} planned splits not made: the run ended before")

@@ -8,18 +8,46 @@ from pathlib import Path
 from torch import Tensor
 from torch.nn.functional import pad
 
+SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".avi")
+
+
+def check_video(path: Path) -> None:
+    """Finds out before the frames are there whether :func:`write_video` can write them; makes the folder.
+
+    Raises:
+        ValueError: a suffix that is no container of H.264 known here.
+        ImportError: imageio-ffmpeg, or the ffmpeg that it brings, is not installed.
+        OSError: the folder cannot be written.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{path}: a video must end in {', '.join(SUFFIXES)}")
+    try:
+        import imageio_ffmpeg
+
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError):
+        raise ImportError("writing a video needs imageio-ffmpeg and its ffmpeg: pip install imageio-ffmpeg") from None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = _partial(path)
+    partial.touch()
+    partial.unlink()
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+
 
 def write_video(path: Path, frames: Tensor, fps: float) -> None:
     """Writes an H.264 video that players everywhere show; makes its folder. The file appears when it is complete.
 
     Args:
-        path: the file, its suffix a container that ffmpeg knows, such as .mp4.
+        path: the file, .mp4, .m4v, .mov, .mkv or .avi.
         frames: uint8 [f, h, w, 3], at least one. An odd size is padded by a copy of its last row or column, since the
             format stores colour for pairs of pixels.
         fps: frames a second.
 
     Raises:
-        ValueError: shape or rate.
+        ValueError: shape, rate or suffix.
         ImportError: imageio-ffmpeg is not installed.
         OSError: ffmpeg cannot write the file.
     """
@@ -27,14 +55,12 @@ def write_video(path: Path, frames: Tensor, fps: float) -> None:
         raise ValueError(f"write_video: frames must have shape [f, h, w, 3] with pixels, got {list(frames.shape)}")
     if fps <= 0:
         raise ValueError(f"write_video: fps must be positive, got {fps}")
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise ImportError("writing a video needs imageio-ffmpeg: pip install imageio-ffmpeg") from None
+    check_video(path)
+    import imageio_ffmpeg
+
     height, width = frames.shape[1:3]
     even = pad(frames.permute(0, 3, 1, 2), (0, width % 2, 0, height % 2), mode="replicate").permute(0, 2, 3, 1)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    partial = _partial(path)
     try:
         writer = imageio_ffmpeg.write_frames(
             str(partial),
@@ -48,8 +74,12 @@ def write_video(path: Path, frames: Tensor, fps: float) -> None:
         for frame in even:
             writer.send(frame.cpu().contiguous().numpy())
         writer.close()
-        if not partial.is_file() or partial.stat().st_size == 0:
-            raise OSError(f"{path}: ffmpeg could not write it")
+        try:  # ffmpeg's own exit status is not told
+            written, _ = imageio_ffmpeg.count_frames_and_secs(str(partial))
+        except RuntimeError:
+            written = 0
+        if written != len(frames):
+            raise OSError(f"{path}: ffmpeg could not write it, {written} of {len(frames)} frames")
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
