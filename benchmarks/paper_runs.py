@@ -240,6 +240,8 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
         for name in paper_looks.missed(trainer):
             say(f"{names[folder]} no look {name!r}: its time had passed before an interruption")
         summary = trainer.run()
+        for router in trainer.routers.values():
+            router.blend = 0.0  # of the final scores alone: looks and curves are of one kind throughout
         paper_looks.look(trainer, settings.budget)
         cameras = scene.test.cameras
         row: Row = {

@@ -5,6 +5,8 @@ All have the shape that the fused kernels know, and leave it by an attribute, a 
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -182,6 +184,52 @@ def test_a_change_out_of_sight_is_found_after_a_while(pair: Any, monkeypatch: py
             found = router(x)
     torch.testing.assert_close(found, field(x), rtol=1e-4, atol=1e-5)
     agree(router, field)
+
+
+def test_a_change_out_of_sight_that_no_plan_could_follow(pair: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def beside(net: Any, h: Tensor) -> Tensor:
+        return h if UNSEEN["scale"] == 1 else h * (2.0 if float(h.detach().max()) > -1 else 1.0)
+
+    router, field = pair(Net(beside))
+    monkeypatch.setitem(UNSEEN, "scale", 3.0)
+    x = encoded()
+    with pytest.warns(UserWarning, match="gives other results than when it was recognised"):
+        for _ in range(512):
+            found = router(x)
+    torch.testing.assert_close(found, field(x), rtol=1e-4, atol=1e-5)
+    assert not plans_of(router)
+
+
+def test_a_buffer_with_numbers_that_are_none(pair: Any) -> None:
+    field = Net()
+    field.mask[3] = float("nan")
+    assert plans_of(pair(field)[0])
+
+
+def test_results_that_a_module_keeps_are_not_kept_by_the_router(pair: Any) -> None:
+    def keep(net: Any, h: Tensor) -> Tensor:
+        net.settings = SimpleNamespace(last=h.detach(), shift=0.0, deep={})
+        return h
+
+    router, _ = pair(Net(keep))
+    seen = []
+    for _ in range(8):
+        router(encoded())
+        seen.append(weakref.ref(router.module.settings.last))
+    gc.collect()
+    assert sum(ref() is not None for ref in seen) <= 1
+
+
+def test_plans_are_made_after_many_numbers() -> None:
+    field = randomised(Scaled())
+    router = VoronoiRouter(field, torch.rand(5, 3) * 2 - 1, coords="first3")
+    x, w = encoded(), torch.rand(1)
+    for step in range(80):
+        router(x, w, step=step)
+    before = len(plans_of(router))
+    for _ in range(4):
+        router.eval()(x, w)
+    assert len(plans_of(router)) == before + 1
 
 
 def test_numbers_among_the_arguments_fill_no_memory() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -88,6 +89,33 @@ def test_a_forward_that_a_derived_field_overrides() -> None:
             close(found, expected)
 
 
+class Own(NeRF):
+    """One with a ``forward`` and an ``activate`` of its own, which may say different things."""
+
+    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        colour, density = super().activate(raw)
+        return colour, 2 * density
+
+    def forward(self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> Any:
+        colour, density = super().forward(positions, directions, ray_index)
+        return colour * 0.5, density
+
+
+@pytest.mark.filterwarnings("ignore:.*runs cell by cell")
+@pytest.mark.parametrize("kind", [Moved, Own])
+def test_such_fields_as_the_renderer_calls_them(kind: type[NeRF]) -> None:
+    field, x = kind(width=16, depth=2), samples()[:, :3]
+    rays, index = directions(10), (torch.arange(40) % 10).int()
+    router = VoronoiRouter(field, centres())
+    expected = field(x, rays, index)
+    for found in (router(x, rays, index), router(x, directions=rays, ray_index=index)):
+        for part, whole in zip(found, expected, strict=True):
+            close(part, whole)
+    compiled = torch.compile(router, backend="eager")
+    for part, whole in zip(compiled(x, rays, index), expected, strict=True):
+        close(part, whole)
+
+
 @pytest.mark.filterwarnings("ignore:.*runs cell by cell")
 def test_hooks_and_weight_norm_of_a_field_with_a_table() -> None:
     field, x = NeRF(width=16, depth=2), samples()[:, :3]
@@ -155,6 +183,33 @@ def test_options_stay_what_they_are() -> None:
         close(router(rows, x), module(rows, x))
 
 
+class Modes(nn.Module):
+    """Modes that are grouped, run cell by cell, and mix samples."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = network()
+
+    def forward(self, x: Tensor, mode: Any) -> Tensor:
+        h = self.net(x)
+        if mode in ("read", 1):
+            return h * (2.0 if float(h.max()) > 1e9 else 1.0)
+        return h - h.mean(0) if mode in ("mix", 2) else h
+
+
+@pytest.mark.parametrize("modes", [("plain", "read", "mix"), (0, 1, 2)])
+@pytest.mark.filterwarnings("ignore:.*runs cell by cell")
+def test_what_one_mode_is_says_nothing_of_the_others(modes: tuple[Any, ...]) -> None:
+    module, x = Modes(), samples()
+    router = VoronoiRouter(module, centres(), coords="first3")
+    plain, read, mix = modes
+    close(router(x, read), module(x, read))
+    with pytest.raises(TypeError, match="treat samples one by one"):
+        router(x, mix)
+    close(router(x, plain), module(x, plain))
+    assert len(router._memory.by_cell) == 1
+
+
 class NamesCoords(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -192,13 +247,17 @@ def test_memory_that_ran_out_once_is_no_reason_for_a_loop(monkeypatch: pytest.Mo
     def full(*_: Any, **__: Any) -> Tensor:
         raise torch.OutOfMemoryError("out of memory")
 
-    router._memory.forget()
-    with monkeypatch.context() as patched:
-        patched.setattr(rules, "grouped_linear", full)
-        with pytest.raises(torch.OutOfMemoryError):
-            router(x)
-    assert not router._memory.by_cell
-    close(router(x), expected)
+    def full_cpu(*_: Any, **__: Any) -> Tensor:
+        return torch.empty(1 << 60)
+
+    for function, error in ((full, torch.OutOfMemoryError), (full_cpu, RuntimeError)):
+        router._memory.forget()
+        with monkeypatch.context() as patched:
+            patched.setattr(rules, "grouped_linear", function)
+            with pytest.raises(error, match="memory"):
+                router(x)
+        assert not router._memory.by_cell
+        close(router(x), expected)
 
 
 def test_state_that_is_loaded_in_inference_mode() -> None:
@@ -238,6 +297,7 @@ def test_calls_from_several_threads() -> None:
     threads[0].start()
     assert inside.wait(5)
     threads[1].start()
+    time.sleep(0.2)  # for the second to come to where it waits, or would not
     go_on.set()
     for thread in threads:
         thread.join(20)

@@ -236,7 +236,11 @@ def with_items(value: dict[Any, Any], items: dict[Any, Any]) -> dict[Any, Any]:
         return value
     if type(value) is dict:
         return items
-    changed = copy.copy(value)
+    try:
+        changed = copy.copy(value)
+    except Exception:  # one that takes attributes for items, before Python 3.11
+        changed = type(value).__new__(type(value))
+        changed.update(value)
     changed.update(items)
     return changed
 

@@ -21,7 +21,7 @@ from voronerf.router.checkpointing import rerun_in
 from voronerf.router.fusion import Plan, Unrecognised, agree
 from voronerf.router.grouping import Entries, Grouping, PerCell
 from voronerf.router.loop import run_cells
-from voronerf.router.memory import Memory, keep
+from voronerf.router.memory import Memory
 from voronerf.router.parameters import as_per_cell, in_place_of_parameters
 from voronerf.router.rays import flattens
 from voronerf.router.recording import Program, Recorder
@@ -30,8 +30,8 @@ from voronerf.router.snapshot import Snapshot, tensor_key
 
 _OP = "VoronoiRouter"
 _STATES = 16  # of a module that calls of one kind are recorded in, before its state counts as one that never recurs
-_CHECK_EVERY = 512  # uses of a plan, beside the module's own forward: what it depends on may be out of sight
-_KINDS = 64  # that are recorded, where numbers or words among the arguments make ever new ones
+_CHECK_EVERY = 512  # uses of a plan it is held against the module's own forward: what that reads may be out of sight
+_VALUES = 16  # of the numbers and words among the arguments, beyond which calls are told apart by their types alone
 
 
 class Call:
@@ -174,6 +174,15 @@ def _constant(value: Any, depth: int = 0) -> Any:
     raise TypeError
 
 
+def _kind(module: nn.Module, call: Call, layout: Layout, memory: Memory) -> Any:
+    """A call's kind: with the numbers and words among its arguments, while there are few of them."""
+    kind, alike = (call.kind(layout, module.training, values=values) for values in (True, False))
+    known = memory.kinds.setdefault(alike, set())
+    if len(known) < _VALUES:
+        known.add(kind)
+    return kind if kind in known else alike
+
+
 def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory) -> Any:
     """Runs a module for all cells, in one pass where that is possible.
 
@@ -184,16 +193,15 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
         grouping: of the samples; of two rows where there are fewer samples.
         memory: of the router.
     """
-    kind, alike = (call.kind(layout, module.training, values=values) for values in (True, False))
-    if alike in memory.by_cell:
-        return _run_by_cell(module, call, layout, grouping, memory, alike)
+    kind = _kind(module, call, layout, memory)
     if len(layout.lead) > 1 and layout.lead[-1] > 1 and layout.n and kind not in memory.flat:
-        keep(memory.flat, kind, tuple(flattens(module, call, layout) or ()))
+        memory.flat[kind] = tuple(flattens(module, call, layout) or ())
     if memory.flat.get(kind):
         layout = replace(layout, flat=memory.flat[kind])
+    if kind in memory.by_cell:
+        return _run_by_cell(module, call, layout, grouping, memory, kind)
     state = None
-    known = kind in memory.recorded or len(memory.recorded) < _KINDS
-    if layout.n >= 2 and known and memory.recorded.get(kind, 0) < _STATES:
+    if layout.n >= 2 and memory.recorded.get(kind, 0) < _STATES:
         state = call.state(memory, module, kind, layout, grouping.device)
     plan = None if state is None else memory.plans.get(state)
     if isinstance(plan, Plan) and plan.fits(layout.n):
@@ -201,7 +209,8 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
         plan.uses += 1
         if plan.uses % _CHECK_EVERY or _still_right(result, module, call, layout, grouping, memory):
             return result
-        plan = memory.plans[state] = "its results have changed"
+        plan = changed = "its results have changed"
+        memory.plans = {key: changed if isinstance(old, Plan) else old for key, old in memory.plans.items()}
         name = f"{type(module).__name__}.{call.method}"
         memory.say_once(
             f"{name} changes",
@@ -219,17 +228,17 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
         return result
     except Ungroupable as error:
         reason, failure = str(error), None
-    except (BackendUnavailable, torch.OutOfMemoryError):
+    except (BackendUnavailable, MemoryError, torch.OutOfMemoryError):
         raise
     except Exception as error:
-        if str(error).startswith(_OP):
+        if str(error).startswith(_OP) or "can't allocate memory" in str(error):  # on a CPU it is a RuntimeError
             raise
         reason, failure = f"its forward fails on the samples of all cells ({error})", error
     try:
-        result = _run_by_cell(module, call, layout, grouping, memory, alike)
+        result = _run_by_cell(module, call, layout, grouping, memory, kind)
     except Exception as error:
         raise error from failure
-    memory.by_cell[alike] = reason
+    memory.by_cell[kind] = reason
     if grouping.k > 1:
         memory.say_once(
             f"{type(module).__name__}.{call.method}",
@@ -261,9 +270,9 @@ def run_entries(
         each = rows.shape[0] // entries.n
         return wrap(entries.unsort(rows.reshape(entries.n, each, *rows.shape[1:]) if each > 1 else rows))
 
-    alike = call.kind(layout, module.training, values=False)
-    if alike in memory.by_cell:
-        return _run_by_cell(module, call, layout, entries, memory, alike, place)
+    kind = _kind(module, call, layout, memory)
+    if kind in memory.by_cell:
+        return _run_by_cell(module, call, layout, entries, memory, kind, place)
     return _run_at_once(module, call, layout, entries, memory, None, place)
 
 
@@ -291,9 +300,11 @@ def _still_right(found: Any, module: nn.Module, call: Call, layout: Layout, grou
     """Whether a plan's results are still those of the module's own forward."""
     if grouping.device.type == "cuda" and torch.cuda.is_current_stream_capturing():
         return True  # nothing can be looked at
-    with torch.no_grad():
-        own = _run_at_once(module, call, layout, grouping, memory, None)
-    return agree(found, own)
+    try:
+        with torch.no_grad():
+            return agree(found, _run_at_once(module, call, layout, grouping, memory, None))
+    except Exception:  # what it fails on now is found out where it runs next
+        return False
 
 
 def _run_plan(plan: Plan, call: Call, layout: Layout, grouping: Grouping) -> Any:

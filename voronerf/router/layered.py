@@ -29,13 +29,13 @@ class LayeredField(Protocol):
 def told_by_table(field: nn.Module) -> bool:
     """Whether a field's table, weights and ``activate`` say all of it.
 
-    They do not where a class derived from the one that has them has a ``forward`` of its own, or where hooks or
+    They do not where a class has a ``forward`` of its own and not both the others, or where hooks or
     parametrisations, such as weight normalisation, change what layers take, give or are.
     """
     first = {}
     for name in ("forward", "linears", "activate"):
         first[name] = next((i for i, base in enumerate(type(field).__mro__) if name in vars(base)), 0)
-    if first["forward"] < min(first["linears"], first["activate"]) or "forward" in vars(field):
+    if first["forward"] < max(first["linears"], first["activate"]) or "forward" in vars(field):
         return False
     return not any(
         part._forward_hooks

@@ -65,23 +65,14 @@ class Assignments:
         self._positions = positions.detach().clone() if source is None else None
 
 
-_MOST = 256  # kinds of calls that are remembered
-
-
-def keep(found: dict[Any, Any], kind: Any, value: Any) -> None:
-    """Remembers something of a kind of calls, in the place of the oldest where there are too many."""
-    if len(found) >= _MOST:
-        del found[next(iter(found))]
-    found[kind] = value
-
-
 class Memory(Trials):
     """What a router remembers between calls. Copies of a router begin anew.
 
     Attributes:
         assignments: the last one.
-        by_cell: why calls of a kind have to run cell by cell, once that is known; numbers and words by their types.
-        separate: those of them that have been found to treat samples one by one.
+        kinds: of calls with as many arguments of the same types and sizes, those with other numbers and words.
+        by_cell: why calls of a kind have to run cell by cell, once that is known.
+        separate: the kinds of calls that have been found to treat samples one by one.
         flat: for kinds of calls with rays, which of the results the module itself flattens to [rays * samples, ...].
         plans: for calls in a state of the module, how the fused network runs them; a recording until it is confirmed
             by a second call; or why there is none.
@@ -97,6 +88,8 @@ class Memory(Trials):
     def forget(self) -> None:
         """Begins anew, after a change of diagram, dtype or device."""
         self.assignments = Assignments()
+        self.said = {topic for topic in self.said if not topic.endswith(" changes")}
+        self.kinds: dict[Any, set[Any]] = {}
         self.by_cell: dict[Any, str] = {}
         self.separate: set[Any] = set()
         self.flat: dict[Any, tuple[bool, ...]] = {}

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from voronerf.backends import BACKENDS
 from voronerf.diagram import VoronoiDiagram
-from voronerf.router.arguments import accepted_names
+from voronerf.router.arguments import accepted_names, argument_names
 from voronerf.router.blended import Mixture, mix_call
 from voronerf.router.calls import Call, run_grouped
 from voronerf.router.grouping import Grouping
@@ -161,6 +161,7 @@ class VoronoiRouter(nn.Module):
 
         self.module: nn.Module = clone_module(module)
         stack_parameters(self.module, self.diagram.num_cells)
+        self._told = self._layered and told_by_table(self.module)
 
     @classmethod
     def from_modules(
@@ -226,13 +227,25 @@ class VoronoiRouter(nn.Module):
                 directions that the field needs and did not get.
             TypeError: When the module turns out to mix samples.
         """
-        if self._layered and (torch.compiler.is_compiling() or told_by_table(self.module)):
+        if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
+            self._told = told_by_table(self.module)
+        if self._told:
             coords = self._coords_of(args, kwargs) if coords is None else coords
             if self._blends:
                 at = self._mixture
                 return evaluate_blended(self.field, self._where, self.backend, at, *args, coords=coords, **kwargs)
             return evaluate_table(self.field, self._where, self.backend, *args, coords=coords, **kwargs)
+        if self._layered:
+            args, kwargs = self._each_direction(args, kwargs)
         return self._call_method("forward", *args, coords=coords, **kwargs)
+
+    def _each_direction(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """For a field's own ``forward`` a direction for each sample, in the place of one for each ray and the rays."""
+        given = dict(zip(argument_names(self.module.forward, len(args)), args)) | kwargs
+        directions, index = given.get("directions"), given.get("ray_index")
+        if directions is None or index is None:
+            return args, kwargs
+        return (), {**given, "directions": directions.index_select(0, index), "ray_index": None}
 
     def _coords_of(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Tensor | None:
         """By the router's rule the coords of a field with a layer table; None for its positions themselves."""

@@ -1,8 +1,8 @@
 """The state of a module that is no parameter, as a key: flags, numbers and buffers that its ``forward`` may depend on.
 
 What a key cannot see: globals, attributes of classes, what functions close over, objects deeper than four levels or
-with more than 64 entries, what comes after the first 512 values in all, and writes through ``.data`` to tensors of more
-than 64 numbers or on another device.
+with more than 64 entries, what comes after the first 512 values in all, what objects without a ``__dict__`` hold (as
+arrays of numpy do), and writes through ``.data`` to tensors of more than 64 numbers or on another device.
 """
 
 from __future__ import annotations
@@ -22,14 +22,17 @@ _DEEPEST, _LARGEST, _MOST = 4, 64, 512
 class Same:
     """An object in a key, equal to itself alone; not its ``id``, which would go to another object after its end.
 
-    Tensors are not kept alive; one that is gone is equal to nothing.
+    It is not kept alive where Python has weak references to it; what is gone is equal to nothing.
     """
 
     __slots__ = ("_hash", "_value")
 
     def __init__(self, value: Any) -> None:
         self._hash = id(value)
-        self._value: Any = weakref.ref(value) if isinstance(value, Tensor) else (lambda: value)
+        try:
+            self._value: Any = weakref.ref(value)
+        except TypeError:
+            self._value = lambda: value
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Same) and self._value() is not None and self._value() is other._value()
@@ -92,7 +95,7 @@ class _Reader:
             items, own = value, type(value)
         else:
             items = getattr(value, "__dict__", {})
-            own = Same(value)
+            own = Same(value) if type(value).__weakrefoffset__ or not items else type(value)
         if not items or len(items) > min(_LARGEST, self._left):
             return own if not items else Same(value)
         self._left -= len(items)
@@ -103,4 +106,8 @@ def tensor_key(tensor: Tensor) -> Any:
     """A tensor by its identity, its version, and its numbers where they are few and at hand."""
     version = None if tensor.is_inference() else tensor._version
     few = tensor.device.type == "cpu" and tensor.numel() <= _LARGEST and tensor.layout is torch.strided
-    return Same(tensor), version, tuple(tensor.detach().flatten().tolist()) if few else None
+    if not few:
+        return Same(tensor), version, None
+    # as bytes: a number that is none differs from itself
+    numbers = tensor.detach().resolve_conj().resolve_neg().flatten().contiguous()
+    return Same(tensor), version, numbers.view(torch.uint8).numpy().tobytes()

@@ -71,11 +71,13 @@ def held(folder: Path) -> Iterator[None]:
             raise ConfigError(f"--out must not be in use by another run, got {folder}") from None
         except OSError:
             pass  # no locks here
-        yield
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                folder.rmdir()  # where nothing was written
     finally:
         os.close(number)
-        with contextlib.suppress(OSError):
-            folder.rmdir()  # where nothing was written
 
 
 def stored_config(run: Path) -> TrainConfig | None:
