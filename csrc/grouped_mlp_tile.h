@@ -103,8 +103,10 @@ struct Tile {
   void run_layer(const MlpPlanLayer& layer) const {
     constexpr int64_t kFew = 8;
     float* value = at(layer.value);
-    // What layers read leaves the product as pairs where whole vectors of them fit; else it is narrowed afterwards.
-    const bool narrowed = VN_HALF && layer.read && layer.activation <= kRelu && layer.padded % (2 * kGranule) == 0;
+    // What layers read leaves the product as pairs where whole vectors of them fit; else it is narrowed afterwards. So
+    // is an odd width, whose last pair would hold a column of padding: not zero where a row is not finite.
+    const bool narrowed = VN_HALF && layer.read && layer.activation <= kRelu && layer.padded % (2 * kGranule) == 0 &&
+                          layer.width % 2 == 0;
     // Sources in groups of kFew: a longer concatenation continues on its own result.
     for (int64_t group = 0, row = 0; group < layer.source_count; group += kFew) {
       Source sources[kFew];

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
+#include <exception>
 
 #ifdef VN_STD_THREADS
 #include <thread>
@@ -55,16 +56,24 @@ class Items {
   const int64_t count_, run_;
 };
 
-// body(item) for every item, on at most `threads` threads, no more than there are runs.
+// body(item) for every item, on at most `threads` threads, no more than there are runs. What is thrown out of body, as
+// where memory has run out, ends the loop and is thrown again to the caller.
 template <typename Body>
 void parallel_for(int64_t count, int64_t run, int threads, const Body& body) {
   const int64_t runs = (count + run - 1) / run;
   Items items(count, run);
+  std::atomic<bool> failed{false};
+  std::exception_ptr failure;
   parallel(static_cast<int>(std::min<int64_t>(threads, runs)), [&](int) {
-    for (int64_t begin, end; items.take(begin, end);) {
-      for (int64_t item = begin; item < end; ++item) body(item);
+    try {
+      for (int64_t begin, end; !failed.load(std::memory_order_relaxed) && items.take(begin, end);) {
+        for (int64_t item = begin; item < end; ++item) body(item);
+      }
+    } catch (...) {
+      if (!failed.exchange(true)) failure = std::current_exception();
     }
   });
+  if (failure) std::rethrow_exception(failure);
 }
 
 }  // namespace voronerf

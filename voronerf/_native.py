@@ -125,12 +125,14 @@ def measure_peak(kind: str, *, isa: str | None = None, threads: int | None = Non
         threads: by default torch's number.
 
     Raises:
-        ValueError: an unknown kind or instruction set, or one that this processor or build does not have.
+        ValueError: an unknown kind or instruction set, one that this processor or build does not have, or no threads.
     """
     if kind not in _PEAKS:
         raise ValueError(f"measure_peak: kind must be one of {', '.join(_PEAKS)}, got {kind!r}")
     if isa is not None and isa not in ISAS:
         raise ValueError(f"measure_peak: isa must be one of {', '.join(ISAS)}, got {isa!r}")
+    if threads is not None and threads < 1:
+        raise ValueError(f"measure_peak: threads must be at least 1, got {threads}")
     number = _ISA if isa is None else ISAS.index(isa)
     peak: float = _C.measure_peak(_PEAKS.index(kind), number, threads or torch.get_num_threads())
     return peak

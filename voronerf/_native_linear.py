@@ -18,6 +18,7 @@ from torch import Tensor
 from voronerf import _native, _native_mlp
 from voronerf.layers import ACTIVATIONS
 from voronerf.reference.grouped_linear import grouped_linear as _reference
+from voronerf.reference.second_derivatives import aliases, second_derivatives
 
 _STORED = (torch.float32, torch.bfloat16)
 
@@ -125,10 +126,10 @@ def _backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> 
 def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | None, ...]:
     """Derivative of the gradients, through the reference formula."""
     gradient, x, offsets, weight, bias = ctx.saved_tensors
+    leaves, graph = aliases((x, weight, bias, gradient))
     with torch.enable_grad():
-        x, weight, gradient = (tensor.detach().requires_grad_() for tensor in (x, weight, gradient))
-        bias = None if bias is None else bias.detach().requires_grad_()
-        leaves = (x, weight, bias, gradient)
+        x, weight, bias, gradient = leaves
+        assert x is not None and weight is not None
         with torch.autocast(x.device.type, enabled=False):
             out = _reference(x, offsets, weight, bias, activation=ctx.activation)
         chosen = (ctx.wanted[0], ctx.wanted[1], ctx.wanted[1])
@@ -137,14 +138,7 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | Non
             for leaf, cotangent, want in zip(leaves, cotangents, chosen)
             if want and leaf is not None and cotangent is not None
         ]
-        firsts = torch.autograd.grad(
-            out, [leaf for leaf, _ in pairs], gradient, create_graph=True, allow_unused=True, materialize_grads=True
-        )
-        total = out.new_zeros(())
-        for first, (_, cotangent) in zip(firsts, pairs):
-            total = total + (first * cotangent).sum()
-        seconds = iter(torch.autograd.grad(total, [leaf for leaf in leaves if leaf is not None], allow_unused=True))
-    to_x, to_weight, to_bias, to_gradient = (None if leaf is None else next(seconds) for leaf in leaves)
+        to_x, to_weight, to_bias, to_gradient = second_derivatives([(out, gradient)], pairs, leaves, graph)
     return to_gradient, to_x, None, to_weight, to_bias, None, None
 
 

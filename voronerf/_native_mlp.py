@@ -24,6 +24,7 @@ from voronerf import _native
 from voronerf.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_mlp import grouped_mlp as _reference
+from voronerf.reference.second_derivatives import aliases, second_derivatives
 from voronerf.reference.specification import encode_positions
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
@@ -411,11 +412,8 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
     """Derivative of the gradients, through the reference formula."""
     gradient, positions, offsets, directions, direction_index, order, *parameters = ctx.saved_tensors
     count = ctx.count
+    leaves, graph = aliases((*parameters, positions, directions, gradient))
     with torch.enable_grad():
-        leaves = [
-            None if tensor is None else tensor.detach().requires_grad_()
-            for tensor in (*parameters, positions, directions, gradient)
-        ]
         *inputs, gradient = leaves
         rows, seen = _given(leaves[-3]), leaves[-2]
         if order is not None:
@@ -439,15 +437,7 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
             for tensor, cotangent, want in zip(inputs, cotangents, chosen)
             if want and tensor is not None and tensor.numel() and cotangent is not None
         ]
-        firsts = torch.autograd.grad(
-            out, [tensor for tensor, _ in pairs], gradient, create_graph=True, allow_unused=True, materialize_grads=True
-        )
-        total = out.new_zeros(())
-        for first, (_, cotangent) in zip(firsts, pairs):
-            total = total + (first * cotangent).sum()
-        present = [leaf for leaf in leaves if leaf is not None]
-        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
-    results = [None if leaf is None else next(seconds) for leaf in leaves]
+        results = second_derivatives([(out, gradient)], pairs, leaves, graph)
     return (
         results[-1],
         results[-3],

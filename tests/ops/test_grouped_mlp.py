@@ -167,6 +167,20 @@ def test_integrated_inside_and_before(device: torch.device, backend: str, scale:
     torch.testing.assert_close(inside, before, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("width", [15, 30, 31, 32, 63])
+def test_infinity_in_bfloat16_stays_what_it_is(device: torch.device, backend: str, width: int) -> None:
+    """Rows of pairs end in padding, whose product with infinity is no number."""
+    weights = [torch.ones(1, width, 2, device=device), torch.ones(1, 5, width, device=device)]
+    weights[0][:, :, 0] = -1
+    table = MLP((Layer((POSITIONS,), width, "relu"), Layer((0,), 5)), (1,))
+    x = torch.tensor([[torch.inf, 1.0], [1.0, 3.0]], device=device)
+    offsets = torch.tensor([0, 2], dtype=torch.int32, device=device)
+    half = [weight.bfloat16() for weight in weights]
+    need("grouped_mlp", backend, device, torch.bfloat16)
+    found = grouped_mlp(x.bfloat16(), offsets, half, [None, None], layers=table, backend=backend)
+    assert found.tolist() == [[0.0] * 5, [2.0 * width] * 5]
+
+
 def test_identical_cells_are_one_chain_of_layers(device: torch.device, backend: str) -> None:
     case = Case.make("plain", COUNTS["unequal"])
     leaves = [tensor.to(device) for tensor in case.inputs]

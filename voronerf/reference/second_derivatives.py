@@ -1,4 +1,4 @@
-"""Autograd of the kernels' ops: what native and Warp share, and second derivatives through the reference formulas.
+"""Autograd of the kernels' ops: what native and Warp share, and further derivatives through the reference formulas.
 
 A kernel's op and its backward are custom ops of the same arguments in every backend; these functions are registered
 with both. Letters as in the ops.
@@ -6,7 +6,7 @@ with both. Letters as in the ops.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -15,6 +15,52 @@ from torch import Tensor
 from voronerf.reference.composite import composite
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.integrated_encode import integrated_encode
+
+
+def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:
+    """Tensors to differentiate by within the derivative of a backward op, and whether that is differentiated again.
+
+    Where it is, they stay parts of the caller's graph, as aliases: where one of them was computed from another, that
+    path is the caller's. To be called before gradients are switched on.
+    """
+    graph = torch.is_grad_enabled()
+    found = [
+        None if t is None else t.view_as(t) if graph and t.requires_grad else t.detach().requires_grad_()
+        for t in tensors
+    ]
+    return found, graph
+
+
+def second_derivatives(
+    outputs: Sequence[tuple[Tensor, Tensor | None]],
+    firsts: Sequence[tuple[Tensor, Tensor]],
+    tensors: Sequence[Tensor | None],
+    graph: bool,
+) -> list[Tensor | None]:
+    """The derivative of gradients.
+
+    Args:
+        outputs: results of a formula, each with the gradient that arrives at it.
+        firsts: tensors that the formula read, each with the cotangent of the gradient that it has got.
+        tensors: by which is differentiated, None where one is absent.
+        graph: whether the results are differentiated again.
+
+    Returns:
+        For each of the tensors its derivative, None where there is none.
+    """
+    if not firsts:
+        return [None] * len(tensors)
+    parts, arriving = zip(*outputs, strict=True)
+    sources, cotangents = zip(*firsts, strict=True)
+    gradients = torch.autograd.grad(
+        parts, sources, arriving, create_graph=True, allow_unused=True, materialize_grads=True
+    )
+    total = parts[0].new_zeros(())
+    for gradient, cotangent in zip(gradients, cotangents, strict=True):
+        total = total + (gradient * cotangent).sum()
+    present = [tensor for tensor in tensors if tensor is not None]
+    seconds = iter(torch.autograd.grad(total, present, create_graph=graph, allow_unused=True))
+    return [None if tensor is None else next(seconds) for tensor in tensors]
 
 
 def composite_forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -50,10 +96,8 @@ def composite_backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tu
     """Derivative of the gradients of composite."""
     saved = ctx.saved_tensors
     ray_offsets = saved[8]
+    leaves, graph = aliases([None if i == 8 else tensor for i, tensor in enumerate(saved)])
     with torch.enable_grad():
-        leaves = [
-            None if tensor is None or i == 8 else tensor.detach().requires_grad_() for i, tensor in enumerate(saved)
-        ]
         gradients, inputs = leaves[:4], [*leaves[4:8], leaves[9]]
         parts = composite(*inputs[:4], ray_offsets=ray_offsets, background=inputs[4])  # type: ignore[arg-type]
         outputs = [(part, gradient) for part, gradient in zip(parts, gradients) if gradient is not None]
@@ -62,20 +106,7 @@ def composite_backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tu
             for tensor, cotangent, want in zip(inputs, cotangents, ctx.wanted)
             if want and tensor is not None and cotangent is not None
         ]
-        firsts = torch.autograd.grad(
-            [part for part, _ in outputs],
-            [tensor for tensor, _ in pairs],
-            [gradient for _, gradient in outputs],
-            create_graph=True,
-            allow_unused=True,
-            materialize_grads=True,
-        )
-        total = saved[4].new_zeros(())
-        for first, (_, cotangent) in zip(firsts, pairs):
-            total = total + (first * cotangent).sum()
-        present = [leaf for leaf in leaves if leaf is not None]
-        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
-    return (*(None if leaf is None else next(seconds) for leaf in leaves), None)
+        return (*second_derivatives(outputs, pairs, leaves, graph), None)
 
 
 def encode_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -103,8 +134,8 @@ def encode_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor
 
 def encode_backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | None, ...]:
     """Derivative of the gradients of the encodings."""
+    leaves, graph = aliases(ctx.saved_tensors)
     with torch.enable_grad():
-        leaves = [None if tensor is None else tensor.detach().requires_grad_() for tensor in ctx.saved_tensors]
         gradient, x, variances = leaves
         assert x is not None
         if variances is None:
@@ -115,10 +146,5 @@ def encode_backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor
             inputs = [x, variances]
         if not out.requires_grad:
             return (None,) * 5
-        firsts = torch.autograd.grad(out, inputs, gradient, create_graph=True)
-        total = out.new_zeros(())
-        for first, cotangent in zip(firsts, cotangents):
-            total = total + (first * cotangent).sum()
-        present = [leaf for leaf in leaves if leaf is not None]
-        seconds = iter(torch.autograd.grad(total, present, allow_unused=True))
-    return (*(None if leaf is None else next(seconds) for leaf in leaves), None, None)
+        pairs = list(zip(inputs, cotangents))
+        return (*second_derivatives([(out, gradient)], pairs, leaves, graph), None, None)

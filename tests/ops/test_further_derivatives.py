@@ -1,0 +1,100 @@
+"""Losses on second derivatives, such as a curvature: their gradients are third derivatives of the ops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from op_cases import need, offsets_of
+from torch import Tensor
+
+from voronerf import ops
+from voronerf.layers import MLP, POSITIONS, Layer
+
+COUNTS = [4, 0, 5]
+N, K = sum(COUNTS), len(COUNTS)
+Call = Callable[..., Tensor]
+
+
+def draw(*shape: int, seed: int) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+
+
+def linear(backend: str, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    return ops.grouped_linear(x, offsets_of(COUNTS, x.device), weight, bias, activation="sine", backend=backend)
+
+
+NETWORK = MLP((Layer((POSITIONS,), 6, "sine"), Layer((0,), 2, "sigmoid")), (1,), position_octaves=2)
+
+
+def network(backend: str, x: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    offsets = offsets_of(COUNTS, x.device)
+    return ops.grouped_mlp(x, offsets, [first, second], [None, None], layers=NETWORK, backend=backend)
+
+
+def routed(backend: str, x: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    cells = torch.tensor([0, 2, 2, 0, 2, 0, 2, 0, 2], dtype=torch.int32, device=x.device)
+    return ops.routed_mlp(x, [first, second], [None, None], layers=NETWORK, cells=cells, backend=backend)[0]
+
+
+def frequencies(backend: str, x: Tensor) -> Tensor:
+    return ops.frequency_encode(x, 2, backend=backend)
+
+
+def gaussians(backend: str, x: Tensor, variances: Tensor) -> Tensor:
+    return ops.integrated_encode(x, variances.square(), 2, backend=backend)
+
+
+def rays(backend: str, x: Tensor, sigma: Tensor) -> Tensor:
+    depths = torch.linspace(1, 2, N).to(x)
+    deltas = torch.full((N,), 0.3).to(x)
+    offsets = torch.tensor([0, 4, N], dtype=torch.int32, device=x.device)
+    density = sigma.square() + x.square().sum(-1)
+    return ops.composite(density, x.sigmoid(), depths, deltas, ray_offsets=offsets, backend=backend).colour
+
+
+CASES: dict[str, tuple[Call, list[Tensor]]] = {
+    "grouped_linear": (linear, [draw(N, 3, seed=1), draw(K, 4, 3, seed=2), draw(K, 4, seed=3)]),
+    "grouped_mlp": (network, [draw(N, 3, seed=1), draw(K, 6, 15, seed=2), draw(K, 2, 6, seed=3)]),
+    "routed_mlp": (routed, [draw(N, 3, seed=1), draw(K, 6, 15, seed=2), draw(K, 2, 6, seed=3)]),
+    "frequency_encode": (frequencies, [draw(N, 3, seed=1)]),
+    "integrated_encode": (gaussians, [draw(N, 3, seed=1), draw(N, 3, seed=2)]),
+    "composite": (rays, [draw(N, 3, seed=1), draw(N, seed=2)]),
+}
+
+
+def gradients(call: Call, backend: str, values: list[Tensor], device: torch.device, dtype: torch.dtype) -> list[Tensor]:
+    """Of a loss on values, slopes and curvatures, the latter beside a slope in which they are not linear."""
+    leaves = [value.to(device, dtype).requires_grad_() for value in values]
+    y = call(backend, *leaves)
+    weights = draw(*y.shape, seed=9).to(y)
+    (slope,) = torch.autograd.grad((y * weights).sum(), leaves[0], create_graph=True)
+    (bend,) = torch.autograd.grad((slope * (1 + slope)).sum(), leaves[0], create_graph=True)
+    assert bend.requires_grad
+    loss = bend.square().mean() + slope.square().mean() + y.square().mean()
+    return list(torch.autograd.grad(loss, leaves))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_loss_on_second_derivatives(name: str, device: torch.device, backend: str) -> None:
+    need(name, backend, device, torch.float32)
+    call, values = CASES[name]
+    expected = gradients(call, "reference", values, torch.device("cpu"), torch.float64)
+    found = gradients(call, backend, values, device, torch.float32)
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a.double().cpu(), b, rtol=2e-3, atol=2e-4 * float(b.abs().max()))
+
+
+@pytest.mark.op("grouped_mlp")
+def test_slopes_of_no_samples_by_frozen_networks(device: torch.device, backend: str) -> None:
+    """As where a march through empty space has found nothing, and normals are trained on."""
+    need("grouped_mlp", backend, device, torch.float32)
+    x = torch.zeros(0, 3, device=device, requires_grad=True)
+    weights: list[Any] = [draw(K, 6, 15, seed=2).to(device), draw(K, 2, 6, seed=3).to(device)]
+    offsets = offsets_of([0] * K, device)
+    y = ops.grouped_mlp(x, offsets, weights, [None, None], layers=NETWORK, backend=backend)
+    (slope,) = torch.autograd.grad(y.sum(), x, create_graph=True)
+    slope.square().sum().backward()
+    assert x.grad is None or x.grad.shape == (0, 3)
