@@ -43,9 +43,9 @@ from gpu_cases import captured_steps, has_wgmma, small_cases  # noqa: E402
 N = 1 << 22
 """Samples of the timings, as the targets have them."""
 CALLS = 8
-#: Of the inputs of look-ups and sorts, together beyond what the caches of a GPU hold.
-SETS = 4
 """Of a timing, in one graph."""
+SETS = 4
+"""Of the points of look-ups, and a quarter of those of sorts: with the results more than the caches of a GPU hold."""
 CASE_SECONDS = 10.0
 """For one case, after which it is said to hang."""
 FILE_SECONDS = 60.0

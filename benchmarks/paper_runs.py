@@ -257,10 +257,10 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
 
 
 def curve(trainer: Trainer) -> list[Row]:
-    """The evaluations of a finished training, all on the views of those on the way: other views are another curve."""
+    """The evaluations of a finished training, all as those on the way: other views, or blended, are another curve."""
     found = read_metrics(trainer.out)
     config, count = trainer.config, len(trainer.scene.test)
-    if min(config.final_views or count, count) != min(config.eval_views, count):
+    if min(config.final_views or count, count) != min(config.eval_views, count) or config.blend:
         found[-1] |= mean_scores(evaluate(trainer.renderer, trainer.scene, views=config.eval_views))
         found[-1]["views"] = config.eval_views
     return found

@@ -89,6 +89,13 @@ def test_a_forward_that_a_derived_field_overrides() -> None:
             close(found, expected)
 
 
+class Wrapped(Moved):
+    """One whose arguments have no names of their own."""
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return super().forward(*args, **kwargs)
+
+
 class Own(NeRF):
     """One with a ``forward`` and an ``activate`` of its own, which may say different things."""
 
@@ -102,13 +109,20 @@ class Own(NeRF):
 
 
 @pytest.mark.filterwarnings("ignore:.*runs cell by cell")
-@pytest.mark.parametrize("kind", [Moved, Own])
+@pytest.mark.parametrize("kind", [Moved, Wrapped, Own])
 def test_such_fields_as_the_renderer_calls_them(kind: type[NeRF]) -> None:
     field, x = kind(width=16, depth=2), samples()[:, :3]
     rays, index = directions(10), (torch.arange(40) % 10).int()
     router = VoronoiRouter(field, centres())
     expected = field(x, rays, index)
-    for found in (router(x, rays, index), router(x, directions=rays, ray_index=index)):
+    by_rule = VoronoiRouter(field, centres(), coords=lambda p, d, i: p.flip(-1))
+    given = {"directions": rays, "ray_index": index}
+    for found in (
+        router(x, rays, index),
+        router(x, **given),
+        router(x, rays, ray_index=index),
+        by_rule(x, rays, index),
+    ):
         for part, whole in zip(found, expected, strict=True):
             close(part, whole)
     compiled = torch.compile(router, backend="eager")

@@ -138,7 +138,7 @@ def test_resume_needs_no_setting_again(run: Path, tmp_path: Path) -> None:
 def test_folders_with_brackets_and_spaces_are_told_as_they_are(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy = tmp_path / "toys[old] 2"
+    copy = tmp_path / "toys[old] :dog: 2"
     shutil.copytree(run, copy)
     assert main(["eval", str(copy), "--views", "1", "--panels", "0"]) == 0
     assert f"wrote {copy / 'eval.json'}" in capsys.readouterr().out
@@ -188,6 +188,7 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.Capture
     assert "--resume needs a checkpoint" in error_of(capsys, "train", "--resume", "--out", out)
     assert "--resume needs --out" in error_of(capsys, "train", "--resume")
     assert "there is no checkpoint" in error_of(capsys, "eval", str(tmp_path))
+    assert "there is no checkpoint" in error_of(capsys, "render", out)
     assert "--frames must be at least 1, got 0" in error_of(capsys, "render", str(run), "--frames", "0")
     assert "a video must end in" in error_of(capsys, "render", str(run), "--out", str(tmp_path / "turn"))
     assert "--views must be at least 1, got 0" in error_of(capsys, "eval", str(run), "--views", "0")

@@ -84,7 +84,7 @@ def test_a_capture_that_others_split(tmp_path: Path) -> None:
     """As torch-ngp's scripts write it: Blender's files, but with a principal point and distortion."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=4)
-    lens = {"camera_angle_x": 0.9, "fl_x": 20.0, "fl_y": 21.0, "cx": 5.0, "cy": 5.5, "k1": 0.02, "w": 12, "h": 10}
+    lens = {"camera_angle_x": 0.9, "fl_x": 20.0, "fl_y": 21.0, "cx": 5.0, "cy": 5.5, "k1": 0.02, "w": 12.6, "h": 10}
     for folder in (whole, parts):
         write_capture(folder, rig, **lens)
     path = parts / "transforms.json"

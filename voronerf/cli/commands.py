@@ -35,7 +35,7 @@ console = Console(soft_wrap=True)
 
 def say(line: str) -> None:
     """Prints a line as it is."""
-    console.print(line, highlight=False, markup=False)
+    console.print(line, highlight=False, markup=False, emoji=False)
 
 
 def train(config: TrainConfig) -> int:
@@ -56,7 +56,12 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
     second Ctrl-C ends the process at once.
     """
     assert config.out is not None
-    with held(config.out), TrainingDisplay(console, scene.name) as display:
+    with held(config.out):
+        return _train_and_draw(config, config.out, scene)
+
+
+def _train_and_draw(config: TrainConfig, out: Path, scene: Scene) -> dict[str, Any]:
+    with TrainingDisplay(console, scene.name) as display:
         trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
         if trainer.lpips is None:
             display.on_event(trainer.lpips_source)
@@ -73,12 +78,12 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
         finally:
             signal.signal(signal.SIGINT, before)
     if not summary["complete"]:
-        say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(config.out))}")
+        say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}")
         return summary
     if config.panels:
-        write_panels(trainer.renderer, scene, config.out / "images", views=config.panels)
-    write_curve(config.out)
-    say(f"wrote {config.out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
+        write_panels(trainer.renderer, scene, out / "images", views=config.panels)
+    write_curve(out)
+    say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
     return summary
 
 
@@ -171,9 +176,9 @@ def render(
         backend: Backend of the operations.
     """
     check_counts(frames=frames, fps=fps, samples=samples, fine_samples=fine_samples, downscale=downscale)
+    _, renderer, scene = _load(run, data, downscale, samples, fine_samples, occupancy, blend, device, backend)
     path = out or run / "turntable.mp4"
     check_video(path)
-    _, renderer, scene = _load(run, data, downscale, samples, fine_samples, occupancy, blend, device, backend)
     cameras = turntable_cameras(scene.train.cameras, frames).to(device)
     pictures = []
     for frame in track(range(frames), description="rendering", console=console, disable=not console.is_terminal):
@@ -235,7 +240,7 @@ def preload(device: str = "cpu") -> int:
         table.add_row(name, f"{took:.2f}")
     console.print(table)
     cache = kernels.describe()["cache"]
-    console.print(f"{len(seconds)} files in {sum(seconds.values()):.1f} s, kept in {cache}", highlight=False)
+    say(f"{len(seconds)} files in {sum(seconds.values()):.1f} s, kept in {cache}")
     return 0
 
 

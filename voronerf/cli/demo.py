@@ -11,7 +11,7 @@ from voronerf.cli.commands import console, run_training, say
 from voronerf.data import BUILTIN_SIZE, Scene, load_scene
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.plots import plot_curves
-from voronerf.training.runs import read_metrics
+from voronerf.training.runs import held, read_metrics
 
 
 def demo(
@@ -51,7 +51,8 @@ def demo(
     scene = load_scene("builtin", downscale=downscale)
     results: dict[str, dict[str, Any]] = {}
     for name, config in configs.items():
-        _remove_run(out / name)
+        with held(out / name):
+            _remove_run(out / name)
         networks = f"{cells} Voronoi cells" if config.cells else "one coarse network"
         console.print(f"\n[bold]{name}[/bold]: {networks}, {budget:.0f} s", highlight=False)
         results[name] = run_training(config, scene)

@@ -71,4 +71,4 @@ class TrainingDisplay:
 
     def on_event(self, line: str) -> None:
         """Prints a line that stays, above the live one."""
-        self.console.print(line, highlight=False, markup=False)
+        self.console.print(line, highlight=False, markup=False, emoji=False)

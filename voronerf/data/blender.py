@@ -5,6 +5,7 @@ The object sits at the origin, cameras look at it from about 4 units away; what 
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from voronerf.data.images import read_images
 from voronerf.data.scene import Scene, SceneError, Split
 from voronerf.data.transforms import Frame, distinct_names, number, read_transforms
 from voronerf.rendering.cameras import Cameras
+
+log = logging.getLogger(__name__)
 
 NEAR, FAR = 2.0, 6.0
 
@@ -34,7 +37,7 @@ def load_blender(folder: Path, downscale: int) -> Scene:
 
     Returns:
         The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
-        the training views; without alpha the box is None.
+        the training views; without alpha the box is None. Of a capture, what `load_capture` says.
 
     Raises:
         SceneError: a file is missing, broken or inconsistent.
@@ -51,6 +54,8 @@ def load_blender(folder: Path, downscale: int) -> Scene:
 
     if has_lens(entries, train_frames) or has_lens(test_entries, test_frames):
         files = ((train_file, entries, train_frames), (test_file, test_entries, test_frames))
+        if "near" in entries or "far" in entries:
+            log.warning("%s: near and far are not used, since the scene of a capture is moved and scaled", train_file)
         listed = [Listed(path, of_file, frame) for path, of_file, frames in files for frame in frames]
         return capture_scene(folder, listed, torch.arange(len(listed)) >= len(train_frames), downscale)
 

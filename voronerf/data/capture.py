@@ -107,7 +107,7 @@ def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, down
     if images.shape[-1] == 4 and bool((images[..., 3] < 255).any()):
         spacing, background = "linear", "white"
         near, far = 0.05 * nearest, 2.0
-        box = carve_box(cameras, images[..., 3], near, far)
+        box = carve_box(cameras[~held_out], images[~held_out, ..., 3], near, far)
     else:
         images = images[..., :3]
 
@@ -160,7 +160,7 @@ def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame
     width, height = size
     for key, actual in (("w", width), ("h", height)):
         stated = number(values, key, path, positive=True)
-        if stated is not None and stated != actual:
+        if stated is not None and abs(stated - actual) >= 1:  # exporters that scale leave fractions
             raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {path} says {key} = {stated:g}")
     fx, fy = (number(values, key, path, positive=True) for key in ("fl_x", "fl_y"))
     angles = {}

@@ -31,6 +31,7 @@ from voronerf.router.snapshot import Snapshot, tensor_key
 _OP = "VoronoiRouter"
 _STATES = 16  # of a module that calls of one kind are recorded in, before its state counts as one that never recurs
 _CHECK_EVERY = 512  # uses of a plan it is held against the module's own forward: what that reads may be out of sight
+_KINDS = 256  # of calls, told apart by types and sizes, beyond which a router begins anew
 _VALUES = 16  # of the numbers and words among the arguments, beyond which calls are told apart by their types alone
 
 
@@ -177,6 +178,8 @@ def _constant(value: Any, depth: int = 0) -> Any:
 def _kind(module: nn.Module, call: Call, layout: Layout, memory: Memory) -> Any:
     """A call's kind: with the numbers and words among its arguments, while there are few of them."""
     kind, alike = (call.kind(layout, module.training, values=values) for values in (True, False))
+    if alike not in memory.kinds and len(memory.kinds) >= _KINDS:
+        memory.forget()
     known = memory.kinds.setdefault(alike, set())
     if len(known) < _VALUES:
         known.add(kind)
@@ -228,10 +231,10 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
         return result
     except Ungroupable as error:
         reason, failure = str(error), None
-    except (BackendUnavailable, MemoryError, torch.OutOfMemoryError):
+    except BackendUnavailable:
         raise
     except Exception as error:
-        if str(error).startswith(_OP) or "can't allocate memory" in str(error):  # on a CPU it is a RuntimeError
+        if str(error).startswith(_OP) or _is_memory(error):
             raise
         reason, failure = f"its forward fails on the samples of all cells ({error})", error
     try:
@@ -296,6 +299,11 @@ def _next_plan(
     return plan if agree(found, result) else "its results differ"
 
 
+def _is_memory(error: Exception) -> bool:
+    """Whether memory has run out, for which torch has a plain RuntimeError on a CPU."""
+    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error)
+
+
 def _still_right(found: Any, module: nn.Module, call: Call, layout: Layout, grouping: Grouping, memory: Memory) -> bool:
     """Whether a plan's results are still those of the module's own forward."""
     if grouping.device.type == "cuda" and torch.cuda.is_current_stream_capturing():
@@ -303,8 +311,8 @@ def _still_right(found: Any, module: nn.Module, call: Call, layout: Layout, grou
     try:
         with torch.no_grad():
             return agree(found, _run_at_once(module, call, layout, grouping, memory, None))
-    except Exception:  # what it fails on now is found out where it runs next
-        return False
+    except Exception as error:  # what else it fails on now is found out where it runs next
+        return _is_memory(error)
 
 
 def _run_plan(plan: Plan, call: Call, layout: Layout, grouping: Grouping) -> Any:

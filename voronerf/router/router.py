@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from voronerf.backends import BACKENDS
 from voronerf.diagram import VoronoiDiagram
-from voronerf.router.arguments import accepted_names, argument_names
+from voronerf.router.arguments import accepted_names
 from voronerf.router.blended import Mixture, mix_call
 from voronerf.router.calls import Call, run_grouped
 from voronerf.router.grouping import Grouping
@@ -241,11 +241,13 @@ class VoronoiRouter(nn.Module):
 
     def _each_direction(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """For a field's own ``forward`` a direction for each sample, in the place of one for each ray and the rays."""
-        given = dict(zip(argument_names(self.module.forward, len(args)), args)) | kwargs
+        given = dict(zip(("positions", "directions", "ray_index"), args)) | kwargs
         directions, index = given.get("directions"), given.get("ray_index")
         if directions is None or index is None:
             return args, kwargs
-        return (), {**given, "directions": directions.index_select(0, index), "ray_index": None}
+        changed = {"directions": directions.index_select(0, index), "ray_index": None}
+        placed = (*args[:1], *list(changed.values())[: max(len(args) - 1, 0)], *args[3:])
+        return placed, {name: changed.get(name, value) for name, value in kwargs.items()}
 
     def _coords_of(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Tensor | None:
         """By the router's rule the coords of a field with a layer table; None for its positions themselves."""

@@ -57,7 +57,7 @@ def held(folder: Path) -> Iterator[None]:
     Raises:
         ConfigError: When another process holds it.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    made = _made(folder)
     if sys.platform == "win32":
         yield
         return
@@ -75,7 +75,8 @@ def held(folder: Path) -> Iterator[None]:
             yield
         finally:
             with contextlib.suppress(OSError):
-                folder.rmdir()  # where nothing was written
+                if made:
+                    folder.rmdir()  # where nothing was written
     finally:
         os.close(number)
 
