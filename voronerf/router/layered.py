@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 from torch import Tensor, nn
 
@@ -45,6 +45,42 @@ def told_by_table(field: nn.Module) -> bool:
         or "parametrizations" in part._modules
         for part in field.modules()
     )
+
+
+def coords_by_rule(rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Tensor | None:
+    """The coords of a call of such a field, by the rule that its router was given.
+
+    Args:
+        rule: None or "first3", a slice of the features of the positions, or a function of the arguments.
+        args: of the call, the positions first.
+        kwargs: of the call.
+
+    Returns:
+        Positions that decide the cells; None for those of the samples themselves.
+
+    Raises:
+        TypeError: for a function that returns no tensor.
+    """
+    if rule is None or rule == "first3":
+        return None
+    if isinstance(rule, slice):
+        positions = args[0] if args else kwargs.get("positions")
+        return None if positions is None else cast(Tensor, positions[..., rule])
+    found = rule(*args, **kwargs)
+    if not isinstance(found, Tensor):
+        raise TypeError(f"VoronoiRouter: what coords returns must be a tensor, got {type(found).__name__}")
+    return found
+
+
+def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The arguments for a field's own ``forward``: a direction for each sample, in the place of one for each ray."""
+    given = dict(zip(("positions", "directions", "ray_index"), args)) | kwargs
+    directions, index = given.get("directions"), given.get("ray_index")
+    if directions is None or index is None:
+        return args, kwargs
+    changed = {"directions": directions.index_select(0, index), "ray_index": None}
+    placed = (*args[:1], *list(changed.values())[: max(len(args) - 1, 0)], *args[3:])
+    return placed, {name: changed.get(name, value) for name, value in kwargs.items()}
 
 
 class Mix(Protocol):

@@ -20,7 +20,14 @@ from voronerf.router.arguments import accepted_names
 from voronerf.router.blended import Mixture, mix_call
 from voronerf.router.calls import Call, run_grouped
 from voronerf.router.grouping import Grouping
-from voronerf.router.layered import LayeredField, evaluate_blended, evaluate_table, told_by_table
+from voronerf.router.layered import (
+    LayeredField,
+    coords_by_rule,
+    each_direction,
+    evaluate_blended,
+    evaluate_table,
+    told_by_table,
+)
 from voronerf.router.memory import Memory
 from voronerf.router.parameters import (
     check_module,
@@ -230,36 +237,14 @@ class VoronoiRouter(nn.Module):
         if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
             self._told = told_by_table(self.module)
         if self._told:
-            coords = self._coords_of(args, kwargs) if coords is None else coords
+            coords = coords_by_rule(self.coords, args, kwargs) if coords is None else coords
             if self._blends:
                 at = self._mixture
                 return evaluate_blended(self.field, self._where, self.backend, at, *args, coords=coords, **kwargs)
             return evaluate_table(self.field, self._where, self.backend, *args, coords=coords, **kwargs)
         if self._layered:
-            args, kwargs = self._each_direction(args, kwargs)
+            args, kwargs = each_direction(args, kwargs)
         return self._call_method("forward", *args, coords=coords, **kwargs)
-
-    def _each_direction(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """For a field's own ``forward`` a direction for each sample, in the place of one for each ray and the rays."""
-        given = dict(zip(("positions", "directions", "ray_index"), args)) | kwargs
-        directions, index = given.get("directions"), given.get("ray_index")
-        if directions is None or index is None:
-            return args, kwargs
-        changed = {"directions": directions.index_select(0, index), "ray_index": None}
-        placed = (*args[:1], *list(changed.values())[: max(len(args) - 1, 0)], *args[3:])
-        return placed, {name: changed.get(name, value) for name, value in kwargs.items()}
-
-    def _coords_of(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Tensor | None:
-        """By the router's rule the coords of a field with a layer table; None for its positions themselves."""
-        if self.coords is None or self.coords == "first3":
-            return None
-        if isinstance(self.coords, slice):
-            positions = args[0] if args else kwargs.get("positions")
-            return None if positions is None else cast(Tensor, positions[..., self.coords])
-        found = self.coords(*args, **kwargs)
-        if not isinstance(found, Tensor):
-            raise TypeError(f"VoronoiRouter: what coords returns must be a tensor, got {type(found).__name__}")
-        return found
 
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
