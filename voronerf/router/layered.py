@@ -148,6 +148,7 @@ def evaluate_table(
 
     Raises:
         ValueError: for shapes that disagree, or directions that the field needs and did not get.
+        TypeError: for coords that are not floating-point.
     """
     table = field.layers
     features = 6 if table.integrated else 3
