@@ -17,7 +17,7 @@ CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
 # The CUDA code takes minutes to compile, and nothing here would run it without a GPU: `make cuda-check` compiles all of it.
 export VORONERF_CUDA ?= $(if $(wildcard /dev/nvidiactl /dev/dxg),auto,0)
 
-SOURCES := $(wildcard csrc/*) setup.py pyproject.toml
+SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
@@ -44,7 +44,7 @@ check: $(VENV)/.built
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/mypy
-	@$(BIN)/clang-format --dry-run --Werror csrc/*
+	@$(BIN)/clang-format --dry-run --Werror $$(find csrc -type f)
 	@$(BIN)/pytest -q tests/test_layers.py
 
 cuda-check:
@@ -53,7 +53,7 @@ cuda-check:
 # Everything to be learnt from a machine with a GPU, in eight minutes; OUT is a folder for what it says.
 OUT ?= build/gpu-check
 gpu-check:
-	@$(PYTHON) .ci/gpu_check.py --out $(OUT) $(GPU_CHECK_ARGS)
+	@$(PYTHON) benchmarks/gpu/gpu_check.py --out $(OUT) $(GPU_CHECK_ARGS)
 
 # The tests of the operations on CUDA kernels that run on the CPU, threads in several orders.
 emulate-cuda: $(VENV)/.built

@@ -2,7 +2,7 @@
 
 The extension knows nothing of torch: C++17, pybind11 and, where nvcc is found, CUDA. A build.ninja is written and run,
 so a build is parallel and redoes only what has changed, headers included. Files named ``*_isa.cpp`` are compiled once
-for each instruction set (csrc/isa.h); the choice among them is made at run time.
+for each instruction set (csrc/common/isa.h); the choice among them is made at run time.
 
 Environment:
     CXX, CXXFLAGS                the C++ compiler and its flags (default c++, else g++); "ccache g++" works too
@@ -146,10 +146,10 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     # Without OpenMP its pragmas mean nothing, nor do the numbers of threads that stand in them.
     openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
     includes = [f"-I{SOURCES}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
-    # After CXXFLAGS: results are defined by separate roundings (csrc/nearest_centre_math.h), fused ones are named, and
-    # NaN and infinity are told apart from numbers.
+    # After CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h), fused ones are
+    # named, and NaN and infinity are told apart from numbers.
     extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off"]
-    # libgomp is left out of the link: voronerf/_native.py binds the module to the copy that torch has loaded.
+    # libgomp is left out of the link: voronerf/native/__init__.py binds the module to the copy that torch has loaded.
     if cuda.nvcc is not None:
         # nvcc knows where its static runtime is. With that, the module loads on a machine without CUDA.
         common.append("-DVN_WITH_CUDA")
@@ -179,7 +179,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
             "  description = $out",
         ]
     objects = []
-    for source in sorted(SOURCES.iterdir()):
+    for source in sorted(SOURCES.rglob("*.c*")):
         if source.name.endswith("_isa.cpp"):
             for isa, flags_of_isa in isas().items():
                 objects.append(f"{source.stem}.{isa}.o")

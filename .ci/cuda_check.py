@@ -41,7 +41,7 @@ def main(architectures: list[str]) -> int:
     architectures = [architecture for architecture in architectures if architecture != "--update"]
     nvcc = shutil.which("nvcc") or shutil.which("nvcc", path="/usr/local/cuda/bin")
     # The networks' files compile longest; the others fill the gaps that they leave at the end.
-    sources = sorted((ROOT / "csrc").glob("*.cu"), key=lambda path: ("grouped_mlp" not in path.name, path.name))
+    sources = sorted((ROOT / "csrc").rglob("*.cu"), key=lambda path: ("grouped_mlp" not in path.name, path.name))
     if nvcc is None:
         print("cuda-check: nothing was compiled, because nvcc is neither on PATH nor in /usr/local/cuda/bin.")
         return 1

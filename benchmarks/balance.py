@@ -23,9 +23,9 @@ import tyro
 from harness import metadata
 from torch import Tensor
 
-from voronerf.balance import balance
-from voronerf.training.files import write_text
-from voronerf.transport import fair_share
+from voronerf.diagram.balance import balance
+from voronerf.diagram.transport import fair_share
+from voronerf.files import write_text
 
 METHODS: dict[str, dict[str, Any]] = {
     "published": {},

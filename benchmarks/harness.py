@@ -189,7 +189,7 @@ class Others:
 class Peaks:
     """The machine's limits, measured whenever asked for, so that they keep step with the clock of the processor.
 
-    On the CPU by ``voronerf._native.measure_peak``; on CUDA by torch's product of large matrices and a large copy,
+    On the CPU by ``voronerf.native.measure_peak``; on CUDA by torch's product of large matrices and a large copy,
     which are what a user can reach rather than the limit itself.
     """
 
@@ -206,7 +206,7 @@ class Peaks:
             return self._keep(f"{kind}, torch", _cuda_peak(kind, self.device))
         if backends.missing("native", self.device) is not None:
             return None
-        from voronerf import _native
+        from voronerf import native as _native
 
         isa = _native.ISAS[_native._ISA]
         try:
@@ -244,7 +244,7 @@ def instruction_set(name: str | None) -> Iterator[None]:
     if name is None:
         yield
         return
-    from voronerf import _native
+    from voronerf import native as _native
 
     if name not in _native.ISAS or not _native._C.isa_supported(_native.ISAS.index(name)):
         raise ValueError(f"this processor has no {name}")

@@ -25,11 +25,11 @@ from harness import metadata
 
 from voronerf.cli.main import EXPECTED
 from voronerf.data import builtin_scene
+from voronerf.evaluation.metrics import psnr
+from voronerf.evaluation.scores import render_view
+from voronerf.files import write_text
 from voronerf.router import VoronoiRouter
 from voronerf.training.config import TrainConfig
-from voronerf.training.evaluation import render_view
-from voronerf.training.files import write_text
-from voronerf.training.metrics import psnr
 from voronerf.training.model import load_grid, load_run, make_renderer
 from voronerf.training.runs import read_metrics
 from voronerf.training.trainer import Trainer

@@ -25,8 +25,8 @@ from torch.profiler import ProfilerActivity, profile
 
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
+from voronerf.files import write_text
 from voronerf.training.config import FieldName, SamplingName, TrainConfig
-from voronerf.training.files import write_text
 from voronerf.training.trainer import Trainer
 
 # What operators are for, by what their names hold; the first that fits. The time of a forward pass that is recorded for

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
-from targets import ELSEWHERE, Row, comparisons, reached, verdict
+from ops.targets import ELSEWHERE, Row, comparisons, reached, verdict
 
 README = (
     r"^nearest_centre/n=262144 k=(16|512|4096 frozen)/float32",

@@ -29,17 +29,17 @@ from typing import Any, NoReturn
 # The private op caches compiled products by their shapes; its default of 1,024 is too few for a loop over many cells.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 
-import cases_lookup
-import cases_marching
-import cases_network
-import cases_sampling
 import torch
-from case import Case, Contender, NotApplicable, Work, dtype_name
 from harness import Others, Peaks, Stopwatch, Timing, instruction_set, measure, metadata
-from targets import architecture_lines, target_lines
+from ops import cases_lookup as cases_lookup
+from ops import cases_marching as cases_marching
+from ops import cases_network as cases_network
+from ops import cases_sampling as cases_sampling
+from ops.case import Case, Contender, NotApplicable, Work, dtype_name
+from ops.targets import architecture_lines, target_lines
 
 from voronerf import backends
-from voronerf.training.files import write_text
+from voronerf.files import write_text
 
 OPTIONAL = {"scipy": "scipy", "faiss": "faiss-cpu", "jax": "jax", "pykeops": "pykeops", "warp": "warp-lang"}
 """Packages that are used where they are installed, and what to install."""

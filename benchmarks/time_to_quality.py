@@ -24,9 +24,9 @@ from turns import take_turns
 
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
+from voronerf.evaluation.plots import plot_curves
+from voronerf.files import write_text
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.files import write_text
-from voronerf.training.plots import plot_curves
 from voronerf.training.runs import read_metrics, write_panels
 from voronerf.training.trainer import Trainer
 

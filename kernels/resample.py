@@ -1,6 +1,6 @@
 """Inverse of the cumulative distribution as a Warp kernel. r rays, s bins of a ray.
 
-A thread takes a ray and walks sorted targets and bins side by side, as csrc/resample.cpp does; the running mass is
+A thread takes a ray and walks sorted targets and bins side by side, as csrc/rays/resample.cpp does; the running mass is
 float64. Targets are sorted by torch.
 """
 

@@ -54,7 +54,7 @@ def test_auto_takes_what_supports_the_call() -> None:
 
 @pytest.mark.native
 def test_auto_prefers_native_on_the_cpu() -> None:
-    assert resolve("nearest_centre", backend="auto", device=CPU, dtype=torch.float32).__module__ == "voronerf._native"
+    assert resolve("nearest_centre", backend="auto", device=CPU, dtype=torch.float32).__module__ == "voronerf.native"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

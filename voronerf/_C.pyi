@@ -1,4 +1,4 @@
-# The compiled module (csrc/bindings.cpp). Addresses are those of contiguous tensors, 0 for an absent one.
+# The compiled module (csrc/bindings/bindings.cpp). Addresses are those of contiguous tensors, 0 for an absent one.
 from collections.abc import Callable
 from typing import Any
 

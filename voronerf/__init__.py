@@ -3,8 +3,16 @@
 __version__ = "0.1.0"
 
 from voronerf.backends import BackendUnavailable
-from voronerf.balance import Balance, balance, imbalance
-from voronerf.diagram import VoronoiDiagram, uniform_centres
+from voronerf.diagram import (
+    Balance,
+    SampleReservoir,
+    Split,
+    VoronoiDiagram,
+    balance,
+    imbalance,
+    split_diagram,
+    uniform_centres,
+)
 from voronerf.fields import NeRF
 from voronerf.layers import MLP, Layer
 from voronerf.ops import (
@@ -27,8 +35,6 @@ from voronerf.ops import (
 )
 from voronerf.rendering import OccupancyGrid
 from voronerf.router import VoronoiRouter
-from voronerf.subdivision import Split, split_diagram
-from voronerf.training.reservoir import SampleReservoir
 
 __all__ = [
     "MLP",

@@ -103,28 +103,30 @@ def _warp(op: str, *, file: str | None = None, dtypes: tuple[torch.dtype, ...] =
 _REGISTRY: dict[tuple[str, str], Implementation] = {
     **{(op, "reference"): Implementation(f"voronerf.reference.{op}:{op}") for op in OPS},
     ("nearest_centre_grid", "reference"): Implementation("voronerf.reference.centre_grid:nearest_centre_grid"),
-    ("nearest_centre", "native"): Implementation("voronerf._native:nearest_centre", ("cpu", "cuda"), _COORDINATES),
-    ("centre_grid", "native"): Implementation("voronerf._native_grid:centre_grid", ("cpu",), _COORDINATES),
+    ("nearest_centre", "native"): Implementation("voronerf.native:nearest_centre", ("cpu", "cuda"), _COORDINATES),
+    ("centre_grid", "native"): Implementation("voronerf.native.centre_grid:centre_grid", ("cpu",), _COORDINATES),
     ("nearest_centre_grid", "native"): Implementation(
-        "voronerf._native_grid:nearest_centre_grid", ("cpu",), _COORDINATES
+        "voronerf.native.centre_grid:nearest_centre_grid", ("cpu",), _COORDINATES
     ),
-    ("locate_cell", "native"): Implementation("voronerf._native:locate_cell", ("cpu", "cuda"), _COORDINATES),
-    ("draw_cell", "native"): Implementation("voronerf._native_sampling:draw_cell", ("cpu", "cuda"), (torch.float32,)),
-    ("cell_sort", "native"): Implementation("voronerf._native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
-    ("grouped_linear", "native"): Implementation("voronerf._native_linear:grouped_linear", ("cpu", "cuda"), _FLOATS),
-    ("grouped_mlp", "native"): Implementation("voronerf._native_mlp:grouped_mlp", ("cpu", "cuda"), _FLOATS),
-    ("routed_mlp", "native"): Implementation("voronerf._native_route:routed_mlp", ("cpu", "cuda"), _FLOATS),
-    ("composite", "native"): Implementation("voronerf._native_composite:composite", ("cpu", "cuda"), _FLOATS),
+    ("locate_cell", "native"): Implementation("voronerf.native:locate_cell", ("cpu", "cuda"), _COORDINATES),
+    ("draw_cell", "native"): Implementation("voronerf.native.sampling:draw_cell", ("cpu", "cuda"), (torch.float32,)),
+    ("cell_sort", "native"): Implementation("voronerf.native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
+    ("grouped_linear", "native"): Implementation(
+        "voronerf.native.grouped_linear:grouped_linear", ("cpu", "cuda"), _FLOATS
+    ),
+    ("grouped_mlp", "native"): Implementation("voronerf.native.grouped_mlp:grouped_mlp", ("cpu", "cuda"), _FLOATS),
+    ("routed_mlp", "native"): Implementation("voronerf.native.routed_mlp:routed_mlp", ("cpu", "cuda"), _FLOATS),
+    ("composite", "native"): Implementation("voronerf.native.composite:composite", ("cpu", "cuda"), _FLOATS),
     ("frequency_encode", "native"): Implementation(
-        "voronerf._native_sampling:frequency_encode", ("cpu", "cuda"), _FLOATS
+        "voronerf.native.sampling:frequency_encode", ("cpu", "cuda"), _FLOATS
     ),
     ("integrated_encode", "native"): Implementation(
-        "voronerf._native_sampling:integrated_encode", ("cpu", "cuda"), _FLOATS
+        "voronerf.native.sampling:integrated_encode", ("cpu", "cuda"), _FLOATS
     ),
-    ("resample", "native"): Implementation("voronerf._native_sampling:resample", ("cpu", "cuda"), _FLOATS),
-    ("march_rays", "native"): Implementation("voronerf._native_march:march_rays", ("cpu",), (torch.float32,)),
+    ("resample", "native"): Implementation("voronerf.native.sampling:resample", ("cpu", "cuda"), _FLOATS),
+    ("march_rays", "native"): Implementation("voronerf.native.march_rays:march_rays", ("cpu",), (torch.float32,)),
     ("update_occupancy", "native"): Implementation(
-        "voronerf._native_march:update_occupancy", ("cpu",), (torch.float32,)
+        "voronerf.native.march_rays:update_occupancy", ("cpu",), (torch.float32,)
     ),
     ("nearest_centre", "warp"): _warp("nearest_centre", dtypes=_COORDINATES),
     ("nearest_centre_grid", "warp"): _warp("nearest_centre_grid", dtypes=_COORDINATES),
@@ -137,7 +139,7 @@ _REGISTRY: dict[tuple[str, str], Implementation] = {
     ("resample", "warp"): _warp("resample"),
     ("march_rays", "warp"): _warp("march_rays", dtypes=(torch.float32,)),
     ("balance_centres", "native"): Implementation(
-        "voronerf._native_balance:balance_centres", ("cpu",), (torch.float32,)
+        "voronerf.native.balance_centres:balance_centres", ("cpu",), (torch.float32,)
     ),
     ("balance_centres", "warp"): _warp("balance_centres", dtypes=(torch.float32,)),
     ("camera_rays", "warp"): _warp("camera_rays", dtypes=(torch.float32,)),
@@ -196,7 +198,7 @@ def missing(backend: str, device: torch.device) -> str | None:
     if backend == "reference":
         return None
     try:
-        module = _import("voronerf._native" if backend == "native" else "voronerf.kernels")
+        module = _import("voronerf.native" if backend == "native" else "voronerf.kernels")
     except BackendUnavailable as error:
         return str(error)
     reason: str | None = module.missing(device)
@@ -242,7 +244,7 @@ def describe() -> dict[str, Any]:
         "torch": torch.__version__,
         "threads": torch.get_num_threads(),
         "cuda devices": [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())],
-        "native": _describe("voronerf._native"),
+        "native": _describe("voronerf.native"),
         "warp": _describe("voronerf.kernels"),
     }
 

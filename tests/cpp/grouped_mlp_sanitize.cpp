@@ -13,7 +13,7 @@
 #include <random>
 #include <vector>
 
-#include "grouped_mlp.h"
+#include "network/grouped_mlp.h"
 
 namespace {
 

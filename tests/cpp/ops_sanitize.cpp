@@ -14,15 +14,15 @@
 #include <string>
 #include <vector>
 
-#include "cell_sort.h"
-#include "centre_grid.h"
-#include "composite.h"
-#include "draw_cell.h"
-#include "encode.h"
-#include "grouped_linear.h"
-#include "locate_cell.h"
-#include "nearest_centre.h"
-#include "resample.h"
+#include "geometry/cell_sort.h"
+#include "geometry/centre_grid.h"
+#include "rays/composite.h"
+#include "geometry/draw_cell.h"
+#include "encoding/encode.h"
+#include "network/grouped_linear.h"
+#include "geometry/locate_cell.h"
+#include "geometry/nearest_centre.h"
+#include "rays/resample.h"
 
 namespace {
 

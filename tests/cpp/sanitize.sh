@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Builds the C++ tests with sanitizers and runs them: sanitize.sh [cases]. First AddressSanitizer and
-# UndefinedBehaviorSanitizer, then ThreadSanitizer, for which teams are of std::thread (csrc/parallel.h): it takes the
+# UndefinedBehaviorSanitizer, then ThreadSanitizer, for which teams are of std::thread (csrc/common/parallel.h): it takes the
 # barriers of an OpenMP runtime that was built without it for races.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -38,7 +38,7 @@ check() {
   setarch -R "$build/$name/run" "$count"
 }
 
-mlp="csrc/grouped_mlp_isa csrc/grouped_mlp_half_isa csrc/grouped_mlp csrc/grouped_mlp_plan csrc/row_tasks csrc/isa
+mlp="csrc/network/cpu/grouped_mlp_isa csrc/network/cpu/grouped_mlp_half_isa csrc/network/grouped_mlp csrc/network/cpu/grouped_mlp_plan csrc/network/cpu/row_tasks csrc/common/isa
   tests/cpp/grouped_mlp_sanitize"
 check grouped_mlp "-fsanitize=address,undefined -fopenmp" "$mlp" "$cases"
 check grouped_mlp_threads "-fsanitize=thread -DVN_STD_THREADS" "$mlp" "$((cases / 3))"

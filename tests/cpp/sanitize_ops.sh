@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Builds the C++ tests of every operation but the whole networks' twice, with AddressSanitizer and UndefinedBehaviorSanitizer
-# and with ThreadSanitizer (teams on std::thread, csrc/parallel.h), and runs them: sanitize_ops.sh [cases].
+# and with ThreadSanitizer (teams on std::thread, csrc/common/parallel.h), and runs them: sanitize_ops.sh [cases].
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 build=$(mktemp -d)
@@ -18,14 +18,14 @@ check() { # name, cases, flags
   local name=$1 cases=$2 objects=() jobs=()
   shift 2
   for source in "${plain[@]}"; do
-    jobs+=("csrc/$source.cpp $build/$source.$name.o")
+    jobs+=("$(find csrc -name "$source.cpp") $build/$source.$name.o")
     objects+=("$build/$source.$name.o")
   done
   jobs+=("tests/cpp/ops_sanitize.cpp $build/test.$name.o")
   objects+=("$build/test.$name.o")
   for source in "${per_isa[@]}"; do
     for isa in "${isas[@]}"; do
-      jobs+=("csrc/$source.cpp $build/$source.${isa%% *}.$name.o ${isa#* }")
+      jobs+=("$(find csrc -name "$source.cpp") $build/$source.${isa%% *}.$name.o ${isa#* }")
       objects+=("$build/$source.${isa%% *}.$name.o")
     done
   done

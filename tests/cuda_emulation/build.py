@@ -55,9 +55,9 @@ def _build(out: Path, sanitizer: str) -> Path:
     import pybind11
 
     module = out / sanitizer / f"voronerf_emulation{sysconfig.get_config_var('EXT_SUFFIX')}"
-    kernels = [source for source in sorted((ROOT / "csrc").glob("*.cu")) if source.name not in REPLACED]
+    kernels = [source for source in sorted((ROOT / "csrc").rglob("*.cu")) if source.name not in REPLACED]
     sources = [*kernels, *sorted(HERE.glob("*.cu")), *sorted(HERE.glob("*.cpp"))]
-    sources += [ROOT / "csrc" / name for name in ("bindings_cuda.cpp", *SHARED) if (ROOT / "csrc" / name).exists()]
+    sources += [path for path in sorted((ROOT / "csrc").rglob("*.cpp")) if path.name in ("bindings_cuda.cpp", *SHARED)]
     includes = [ROOT / "csrc", HERE, Path(pybind11.get_include()), Path(sysconfig.get_path("include"))]
     flags = ["-std=c++17", "-O1", "-g1", "-fPIC", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=hidden"]
     flags += ["-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-DVN_EMULATE", "-DVN_WITH_CUDA"]

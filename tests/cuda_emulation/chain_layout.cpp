@@ -2,10 +2,10 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include "bindings_mlp_table.h"
+#include "bindings/bindings_mlp_table.h"
 #include "emulation.h"
-#include "encode_math.h"
-#include "grouped_mlp_cuda_chain.h"
+#include "encoding/encode_math.h"
+#include "network/cuda/grouped_mlp_cuda_chain.h"
 
 namespace py = pybind11;
 

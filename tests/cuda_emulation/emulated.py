@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any
 from unittest import mock
 
-from voronerf import _native
+from voronerf import native as _native
 
 
 @functools.cache

@@ -1,6 +1,6 @@
 // What nvcc gives to a .cu file, for g++: the same sources run on the CPU, a grid block by block, every thread a fiber.
 //
-// Test only: csrc/cuda_wrappers.h includes it under VN_EMULATE. Threads of a block run in an order shuffled by a seed,
+// Test only: csrc/common/cuda_wrappers.h includes it under VN_EMULATE. Threads of a block run in an order shuffled by a seed,
 // and are stopped at barriers and at operations of the warp, where all lanes must meet. Shared memory is poisoned
 // before every block. It proves logic, not speed; there are no partial warps (every mask names all 32 lanes).
 #pragma once
@@ -291,7 +291,7 @@ inline int __popc(unsigned x) {
 
 namespace voronerf {
 
-// The twins of the instructions in csrc/cuda_wrappers.h, by the fragment layouts of the PTX manual (section "Matrix
+// The twins of the instructions in csrc/common/cuda_wrappers.h, by the fragment layouts of the PTX manual (section "Matrix
 // fragments for mma.m16n8k16" and after it).
 
 inline unsigned half_bits(float x, bool bfloat16) {

@@ -1,4 +1,4 @@
-// The twins of the instructions in csrc/cuda_wgmma.h. A product is done when it is waited for, as late as it may be on
+// The twins of the instructions in csrc/network/cuda/cuda_wgmma.h. A product is done when it is waited for, as late as it may be on
 // a GPU, its sums unreadable until then; what its operands were when it began they must be still. What is written down
 // here comes from the PTX manual, "Asynchronous Warpgroup Level Matrix-Multiply-Accumulate Instructions", and knows
 // nothing of how a kernel packs its weights.

@@ -2,7 +2,7 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include "cuda_wgmma.h"
+#include "network/cuda/cuda_wgmma.h"
 #include "group_product.h"
 
 namespace py = pybind11;

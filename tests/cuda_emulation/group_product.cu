@@ -1,6 +1,6 @@
 // One product of a group of four warps over several steps of 16, right or with one bug of a kind that the emulation is
 // there to find (emulation_groups.h).
-#include "cuda_wgmma.h"
+#include "network/cuda/cuda_wgmma.h"
 #include "group_product.h"
 
 namespace {

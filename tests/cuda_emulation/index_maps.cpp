@@ -1,5 +1,5 @@
-// csrc/index_maps.h for test_index_maps.py.
-#include "index_maps.h"
+// csrc/common/index_maps.h for test_index_maps.py.
+#include "common/index_maps.h"
 
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>

@@ -1,12 +1,12 @@
-// The CUDA half of voronerf._C, emulated: the bindings of csrc/bindings_cuda.cpp over .cu files compiled by g++.
+// The CUDA half of voronerf._C, emulated: the bindings of csrc/bindings/bindings_cuda.cpp over .cu files compiled by g++.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include "bindings_cuda.h"
-#include "bindings_mlp_table.h"
-#include "cell_sort.h"
+#include "bindings/bindings_cuda.h"
+#include "bindings/bindings_mlp_table.h"
+#include "geometry/cell_sort.h"
 #include "emulation.h"
-#include "grouped_mlp_cuda_layers.h"
+#include "network/cuda/grouped_mlp_cuda_layers.h"
 
 namespace py = pybind11;
 

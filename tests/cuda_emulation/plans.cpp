@@ -4,8 +4,8 @@
 
 #include <vector>
 
-#include "bindings_mlp_table.h"
-#include "grouped_mlp_cuda_layers.h"
+#include "bindings/bindings_mlp_table.h"
+#include "network/cuda/grouped_mlp_cuda_layers.h"
 
 namespace py = pybind11;
 

@@ -1,5 +1,5 @@
 // Small kernels, each right or with one bug of a kind that the emulation is there to find; `bug` 0 is the right one.
-#include "cuda_wrappers.h"
+#include "common/cuda_wrappers.h"
 
 namespace {
 

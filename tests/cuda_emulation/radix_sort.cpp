@@ -1,6 +1,6 @@
-// Stands in for csrc/radix_sort.cu, the toolkit's radix sort, which g++ cannot compile: a stable sort by the same bits,
+// Stands in for csrc/geometry/radix_sort.cu, the toolkit's radix sort, which g++ cannot compile: a stable sort by the same bits,
 // strict about what the real one is given. What is around it is the code that runs on a GPU.
-#include "radix_sort.h"
+#include "geometry/radix_sort.h"
 
 #include <algorithm>
 #include <cstring>

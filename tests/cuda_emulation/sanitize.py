@@ -121,7 +121,7 @@ def resample(module: ModuleType) -> None:
 
 
 # Sine 20 of 2 octaves of positions, softplus 70 of that and positions, sigmoid 18 of that and directions; out come the
-# last and the first. As voronerf/_native_mlp.py writes it.
+# last and the first. As voronerf/native/grouped_mlp.py writes it.
 TABLE = [3, 3, 2, -1, 0, 0, 0, 3, 2, 20, 4, 1, -1, 70, 2, 2, 0, -1, 18, 3, 2, 1, -2, 2, 0]
 SHAPES = [(20, 15), (70, 35), (18, 73)]
 

@@ -13,9 +13,9 @@ from emulated_networks import BRANCHED, GAUSSIANS, KIB, SKIPS, THICK, WIDE, case
 from test_emulated_layers import nerf
 
 import voronerf
-from voronerf import _native_mlp
 from voronerf.fields import NeRF
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.native import grouped_mlp as _native_mlp
 
 HALVES = ("bfloat16", "float16")
 HELD, STORED, IN_POSITIONS, IN_DIRECTIONS = range(4)

@@ -20,9 +20,9 @@ from test_emulated_chain import (
 )
 from test_emulated_chain import numbers as table
 
-from voronerf import _native_mlp
 from voronerf.fields import NeRF
 from voronerf.layers import MLP
+from voronerf.native import grouped_mlp as _native_mlp
 
 WGMMA = _native_mlp.WAYS.index("wgmma")
 RULE = "wgmma must be asked for with compute capability 9.0 and kernels compiled for sm_90a"

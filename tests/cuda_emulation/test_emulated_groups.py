@@ -1,4 +1,4 @@
-"""Products of a group of four warps (csrc/cuda_wgmma.h): descriptors, results, and the mistakes that are found."""
+"""Products of a group of four warps (cuda_wgmma.h): descriptors, results, and the mistakes that are found."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ from emulated import emulated, module
 from emulated_networks import ALLOWED, BRANCHED, BROAD, DENSE, GAUSSIANS, KIB, WIDE, case, check, run
 
 import voronerf
-from voronerf import _native_mlp
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.native import grouped_mlp as _native_mlp
 
 SMALL = 1 * KIB
 """Shared memory that no fused network fits."""

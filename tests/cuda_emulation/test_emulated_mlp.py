@@ -10,8 +10,8 @@ from emulated import emulated, module
 from emulated_networks import ALLOWED, BRANCHED, GAUSSIANS, KIB, WIDE, case, check, run
 
 import voronerf
-from voronerf import _native_mlp
 from voronerf.layers import MLP, POSITIONS, Layer
+from voronerf.native import grouped_mlp as _native_mlp
 
 
 @pytest.mark.parametrize("precision", ALLOWED)

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 
 
 def program(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / "gpu" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     loaded = sys.modules[name] = importlib.util.module_from_spec(spec)  # its dataclasses look for it there
     spec.loader.exec_module(loaded)
@@ -115,7 +115,7 @@ sys.exit(gpu_parts.main(sys.argv[1:]))
 
 def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path: Path) -> None:
     """In processes that truly start themselves anew, with a device that stays broken."""
-    (tmp_path / "faults.py").write_text(AFTER_FAULTS.format(ci=str(ROOT / ".ci")))
+    (tmp_path / "faults.py").write_text(AFTER_FAULTS.format(ci=str(ROOT / "benchmarks" / "gpu")))
     command = [sys.executable, "faults.py", "small", "out", "--case-seconds", "0.5"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=50)
     told = [line for line in result.stdout.splitlines() if line.startswith(("right", "WRONG"))]
@@ -360,7 +360,7 @@ def test_programs_of_a_bare_machine_import_what_it_has() -> None:
 import sys
 for name in {absent!r}:
     sys.modules[name] = None
-sys.path[:0] = [{str(ROOT / ".ci")!r}]
+sys.path[:0] = [{str(ROOT / "benchmarks" / "gpu")!r}]
 import gpu_parts, gpu_check
 gpu_parts.small_cases("cpu"), gpu_parts.captured_steps("cpu", 4)
 import harness, networks, case, throughput

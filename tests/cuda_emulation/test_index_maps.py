@@ -1,4 +1,4 @@
-"""The index maps of the CUDA kernels (csrc/index_maps.h), all of them: every element once, none out of range."""
+"""The index maps of the CUDA kernels (csrc/common/index_maps.h), all of them: every element once, none out of range."""
 
 from __future__ import annotations
 

@@ -12,7 +12,8 @@ import torch
 from emulated import emulated
 
 import voronerf
-from voronerf import VoronoiDiagram, _native
+from voronerf import VoronoiDiagram
+from voronerf import native as _native
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)

@@ -9,9 +9,9 @@ import torch
 from emulated import module
 from emulated_networks import BRANCHED, GAUSSIANS, KIB, WIDE
 
-from voronerf import _native_mlp
 from voronerf.fields import density_table, nerf_table
 from voronerf.layers import MLP
+from voronerf.native import grouped_mlp as _native_mlp
 
 MIB = 1024 * KIB
 # Capability, shared memory that a block may ask for, multiprocessors, second-level cache.

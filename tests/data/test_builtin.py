@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from voronerf.data import builtin_scene, load_scene
-from voronerf.data.builtin import bounds, cast
-from voronerf.data.builtin_solids import SOLIDS
+from voronerf.data.builtin.opaque import bounds, cast
+from voronerf.data.builtin.opaque_solids import SOLIDS
+from voronerf.data.builtin.solids import Box, Cylinder, Solid, Sphere, Torus, rotation
 from voronerf.data.carving import carve_box
 from voronerf.data.scene import Scene
-from voronerf.data.solids import Box, Cylinder, Solid, Sphere, Torus, rotation
 from voronerf.rendering.cameras import Cameras
 
 

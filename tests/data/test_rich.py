@@ -7,10 +7,10 @@ import pytest
 
 from voronerf.backends import BackendUnavailable
 from voronerf.data import load_scene, rich_scene
-from voronerf.data.builtin import LIGHT, cast
-from voronerf.data.builtin_solids import SOLIDS as FEW
-from voronerf.data.rich import SOLIDS, caster
-from voronerf.data.solids import Box, Cylinder, Sphere, Torus, first_hits, normalised
+from voronerf.data.builtin.opaque import LIGHT, cast
+from voronerf.data.builtin.opaque_solids import SOLIDS as FEW
+from voronerf.data.builtin.rich import SOLIDS, caster
+from voronerf.data.builtin.solids import Box, Cylinder, Sphere, Torus, first_hits, normalised
 
 
 def rays(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

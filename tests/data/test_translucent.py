@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from voronerf.data import load_scene, translucent_scene
+from voronerf.data.builtin.translucent import MEDIA, Medium, bounds, integrate, layered_block, striped_shell
 from voronerf.data.scene import Scene
-from voronerf.data.translucent import MEDIA, Medium, bounds, integrate, layered_block, striped_shell
 
 
 @pytest.fixture(scope="module")

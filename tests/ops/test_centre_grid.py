@@ -104,7 +104,7 @@ def test_ties_of_a_regular_grid(k: int) -> None:
 @native
 @pytest.mark.parametrize("isa", ["portable", "avx2", "avx512"])
 def test_instruction_sets_and_threads_build_the_same_grid(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from voronerf import _native
+    from voronerf import native as _native
 
     index = _native.ISAS.index(isa)
     if not _native._C.isa_supported(index):
@@ -233,7 +233,7 @@ def test_compiled_graphs_refuse_grids_of_another_size() -> None:
 
 @native
 def test_ops_pass_opcheck_and_compile_whole() -> None:
-    from voronerf import _native_grid
+    from voronerf.native import centre_grid as _native_grid
 
     points, centres, weights = torch.rand(50, 3), torch.rand(70, 3), torch.rand(70)
     grid = centre_grid(centres, weights=weights)
@@ -247,7 +247,7 @@ def test_ops_pass_opcheck_and_compile_whole() -> None:
 
 @native
 def test_diagrams_make_a_grid_where_it_pays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("voronerf.diagram._GRID_POINTS", 1500)
+    monkeypatch.setattr("voronerf.diagram.voronoi._GRID_POINTS", 1500)
     points = 4 * torch.rand(1000, 3) - 2
     for weights in (None, torch.rand(512) / 100):
         diagram = VoronoiDiagram(2 * torch.rand(512, 3) - 1, weights=weights)

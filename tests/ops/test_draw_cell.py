@@ -252,7 +252,7 @@ def test_half_types_and_float64() -> None:
 def test_every_instruction_set_and_number_of_threads(
     isa: str, shape: tuple[int, ...], weighted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from voronerf import _native
+    from voronerf import native as _native
 
     if not _native._C.isa_supported(_native.ISAS.index(isa)):
         pytest.skip(f"this processor has no {isa}")

@@ -146,7 +146,7 @@ def test_compiles_whole_with_a_capacity(device: torch.device, backend: str) -> N
 
 @pytest.mark.native
 def test_native_ops_pass_opcheck() -> None:
-    from voronerf import _native_march
+    from voronerf.native import march_rays as _native_march
 
     given = [*case(5).values(), None, None]
     rest = (9, False, 9)
@@ -160,7 +160,7 @@ def test_native_ops_pass_opcheck() -> None:
 @pytest.mark.native
 @pytest.mark.parametrize("threads", [1, 3])
 def test_instruction_sets_and_threads_agree(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
-    from voronerf import _native
+    from voronerf import native as _native
 
     given, uniforms = case(300, (9, 8, 7)), torch.rand(300, 70)
     expected = march(given, 70, torch.device("cpu"), "reference", uniforms=uniforms, most=9)

@@ -437,7 +437,7 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name: str
 @pytest.mark.native
 @pytest.mark.parametrize("source", ["flat", "tree", "cells", "one"])
 def test_opcheck(source: str) -> None:
-    native = pytest.importorskip("voronerf._native_route")
+    native = pytest.importorskip("voronerf.native.routed_mlp")
     case = Case.make("integrated", source, n=7)
     given = case.given()
     count = len(case.bias)

@@ -60,7 +60,7 @@ def test_infinite_values_strides_and_compile(device: torch.device, backend: str)
 
 @pytest.mark.native
 def test_native_op_passes_opcheck() -> None:
-    from voronerf import _native_march
+    from voronerf.native import march_rays as _native_march
 
     assert _native_march.update_occupancy
     cells = torch.tensor([3, 0], dtype=torch.int32)

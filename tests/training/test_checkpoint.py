@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from voronerf.files import read_json_lines, write_text
 from voronerf.training.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -18,7 +19,6 @@ from voronerf.training.checkpoint import (
     optimizer_tensors,
     save_checkpoint,
 )
-from voronerf.training.files import read_json_lines, write_text
 
 
 def example() -> Checkpoint:

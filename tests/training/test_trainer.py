@@ -16,12 +16,12 @@ import torch
 import voronerf.training.trainer as trainer_module
 from voronerf.backends import BackendUnavailable
 from voronerf.data import Scene, builtin_scene
+from voronerf.evaluation.scores import evaluate, mean_scores, render_view
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
 from voronerf.training.batches import Batch
 from voronerf.training.checkpoint import CheckpointError, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.evaluation import evaluate, mean_scores, render_view
 from voronerf.training.model import (
     checkpoint_path,
     count_parameters,

@@ -12,9 +12,9 @@ import torch
 
 from voronerf.cli import main
 from voronerf.data import Scene, builtin_scene
+from voronerf.evaluation.scores import evaluate, render_view
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.evaluation import evaluate, render_view
 from voronerf.training.model import (
     checkpoint_path,
     count_parameters,

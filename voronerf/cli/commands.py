@@ -20,15 +20,15 @@ from rich.table import Table
 from voronerf import backends
 from voronerf.cli.display import TrainingDisplay
 from voronerf.data import Scene, load_scene
+from voronerf.evaluation.lpips import find_lpips
+from voronerf.evaluation.video import check_video, write_video
+from voronerf.files import write_text
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.renderer import Renderer
 from voronerf.training.config import ConfigError, TrainConfig, check_device
-from voronerf.training.files import write_text
-from voronerf.training.lpips import find_lpips
 from voronerf.training.model import load_grid, load_run, make_renderer
 from voronerf.training.runs import choose_directory, held, score_views, write_curve, write_panels
 from voronerf.training.trainer import Trainer
-from voronerf.training.video import check_video, write_video
 
 console = Console(soft_wrap=True)
 

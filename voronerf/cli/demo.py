@@ -9,8 +9,8 @@ from rich.table import Table
 
 from voronerf.cli.commands import console, run_training, say
 from voronerf.data import BUILTIN_SIZE, Scene, load_scene
+from voronerf.evaluation.plots import plot_curves
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.plots import plot_curves
 from voronerf.training.runs import held, read_metrics
 
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from voronerf.data.blender import load_blender
-from voronerf.data.builtin import builtin_scene
+from voronerf.data.builtin import builtin_scene, rich_scene, translucent_scene
 from voronerf.data.capture import load_capture
-from voronerf.data.rich import rich_scene
 from voronerf.data.scene import Scene, SceneError, Split
-from voronerf.data.translucent import translucent_scene
 
 __all__ = ["Scene", "SceneError", "Split", "builtin_scene", "load_scene", "rich_scene", "translucent_scene"]
 

@@ -22,7 +22,7 @@ def balance_centres(
     global_norm: bool = False,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Moves centres `steps` times towards cells of equal mass, all centres at once; see ``voronerf.balance``.
+    """Moves centres `steps` times towards cells of equal mass, all centres at once; see ``voronerf.diagram.balance``.
 
     ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i``, where N(i) are the `neighbours`
     closest centres, of those equally far the first, and all others where there are fewer (Elsner et al. 2023, section

@@ -21,7 +21,7 @@ class CentreGrid:
     Attributes:
         centres: float32 or float64 [k, 3], a copy of those the grid was made from.
         weights: [k] in the same dtype, or None.
-        tables: the lists and the way to them; csrc/centre_grid.h says what is in them.
+        tables: the lists and the way to them; csrc/geometry/centre_grid.h says what is in them.
     """
 
     centres: Tensor

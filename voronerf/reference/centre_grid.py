@@ -1,6 +1,6 @@
 """A grid of candidate lists, and the nearest centre by it. n points, k centres.
 
-What the tables mean and the map from space to cells are said in csrc/centre_grid.h and csrc/centre_grid_math.h. A list
+What the tables mean and the map from space to cells are said in csrc/geometry/centre_grid.h. A list
 may hold any superset of the centres that are nearest somewhere in its cell; this grid has no bricks and drops only
 what one other centre beats in all of a cell.
 """

@@ -1,4 +1,4 @@
-"""Results of neighbouring cells mixed near their borders, see `voronerf.blending`.
+"""Results of neighbouring cells mixed near their borders, see `voronerf.diagram.blending`.
 
 n samples, m further entries: a sample together with a cell that is not its own.
 """
@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.blending import blend_cells
 from voronerf.diagram import VoronoiDiagram
+from voronerf.diagram.blending import blend_cells
 from voronerf.router.arguments import Layout, map_result
 from voronerf.router.calls import Call, run_entries
 from voronerf.router.grouping import Entries

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from voronerf.backends import BACKENDS
 from voronerf.diagram import VoronoiDiagram
+from voronerf.diagram.subdivision import split_diagram
 from voronerf.router.arguments import accepted_names
 from voronerf.router.blended import Mixture, mix_call
 from voronerf.router.calls import Call, run_grouped
@@ -41,7 +42,6 @@ from voronerf.router.parameters import (
     take_cell,
     warn_fresh_state,
 )
-from voronerf.subdivision import split_diagram
 
 Assignment = Literal["nearest", "stochastic"]
 
@@ -96,7 +96,7 @@ class VoronoiRouter(nn.Module):
         backend: Of every operation, see ``voronerf info``.
         blend: Margin in scene units, an attribute as well: in eval mode samples this near to a border are evaluated in
             the cells beyond it too, four cells at most, and the results are averaged by distance, so that nothing
-            jumps across borders (:mod:`voronerf.blending`). Other samples are as without. Not within a full graph of
+            jumps across borders (:mod:`voronerf.diagram`). Other samples are as without. Not within a full graph of
             ``torch.compile``.
 
     Raises:

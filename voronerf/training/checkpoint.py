@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from voronerf.training.files import write_bytes
+from voronerf.files import write_bytes
 
 FORMAT = "voronerf-checkpoint-1"
 

@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from voronerf.data import Scene
+from voronerf.evaluation.lpips import Lpips
+from voronerf.evaluation.panels import save_panel
+from voronerf.evaluation.plots import plot_curves
+from voronerf.evaluation.scores import evaluate, mean_scores, render_view, view_numbers
+from voronerf.files import read_json_lines
 from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.evaluation import evaluate, mean_scores, render_view, view_numbers
-from voronerf.training.files import read_json_lines
-from voronerf.training.lpips import Lpips
 from voronerf.training.model import checkpoint_path
-from voronerf.training.panels import save_panel
-from voronerf.training.plots import plot_curves
 
 
 def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
-from voronerf.subdivision import Split, split_diagram
+from voronerf.diagram.subdivision import Split, split_diagram
+from voronerf.files import write_bytes
 from voronerf.training.config import TrainConfig
-from voronerf.training.files import write_bytes
 from voronerf.training.schedule import PlannedSplit
 
 

@@ -17,6 +17,10 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.data import Scene
+from voronerf.diagram.reservoir import SampleReservoir
+from voronerf.evaluation.lpips import Lpips, find_lpips
+from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
+from voronerf.files import read_json_lines, write_text
 from voronerf.rendering.marching import Marched
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.volume import Rendered
@@ -31,10 +35,7 @@ from voronerf.training.checkpoint import (
     save_checkpoint,
 )
 from voronerf.training.config import TrainConfig, differences
-from voronerf.training.evaluation import ViewScore, evaluate, mean_scores
-from voronerf.training.files import read_json_lines, write_text
 from voronerf.training.graphs import GraphedStep, set_learning_rate
-from voronerf.training.lpips import Lpips, find_lpips
 from voronerf.training.model import (
     HALVES,
     OCCUPANCY_DECAY,
@@ -48,7 +49,6 @@ from voronerf.training.model import (
     router_states,
 )
 from voronerf.training.progress import Progress, Stage, TrainingError
-from voronerf.training.reservoir import SampleReservoir
 from voronerf.training.splitting import median, save_samples, split_by_samples
 
 #: Steps between looks at random cells, which bring back those that were thought empty, and the share looked at.

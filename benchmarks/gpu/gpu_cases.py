@@ -1,0 +1,269 @@
+"""What ``gpu_parts.py`` tries: every operation once against float64, and the steps that it captures."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+STEPS: dict[str, tuple[int, str, bool, int]] = {
+    "fused": (64, "float32", False, 8),
+    "fused, bfloat16": (64, "bfloat16", False, 8),
+    "fused, directions by an index": (64, "float32", True, 8),
+    "by layers": (300, "float32", False, 8),
+    "by layers, bfloat16, directions by an index": (300, "bfloat16", True, 8),
+    "many cells, sorted by radix": (16, "float32", False, 1030),
+}
+"""Steps to capture: the width, beyond 256 layer by layer, the type of the weights, whether there are directions, and
+the number of cells."""
+
+
+def has_wgmma(device: str) -> bool:
+    """Whether a device multiplies by groups of warps: an H100 or an H200, or the emulated one."""
+    import torch
+
+    return device == "cpu" or torch.cuda.get_device_capability(device) == (9, 0)
+
+
+def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
+    """Names and checks, which raise."""
+    import torch
+    from emulated_networks import (
+        ALLOWED,
+        BRANCHED,
+        BROAD,
+        DENSE,
+        GAUSSIANS,
+        NARROW,
+        SKIPS,
+        THICK,
+        WIDE,
+        check,
+        check_forward,
+    )
+
+    import voronerf
+    from voronerf import native as _native
+    from voronerf.fields import NeRF
+    from voronerf.layers import MLP, POSITIONS, Layer
+    from voronerf.native import grouped_mlp as _native_mlp
+    from voronerf.reference.cell_sort import cell_sort as specified
+
+    where = torch.device(device)
+
+    def lookup(op: str, n: int, k: int, dtype: Any) -> None:
+        points = torch.randint(-3, 4, (n, 3), device=where).to(dtype)
+        centres = torch.randint(-3, 4, (k, 3), device=where).to(dtype)
+        if op == "nearest_centre":
+            found, expected = (voronerf.nearest_centre(points, centres, backend=b) for b in ("native", "reference"))
+        else:
+            diagram = voronerf.VoronoiDiagram(torch.rand(4, 3)).refine({1: torch.rand(k, 3)})[0]
+            tables = [x.to(where) for x in (diagram.centres, diagram.child_offsets, diagram.child)]
+            points = points.float() / 8 + 0.5
+            found, expected = (
+                voronerf.locate_cell(points, *tables, depth=diagram.depth, backend=b) for b in ("native", "reference")
+            )
+        assert torch.equal(found, expected)
+
+    def sort(n: int, k: int, way: str) -> None:
+        # Some cells that are none: they go to the ends.
+        cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32, device=where)
+        expected = specified(cells.cpu().clamp(-1, k) + 1, k + 2)
+        order, offsets = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)
+        _native.sort_cells(cells, order, offsets, "cell_sort", way)
+        assert torch.equal(order.cpu(), expected[0]) and torch.equal(offsets.cpu(), expected[1][1:-1])
+
+    def close(run: Callable[..., Any], leaves: list[Any]) -> None:
+        """Results and gradients against the reference in float64."""
+        outcomes = []
+        for backend, dtype in (("native", torch.float32), ("reference", torch.float64)):
+            given = [leaf.to(where, dtype).requires_grad_() for leaf in leaves]
+            out = run(given, backend)
+            parts = [part for part in (out if isinstance(out, tuple) else (out,)) if part.is_floating_point()]
+            total = sum(
+                (part * torch.linspace(0.5, 1.5, part.numel(), device=where).view_as(part)).sum() for part in parts
+            )
+            outcomes.append([*parts, *torch.autograd.grad(total, given, allow_unused=True, materialize_grads=True)])
+        for part, exact in zip(*outcomes):
+            assert (part.double() - exact).norm() <= 1e-5 * exact.norm() + 1e-6, (
+                list(part.shape),
+                part.isfinite().all(),
+            )
+
+    def composite() -> None:
+        offsets = torch.tensor([0, 0, 1, 71, 180], dtype=torch.int32, device=where)
+        close(
+            lambda x, b: tuple(voronerf.composite(*x, ray_offsets=offsets, backend=b)),
+            [torch.rand(180), torch.rand(180, 3), torch.rand(180).cumsum(0), torch.rand(180)],
+        )
+
+    def resample() -> None:
+        weights, edges = torch.rand(6, 45), torch.rand(6, 46).cumsum(1)
+        found = voronerf.resample(weights.to(where), edges.to(where), 70, backend="native")
+        torch.testing.assert_close(found.cpu(), voronerf.resample(weights, edges, 70, backend="reference"))
+
+    def draw() -> None:
+        diagram = voronerf.VoronoiDiagram(torch.rand(12, 3)).refine({1: torch.rand(5, 3)})[0]
+        given = (torch.rand(3000, 3), diagram.centres, diagram.child_offsets, diagram.child, torch.rand(3000, 2))
+        options: dict[str, Any] = {"temperature": 0.1, "depth": 2}
+        found = voronerf.draw_cell(*(tensor.to(where) for tensor in given), **options, backend="native")
+        # numbers within rounding of a border are few
+        assert int((found.cpu() != voronerf.draw_cell(*given, **options, backend="reference")).sum()) <= 3
+
+    def shifted(tensor: Any) -> Any:
+        """The same numbers, beginning four bytes (eight in float64) into their memory: nothing wider is aligned."""
+        return torch.cat([tensor.new_zeros(1), tensor.flatten()])[1:].view(tensor.shape)
+
+    def route(view: Callable[[Any], Any] = lambda tensor: tensor) -> None:
+        layers = WIDE
+        shapes = layers.weight_shapes(3)
+        centres = torch.rand(5, 3)
+
+        def run(x: list[Any], backend: str) -> Any:
+            options: dict[str, Any] = {"centres": view(centres.to(where)), "layers": layers, "backend": backend}
+            x = [view(part) for part in x]
+            return voronerf.routed_mlp(x[0], x[1:], [None] * len(shapes), **options)[0]
+
+        close(run, [torch.rand(300, 3), *(torch.randn(5, o, i) / i**0.5 for o, i in shapes)])
+
+    def views() -> None:
+        """Of every other operation that takes floating-point numbers."""
+        close(lambda x, b: voronerf.frequency_encode(shifted(x[0]), 10, backend=b), [torch.rand(90, 3)])
+        close(
+            lambda x, b: tuple(voronerf.composite(*map(shifted, x), backend=b)),
+            [torch.rand(6, 30), torch.rand(6, 30, 3), torch.rand(6, 30).cumsum(1), torch.rand(6, 30)],
+        )
+        cells = shifted(torch.randint(0, 5, (300,), dtype=torch.int32, device=where))
+        found, expected = (voronerf.cell_sort(cells, 5, backend=b) for b in ("native", "reference"))
+        assert all(torch.equal(a, b) for a, b in zip(found, expected))
+
+    def beyond_float16() -> None:
+        """Values that layers read are cut off where float16 ends; gradients are not, for a GradScaler to see."""
+        layers = MLP((Layer((POSITIONS,), 16, "relu"), Layer((0,), 16, "relu"), Layer((1,), 3)), (2, 0))
+        sizes = layers.weight_shapes(3)
+        leaves = [torch.ones(40, 3), *(torch.randn(2, o, i) / (1 if i == 3 else 64) for o, i in sizes)]
+        leaves[0][::8] = 1e6
+        leaves[1][:, ::2] = leaves[1][:, ::2].abs()  # some sums are large, whatever the signs of the others
+        leaves = [leaf.to(where).requires_grad_() for leaf in leaves]
+        offsets = torch.tensor([0, 23, 40], dtype=torch.int32, device=where)
+        halves = [leaf.half() for leaf in leaves[1:]]
+        out = voronerf.grouped_mlp(leaves[0], offsets, halves, [None] * 3, layers=layers, backend="native")
+        assert not out.isnan().any() and out[:, 3:].isinf().any() and out[:, :3].isfinite().all()
+        gradients = torch.autograd.grad(out, leaves, torch.ones_like(out), retain_graph=True)
+        assert not any(gradient.isnan().any() for gradient in gradients)
+        overflowing = torch.autograd.grad(out, leaves, torch.full_like(out, 6e4))
+        assert not all(gradient.isfinite().all() for gradient in overflowing)
+
+    def network(layers: Any, counts: list[int], d: int, precision: str, way: str = "auto") -> None:
+        with where, _native_mlp.taking(way):
+            check(layers, counts, d, precision)
+
+    def forward(layers: Any, precision: str, way: str) -> None:
+        with where, _native_mlp.taking(way):
+            check_forward(layers, [37, 0, 60], 3, precision)
+
+    networks = {"branched": (BRANCHED, 3), "wide": (WIDE, 7), "gaussians": (GAUSSIANS, 6), "broad": (BROAD, 3)}
+    cases: list[tuple[str, Callable[[], None]]] = [
+        *(
+            (f"nearest_centre {k} {d}", functools.partial(lookup, "nearest_centre", 300, k, d))
+            for k, d in ((17, torch.float32), (700, torch.float32), (17, torch.float64))
+        ),
+        ("locate_cell", functools.partial(lookup, "locate_cell", 300, 3, torch.float32)),
+        ("draw_cell", draw),
+        *(
+            (f"cell_sort {n} {k} by {way}", functools.partial(sort, n, k, way))
+            for n, k, way in (
+                (5000, 3, "counting"),
+                (4200, 1022, "counting"),
+                (5000, 3, "radix"),
+                (20_000, 4096, "automatic"),
+                (300, 65_535, "automatic"),
+                (0, 4096, "automatic"),
+            )
+        ),
+        (
+            "frequency_encode",
+            lambda: close(lambda x, b: voronerf.frequency_encode(x[0], 10, backend=b), [torch.rand(90, 3)]),
+        ),
+        (
+            "integrated_encode",
+            lambda: close(
+                lambda x, b: voronerf.integrated_encode(x[0], x[1], 4, backend=b),
+                [torch.rand(90, 3), torch.rand(90, 3)],
+            ),
+        ),
+        ("composite", composite),
+        ("resample", resample),
+        *(
+            (f"grouped_mlp {name} {precision}", functools.partial(network, layers, [70, 0, 1, 40], d, precision))
+            for name, (layers, d) in networks.items()
+            for precision in ALLOWED
+        ),
+        # Chained where nothing else is said: beside it the other ways of the same networks.
+        *(
+            (
+                f"grouped_mlp {name} {precision} by {way}",
+                functools.partial(network, networks[name][0], [70, 0, 1, 40], networks[name][1], precision, way),
+            )
+            for name, way in (("branched", "tiles"), ("gaussians", "tiles"), ("branched", "layers"))
+            for precision in ("bfloat16", "float16")
+        ),
+        *(
+            (f"grouped_mlp {name} {precision} forward by {way}", functools.partial(forward, layers, precision, way))
+            for name, layers, precision, ways in (
+                ("skips", SKIPS, "bfloat16", ("chain", "wgmma")),
+                ("skips", SKIPS, "float16", ("chain", "tiles", "wgmma")),
+                ("nerf64", NeRF(width=64).layers, "bfloat16", ("chain", "wgmma")),
+                ("thick", THICK, "bfloat16", ("chain", "wgmma")),
+                ("narrow", NARROW, "bfloat16", ("chain", "wgmma")),
+            )
+            for way in ways
+            if way != "wgmma" or has_wgmma(device)
+        ),
+        ("grouped_mlp dense float32", functools.partial(network, DENSE, [37, 3], 3, "float32")),
+        ("grouped_mlp beyond float16", beyond_float16),
+        ("routed_mlp", route),
+        ("routed_mlp of unaligned views", functools.partial(route, shifted)),
+        ("unaligned views", views),
+    ]
+    return cases
+
+
+def captured_steps(device: str, n: int = 4096) -> list[tuple[str, Callable[..., list[Any]]]]:
+    """Names and steps: nearest centre, sort, networks and the gradients of their parameters."""
+    return [(name, _step(*settings, device, n)) for name, settings in STEPS.items()]
+
+
+def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -> Callable[..., list[Any]]:
+    import torch
+
+    import voronerf
+    from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+
+    kind = getattr(torch, dtype)
+    last = Layer((1, DIRECTIONS) if directed else (1,), 4)
+    layers = MLP((Layer((POSITIONS,), width, "relu"), Layer((0,), width, "relu"), last), (2,), 10, 4)
+    shapes = layers.weight_shapes(3, 3 if directed else 0)
+    weights = [(torch.randn(k, o, i) / i**0.5).to(device, kind).requires_grad_() for o, i in shapes]
+    biases = [torch.zeros(k, o, dtype=kind, device=device, requires_grad=True) for o, _ in shapes]
+    options: dict[str, Any] = {"layers": layers, "centres": torch.rand(k, 3).to(device)}
+    points = torch.rand(n, 3).to(device)
+    if directed:
+        options["directions"] = torch.nn.functional.normalize(torch.randn(16, 3), dim=1).to(device)
+        options["direction_index"] = torch.randint(0, 16, (n,), dtype=torch.int32).to(device)
+
+    def step(backend: str = "native", dtype: Any = None) -> list[Any]:
+        """The gradients, with everything in another type where one is given."""
+
+        def cast(value: Any) -> Any:
+            return value.to(dtype) if isinstance(value, torch.Tensor) and value.is_floating_point() else value
+
+        given, leaves = {"positions": points, **options}, [*weights, *biases]
+        if dtype is not None:
+            given = {name: cast(value) for name, value in given.items()}
+            leaves = [cast(leaf.detach()).requires_grad_() for leaf in leaves]
+        given |= {"weights": leaves[: len(shapes)], "biases": leaves[len(shapes) :]}
+        out, _ = voronerf.routed_mlp(**given, backend=backend)
+        return list(torch.autograd.grad((out if dtype else out.float()).square().mean(), leaves))
+
+    return step

@@ -1,0 +1,238 @@
+"""Everything to be learnt from a machine with a GPU, in one command: ``gpu_check.py --out DIR``.
+
+For a bare machine: torch with CUDA, nvcc and ninja, no network. Parts run one after another, each for itself: one that
+fails or runs into its limit is told with its last lines, and the next one begins. All of them together keep within
+--seconds, eight minutes by default, the most telling first: what finds no time any more is left out. ``--parts`` takes
+some of them, ``--data DIR`` is a Blender scene for the training.
+
+    machine    versions, and what is missing
+    build      the extension for this GPU alone
+    small      every operation once against float64, each case for itself and with a time limit of its own
+    captured   steps of the route in CUDA graphs, fused and layer by layer
+    roofs      the kernels at full size, beside the machine's own limits
+    training   short trainings, on --data or the built-in scene
+    tests      the tests of the operations on CUDA, a process for each file
+    memcheck   compute-sanitizer over the small cases, where it is installed
+    racecheck  the same for races in shared memory
+    benchmark  benchmarks/throughput.py --quick
+
+DIR gets summary.json, with the outcome of every part and all that it has found (each case, timing, training and file of
+tests), and what each part said, as text. The last lines printed are the summary; the exit status counts failures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+ROOT = Path(__file__).resolve().parents[2]
+PYTHON = sys.executable
+TAIL = 40
+"""Lines of a failure that are printed."""
+SPLIT = "--split-compile=0"
+TARGETS = {"90": "90a"}
+"""What to build for, where that is not the compute capability as it is: with wgmma, to compare it."""
+SHORTEST = 10.0
+"""Seconds for which a part is not begun."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part: its command, or why it is left out, the seconds it may take, and the JSON that it leaves."""
+
+    command: list[str] | str
+    seconds: int
+    environment: tuple[tuple[str, str], ...] = ()
+    found: Path | None = None
+
+
+def main(arguments: list[str]) -> int:
+    """Run the parts and return the number of those that failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for summary.json and the parts' outputs")
+    parser.add_argument("--parts", nargs="+", help="some of the parts, in this order")
+    parser.add_argument("--data", type=Path, help="a Blender scene for the training, else the built-in one")
+    parser.add_argument("--seconds", type=float, default=470, help="for all parts together")
+    given = parser.parse_args(arguments)
+    given.out = given.out.resolve()  # the parts run elsewhere
+    given.data = given.data and given.data.resolve()
+    known = parts(given.out, given.data)
+    chosen = given.parts or list(known)
+    if unknown := [name for name in chosen if name not in known]:
+        parser.error(f"--parts takes {', '.join(known)}, got {', '.join(unknown)}")
+    given.out.mkdir(parents=True, exist_ok=True)
+    results = {}
+    end = time.perf_counter() + given.seconds
+    for name in chosen:
+        print(f"gpu-check: {name} ...", flush=True)
+        results[name] = run(name, known[name], given.out, end - time.perf_counter())
+        # Kept after every part, should this be stopped from outside.
+        (given.out / "summary.json").write_text(json.dumps({"device": device(), "parts": results}, indent=1) + "\n")
+    print(f"\ngpu-check on {device()}:")
+    for line in highlights({name: result.get("found") for name, result in results.items()}):
+        print(f"  {line}")
+    for name, result in results.items():
+        print(f"  {name:10} {result['outcome']:8} {result['seconds']:6.1f} s  {result['last']}")
+    return sum(result["outcome"] == "failed" for result in results.values())
+
+
+def parts(out: Path, data: Path | None) -> dict[str, Part]:
+    """The parts by name."""
+    sanitizer = shutil.which("compute-sanitizer", path=os.environ.get("PATH", "") + ":/usr/local/cuda/bin")
+    architecture = capability()
+    # nvcc optimises the kernels of a file in parallel, where it can.
+    target = TARGETS.get(architecture or "", architecture or "")
+    built = (("VORONERF_CUDA", "1"), ("VORONERF_CUDA_ARCHITECTURES", target), ("NVCC_APPEND_FLAGS", SPLIT))
+    own = [PYTHON, str(ROOT / "benchmarks" / "gpu" / "gpu_parts.py")]
+    # Each allocation for itself, so that what reads or writes beyond one leaves all of them.
+    apart = (("PYTORCH_NO_CUDA_MEMORY_CACHING", "1"),)
+    benchmark = [PYTHON, str(ROOT / "benchmarks" / "throughput.py"), "--device", "cuda", "--quick", "--json"]
+
+    def part(
+        command: list[str], seconds: int, environment: tuple[tuple[str, str], ...] = (), found: Path | None = None
+    ) -> Part:
+        return Part(command, seconds, environment, found) if architecture else Part("torch sees no GPU", 0)
+
+    def sanitized(tool: str, environment: tuple[tuple[str, str], ...] = ()) -> Part:
+        if sanitizer is None:
+            return Part("no compute-sanitizer", 0)
+        command = [sanitizer, "--error-exitcode", "9", "--target-processes", "all", "--tool", tool, *own, "small"]
+        found = out / tool
+        return part([*command, str(found), "--case-seconds", "30"], 60, environment, found / "small.json")
+
+    tested = part([*own, "tests", str(out / "tests")], 100, (), out / "tests" / "tests.json")
+    trained, scene = out / "training", "builtin" if data is None else str(data)
+    return {
+        "machine": Part([*own, "machine", str(out)], 30, (), out / "machine.json"),
+        "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 180, built),
+        "small": part([*own, "small", str(out)], 60, (), out / "small.json"),
+        "captured": part([*own, "captured", str(out)], 45, (), out / "captured.json"),
+        "roofs": part([*own, "roofs", str(out)], 60, (), out / "roofs.json"),
+        "training": part([*own, "training", str(trained), scene], 80, (), trained / "training.json"),
+        "tests": tested if importlib.util.find_spec("pytest") else Part("no pytest", 0),
+        "memcheck": sanitized("memcheck", apart),
+        "racecheck": sanitized("racecheck"),
+        "benchmark": part([*benchmark, str(out / "throughput.json")], 60, (), out / "throughput.json"),
+    }
+
+
+def run(name: str, part: Part, out: Path, left: float) -> dict[str, Any]:
+    """Outcome, seconds and the last line of one part, which has ``left`` at most; what it said goes to a file."""
+    if isinstance(part.command, str):
+        return {"outcome": "left out", "seconds": 0.0, "last": part.command}
+    limit = min(part.seconds, left)
+    if limit < SHORTEST:
+        return {"outcome": "left out", "seconds": 0.0, "last": "no time left"}
+    paths = os.pathsep.join(path for path in (str(ROOT), os.environ.get("PYTHONPATH")) if path)
+    environment = {**os.environ, **dict(part.environment), "PYTHONPATH": paths}
+    if part.found is not None:
+        part.found.unlink(missing_ok=True)  # an earlier run's
+    begin = time.perf_counter()
+    with (out / f"{name}.txt").open("w+", errors="replace") as log:
+        try:
+            status = run_group(part.command, environment, log, limit)
+        except OSError as error:
+            status = str(error)
+        log.seek(0)
+        lines = [line for line in log.read().splitlines() if line.strip()]
+    if status != 0:
+        print("\n".join(f"    {line}" for line in lines[-TAIL:]))
+    last = lines[-1][:160] if lines else ""
+    return {
+        "outcome": "passed" if status == 0 else "failed",
+        "seconds": time.perf_counter() - begin,
+        "last": last if isinstance(status, int) else f"{status}; {last}",
+        "found": read(part.found),
+    }
+
+
+def read(path: Path | None) -> object:
+    """What a part has left as JSON; the reason where that cannot be read, as after an end in the middle of a line."""
+    if path is None or not path.exists():
+        return None
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        return f"{path.name}: {error}"
+
+
+def highlights(found: dict[str, Any]) -> list[str]:
+    """What the parts have found, a line each: timings beside what was aimed at, trainings, and what is wrong."""
+
+    def rows(part: str, kind: str) -> list[dict[str, Any]]:
+        kept = found.get(part)
+        return kept.get(kind, []) if isinstance(kept, dict) else []
+
+    lines = []
+    for row in rows("roofs", "rows"):
+        aim = row["aim"]
+        verdict = "" if aim is None else f", {'reached' if row['share'] >= aim else 'MISSED'} {100 * aim:.0f} %"
+        share = f"{100 * row['share']:5.1f} % of {row['limit']}"
+        lines.append(f"{row['name']:32} {1e3 * row['seconds']:8.3f} ms {share}{verdict}")
+    times = {row["name"]: row["seconds"] for row in rows("roofs", "rows")}
+    for name, seconds in times.items():
+        radix = times.get(name.replace("by counting", "by radix"))
+        if name.endswith("by counting") and radix is not None:
+            lines.append(f"{name}: {seconds / radix:.2f} x the time of radix")
+        for way in ("tiles", "wgmma"):
+            other = times.get(f"{name} by {way}")
+            if other is not None:
+                lines.append(f"{name}: {seconds / other:.2f} x the time of {way}")
+    for row in rows("training", "trainings"):
+        said = f"PSNR {row['psnr']:.2f} after {row['steps']} steps" if row["right"] else f"FAILED: {row['said']}"
+        lines.append(f"training {row['name']}: {said}")
+    for part in ("small", "captured", "roofs", "memcheck", "racecheck"):
+        lines += [f"WRONG in {part}: {row['name']}: {row['said']}" for row in rows(part, "cases") if not row["right"]]
+    lines += [f"WRONG in tests: {row['name']}: {row['said']}" for row in rows("tests", "files") if not row["right"]]
+    return lines
+
+
+def run_group(command: list[str], environment: dict[str, str], log: TextIO, limit: float) -> int | str:
+    """Exit status of a command, or what became of it: past ``limit`` seconds, all that it started is ended with it."""
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+    )
+    try:
+        return process.wait(limit)
+    except subprocess.TimeoutExpired:
+        return f"stopped after {limit:.0f} s"
+    finally:
+        # Of a command that has ended, what it left behind; nothing more is to run beside the next part.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        # A process that waits inside of the driver may not end.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(10)
+
+
+def capability() -> str | None:
+    """Compute capability of the GPU, such as "90"; None without one."""
+    import torch
+
+    if not torch.cuda.is_available():
+        return None
+    major, minor = torch.cuda.get_device_capability()
+    return f"{major}{minor}"
+
+
+def device() -> str:
+    """The GPU and the versions that belong to it."""
+    import torch
+
+    name = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
+    return f"{name}, torch {torch.__version__}, CUDA {torch.version.cuda}"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

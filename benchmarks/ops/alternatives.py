@@ -1,0 +1,379 @@
+"""What a user would otherwise run in place of grouped_mlp and grouped_linear, each at its best setting.
+
+Samples are sorted by cell, and encoded inputs are given to the alternatives for nothing, while grouped_mlp encodes
+inside. Every call of each returns its output as one new tensor, through which training goes. n samples, k cells, i
+inputs and o outputs of a layer.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ops.case import BACKWARD, Contender, NotApplicable, optional
+from ops.networks import Batch, with_gradients
+from voronerf import ops
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.reference.specification import encode
+
+PIECE = 4096
+"""Rows of a piece whose activations stay in cache."""
+MOST_BYTES = 3 << 30
+"""Memory that padding may take."""
+STATIC_CELLS = 64
+"""Cells up to which JAX gets a program with one product for each; beyond, compiling it takes minutes."""
+
+Linear = Callable[[Tensor, Any, Any, str], Tensor]
+
+
+class Encoded:
+    """Encoded inputs of two sets of samples, in a dtype: large, so made once for all alternatives that share it."""
+
+    def __init__(self, batch: Batch, dtype: torch.dtype) -> None:
+        sets = batch.positions[:2]
+        self.positions = [encode(x, batch.net.position_octaves).to(dtype) for x in sets]
+        self.directions: Tensor | None = None
+        if batch.directions is not None:
+            encoded = encode(batch.directions, batch.net.direction_octaves).to(dtype)
+            self.directions = encoded[batch.direction_index]
+
+
+def evaluate(net: MLP, x: Any, d: Any, weights: Sequence[Any], biases: Sequence[Any], linear: Linear) -> list[Any]:
+    """Results of the output layers, by whichever product."""
+    results: list[Any] = []
+    for layer, weight, bias in zip(net.layers, weights, biases):
+        sources = [x if s == POSITIONS else d if s == DIRECTIONS else results[s] for s in layer.inputs]
+        joined = sources[0] if len(sources) == 1 else torch.cat(sources, -1)
+        results.append(linear(joined, weight, bias, layer.activation))
+    return [results[index] for index in net.outputs]
+
+
+def torch_linear(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
+    """addmm and ReLU in place, which is what the gradient needs as well."""
+    y = F.linear(x, weight, bias)
+    return y.relu_() if activation == "relu" else y
+
+
+def join(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+
+
+def row_pieces(bounds: Sequence[int], piece: int | None) -> Iterator[tuple[int, int, int]]:
+    """(cell, first row, last row), cells without rows left out."""
+    for cell, (start, stop) in enumerate(itertools.pairwise(bounds)):
+        step = piece or max(stop - start, 1)
+        for first in range(start, stop, step):
+            yield cell, first, min(first + step, stop)
+
+
+def loop(
+    batch: Batch, encoded: Encoded, *, piece: int | None = None, stacked: bool = False, compiled: bool = False
+) -> Contender:
+    """A loop over cells, each a plain torch network.
+
+    Parameters of a cell are leaves of their own unless ``stacked``: gradients then need no stacking.
+    """
+    dtype, net = encoded.positions[0].dtype, batch.net
+    parts = [tensor.detach().to(dtype) for tensor in batch.parameters]
+    training, count = batch.direction == BACKWARD, len(batch.weights)
+    if stacked:
+        leaves = [tensor.clone().requires_grad_(training) for tensor in parts]
+    else:
+        per_cell = [[piece.clone().requires_grad_(training) for piece in tensor.unbind()] for tensor in parts]
+        leaves = [leaf for tensor in per_cell for leaf in tensor]
+    pieces = list(row_pieces(batch.bounds, piece))
+
+    def network(x: Tensor, d: Tensor | None, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+        return join(evaluate(net, x, d, weights, biases, torch_linear))
+
+    step: Callable[..., Tensor] = network
+    if compiled:
+        torch.compiler.reset()  # no row is compiled for what an earlier one has met
+        step = torch.compile(network, dynamic=True)
+
+    def outputs(call: int) -> Iterator[tuple[slice, Tensor]]:
+        x, d = encoded.positions[call % 2], encoded.directions
+        columns = [tensor.unbind() for tensor in leaves] if stacked else per_cell
+        cells = list(zip(*columns))
+        for cell, first, last in pieces:
+            rows, own = slice(first, last), cells[cell]
+            yield rows, step(x[rows], None if d is None else d[rows], own[:count], own[count:])
+
+    def forward(call: int) -> Tensor:
+        out = torch.empty(batch.n, net.out_features, dtype=dtype, device=parts[0].device)
+        with torch.no_grad():
+            for rows, result in outputs(call):
+                out[rows] = result
+        return out
+
+    def both(call: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
+        out = torch.cat([result for _, result in outputs(call)])
+        return out, torch.autograd.grad(out, leaves, batch.gradient(call).to(dtype), allow_unused=True)
+
+    def adapt(result: tuple[Tensor, tuple[Tensor | None, ...]]) -> tuple[Tensor, list[Tensor]]:
+        out, found = result
+        full = [torch.zeros_like(leaf) if one is None else one for leaf, one in zip(leaves, found)]
+        if not stacked:
+            full = [torch.stack(full[at : at + batch.k]) for at in range(0, len(full), batch.k)]
+        return out, full
+
+    if compiled:
+        compile_now(lambda: (both if training else forward)(1))
+    return Contender(both, adapt) if training else Contender(forward)
+
+
+def compile_now(run: Callable[[], Any]) -> None:
+    """Compiles outside of the timing; a compiler that fails is a reason, not an error of the benchmark."""
+    try:
+        run()
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise NotApplicable(f"torch.compile failed: {type(error).__name__}: {reason}"[:300]) from error
+
+
+def padded_bmm(batch: Batch, encoded: Encoded) -> Contender:
+    """All cells padded to the rows of the largest, then one batched product a layer."""
+    net, bounds, dtype = batch.net, torch.tensor(batch.bounds), encoded.positions[0].dtype
+    most, device = int(bounds.diff().max()), batch.positions[0].device
+    kept = sum(layer.width for layer in net.layers) * (2 if batch.direction == BACKWARD else 0)
+    widest = max(layer.width for layer in net.layers)
+    size = batch.k * most * (encoded.positions[0].shape[1] + kept + 2 * widest) * dtype.itemsize
+    if size > MOST_BYTES:
+        raise NotApplicable(f"padding {batch.k} cells to {most} rows would take {size / 2**30:.1f} GiB")
+    row = torch.arange(batch.n)
+    cell = torch.searchsorted(bounds, row, right=True) - 1
+    slot = (cell * most + row - bounds[cell]).to(device)
+    source = torch.zeros(batch.k * most, dtype=torch.int64, device=device)
+    source[slot] = row.to(device)
+    leaves = _leaves(batch, dtype)
+    transposed = [weight.transpose(1, 2) for weight in leaves[: len(batch.weights)]]
+    biases = [bias[:, None] for bias in leaves[len(batch.weights) :]]
+
+    def product(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
+        y = torch.baddbmm(bias, x, weight)
+        return y.relu_() if activation == "relu" else y
+
+    def pad(x: Tensor | None) -> Tensor | None:
+        return None if x is None else x[source].view(batch.k, most, -1)
+
+    def forward(call: int) -> Tensor:
+        x, d = pad(encoded.positions[call % 2]), pad(encoded.directions)
+        out = join(evaluate(net, x, d, transposed, biases, product))
+        return out.view(batch.k * most, -1)[slot]
+
+    return _finish(batch, forward, leaves)
+
+
+def _leaves(batch: Batch, dtype: torch.dtype) -> list[Tensor]:
+    training = batch.direction == BACKWARD
+    return [tensor.detach().to(dtype).clone().requires_grad_(training) for tensor in batch.parameters]
+
+
+def _finish(batch: Batch, forward: Callable[[int], Tensor], leaves: list[Tensor], *, same: bool = True) -> Contender:
+    run = with_gradients(batch, forward, leaves)
+    if same or batch.direction != BACKWARD:
+        return Contender(run)
+    return Contender(run, lambda result: (result[0], None))
+
+
+def grouped_mm(batch: Batch, encoded: Encoded) -> Contender:
+    """torch's own grouped product.
+
+    It takes no bias and rows of multiples of 16 bytes: every source carries a column of ones, whose weights are the
+    bias, and zeros up to a multiple of eight.
+    """
+    net, dtype = batch.net, encoded.positions[0].dtype
+    if not hasattr(F, "grouped_mm"):
+        raise NotApplicable("this torch has no F.grouped_mm")
+    x = [_with_one(tensor) for tensor in encoded.positions]
+    d = None if encoded.directions is None else _with_one(encoded.directions)
+    widths: dict[int | str, int] = {POSITIONS: encoded.positions[0].shape[1]}
+    if encoded.directions is not None:
+        widths[DIRECTIONS] = encoded.directions.shape[1]
+    leaves = []
+    for index, (layer, weight, bias) in enumerate(zip(net.layers, batch.weights, batch.biases)):
+        widths[index] = layer.width
+        rows = [_eights(widths[source]) for source in layer.inputs]
+        full = torch.zeros(batch.k, sum(rows), _eights(layer.width), dtype=dtype, device=weight.device)
+        at = taken = 0
+        for source, length in zip(layer.inputs, rows):
+            width = widths[source]
+            full[:, at : at + width, : layer.width] = weight.detach()[:, :, taken : taken + width].transpose(1, 2)
+            at, taken = at + length, taken + width
+        one = widths[layer.inputs[0]]
+        full[:, one, : layer.width] = bias.detach()
+        full[:, one, layer.width] = 1
+        leaves.append(full.requires_grad_(batch.direction == BACKWARD))
+    ends = batch.offsets[1:].contiguous()
+
+    def product(x: Tensor, weight: Tensor, _: Any, activation: str) -> Tensor:
+        y = F.grouped_mm(x, weight, offs=ends)
+        return y.relu_() if activation == "relu" else y
+
+    def forward(call: int) -> Tensor:
+        parts = evaluate(net, x[call % 2], d, leaves, leaves, product)
+        return join([part[:, : net.layers[index].width] for part, index in zip(parts, net.outputs)])
+
+    return _finish(batch, forward, leaves, same=False)
+
+
+def _eights(width: int) -> int:
+    return -(-(width + 1) // 8) * 8
+
+
+def _with_one(x: Tensor) -> Tensor:
+    padded = x.new_zeros(x.shape[0], _eights(x.shape[1]))
+    padded[:, : x.shape[1]] = x
+    padded[:, x.shape[1]] = 1
+    return padded
+
+
+def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Contender:
+    """A loop over cells of the private op behind torch.compile's linear layers: prepacked weights, ReLU inside."""
+    if batch.direction == BACKWARD:
+        raise NotApplicable("the op has no gradient")
+    if batch.positions[0].device.type != "cpu":
+        raise NotApplicable("runs on the CPU")
+    try:
+        linear, pack = torch.ops.mkldnn._linear_pointwise, torch.ops.mkldnn._reorder_linear_weight
+    except AttributeError as error:
+        raise NotApplicable(f"this torch has no such op: {error}") from error
+    net, dtype = batch.net, encoded.positions[0].dtype
+    rows = piece or max(max(b - a for a, b in itertools.pairwise(batch.bounds)), 1)
+    packed = [[pack(own.to(dtype), rows) for own in weight.detach()] for weight in batch.weights]
+    cells = list(zip(*packed)), list(zip(*[bias.detach().to(dtype).unbind() for bias in batch.biases]))
+    pieces = list(row_pieces(batch.bounds, piece))
+
+    def product(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
+        return linear(x, weight, bias, activation, [], "")
+
+    def forward(call: int) -> Tensor:
+        x, d = encoded.positions[call % 2], encoded.directions
+        out = torch.empty(batch.n, net.out_features, dtype=dtype)
+        for cell, first, last in pieces:
+            own = slice(first, last)
+            columns = None if d is None else d[own]
+            out[own] = join(evaluate(net, x[own], columns, cells[0][cell], cells[1][cell], product))
+        return out
+
+    return _finish(batch, forward, [])
+
+
+def jax_program(batch: Batch, encoded: Encoded) -> Contender:
+    """JAX, compiled: one product for each cell where they are few, ``ragged_dot`` where they are many."""
+    jax = optional("jax")
+    jnp = optional("jax.numpy")
+    if batch.positions[0].device.type != "cpu":
+        raise NotApplicable("runs on the CPU")
+    if batch.dtype != torch.float32:
+        raise NotApplicable("measured in float32")
+    net, count = batch.net, len(batch.weights)
+    x = [jnp.asarray(tensor.numpy()) for tensor in encoded.positions]
+    d = None if encoded.directions is None else jnp.asarray(encoded.directions.numpy())
+    leaves = [jnp.asarray(tensor.detach().numpy()) for tensor in batch.parameters]
+    sizes = jnp.asarray(batch.offsets.diff().numpy())
+    cells = jnp.repeat(jnp.arange(batch.k), sizes, total_repeat_length=batch.n)
+
+    def layers(x: Any, d: Any, own: Sequence[Any], product: Callable[..., Any]) -> Any:
+        results: list[Any] = []
+        for layer, weight, bias in zip(net.layers, own[:count], own[count:]):
+            sources = [x if s == POSITIONS else d if s == DIRECTIONS else results[s] for s in layer.inputs]
+            y = product(jnp.concatenate(sources, -1), weight, bias)
+            results.append(jax.nn.relu(y) if layer.activation == "relu" else y)
+        return jnp.concatenate([results[index] for index in net.outputs], -1)
+
+    def static(x: Any, d: Any, leaves: Any) -> Any:
+        parts = []
+        for cell, first, last in row_pieces(batch.bounds, None):
+            own = [leaf[cell] for leaf in leaves]
+            columns = None if d is None else d[first:last]
+            parts.append(layers(x[first:last], columns, own, lambda x, w, b: x @ w.T + b))
+        return jnp.concatenate(parts)
+
+    def ragged(x: Any, d: Any, leaves: Any) -> Any:
+        def product(x: Any, w: Any, b: Any) -> Any:
+            return jax.lax.ragged_dot(x, w.transpose(0, 2, 1), sizes) + b[cells]
+
+        return layers(x, d, leaves, product)
+
+    program = static if batch.k <= STATIC_CELLS else ragged
+    to_torch = torch.from_dlpack
+    if batch.direction != BACKWARD:
+        run = jax.jit(program)
+        run(x[0], d, leaves).block_until_ready()  # compiles
+        return Contender(lambda call: run(x[call % 2], d, leaves).block_until_ready(), to_torch)
+
+    @jax.jit
+    def both(x: Any, d: Any, leaves: Any, gradient: Any) -> Any:
+        out, pull = jax.vjp(lambda leaves: program(x, d, leaves), leaves)
+        return out, pull(gradient)[0]
+
+    gradients = [jnp.asarray(gradient.numpy()) for gradient in batch.gradients]
+    jax.block_until_ready(both(x[0], d, leaves, gradients[0]))  # compiles
+    return Contender(
+        lambda call: jax.block_until_ready(both(x[call % 2], d, leaves, gradients[min(call, 1)])),
+        lambda result: (to_torch(result[0]), [to_torch(part) for part in result[1]]),
+    )
+
+
+def alternatives(batch: Batch, *, compiled: bool) -> dict[str, Callable[[], Contender]]:
+    """Everything above that makes sense for a batch; bfloat16 competes with float32 as well."""
+    made: dict[torch.dtype, Encoded] = {}
+
+    def encoded(dtype: torch.dtype) -> Encoded:
+        if dtype not in made:
+            made[dtype] = Encoded(batch, dtype)
+        return made[dtype]
+
+    def own() -> Encoded:
+        return encoded(batch.dtype)
+
+    found: dict[str, Callable[[], Contender]] = {
+        "torch loop": lambda: loop(batch, own()),
+        f"torch loop, {PIECE} rows": lambda: loop(batch, own(), piece=PIECE),
+    }
+    if batch.dtype != torch.float32:
+        found["torch loop, float32"] = lambda: loop(batch, encoded(torch.float32))
+        found[f"torch loop, {PIECE} rows, float32"] = lambda: loop(batch, encoded(torch.float32), piece=PIECE)
+    if batch.direction == BACKWARD and batch.k > 1:
+        found["torch loop, stacked"] = lambda: loop(batch, own(), stacked=True)
+    if compiled:
+        found["torch.compile of the loop"] = lambda: loop(batch, own(), compiled=True)
+    if batch.k > 1:
+        found["padded bmm"] = lambda: padded_bmm(batch, own())
+        found["F.grouped_mm"] = lambda: grouped_mm(batch, own())
+    if batch.direction != BACKWARD:
+        found["oneDNN"] = lambda: onednn(batch, own())
+        found[f"oneDNN, {PIECE} rows"] = lambda: onednn(batch, own(), piece=PIECE)
+    found["jax"] = lambda: jax_program(batch, own())
+    return found
+
+
+def ours(batch: Batch, backend: str) -> Contender:
+    """grouped_mlp, or grouped_linear for a single layer without encoding, on one of its backends."""
+    single = len(batch.net.layers) == 1 and batch.net.position_octaves is None
+
+    def forward(call: int) -> Tensor:
+        x = batch.positions[call % len(batch.positions)]
+        if single:
+            activation = batch.net.layers[0].activation
+            return ops.grouped_linear(
+                x, batch.offsets, batch.weights[0], batch.biases[0], activation=activation, backend=backend
+            )
+        return ops.grouped_mlp(
+            x,
+            batch.offsets,
+            batch.weights,
+            batch.biases,
+            layers=batch.net,
+            directions=batch.directions,
+            direction_index=batch.direction_index,
+            backend=backend,
+        )
+
+    return Contender(with_gradients(batch, forward, batch.parameters))

@@ -1,0 +1,335 @@
+"""Cases of frequency_encode, integrated_encode, composite and resample. n points or samples."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ops.alternatives import compile_now
+from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation, uniform_points
+from voronerf import ops
+
+FULL, HALF = torch.float32, torch.bfloat16
+BASE = 1 << 18
+ALL = ("native", "reference", "warp")
+OCTAVES = 10
+SAMPLES = 64
+"""Of a ray, on average where rays are packed."""
+FINE = 128
+"""Depths that resample draws from SAMPLES bins."""
+CHECKED = 4096
+"""Rows, or rays, compared with float64."""
+
+Function = Callable[..., Any]
+
+
+def cases() -> list[Case]:
+    """The rows of these ops."""
+    found = []
+    for n, dtype, direction in (
+        (BASE, FULL, FORWARD),
+        (BASE, FULL, BACKWARD),
+        (BASE, HALF, FORWARD),
+        *[(n, FULL, FORWARD) for n in (1 << 10, 1 << 14, 1 << 20)],
+    ):
+        base = (n, dtype) == (BASE, FULL)
+        for op in ("frequency_encode", "integrated_encode"):
+            if op == "integrated_encode" and n in (1 << 10, 1 << 14):
+                continue
+            work = functools.partial(_encode_work, op, n, dtype, direction, base)
+            shown = ALL if base else ("native",)
+            quick = base and direction == FORWARD
+            found.append(Case(op, f"L={OCTAVES} n={n}", dtype, direction, n, None, work, shown, quick))
+    for n, packed, direction in (
+        *[(BASE, packed, direction) for packed in (False, True) for direction in (FORWARD, BACKWARD)],
+        *[(n, False, direction) for n in (1 << 10, 1 << 14, 1 << 20) for direction in (FORWARD, BACKWARD)],
+    ):
+        base = n == BASE
+        kind = "packed" if packed else "dense"
+        work = functools.partial(_composite_work, n, packed, direction, base and not packed)
+        shown = ALL if base else ("native",)
+        quick = base and direction == FORWARD
+        found.append(Case("composite", f"{kind} n={n}", FULL, direction, n, None, work, shown, quick))
+    for n in (BASE, 1 << 10, 1 << 14, 1 << 20):
+        work = functools.partial(_resample_work, n)
+        name = f"{SAMPLES} bins {FINE} depths n={n}"
+        base = n == BASE
+        found.append(Case("resample", name, FULL, FORWARD, n, None, work, ALL if base else ("native",), base))
+    return found
+
+
+def _contender(function: Function, sets: Sequence[Sequence[Tensor]], gradients: Sequence[Tensor] | None) -> Contender:
+    """A function of a set of tensors: its result or, with gradients of it, those of the set's floating tensors."""
+
+    def forward(call: int) -> Any:
+        with torch.no_grad():
+            return function(*sets[call % len(sets)])
+
+    def both(call: int) -> tuple[Any, Any]:
+        inputs = [t.detach().requires_grad_() if t.is_floating_point() else t for t in sets[call % len(sets)]]
+        results = function(*inputs)
+        outputs = [results] if isinstance(results, Tensor) else list(results)
+        wanted = [tensor for tensor in inputs if tensor.requires_grad]
+        return results, torch.autograd.grad(outputs[: len(gradients or ())], wanted, gradients)
+
+    return Contender(forward if gradients is None else both)
+
+
+def _flat(result: Any) -> list[Tensor]:
+    """All tensors of a nested result."""
+    return [result] if isinstance(result, Tensor) else [tensor for part in result for tensor in _flat(part)]
+
+
+def _work(
+    op: Function,
+    functions: dict[str, Function],
+    sets: Sequence[Sequence[Tensor]],
+    gradients: Sequence[Tensor] | None,
+    checked: Callable[[list[Tensor]], list[Tensor]],
+    exact: Callable[[], list[Tensor]],
+    amount: float,
+    compiled: Sequence[str],
+    tolerance: float,
+) -> Work:
+    """The case of a plain function.
+
+    Args:
+        op: the operation, with ``backend`` as an argument.
+        functions: alternatives with the arguments of the op.
+        sets: arguments of consecutive calls.
+        gradients: of the first results; None for a forward case.
+        checked: of a flat result, what is compared.
+        exact: the same in float64.
+        amount: bytes a call.
+        compiled: the alternatives that are compiled as well.
+        tolerance: largest error of an alternative.
+    """
+    expected: list[Tensor] = []
+
+    def error(result: Any) -> float:
+        if not expected:
+            expected.extend(exact())
+        return max(relative_error(a, b) for a, b in zip(checked(_flat(result)), expected))
+
+    def compiling(function: Function) -> Contender:
+        torch.compiler.reset()  # no row is compiled for what an earlier one has met
+        contender = _contender(torch.compile(function), sets, gradients)
+        compile_now(lambda: contender.run(1))
+        return contender
+
+    alternatives: dict[str, Callable[[], Contender]] = {
+        name: functools.partial(_contender, function, sets, gradients) for name, function in functions.items()
+    }
+    for name in compiled:
+        alternatives[f"{name}, torch.compile"] = functools.partial(compiling, functions[name])
+    return Work(
+        lambda backend: _contender(functools.partial(op, backend=backend), sets, gradients),
+        alternatives,
+        error,
+        tolerance,
+        amount,
+        "copy",
+    )
+
+
+def _encode_work(op: str, n: int, dtype: torch.dtype, direction: str, compiled: bool, device: torch.device) -> Work:
+    integrated = op == "integrated_encode"
+    features = 6 * OCTAVES + (0 if integrated else 3)
+    count = rotation(n * (12 + features * dtype.itemsize))
+    sets: list[list[Tensor]] = [[uniform_points(n, seed, device).to(dtype)] for seed in range(count)]
+    if integrated:
+        sets = [[x, (torch.rand(n, 3, generator=generator(9)) * 1e-4).to(device, dtype)] for (x,) in sets]
+    gradients = None
+    if direction == BACKWARD:
+        gradients = [torch.randn(n, features, generator=generator(5)).to(device, dtype)]
+    run = getattr(ops, op)
+    step = max(1, n // CHECKED)
+
+    def exact() -> list[Tensor]:
+        rows = [tensor[::step].double().contiguous() for tensor in sets[0]]
+        given = None if gradients is None else [gradients[0][::step].double()]
+        return _flat(_contender(lambda *x: run(*x, OCTAVES, backend="reference"), [rows], given).run(0))
+
+    functions: dict[str, Function] = (
+        {"torch, octave by octave": _integrated_by_octave, "torch, all octaves at once": _integrated_at_once}
+        if integrated
+        else {"torch, octave by octave": _frequency_by_octave, "torch, all octaves at once": _frequency_at_once}
+    )
+    # Read the points, write the features; and the other way round, with the points once more, for the gradient.
+    raw = (6 if integrated else 3) * dtype.itemsize
+    amount = float(n) * (raw + features * dtype.itemsize)
+    if direction == BACKWARD:
+        amount += float(n) * (2 * raw + features * dtype.itemsize)
+    return _work(
+        lambda *x, backend: run(*x, OCTAVES, backend=backend),
+        functions,
+        sets,
+        gradients,
+        lambda found: [tensor[::step] for tensor in found],
+        exact,
+        amount,
+        ["torch, octave by octave"] if compiled else [],  # the other form is slower, above all its gradient
+        1e-3 if dtype == FULL else 1.5,  # angles of hundreds of radians have no digits left in a bfloat16 formula
+    )
+
+
+def _frequency_by_octave(x: Tensor) -> Tensor:
+    parts = [x]
+    for octave in range(OCTAVES):
+        parts += [torch.sin(x * 2.0**octave), torch.cos(x * 2.0**octave)]
+    return torch.cat(parts, 1)
+
+
+def _frequency_at_once(x: Tensor) -> Tensor:
+    angles = x[:, None, None, :] * _powers(x)
+    return torch.cat([x, torch.cat([angles.sin(), angles.cos()], 2).flatten(1)], 1)
+
+
+def _integrated_by_octave(mean: Tensor, variance: Tensor) -> Tensor:
+    parts = []
+    for octave in range(OCTAVES):
+        blur = torch.exp(-0.5 * 4.0**octave * variance)
+        parts += [torch.sin(mean * 2.0**octave) * blur, torch.cos(mean * 2.0**octave) * blur]
+    return torch.cat(parts, 1)
+
+
+def _integrated_at_once(mean: Tensor, variance: Tensor) -> Tensor:
+    powers = _powers(mean)
+    angles, blur = mean[:, None, None, :] * powers, torch.exp(-0.5 * powers**2 * variance[:, None, None, :])
+    return torch.cat([angles.sin() * blur, angles.cos() * blur], 2).flatten(1)
+
+
+def _powers(x: Tensor) -> Tensor:
+    return (2.0 ** torch.arange(OCTAVES, device=x.device)).to(x.dtype)[None, :, None, None]
+
+
+def _composite_work(n: int, packed: bool, direction: str, compiled: bool, device: torch.device) -> Work:
+    rays = n // SAMPLES
+    ray_offsets = None
+    shape: tuple[int, ...] = (rays, SAMPLES)
+    if packed:
+        # From none to twice the average.
+        lengths = torch.randint(0, 2 * SAMPLES + 1, (rays,), generator=generator(2))
+        ray_offsets = torch.nn.functional.pad(lengths.cumsum(0), (1, 0)).to(device, torch.int32)
+        shape = (int(lengths.sum()),)
+    total = shape[0] if packed else n
+
+    def samples(seed: int) -> list[Tensor]:
+        random = generator(seed)
+        sigma = torch.rand(shape, generator=random) * 10
+        rgb = torch.rand(*shape, 3, generator=random)
+        deltas = torch.rand(shape, generator=random) * 0.02 + 0.01
+        depths = deltas.cumsum(-1) if not packed else torch.rand(shape, generator=random) + 1
+        return [tensor.to(device) for tensor in (sigma, rgb, depths, deltas)]
+
+    sets = [samples(seed) for seed in range(rotation(28 * total))]
+    gradients = None
+    if direction == BACKWARD:
+        gradients = [torch.randn(rays, width, generator=generator(5)).to(device) for width in (3, 1, 1)]
+        gradients = [gradients[0], *(tensor[:, 0].contiguous() for tensor in gradients[1:])]
+    extra = {"ray_offsets": ray_offsets} if packed else {}
+
+    def exact() -> list[Tensor]:
+        wide = [[tensor.double() for tensor in sets[0]]]
+        given = None if gradients is None else [tensor.double() for tensor in gradients]
+        reference = functools.partial(ops.composite, **extra, backend="reference")
+        return _flat(_contender(reference, wide, given).run(0))
+
+    functions: dict[str, Function] = (
+        {"torch, running sum + index_add": functools.partial(_composite_packed, ray_offsets)}
+        if ray_offsets is not None
+        else {"torch cumprod": _composite_cumprod, "torch cumsum": _composite_cumsum}
+    )
+    # Read density, colour, depth and length of a sample, write its weight; the backward reads them once more and writes
+    # as many gradients.
+    bytes_a_sample = 28.0 if direction == FORWARD else 28.0 + 24.0 + 24.0
+    return _work(
+        functools.partial(ops.composite, **extra),
+        functions,
+        sets,
+        gradients,
+        lambda found: found,
+        exact,
+        bytes_a_sample * total,
+        list(functions) if compiled else [],
+        1e-3,
+    )
+
+
+def _rendered(weights: Tensor, rgb: Tensor, depths: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    return (weights[..., None] * rgb).sum(1), weights.sum(1), (weights * depths).sum(1), weights
+
+
+def _composite_cumprod(sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor) -> Any:
+    """As nerf-pytorch writes it."""
+    passing = torch.exp(-sigma * deltas)
+    front = torch.cumprod(torch.cat([torch.ones_like(passing[:, :1]), passing[:, :-1] + 1e-10], 1), 1)
+    return _rendered((1 - passing) * front, rgb, depths)
+
+
+def _composite_cumsum(sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor) -> Any:
+    """In logarithms, as mip-NeRF's successors write it."""
+    optical = sigma * deltas
+    front = torch.exp(-F.pad(optical[:, :-1].cumsum(1), (1, 0)))
+    return _rendered(front * -torch.expm1(-optical), rgb, depths)
+
+
+def _composite_packed(
+    ray_offsets: Tensor, sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One running sum over all rays, in float64 for its digits, less its value where the ray begins."""
+    rays = ray_offsets.shape[0] - 1
+    ray = torch.repeat_interleave(torch.arange(rays, device=sigma.device), ray_offsets.diff())
+    optical = sigma * deltas
+    running = F.pad(optical.double().cumsum(0), (1, 0))
+    front = torch.exp(-(running[:-1] - running[ray_offsets.long()][ray])).to(sigma.dtype)
+    weights = front * -torch.expm1(-optical)
+    columns = torch.cat([rgb, torch.ones_like(depths)[:, None], depths[:, None]], 1) * weights[:, None]
+    total = columns.new_zeros(rays, 5).index_add(0, ray, columns)
+    return total[:, :3], total[:, 3], total[:, 4], weights
+
+
+def _resample_work(n: int, device: torch.device) -> Work:
+    rays = max(1, n // SAMPLES)
+
+    def bins(seed: int) -> list[Tensor]:
+        random = generator(seed)
+        weights = torch.rand(rays, SAMPLES, generator=random) ** 4 + 1e-3
+        edges = (torch.rand(rays, SAMPLES + 1, generator=random) + 0.1).cumsum(1)
+        return [weights.to(device), edges.to(device)]
+
+    sets = [bins(seed) for seed in range(rotation(4 * rays * (2 * SAMPLES + 1)))]
+    step = max(1, rays // CHECKED)
+
+    def exact() -> list[Tensor]:
+        weights, edges = (tensor[::step].double() for tensor in sets[0])
+        return [ops.resample(weights, edges, FINE, backend="reference")]
+
+    return _work(
+        lambda weights, edges, backend: ops.resample(weights, edges, FINE, backend=backend),
+        {"torch cumsum + searchsorted": _resample_torch},
+        sets,
+        None,
+        lambda found: [found[0][::step]],
+        exact,
+        4.0 * rays * (2 * SAMPLES + 1 + FINE),
+        ["torch cumsum + searchsorted"] if n == BASE else [],
+        1e-2,
+    )
+
+
+def _resample_torch(weights: Tensor, edges: Tensor) -> Tensor:
+    """As nerf-pytorch's sample_pdf, at the middles of equal strata."""
+    cdf = F.pad((weights / weights.sum(1, keepdim=True)).cumsum(1), (1, 0))
+    middles = (torch.arange(FINE, dtype=weights.dtype, device=weights.device) + 0.5) / FINE
+    u = middles.expand(weights.shape[0], FINE).contiguous()
+    above = torch.searchsorted(cdf, u, right=True).clamp(max=SAMPLES)
+    low, high = cdf.gather(1, above - 1), cdf.gather(1, above)
+    inside = (u - low) / (high - low).clamp(min=1e-10)
+    near, far = edges.gather(1, above - 1), edges.gather(1, above)
+    return near + inside * (far - near)

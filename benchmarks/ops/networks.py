@@ -1,0 +1,271 @@
+"""The networks of the throughput table, their inputs, their cost, and their gradients in float64.
+
+n samples, r rays, k cells, i inputs and o outputs of a layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ops.case import BACKWARD, generator, relative_error, rotation, uniform_points
+from voronerf import ops
+from voronerf.fields import NeRF
+from voronerf.layers import MLP, POSITIONS, Layer
+from voronerf.reference import specification
+
+RAY = 64
+"""Consecutive samples of one view direction."""
+CHECKED = 4096
+"""Samples whose results and gradients are compared with float64."""
+
+
+def _plain(width: int, depth: int) -> MLP:
+    hidden = [Layer((POSITIONS,), width, "relu"), *[Layer((i,), width, "relu") for i in range(depth - 1)]]
+    return MLP((*hidden, Layer((depth - 1,), 4)), (depth,), position_octaves=10)
+
+
+def _linear(o: int) -> MLP:
+    return MLP((Layer((POSITIONS,), o, "relu"),), (0,))
+
+
+NETS: dict[str, MLP] = {
+    "w64d4": _plain(64, 4),
+    "mlp32": _plain(32, 3),
+    "nerf64": NeRF(width=64).layers,
+    "nerf128": NeRF(width=128).layers,
+    "nerf256": NeRF(width=256).layers,
+}
+# One layer with ReLU, inputs to outputs: the first of a network on encoded positions, and one in the middle.
+LAYERS: dict[str, tuple[int, MLP]] = {
+    "63-64": (63, _linear(64)),
+    "64-64": (64, _linear(64)),
+    "256-256": (256, _linear(256)),
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Floating-point operations a sample, of products alone.
+
+    Attributes:
+        forward: two for each weight.
+        backward: the gradients of all weights, and of what comes from an earlier layer.
+        again: the forward as far as the backward needs it, for code that does not keep activations.
+    """
+
+    forward: float
+    backward: float
+    again: float
+
+
+def cost(net: MLP, features: int = 3) -> Cost:
+    """What a network costs on raw inputs of this width."""
+    shapes = net.weight_shapes(features, 3)
+    forward = 2.0 * sum(o * i for o, i in shapes)
+    inner = 2.0 * sum(
+        layer.width * net.layers[source].width
+        for layer in net.layers
+        for source in layer.inputs
+        if isinstance(source, int)
+    )
+    read = {source for layer in net.layers for source in layer.inputs}
+    again = 2.0 * sum(o * i for index, (o, i) in enumerate(shapes) if index in read)
+    return Cost(forward, forward + inner, again)
+
+
+@dataclass
+class Batch:
+    """Inputs of one case: sets of samples, and one network for each cell.
+
+    Samples of a set are sorted by cell unless it is for the route; all sets share ``offsets``, so that no alternative
+    has to be compiled again for other sizes.
+
+    Attributes:
+        net: layer table.
+        positions: sets of raw positions [n, 3], or inputs [n, d] of a single layer.
+        bounds: ``offsets`` on the host.
+        offsets: int32 [k + 1].
+        directions: [r, 3], where the network reads them.
+        direction_index: int32 [n].
+        weights: one [k, o, i] for each layer.
+        biases: one [k, o] for each layer.
+        gradients: [n, out] twice: zero but for the rows that are checked, for call 0, and dense for the others.
+        checked: rows compared with float64, rising.
+        direction: of the case, forward or with backward.
+    """
+
+    net: MLP
+    positions: list[Tensor]
+    bounds: list[int]
+    offsets: Tensor
+    directions: Tensor | None
+    direction_index: Tensor | None
+    weights: list[Tensor]
+    biases: list[Tensor]
+    gradients: list[Tensor]
+    checked: Tensor
+    direction: str
+
+    @property
+    def n(self) -> int:
+        return self.positions[0].shape[0]
+
+    @property
+    def k(self) -> int:
+        return len(self.bounds) - 1
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.weights[0].dtype
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        return [*self.weights, *self.biases]
+
+    def gradient(self, call: int) -> Tensor:
+        return self.gradients[min(call, 1)]
+
+
+def parameters(net: MLP, k: int, features: int, dtype: torch.dtype, device: torch.device) -> list[list[Tensor]]:
+    """Random weights and biases that keep activations of order one."""
+    random = generator(7)
+    lists: list[list[Tensor]] = [[], []]
+    for o, i in net.weight_shapes(features, 3):
+        lists[0].append(torch.randn(k, o, i, generator=random) * (2 / i) ** 0.5)
+        lists[1].append(torch.randn(k, o, generator=random) * 0.1)
+    return [[tensor.to(device, dtype) for tensor in tensors] for tensors in lists]
+
+
+def make_batch(
+    net: MLP,
+    n: int,
+    k: int,
+    dtype: torch.dtype,
+    direction: str,
+    device: torch.device,
+    *,
+    features: int | None = None,
+    centres: Tensor | None = None,
+) -> Batch:
+    """Samples spread evenly, cells of random centres, and networks.
+
+    Args:
+        net: layer table.
+        n: samples.
+        k: cells.
+        dtype: of the parameters.
+        direction: of the case.
+        device: of everything.
+        features: width of the inputs of a single layer; None for positions.
+        centres: [k, 3] of the route, whose samples come in no order; None for samples sorted by cell.
+    """
+    sets = rotation(4 * n * (features or 3))
+    points = [uniform_points(n, seed, device) for seed in range(sets)]
+    order, offsets = ops.cell_sort(
+        ops.nearest_centre(points[0], uniform_points(k, 1000, device) if centres is None else centres), k
+    )
+    positions = points
+    if features is not None:
+        positions = [torch.randn(n, features, generator=generator(seed)).to(device, dtype) for seed in range(sets)]
+    elif centres is None:
+        # Other samples in the same cells: a little beside those of the first set.
+        first = points[0][order]
+        positions = [first + seed * 1e-4 for seed in range(sets)]
+    rays = max(1, n // RAY)
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator(3)), dim=1).to(device)
+    index = (torch.arange(n, dtype=torch.int32, device=device) // RAY).clamp(max=rays - 1)
+    weights, biases = parameters(net, k, features or 3, dtype, device)
+    checked = torch.arange(0, n, max(1, n // CHECKED), device=device)
+    gradients = []
+    if direction == BACKWARD:
+        for tensor in (*weights, *biases):
+            tensor.requires_grad_()
+        dense = torch.randn(n, net.out_features, generator=generator(5)).to(device, dtype)
+        gradients = [torch.zeros_like(dense).index_copy_(0, checked, dense[checked]), dense]
+    return Batch(
+        net,
+        positions,
+        offsets.tolist(),
+        offsets,
+        directions if net.uses_directions else None,
+        (index if centres is not None else index[order]) if net.uses_directions else None,
+        weights,
+        biases,
+        gradients,
+        checked,
+        direction,
+    )
+
+
+def with_gradients(batch: Batch, forward: Callable[[int], Tensor], leaves: Sequence[Tensor]) -> Callable[[int], Any]:
+    """``forward`` itself for a forward case, without autograd; else (output, gradients of the leaves)."""
+    if batch.direction != BACKWARD:
+
+        def run(call: int) -> Tensor:
+            with torch.no_grad():
+                return forward(call)
+
+        return run
+
+    def run_both(call: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
+        out = forward(call)
+        return out, torch.autograd.grad(out, leaves, batch.gradient(call), allow_unused=True)
+
+    return run_both
+
+
+def network_error(batch: Batch, cells: Tensor | None = None) -> Callable[[Any], float]:
+    """Error of a result of call 0: the output, and the gradients where there are any, each relative to its largest.
+
+    Gradients of the check are those of ``Batch.checked`` alone, so that float64 has to see only these rows. A result
+    may be (output, None): its gradients have another form and are left out.
+
+    Args:
+        batch: the inputs.
+        cells: cell of every sample, for the route; None for sorted samples.
+    """
+    expected: list[Tensor] = []
+
+    def error(result: Any) -> float:
+        if not expected:
+            expected.extend(_exact(batch, cells))
+        out, gradients = result if isinstance(result, tuple) else (result, None)
+        found = [out[batch.checked], *(gradients or [])]
+        return max(relative_error(a, b) for a, b in zip(found, expected))
+
+    return error
+
+
+def _exact(batch: Batch, cells: Tensor | None) -> list[Tensor]:
+    """Output of the checked rows in float64, and the gradients of all parameters."""
+    rows = batch.checked
+    if cells is None:
+        counts = torch.searchsorted(rows.cpu(), torch.tensor(batch.bounds))
+        offsets, back = counts.to(torch.int32).to(rows.device), torch.arange(rows.shape[0], device=rows.device)
+    else:
+        order, offsets = ops.cell_sort(cells[rows].contiguous(), batch.k)
+        rows, back = rows[order], torch.argsort(order)
+    weights = [weight.detach().double() for weight in batch.weights]
+    biases = [bias.detach().double() for bias in batch.biases]
+    if batch.direction == BACKWARD:
+        for tensor in (*weights, *biases):
+            tensor.requires_grad_()
+    out = specification.grouped_mlp(
+        batch.positions[0][rows].double(),
+        offsets,
+        weights,
+        biases,
+        layers=batch.net,
+        directions=None if batch.directions is None else batch.directions.double(),
+        direction_index=None if batch.direction_index is None else batch.direction_index[rows],
+        linear=ops.grouped_linear,
+    )
+    if batch.direction != BACKWARD:
+        return [out[back]]
+    gradient = batch.gradients[0][rows].double()
+    return [out[back].detach(), *torch.autograd.grad(out, [*weights, *biases], gradient)]

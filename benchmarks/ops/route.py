@@ -1,0 +1,234 @@
+"""Cases of routed_mlp, the whole route: positions in any order to outputs in that order. n samples, k cells.
+
+A case named "separate" composes the operations instead. The alternatives are what one writes in torch: look up the cell
+by the fastest way that is installed, then either sort and loop over the cells, or loop over boolean masks, as Mega-NeRF
+does. All of them encode the positions themselves.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ops.alternatives import PIECE, evaluate, join, row_pieces, torch_linear
+from ops.case import BACKWARD, Contender, Work, uniform_points
+from ops.cases_lookup import LOOKUPS
+from ops.networks import NETS, Batch, cost, make_batch, network_error, with_gradients
+from voronerf import ops
+from voronerf.layers import MLP
+
+
+def route_work(
+    name: str,
+    n: int,
+    k: int,
+    dtype: torch.dtype,
+    direction: str,
+    tolerance: float,
+    separate: bool,
+    device: torch.device,
+) -> Work:
+    """The case of a network from ``NETS``, in one operation or in separate ones."""
+    net, centres = NETS[name], uniform_points(k, 1000, device)
+    batch, price = make_batch(net, n, k, dtype, direction, device, centres=centres), cost(net)
+    training = direction == BACKWARD
+    lookup: list[tuple[str, Callable[[Tensor], Any]]] = []
+
+    def find() -> Callable[[Tensor], Any]:
+        if not lookup:
+            lookup.append(fastest_lookup(centres, batch.positions[0]))
+        return lookup[0][1]
+
+    types = (dtype,) if dtype == torch.float32 else (dtype, torch.float32)
+    alternatives: dict[str, Callable[[], Contender]] = {}
+    for kind in types:
+        suffix = "" if kind == dtype else ", float32"
+        for piece in (None, PIECE):
+            rows = f", {piece} rows" if piece else ""
+            alternatives[f"torch sort + loop{rows}{suffix}"] = functools.partial(sorted_loop, batch, find, kind, piece)
+        alternatives[f"torch masks{suffix}"] = functools.partial(masked_loop, batch, find, kind)
+    cells = ops.nearest_centre(batch.positions[0], centres)
+    return Work(
+        functools.partial(composed if separate else ours, batch, centres),
+        alternatives,
+        network_error(batch, cells),
+        tolerance,
+        (price.forward + (price.backward if training else 0.0)) * n,
+        str(dtype).removeprefix("torch."),
+        (price.forward + price.backward + price.again) * n if training else None,
+    )
+
+
+def ours(batch: Batch, centres: Tensor, backend: str) -> Contender:
+    """routed_mlp on one of its backends."""
+
+    def forward(call: int) -> Tensor:
+        out, _ = ops.routed_mlp(
+            batch.positions[call % len(batch.positions)],
+            batch.weights,
+            batch.biases,
+            layers=batch.net,
+            centres=centres,
+            directions=batch.directions,
+            direction_index=batch.direction_index,
+            backend=backend,
+        )
+        return out
+
+    return Contender(with_gradients(batch, forward, batch.parameters))
+
+
+def composed(batch: Batch, centres: Tensor, backend: str) -> Contender:
+    """locate, sort, permute, grouped_mlp, and back to the order of the positions."""
+
+    def forward(call: int) -> Tensor:
+        positions = batch.positions[call % len(batch.positions)]
+        order, offsets = ops.cell_sort(
+            ops.nearest_centre(positions, centres, backend=backend), batch.k, backend=backend
+        )
+        index = batch.direction_index
+        out = ops.grouped_mlp(
+            positions[order],
+            offsets,
+            batch.weights,
+            batch.biases,
+            layers=batch.net,
+            directions=batch.directions,
+            direction_index=None if index is None else index[order],
+            backend=backend,
+        )
+        return torch.empty_like(out).index_copy(0, order.long(), out)
+
+    return Contender(with_gradients(batch, forward, batch.parameters))
+
+
+def fastest_lookup(centres: Tensor, points: Tensor) -> tuple[str, Callable[[Tensor], Any]]:
+    """The lookup of ``LOOKUPS`` that takes least time for these points, by two runs of each."""
+    found = []
+    for name, make in LOOKUPS.items():
+        try:
+            find = make(centres)
+            find(points[: max(1, points.shape[0] // 8)])
+        except Exception:  # one that is not there, or that fails, is no pipeline's
+            continue
+        synchronise(points)
+        start = time.perf_counter()
+        find(points)
+        synchronise(points)
+        found.append((time.perf_counter() - start, name, find))
+    _, name, find = min(found, key=lambda entry: entry[0])
+    return name, find
+
+
+def synchronise(points: Tensor) -> None:
+    """Waits for the device that points are on."""
+    if points.is_cuda:
+        torch.cuda.synchronize(points.device)
+
+
+class Parameters:
+    """Leaves of each cell in a dtype, made once for a contender."""
+
+    def __init__(self, batch: Batch, dtype: torch.dtype) -> None:
+        self.count, self.k, training = len(batch.weights), batch.k, batch.direction == BACKWARD
+        tensors = [tensor.detach().to(dtype) for tensor in batch.parameters]
+        per_cell = [[part.clone().requires_grad_(training) for part in tensor.unbind()] for tensor in tensors]
+        self.leaves = [leaf for parts in per_cell for leaf in parts]
+        self.cells = list(zip(*per_cell))
+
+    def network(self, net: MLP, cell: int, x: Tensor, d: Tensor | None) -> Tensor:
+        own = self.cells[cell]
+        return join(evaluate(net, x, d, own[: self.count], own[self.count :], torch_linear))
+
+    def stack(self, found: tuple[Tensor | None, ...]) -> list[Tensor]:
+        full = [torch.zeros_like(leaf) if one is None else one for leaf, one in zip(self.leaves, found)]
+        return [torch.stack(full[at : at + self.k]) for at in range(0, len(full), self.k)]
+
+
+def torch_encode(x: Tensor, octaves: int, dtype: torch.dtype) -> Tensor:
+    """All octaves at once: the input, then a sine and a cosine block for each octave."""
+    angles = x[:, None, None, :] * (2.0 ** torch.arange(octaves, device=x.device))[None, :, None, None]
+    waves = torch.cat([angles.sin(), angles.cos()], 2)
+    return torch.cat([x, waves.flatten(1)], 1).to(dtype)
+
+
+def encoded_directions(batch: Batch, dtype: torch.dtype) -> Tensor | None:
+    """Encoded once a ray."""
+    octaves = batch.net.direction_octaves
+    return None if batch.directions is None or octaves is None else torch_encode(batch.directions, octaves, dtype)
+
+
+def _of_rows(batch: Batch, directions: Tensor | None, rows: Tensor) -> Tensor | None:
+    """Encoded directions of the samples that an index or a mask names."""
+    return None if directions is None or batch.direction_index is None else directions[batch.direction_index[rows]]
+
+
+def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece: int | None) -> Contender:
+    """Sort by cell with the narrowest key, then each cell's network on its rows; results back by index."""
+    lookup, own, net = find(), Parameters(batch, dtype), batch.net
+    key = torch.uint8 if batch.k <= 256 else torch.int16
+    bounds = torch.arange(batch.k + 1, device=batch.positions[0].device)
+
+    def parts(call: int) -> Iterator[tuple[Tensor, Tensor]]:
+        points, directions = batch.positions[call % len(batch.positions)], encoded_directions(batch, dtype)
+        keys, order = torch.sort(torch.as_tensor(lookup(points)).to(key), stable=True)
+        edges = torch.searchsorted(keys.int(), bounds).tolist()
+        for cell, first, last in row_pieces(edges, piece):
+            rows = order[first:last]
+            x = torch_encode(points[rows], net.position_octaves or 0, dtype)
+            yield rows, own.network(net, cell, x, _of_rows(batch, directions, rows))
+
+    return _contender(batch, parts, own, dtype)
+
+
+def masked_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Contender:
+    """A boolean mask for each cell, as in Mega-NeRF's code."""
+    lookup, own, net = find(), Parameters(batch, dtype), batch.net
+
+    def parts(call: int) -> Iterator[tuple[Tensor, Tensor]]:
+        points, directions = batch.positions[call % len(batch.positions)], encoded_directions(batch, dtype)
+        cells = torch.as_tensor(lookup(points))
+        for cell in range(batch.k):
+            mask = cells == cell
+            x = points[mask]
+            if x.shape[0] == 0:
+                continue
+            encoded = torch_encode(x, net.position_octaves or 0, dtype)
+            yield mask, own.network(net, cell, encoded, _of_rows(batch, directions, mask))
+
+    return _contender(batch, parts, own, dtype)
+
+
+def _contender(
+    batch: Batch, parts: Callable[[int], Iterator[tuple[Tensor, Tensor]]], own: Parameters, dtype: torch.dtype
+) -> Contender:
+    """Puts the parts where they belong; with gradients, the whole output is there before they are taken."""
+
+    def empty() -> Tensor:
+        return torch.empty(batch.n, batch.net.out_features, dtype=dtype, device=batch.positions[0].device)
+
+    def forward(call: int) -> Tensor:
+        out = empty()
+        with torch.no_grad():
+            for rows, result in parts(call):
+                out[rows] = result
+        return out
+
+    def both(call: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
+        results, gradient = list(parts(call)), batch.gradient(call).to(dtype)
+        out = empty()
+        with torch.no_grad():
+            for rows, result in results:
+                out[rows] = result
+        pieces = [gradient[rows] for rows, _ in results]
+        found = torch.autograd.grad([result for _, result in results], own.leaves, pieces, allow_unused=True)
+        return out, found
+
+    if batch.direction != BACKWARD:
+        return Contender(forward)
+    return Contender(both, lambda result: (result[0], own.stack(result[1])))

@@ -1,0 +1,288 @@
+"""Plots and pictures of the paper's experiments, from their results and the looks in the run directories."""
+
+from __future__ import annotations
+
+import io
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from torch import Tensor
+
+from paper import looks as paper_looks
+from paper.claims import Rows
+from voronerf.evaluation.panels import contact_sheet, picture_of_cells, picture_of_error, save_picture
+from voronerf.evaluation.slices import picture_of_density
+from voronerf.files import write_bytes
+
+matplotlib.use("Agg")
+from matplotlib import pyplot
+
+Row = dict[str, Any]
+Point = tuple[float, float]
+GRID = 200  # times at which the curves of several seeds are compared
+DPI = 100
+
+
+def save(figure: Any, path: Path) -> Path:
+    """Writes a plot as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    pyplot.close(figure)
+    write_bytes(path, buffer.getvalue())
+    return path
+
+
+def panes(count: int, width: float = 5.6, height: float = 3.8) -> tuple[Any, list[Any]]:
+    """A figure of axes side by side."""
+    figure, axes = pyplot.subplots(1, count, figsize=(width * count, height), layout="constrained", squeeze=False)
+    for pane in axes[0]:
+        pane.grid(alpha=0.3)
+    return figure, list(axes[0])
+
+
+def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]], number: int = 0) -> Any:
+    """The mean of several curves over the times that they share, and the band between lowest and highest.
+
+    Its number is its colour, the same in every pane, whatever other curves a pane lacks.
+    """
+    curves = [curve for curve in curves if curve]
+    if not curves:
+        return None
+    start, end = max(curve[0][0] for curve in curves), min(curve[-1][0] for curve in curves)
+    marked = [t for t, _ in curves[0] if start <= t <= end]
+    times = np.unique(np.concatenate((np.linspace(start, max(start, end), GRID), marked)))
+    values = np.stack([np.interp(times, *zip(*curve)) for curve in curves])
+    line = axes.plot(times, values.mean(0), label=label, color=f"C{number}")[0]
+    if len(curves) > 1:
+        axes.fill_between(times, values.min(0), values.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
+    return line
+
+
+def shown(evaluation: dict[str, Any]) -> Point:
+    """Seconds and PSNR of the mean error, which for a single picture is its PSNR."""
+    return evaluation["seconds"], evaluation.get("psnr_of_mean_error", evaluation["psnr"])
+
+
+def curves(path: Path, rows: Sequence[Row]) -> Path:
+    """PSNR of the mean squared error, as the paper's curves, over training seconds, a pane a scene.
+
+    Bands are the range over the seeds, dotted lines the splits.
+    """
+    table = Rows(rows)
+    figure, axes = panes(len(table.scenes))
+    for pane, scene in zip(axes, table.scenes):
+        for number, variant in enumerate(table.variants):
+            group = table.of(variant, scene)
+            line = banded(pane, variant, [[shown(m) for m in row["curve"]] for row in group], number)
+            for stage in (group[0].get("stages") or [])[1:] if group and line is not None else []:
+                pane.axvline(stage["started_at_second"], color=line.get_color(), linestyle=":", linewidth=1)
+        pane.set(xlabel="training time [s]", ylabel="test PSNR [dB]", title=scene)
+        if pane.lines:
+            pane.legend(fontsize=8)
+    return save(figure, path)
+
+
+def bars(path: Path, rows: Sequence[Row]) -> Path:
+    """Final PSNR of every variant, a pane a scene: mean and every seed."""
+    table = Rows(rows)
+    figure, axes = panes(len(table.scenes), 7.0, 0.9 + 0.3 * len(table.variants))
+    for pane, scene in zip(axes, table.scenes):
+        names = [name for name in table.variants if table.values(name, scene)][::-1]
+        means = [statistics.fmean(table.values(name, scene)) for name in names]
+        pane.barh(names, means, color="#9db7d5")
+        for height, name in enumerate(names):
+            values = table.values(name, scene)
+            pane.plot(values, [height] * len(values), "k.", markersize=4)
+        if means:
+            lowest = min(min(table.values(name, scene)) for name in names)
+            pane.set_xlim(left=max(0.0, lowest - 1.5))
+        pane.set(xlabel="test PSNR [dB]", title=scene)
+    return save(figure, path)
+
+
+def counts(path: Path, rows: Sequence[Row]) -> Path:
+    """Final PSNR over the number of cells, with networks of one width and with matched parameters."""
+    table = Rows(rows)
+    figure, axes = panes(len(table.scenes))
+    for pane, scene in zip(axes, table.scenes):
+        for matched in (False, True):
+            names = [name for name in table.variants if name.endswith("matched") == matched]
+            widths = sorted({row["width"] for name in names for row in table.of(name, scene)})
+            label = "parameters of 12 cells in total" if matched else f"width {', '.join(map(str, widths))}"
+            points = []
+            for name in names:
+                values = table.values(name, scene)
+                if values:
+                    points.append((name.removesuffix(", matched"), statistics.fmean(values), min(values), max(values)))
+            if points:
+                labels, means, lows, highs = zip(*points)
+                errors = [np.subtract(means, lows), np.subtract(highs, means)]
+                pane.errorbar(labels, means, yerr=errors, marker="o", capsize=3, label=label)
+        pane.set(ylabel="test PSNR [dB]", title=scene)
+    axes[0].legend(fontsize=8)
+    return save(figure, path)
+
+
+def seams(path: Path, rows: Sequence[Row]) -> Path:
+    """The seam measure over training seconds."""
+    table = Rows(rows)
+    figure, axes = panes(len(table.scenes))
+    for pane, scene in zip(axes, table.scenes):
+        for number, variant in enumerate(table.variants):
+            found = [
+                [(e["seconds"], e["seam"]) for e in row["looks"] if e.get("seam") is not None]
+                for row in table.of(variant, scene)
+            ]
+            banded(pane, variant, found, number)
+        pane.set(xlabel="training time [s]", ylabel="difference across cell borders", title=scene)
+        if pane.lines:
+            pane.legend(fontsize=8)
+    return save(figure, path)
+
+
+def balance(path: Path, rows: Sequence[Row]) -> Path:
+    """std(W / max W) before and after, a box each."""
+    figure, axes = panes(1)
+    values, labels = [], []
+    for row in rows:
+        for when in ("before", "after"):
+            values.append(row[f"{when}_all"])
+            labels.append(f"{row['variant']},\n{when}".replace(", ", ",\n"))
+    axes[0].boxplot(values)
+    axes[0].set_xticks(range(1, len(labels) + 1), labels, fontsize=7)
+    axes[0].set(yscale="log", ylabel="std(W / max W)")
+    return save(figure, path)
+
+
+# --- pictures -------------------------------------------------------------------------------------------------------
+
+
+def _error(look: dict[str, Any]) -> Tensor:
+    colour, truth = (torch.from_numpy(look[name]).float() / 255 for name in ("colour", "truth"))
+    return picture_of_error(colour, truth)
+
+
+def _cells(look: dict[str, Any]) -> Tensor:
+    opacity = torch.from_numpy(look["opacity"]).float() / 255
+    return picture_of_cells(torch.from_numpy(look["cells"]), opacity, torch.from_numpy(look["colour"]).float() / 255)
+
+
+def _view(look: dict[str, Any]) -> Tensor:
+    return torch.from_numpy(look["colour"])
+
+
+def _density(look: dict[str, Any]) -> Tensor:
+    return picture_of_density(torch.from_numpy(look["density"]).float())
+
+
+def sheet(
+    path: Path, rows: Sequence[Row], folder: Path, columns: Sequence[tuple[str, str, Callable[[dict[str, Any]], Any]]]
+) -> Path | None:
+    """Pictures of the first seed: a line for every scene and variant, columns of (caption, look, picture of a look)."""
+    lines = []
+    for row in rows:
+        if row["seed"] != 0:
+            continue
+        pictures = {}
+        for caption, name, draw in columns:
+            look = paper_looks.load(folder / "runs" / row["run"], name)
+            picture = None if look is None else draw(look)
+            if picture is not None:
+                pictures[f"{caption.format(variant=row['variant'], scene=row['scene'])}"] = picture
+        if len(pictures) == len(columns):
+            lines.append(contact_sheet(pictures))
+    if not lines:
+        return None
+    save_picture(path, stacked(lines))
+    return path
+
+
+def stacked(pictures: Sequence[Tensor]) -> Tensor:
+    """Pictures uint8 [h, w, 3] below each other, the narrower ones with white beside them."""
+    width = max(picture.shape[1] for picture in pictures)
+    return torch.cat([torch.nn.functional.pad(p, (0, 0, 0, width - p.shape[1]), value=255) for p in pictures])
+
+
+def ghosting(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:
+    """Held-out views before the split, soon after it and at the end."""
+    truth = lambda look: torch.from_numpy(look["truth"])  # noqa: E731
+    columns = [
+        ("{scene}", "end", truth),
+        ("before the split", "before", _view),
+        ("{variant}, soon after", "after", _view),
+        ("error, soon after", "after", _error),
+        ("{variant}, end", "end", _view),
+        ("error, end", "end", _error),
+    ]
+    return sheet(path, rows, folder, columns)
+
+
+def density(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:
+    """Slices of the density."""
+    columns = [
+        ("{scene}, coarse", "before", _density),
+        ("{variant}, soon after", "after", _density),
+        ("{variant}, end", "end", _density),
+    ]
+    return sheet(path, rows, folder, columns)
+
+
+def title(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:
+    """A held-out view and its cells."""
+    columns = [
+        ("{scene}", "end", lambda look: torch.from_numpy(look["truth"])),
+        ("{variant}", "end", _view),
+        ("cells", "end", _cells),
+    ]
+    return sheet(path, rows, folder, columns)
+
+
+def limits(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:
+    """View, error and cells of every variant at the end."""
+    columns = [
+        ("{scene}", "end", lambda look: torch.from_numpy(look["truth"])),
+        ("{variant}", "end", _view),
+        ("error", "end", _error),
+        ("cells", "end", _cells),
+    ]
+    return sheet(path, rows, folder, columns)
+
+
+PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
+    "sampling": bars,
+    "architecture": bars,
+    "kilonerf": curves,
+    "convergence": curves,
+    "initialisation": curves,
+    "split-kinds": curves,
+    "early-late": curves,
+    "cell-count": counts,
+    "seams": seams,
+    "limits": curves,
+    "nested-2d": curves,
+    "balance": balance,
+}
+PICTURES: dict[str, Callable[[Path, Sequence[Row], Path], Path | None]] = {
+    "ghosting": ghosting,
+    "density": density,
+    "title": title,
+    "limits": limits,
+    "split-kinds": title,
+}
+
+
+def draw(name: str, rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Draws an experiment into ``folder``; returns the files."""
+    found: list[Path | None] = []
+    if name in PLOTS and rows:
+        found.append(PLOTS[name](folder / f"{name}.png", rows))
+    if name in PICTURES and rows:
+        found.append(PICTURES[name](folder / f"{name}-pictures.png", rows, folder))
+    if name == "nested-2d":
+        found.append(folder / "nested-2d-pictures.png")
+    return [path for path in found if path is not None and path.is_file()]

@@ -1,0 +1,134 @@
+"""What a training looks like on the way: a held-out view, a slice through its density, its cells, its seams.
+
+A look is a file of a run directory, looks/NAME.npz; NAME says when: "before" and "after" the first split, at quarters
+of the run, "end".
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from voronerf.data import Scene
+from voronerf.evaluation.metrics import psnr
+from voronerf.evaluation.scores import render_view
+from voronerf.evaluation.seams import seam
+from voronerf.evaluation.slices import slice_density, slice_points
+from voronerf.files import write_bytes
+from voronerf.training.trainer import Trainer
+
+VERSION = 1  # of what a look holds; those of another version are not used
+#: Fraction of the run after the first split at which inherited and random networks are compared.
+AFTER = 0.04
+QUARTERS = (0.25, 0.5, 0.75)
+SLICE = 96  # points on each side of a slice
+SEAM_VIEWS = 2  # test views whose seams are measured
+
+
+def stops(trainer: Trainer) -> list[tuple[str, float]]:
+    """Names and training seconds of a run's looks, the end left out."""
+    budget = float(trainer.config.budget or 0.0)
+    found = {f"at-{100 * at:02.0f}": at for at in QUARTERS}
+    if trainer.plan:
+        first = trainer.plan[0].at / (budget if trainer.config.split_unit == "seconds" else 1.0)
+        if trainer.config.split_unit != "steps" and first + AFTER < 1:
+            found |= {"before": first, "after": first + AFTER}
+    return sorted(((name, at * budget) for name, at in found.items()), key=lambda item: item[1])
+
+
+def held_out_view(scene: Scene) -> int:
+    """The test view that is looked at."""
+    return len(scene.test) // 3
+
+
+def reached(trainer: Trainer, second: float) -> None:
+    """Looks at a trainer that has come to one of its stops, unless that was done before an interruption."""
+    names = [name for name, at in stops(trainer) if at == second]
+    if all((trainer.out / "looks" / f"{name}.npz").is_file() for name in names):
+        return
+    if "after" in names and trainer.level == 0:
+        # Steps may be longer than the time between the two stops; this one makes the split.
+        trainer.advance(math.nextafter(trainer.seconds, math.inf))
+    for name in names:
+        look(trainer, second, name)
+
+
+def forget_later(trainer: Trainer) -> None:
+    """Deletes a resumed run's looks at steps after its checkpoint, which will be made again."""
+    for entry in numbers(trainer.out):
+        if entry["seconds"] > trainer.seconds:
+            (trainer.out / "looks" / f"{entry['look']}.npz").unlink()
+
+
+def missed(trainer: Trainer) -> list[str]:
+    """The looks that a finished run has not: their time had passed when it was resumed."""
+    return [name for name, _ in stops(trainer) if not (trainer.out / "looks" / f"{name}.npz").is_file()]
+
+
+@torch.no_grad()
+def look(trainer: Trainer, second: float, name: str = "end") -> None:
+    """Writes a look of a trainer as it is; ``second`` is when it was due."""
+    data = io.BytesIO()
+    np.savez_compressed(data, **picture(trainer), at=second, seconds=trainer.seconds, step=trainer.step)
+    write_bytes(trainer.out / "looks" / f"{name}.npz", data.getvalue())
+
+
+def picture(trainer: Trainer) -> dict[str, Any]:
+    """The arrays of a look."""
+    scene, router = trainer.scene, trainer.router
+    view = held_out_view(scene)
+    image = render_view(trainer.renderer, scene, view)
+    cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=trainer.config.backend)
+    found = {
+        "colour": (image.colour.clamp(0, 1) * 255).round().to(torch.uint8),
+        "opacity": (image.opacity.clamp(0, 1) * 255).round().to(torch.uint8),
+        "cells": cells.reshape(image.opacity.shape).int(),
+        "truth": (scene.test.truth(view, scene.background_colour()) * 255).round().to(torch.uint8),
+    }
+    points = slice_points(scene, size=SLICE)
+    found["density"] = slice_density(
+        router, points, cones=trainer.renderer.cones, contraction=trainer.renderer.contraction
+    ).half()
+    found["slice_cells"] = router.diagram.locate(points.reshape(-1, 3)).reshape(SLICE, SLICE).int()
+    score = psnr(found["colour"].float() / 255, found["truth"].float() / 255)
+    return {name: value.cpu().numpy() for name, value in found.items()} | {
+        "num_cells": router.num_cells,
+        "psnr": float(score),
+        **seams(trainer),
+    }
+
+
+def seams(trainer: Trainer) -> dict[str, float]:
+    """The step in colour across the borders of cells, {} where none is visible.
+
+    Of trainings with one field of points; others are not asked.
+    """
+    if len(trainer.routers) > 1 or trainer.renderer.fine_samples or trainer.renderer.cones:
+        return {}
+    scene, renderer = trainer.scene, trainer.renderer
+    found = seam(trainer.router, scene, lambda view: render_view(renderer, scene, view), views=SEAM_VIEWS)
+    return {} if math.isnan(found) else {"seam": found}
+
+
+def load(folder: Path, name: str) -> dict[str, Any] | None:
+    """The arrays of a run's look, None where it was not made."""
+    path = folder / "looks" / f"{name}.npz"
+    if not path.is_file():
+        return None
+    with np.load(path) as file:
+        return {key: file[key] for key in file.files}
+
+
+def numbers(folder: Path) -> list[dict[str, Any]]:
+    """What is a number in the looks of a run, in the order of time."""
+    found = []
+    for path in (folder / "looks").glob("*.npz"):
+        with np.load(path) as file:
+            values = {key: file[key].item() for key in file.files if file[key].ndim == 0}
+        found.append({"look": path.stem, **values})
+    return sorted(found, key=lambda entry: entry["at"])

@@ -1,0 +1,54 @@
+// The few macros and helpers that every file may use. Torch-free: the standard library and, under nvcc, the CUDA
+// toolkit.
+#pragma once
+
+#include <cstdint>
+#include <stdexcept>
+#include <string>
+
+#include "common/hd.h"
+
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
+#if defined(__CUDACC__) || defined(VN_EMULATE)
+#ifdef __CUDACC__
+#include <cuda_runtime.h>
+#else
+#include "emulation.h"
+#endif
+// A CUDA error becomes an exception that names the call. Launches are checked with cudaGetLastError(), which does not
+// synchronise: a fault inside a kernel shows at the caller's next synchronisation.
+#define VN_CUDA_CHECK(call)                                                               \
+  do {                                                                                    \
+    const cudaError_t vn_error = (call);                                                  \
+    if (vn_error != cudaSuccess) {                                                        \
+      throw std::runtime_error(std::string(#call ": ") + ::cudaGetErrorString(vn_error)); \
+    }                                                                                     \
+  } while (false)
+#endif
+
+// Internal invariants: what Python has validated is not validated again.
+#define VN_CHECK(condition, message)                     \
+  do {                                                   \
+    if (!(condition)) throw std::runtime_error(message); \
+  } while (false)
+
+namespace voronerf {
+
+template <typename T>
+VN_HD constexpr T ceil_div(T a, T b) {
+  return (a + b - 1) / b;
+}
+
+// Number of this thread in its team; 0 in a build without OpenMP.
+inline int thread_number() {
+#ifdef _OPENMP
+  return omp_get_thread_num();
+#else
+  return 0;
+#endif
+}
+
+}  // namespace voronerf

@@ -1,0 +1,15 @@
+#include "bindings/launchers.h"
+#include "common/common.h"
+
+namespace voronerf {
+
+CudaDevice::CudaDevice(int device) : device_(device), before_(device) {
+  VN_CUDA_CHECK(cudaGetDevice(&before_));
+  if (before_ != device_) VN_CUDA_CHECK(cudaSetDevice(device_));
+}
+
+CudaDevice::~CudaDevice() {
+  if (before_ != device_) cudaSetDevice(before_);  // it was current a moment ago, and a destructor must not throw
+}
+
+}  // namespace voronerf

@@ -1,0 +1,113 @@
+#include "common/measure_peak.h"
+
+#include <atomic>
+#include <chrono>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <new>
+#include <stdexcept>
+
+#include "common/measure_peak_isa.h"
+#include "common/parallel.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr double kBurst = 1.5e-3, kSeconds = 0.1;
+constexpr int64_t kCopied = int64_t{1} << 24;  // floats: 64 MiB to 64 MiB
+constexpr int64_t kLine = 64;
+
+double now() {
+  return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+int64_t run_float32(Isa isa, int64_t turns, float* sink) {
+  VN_FOR_ISA(isa, peak_float32(turns, sink))
+}
+
+void stream(Isa isa, const float* from, float* to, int64_t floats){VN_FOR_ISA(isa, peak_copy(from, to, floats))}
+
+int64_t multiply_adds(Peak kind, Isa isa, int64_t turns, float* sink) {
+#if VN_HAS_HALF
+  if (kind == Peak::bfloat16) return avx512::peak_bfloat16(turns, sink);
+#else
+  (void)kind;
+#endif
+  return run_float32(isa, turns, sink);
+}
+
+double measure_multiply_adds(Peak kind, Isa isa, int threads) {
+  alignas(kLine) float sink[16] = {};
+  int64_t turns = 1000;
+  const double start = now();
+  const double flops_a_turn = static_cast<double>(multiply_adds(kind, isa, turns, sink));
+  for (double took = 0; took < kBurst; turns *= 2) {
+    const double begin = now();
+    multiply_adds(kind, isa, turns, sink);
+    took = now() - begin;
+  }
+  double best = 0;
+  do {
+    std::atomic<int> members{0};
+    const double begin = now();
+    parallel(threads, [&](int) {
+      alignas(kLine) float own[16] = {};
+      ++members;
+      multiply_adds(kind, isa, turns, own);
+    });
+    best = std::max(best, members * flops_a_turn * static_cast<double>(turns) / (now() - begin));
+  } while (now() - start < kSeconds);
+  return best;
+}
+
+double measure_copy(Isa isa, int threads) {
+  struct Free {
+    void operator()(float* memory) const { std::free(memory); }
+  };
+  const std::unique_ptr<float, Free> memory(
+      static_cast<float*>(std::aligned_alloc(kLine, 2 * kCopied * sizeof(float))));
+  if (memory == nullptr) throw std::bad_alloc();
+  float *from = memory.get(), *to = from + kCopied;
+  constexpr int64_t kPiece = 1 << 16;
+  std::atomic<int64_t> copied{0};
+  const auto copy = [&](bool streaming) {
+    copied = 0;
+    // The same pieces for the same thread each time, as the pages were first touched.
+    parallel(threads, [&](int thread) {
+      for (int64_t at = thread * kPiece; at < kCopied; at += threads * kPiece, copied += kPiece) {
+        if (streaming) {
+          stream(isa, from + at, to + at, kPiece);
+        } else {
+          std::memcpy(to + at, from + at, kPiece * sizeof(float));
+        }
+      }
+    });
+  };
+  std::memset(from, 0, kCopied * sizeof(float));
+  copy(false);
+  double best = 0;
+  const double start = now();
+  bool streaming = false;
+  do {
+    const double begin = now();
+    copy(streaming);
+    // Of a smaller team than was asked for some pieces are nobody's.
+    best = std::max(best, 2.0 * static_cast<double>(copied) * sizeof(float) / (now() - begin));
+    streaming = !streaming;
+  } while (now() - start < kSeconds);
+  return best;
+}
+
+}  // namespace
+
+double measure_peak(Peak kind, Isa isa, int threads) {
+  if (!isa_supported(isa)) throw std::invalid_argument("measure_peak: isa must be one that this processor supports");
+  if (kind == Peak::bfloat16 && !isa_multiplies_bfloat16(isa)) {
+    throw std::invalid_argument("measure_peak: kind must be one that the instruction set has, got bfloat16");
+  }
+  return kind == Peak::copy ? measure_copy(isa, threads) : measure_multiply_adds(kind, isa, threads);
+}
+
+}  // namespace voronerf

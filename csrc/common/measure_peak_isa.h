@@ -1,0 +1,21 @@
+// The loops of measure_peak, once for each instruction set (measure_peak_isa.cpp).
+#pragma once
+
+#include <cstdint>
+
+#include "common/isa.h"
+
+namespace voronerf {
+
+// `turns` times a block of independent multiply-adds; returns floating-point operations a turn. `sink` takes the sums.
+VN_DECLARE_FOR_ISA(int64_t peak_float32(int64_t turns, float* sink))
+#if VN_HAS_HALF
+namespace avx512 {
+int64_t peak_bfloat16(int64_t turns, float* sink);
+}  // namespace avx512
+#endif
+
+// Streaming stores where the instruction set has them; both ends aligned to 64 bytes, floats a multiple of 16.
+VN_DECLARE_FOR_ISA(void peak_copy(const float* from, float* to, int64_t floats))
+
+}  // namespace voronerf

@@ -1,0 +1,28 @@
+// The nested query: points [n,3] go down a tree of diagrams to a leaf, leaves [n].
+//
+// Diagram j owns rows child_offsets[j] : child_offsets[j+1] of centres [m,3] (and of weights [m], or null); diagram 0
+// is the root. child[c] >= 0: centre c is refined by diagram child[c]; child[c] < 0: centre c is leaf -child[c] - 1.
+// `depth` is the number of levels. At each level the nearest centre is that of nearest_centre.h.
+#pragma once
+
+#include <cstdint>
+
+#include "common/isa.h"
+
+namespace voronerf {
+
+// Null if the tables are sound, else what is wrong with them, to follow "locate_cell: ". g diagrams.
+const char* locate_cell_fault(const int32_t* child_offsets, const int32_t* child, int64_t g, int64_t m);
+
+// int32 elements of workspace for a number of threads and m centres.
+inline int64_t locate_cell_workspace(int64_t m, int threads) {
+  return threads * m;
+}
+
+// The tables are sound (locate_cell_fault). False if a point is not at a leaf after `depth` levels.
+template <typename T>
+bool locate_cell_cpu(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
+                     const int32_t* child, int32_t* leaves, int32_t* workspace, int64_t n, int64_t m, int depth,
+                     Isa isa, int threads);
+
+}  // namespace voronerf

@@ -1,0 +1,116 @@
+// Points that go down a tree of diagrams on the CPU, a block at a time: at each level the block's points lie grouped by
+// the diagram they are in, every group is asked about at once, and a counting sort by the centre found makes the groups
+// of the next level. A point costs the sum of its diagrams' sizes (32 centres for 16 x 16 cells, not 256), and the
+// block stays in the second-level cache throughout. What a centre is found by, the caller says.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+
+#include "common/common.h"
+#include "common/parallel.h"
+
+namespace voronerf {
+
+constexpr int kDescentBlock = 2048;
+
+// Diagram j owns rows child_offsets[j] : child_offsets[j+1] of the centres; child and depth as in locate_cell.h.
+struct DescentTree {
+  const int32_t *child_offsets, *child;
+  int depth;
+};
+
+// Rows begin:end of the block are in this diagram.
+struct DescentGroup {
+  int32_t diagram, begin, end;
+};
+
+// The points of a level, their rows in the block, and their groups. Every group has a point, so there are enough.
+template <typename T>
+struct DescentLevel {
+  T points[3 * kDescentBlock];
+  int32_t rows[kDescentBlock];
+  DescentGroup groups[kDescentBlock];
+  int num_groups;
+};
+
+// One group: leaves are written, the other points appended to `next`. `place` holds one count a centre of the diagram.
+template <typename T, typename Find>
+void descend_group(const DescentTree& tree, const DescentLevel<T>& level, int depth, const DescentGroup& group,
+                   DescentLevel<T>& next, int32_t& filled, int32_t* place, int32_t* leaves, const Find& find) {
+  const int32_t first = tree.child_offsets[group.diagram], size = tree.child_offsets[group.diagram + 1] - first;
+  int32_t found[kDescentBlock];
+  find(level.points + 3 * group.begin, level.rows + group.begin, group.end - group.begin, first, size, depth, found);
+  std::fill(place, place + size, 0);
+  for (int32_t i = group.begin; i < group.end; ++i) {
+    const int32_t centre = found[i - group.begin], child = tree.child[first + centre];
+    if (child < 0) {
+      leaves[level.rows[i]] = ~child;  // -child - 1, which could overflow
+    } else {
+      ++place[centre];
+    }
+  }
+  for (int32_t c = 0; c < size; ++c) {
+    if (place[c] == 0) continue;
+    const int32_t count = place[c];
+    next.groups[next.num_groups++] = {tree.child[first + c], filled, filled + count};
+    place[c] = filled;
+    filled += count;
+  }
+  for (int32_t i = group.begin; i < group.end; ++i) {
+    const int32_t centre = found[i - group.begin];
+    if (tree.child[first + centre] < 0) continue;
+    const int32_t to = place[centre]++;
+    next.rows[to] = level.rows[i];
+    std::copy(level.points + 3 * i, level.points + 3 * i + 3, next.points + 3 * to);
+  }
+}
+
+// False if a point is not at a leaf after the last level.
+template <typename T, typename Find>
+bool descend_block(const DescentTree& tree, const T* points, int32_t* leaves, int32_t n, int32_t* place,
+                   const Find& find) {
+  DescentLevel<T> levels[2];
+  std::copy(points, points + 3 * n, levels[0].points);
+  for (int32_t i = 0; i < n; ++i) levels[0].rows[i] = i;
+  levels[0].groups[0] = {0, 0, n};
+  levels[0].num_groups = 1;
+  for (int d = 0; d < tree.depth; ++d) {
+    const DescentLevel<T>& level = levels[d % 2];
+    DescentLevel<T>& next = levels[(d + 1) % 2];
+    next.num_groups = 0;
+    int32_t filled = 0;
+    for (int i = 0; i < level.num_groups; ++i) {
+      descend_group(tree, level, d, level.groups[i], next, filled, place, leaves, find);
+    }
+    if (filled == 0) return true;
+  }
+  return false;
+}
+
+// All n points to their leaves, blocks over threads; `place` holds m int32 a thread. find(points, rows, count, first,
+// size, level, found, start, thread) finds one of `size` centres from row `first` on for each of `count` points, rows
+// `start + rows[i]` of all. False if a point does not arrive at a leaf.
+template <typename T, typename Find>
+bool descend(const DescentTree& tree, const T* points, int32_t* leaves, int32_t* place, int64_t n, int64_t m,
+             int threads, const Find& find) {
+  const int64_t blocks = ceil_div<int64_t>(n, kDescentBlock);
+  std::atomic<bool> arrived{true};
+  Items items(blocks);
+  parallel(static_cast<int>(std::min<int64_t>(threads, blocks)), [&](int thread) {
+    for (int64_t b, end; items.take(b, end);) {
+      const int64_t start = b * kDescentBlock;
+      const int32_t rows = static_cast<int32_t>(std::min<int64_t>(kDescentBlock, n - start));
+      const auto in_block = [&](const T* at, const int32_t* which, int32_t count, int32_t first, int32_t size,
+                                int level,
+                                int32_t* found) { find(at, which, count, first, size, level, found, start, thread); };
+      if (!descend_block(tree, points + 3 * start, leaves + start, rows, place + thread * m, in_block)) {
+        arrived.store(false, std::memory_order_relaxed);
+      }
+    }
+  });
+  return arrived;
+}
+
+}  // namespace voronerf

@@ -1,0 +1,208 @@
+// grouped_mlp over threads, task by task (row_tasks.h).
+#include "network/grouped_mlp.h"
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+#include "common/common.h"
+#include "common/parallel.h"
+#include "network/cpu/grouped_mlp_isa.h"
+#include "network/cpu/grouped_mlp_planner.h"
+#include "network/cpu/row_tasks.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr RowLimits kRows{96, 1024}, kGradientRows{384, 4096};
+// Tasks are whole tiles or halves of one.
+constexpr int64_t kTaskUnit = 48;
+
+void check(const MlpTable& table, const MlpInputs& in) {
+  constexpr const char* kNames[] = {"grouped_mlp", "grouped_linear", "routed_mlp"};
+  const std::string op = kNames[static_cast<int>(table.caller)];
+  check_offsets(op, in.offsets, in.k, in.n);
+  if (in.direction_index == nullptr) return;
+  int32_t low = 0, high = -1;
+  for (int64_t i = 0; i < in.n; ++i) {
+    low = std::min(low, in.direction_index[i]);
+    high = std::max(high, in.direction_index[i]);
+  }
+  if (low < 0 || high >= in.r) {
+    throw std::invalid_argument(op + ": direction_index must be 0 to " + std::to_string(in.r - 1) + ", got " +
+                                std::to_string(low < 0 ? low : high));
+  }
+}
+
+// Rows of no cell.
+void zero_strays(const MlpInputs& in, int64_t width, float* out) {
+  const auto clear = [&](int64_t begin, int64_t end) {
+    if (in.order == nullptr) {
+      std::fill(out + begin * width, out + end * width, 0.0f);
+    } else {
+      for (int64_t i = begin; i < end; ++i) std::fill_n(out + in.order[i] * width, width, 0.0f);
+    }
+  };
+  clear(0, in.offsets[0]);
+  clear(in.offsets[in.k], in.n);
+}
+
+bool use_half(const MlpTable& table, Isa isa) {
+  return table.half && isa_multiplies_bfloat16(isa);
+}
+
+void prepare(Isa isa, const MlpPlan& plan, float* own) {
+  VN_FOR_ISA(isa, mlp_prepare(plan, own))
+}
+void pack(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, float* own) {
+#if VN_HAS_HALF
+  if (plan.half) return avx512::mlp_half_pack(plan, data, cell, own);
+#endif
+  VN_FOR_ISA(isa, mlp_pack(plan, data, cell, own))
+}
+void forward(Isa isa, const MlpPlan& plan, const MlpData& data, const RowTask& task, float* own) {
+#if VN_HAS_HALF
+  if (plan.half) return avx512::mlp_half_forward(plan, data, task.begin, task.end, own);
+#endif
+  VN_FOR_ISA(isa, mlp_forward(plan, data, task.begin, task.end, own))
+}
+void backward(Isa isa, const MlpPlan& plan, const MlpData& data, const RowTask& task, float* own, float* partial) {
+#if VN_HAS_HALF
+  if (plan.half) return avx512::mlp_half_backward(plan, data, task.begin, task.end, own, partial);
+#endif
+  VN_FOR_ISA(isa, mlp_backward(plan, data, task.begin, task.end, own, partial))
+}
+void reduce(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t layer, float* partials,
+            int64_t count) {
+  VN_FOR_ISA(isa, mlp_reduce(plan, data, cell, layer, partials, count))
+}
+
+// Weights of a cell on their way to the cache: of many small cells, each would be waited for. Large ones take so long
+// to run that reading them does not show, and would push out what is in use.
+void fetch(const MlpPlan& plan, const MlpData& data, int64_t cell) {
+  constexpr int64_t kLine = 16, kMostFetched = 1 << 15;  // floats
+  int64_t total = 0;
+  for (int64_t l = 0; l < plan.layer_count; ++l) total += plan.layers[l].width * plan.layers[l].depth;
+  if (total > kMostFetched) return;
+  for (int64_t l = 0; l < plan.layer_count; ++l) {
+    const int64_t size = plan.layers[l].width * plan.layers[l].depth;
+    const float* weights = data.weights[l] + cell * size;
+    for (int64_t i = 0; i < size; i += kLine) __builtin_prefetch(weights + i, 0, 2);
+  }
+}
+
+// Floats of a thread's workspace.
+int64_t stride(const MlpPlan& plan) {
+  return ceil_div(plan.workspace, kGranule) * kGranule;
+}
+
+template <typename Run>
+void run_tasks(const RowTasks& tasks, const MlpPlan& plan, const MlpData& data, float* memory, Isa isa, int threads,
+               const Run& run) {
+  const auto pack_cell = [&](int64_t cell, float* own, bool first) {
+    if (first) prepare(isa, plan, own);
+    pack(isa, plan, data, cell, own);
+  };
+  const auto ahead = [&](int64_t cell) { fetch(plan, data, cell); };
+  for_each_task(tasks, memory, stride(plan), threads, pack_cell, ahead, run);
+}
+
+MlpData pointers(const MlpInputs& in) {
+  MlpData data;
+  data.positions = in.positions;
+  data.directions = in.directions;
+  data.direction_index = in.direction_index;
+  data.order = in.order;
+  data.weights = in.weights;
+  data.biases = in.biases;
+  return data;
+}
+
+MlpGathered gathered(const MlpInputs& in) {
+  return {in.order != nullptr, in.order != nullptr || in.direction_index != nullptr};
+}
+
+// Gradients of the samples' directions, rows as sorted, summed over each ray's samples in that order.
+void sum_by_ray(const MlpInputs& in, int64_t q, const float* samples, float* out) {
+  std::fill(out, out + in.r * q, 0.0f);
+  for (int64_t i = in.offsets[0]; i < in.offsets[in.k]; ++i) {
+    float* to = out + in.direction_index[in.order == nullptr ? i : in.order[i]] * q;
+    for (int64_t f = 0; f < q; ++f) to[f] += samples[i * q + f];
+  }
+}
+
+}  // namespace
+
+void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa isa, int threads) {
+  check(table, in);
+  const MlpPlanner planner(table, gathered(in), {false, false, false, use_half(table, isa)});
+  const MlpPlan& plan = planner.plan();
+  zero_strays(in, plan.out_features, out);
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kRows, kTaskUnit, 0);
+  if (tasks.tasks.empty()) return;
+  MlpData data = pointers(in);
+  data.out = out;
+  const Workspace workspace(stride(plan) * threads);
+  run_tasks(tasks, plan, data, workspace.data(), isa, threads,
+            [&](const RowTask& task, float* own) { forward(isa, plan, data, task, own); });
+}
+
+void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const MlpGradients& gradients, Isa isa,
+                              int threads) {
+  check(table, in);
+  const bool indexed = in.direction_index != nullptr;
+  const MlpWanted wanted{gradients.weights != nullptr, gradients.positions != nullptr, gradients.directions != nullptr,
+                         use_half(table, isa)};
+  const MlpPlanner planner(table, gathered(in), wanted);
+  const MlpPlan& plan = planner.plan();
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kGradientRows, kTaskUnit, plan.partial);
+  const int64_t partials = wanted.parameters ? tasks.first_partial[in.k] : 0;
+  // Gradients of the samples' directions, before they are summed over each ray's samples.
+  const bool by_ray = wanted.directions && indexed && plan.directions.used;
+  const int64_t samples = by_ray ? in.n * table.directions : 0;
+  const Workspace workspace(stride(plan) * threads + partials * plan.partial + ceil_div(samples, kGranule) * kGranule);
+  float* memory = workspace.data();
+  float* partial = memory + stride(plan) * threads;
+  float* sample_directions = partial + partials * plan.partial;
+
+  MlpData data = pointers(in);
+  data.grad_out = gradients.output;
+  data.grad_weights = gradients.weights;
+  data.grad_biases = gradients.biases;
+  data.grad_positions = gradients.positions;
+  data.grad_directions = indexed ? sample_directions : gradients.directions;
+  const auto clear = [&](float* out, int64_t width, bool used) {
+    if (used) {
+      zero_strays(in, width, out);
+    } else {
+      std::fill(out, out + in.n * width, 0.0f);
+    }
+  };
+  if (wanted.positions) clear(data.grad_positions, table.positions, plan.positions.used);
+  if (wanted.directions && !indexed) clear(data.grad_directions, table.directions, plan.directions.used);
+
+  if (!tasks.tasks.empty()) {
+    run_tasks(tasks, plan, data, memory, isa, threads, [&](const RowTask& task, float* own) {
+      float* to = task.partial < 0 ? own + plan.own_partial : partial + task.partial * plan.partial;
+      backward(isa, plan, data, task, own, to);
+      if (task.partial >= 0 || !wanted.parameters) return;
+      for (int64_t l = 0; l < plan.layer_count; ++l) reduce(isa, plan, data, task.cell, l, to, 1);
+    });
+  }
+  if (wanted.parameters) {
+    parallel_for(in.k * plan.layer_count, 1, threads, [&](int64_t item) {
+      const int64_t cell = item / plan.layer_count, l = item % plan.layer_count;
+      const int64_t first = tasks.first_partial[cell], count = tasks.partials(cell);
+      const bool empty = in.offsets[cell + 1] == in.offsets[cell];
+      if (count > 0 || empty) reduce(isa, plan, data, cell, l, partial + first * plan.partial, count);
+    });
+  }
+  if (by_ray) {
+    sum_by_ray(in, table.directions, sample_directions, gradients.directions);
+  } else if (wanted.directions && indexed) {
+    std::fill(gradients.directions, gradients.directions + in.r * table.directions, 0.0f);
+  }
+}
+
+}  // namespace voronerf

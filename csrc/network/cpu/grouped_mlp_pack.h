@@ -1,0 +1,141 @@
+// Weights of a cell in the order in which the products of grouped_mlp read them: in panels of 64 columns, so that a
+// block walks memory in a straight line.
+#pragma once
+
+#include "network/cpu/bfloat16_tile.h"
+#include "network/cpu/gemm_tile.h"
+#include "network/cpu/grouped_mlp_plan.h"
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+namespace {
+
+VN_INLINE int64_t smaller(int64_t a, int64_t b) {
+  return a < b ? a : b;
+}
+
+VN_INLINE int64_t padded_width(const MlpPlanSource& source) {
+  return (source.width + kGranule - 1) / kGranule * kGranule;
+}
+
+// Four rows of `from` become the four columns of `to`; by fours, since weights of small networks are packed often.
+VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t count, float* to, int64_t to_stride) {
+  int64_t i = 0;
+#if VN_ISA > 0
+  for (; i + 4 <= count; i += 4) {
+    __m128 a = _mm_loadu_ps(from + i), b = _mm_loadu_ps(from + from_stride + i);
+    __m128 c = _mm_loadu_ps(from + 2 * from_stride + i), d = _mm_loadu_ps(from + 3 * from_stride + i);
+    _MM_TRANSPOSE4_PS(a, b, c, d);
+    _mm_storeu_ps(to + i * to_stride, a);
+    _mm_storeu_ps(to + (i + 1) * to_stride, b);
+    _mm_storeu_ps(to + (i + 2) * to_stride, c);
+    _mm_storeu_ps(to + (i + 3) * to_stride, d);
+  }
+#endif
+  for (; i < count; ++i) {
+    for (int64_t row = 0; row < 4; ++row) to[i * to_stride + row] = from[row * from_stride + i];
+  }
+}
+
+// Weights [o][depth] -> [dots][depth], in pairs with bfloat16 operands, filled up with 0.
+[[maybe_unused]] void pack_dots(const float* weights, const MlpPlanLayer& layer, float* packed) {
+  for (int64_t o = 0; o < layer.dots; ++o, packed += layer.packed_depth) {
+    for (int64_t i = 0; i < layer.packed_depth; i += kLanes) {
+      if (o >= layer.width) {
+        store(packed + i, splat(0.0f));
+        continue;
+      }
+#if VN_HALF
+      const float* from = weights + o * layer.depth + 2 * i;
+      store(packed + i, joined(load(from), load(from + kLanes)));
+#else
+      store(packed + i, load(weights + o * layer.depth + i));
+#endif
+    }
+  }
+}
+
+#if VN_HALF
+
+// Weights [o][depth] -> panels [pairs of inputs][<= 64 of o, padded to 16 with 0]; each source starts a pair. Rows are
+// narrowed four at a time into `scratch`, then transposed, a pair being as wide as a float.
+void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed, float* scratch) {
+  const int64_t stride = layer.packed_depth + kGranule;
+  for (int64_t first = 0; first < layer.padded; first += kPanel) {
+    const int64_t columns = smaller(kPanel, layer.padded - first);
+    for (int64_t column = 0; column < columns; column += 4) {
+      for (int64_t row = 0; row < 4; ++row) {
+        const int64_t o = first + column + row;
+        float* pairs = scratch + row * stride;
+        if (o >= layer.width) {
+          for (int64_t i = 0; i < layer.packed_depth; ++i) pairs[i] = 0.0f;
+          continue;
+        }
+        for (int64_t s = 0; s < layer.source_count; ++s) {
+          const MlpPlanSource& source = layer.sources[s];
+          narrow_row(weights + o * layer.depth + source.row, source.width, pairs + source.packed_row);
+        }
+      }
+      transpose_four(scratch, stride, layer.packed_depth, packed + first * layer.packed_depth + column, columns);
+    }
+  }
+}
+
+// The inputs of one source: weights [o][depth] -> panels [pairs of o][<= 64 of its width, padded to 16 with 0].
+void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source, float* packed) {
+  const int64_t padded = padded_width(source);
+  for (int64_t first = 0; first < padded; first += kPanel) {
+    const int64_t columns = smaller(kPanel, padded - first);
+    for (int64_t o = 0; o < layer.width; o += 2, packed += columns) {
+      for (int64_t c = 0; c < columns; c += kGranule) {
+        const int64_t count = smaller(kGranule, source.width - first - c);
+        const float* from = weights + o * layer.depth + source.row + first + c;
+        const F32 even = load_some(from, count);
+        const F32 odd = o + 1 < layer.width ? load_some(from + layer.depth, count) : splat(0.0f);
+        store(packed + c, interleave(even, odd));
+      }
+    }
+  }
+}
+
+#else
+
+// weights [o][depth] -> panels [depth][<= 64 of o, padded to 16 with 0].
+void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed, float*) {
+  for (int64_t first = 0; first < layer.padded; first += kPanel) {
+    const int64_t columns = smaller(kPanel, layer.padded - first);
+    float* panel = packed + first * layer.depth;
+    for (int64_t column = 0; column < columns; column += 4) {
+      const int64_t o = first + column;
+      if (o + 4 <= layer.width) {
+        transpose_four(weights + o * layer.depth, layer.depth, layer.depth, panel + column, columns);
+        continue;
+      }
+      for (int64_t i = 0; i < layer.depth; ++i) {
+        for (int64_t c = 0; c < 4; ++c) {
+          panel[i * columns + column + c] = o + c < layer.width ? weights[(o + c) * layer.depth + i] : 0.0f;
+        }
+      }
+    }
+  }
+}
+
+// The inputs of one source: weights [o][depth] -> panels [o][<= 64 of its width, padded to 16 with 0].
+void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source, float* packed) {
+  const int64_t padded = padded_width(source);
+  for (int64_t first = 0; first < padded; first += kPanel) {
+    const int64_t columns = smaller(kPanel, padded - first), count = smaller(columns, source.width - first);
+    for (int64_t o = 0; o < layer.width; ++o) {
+      const float* from = weights + o * layer.depth + source.row + first;
+      for (int64_t c = 0; c < count; ++c) packed[c] = from[c];
+      for (int64_t c = count; c < columns; ++c) packed[c] = 0.0f;
+      packed += columns;
+    }
+  }
+}
+
+#endif
+
+}  // namespace
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf

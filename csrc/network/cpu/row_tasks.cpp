@@ -1,0 +1,79 @@
+#include "network/cpu/row_tasks.h"
+
+#include <cstdlib>
+#include <memory>
+#include <new>
+#include <stdexcept>
+
+#include "common/common.h"
+
+namespace voronerf {
+
+namespace {
+
+// Tasks to aim at.
+constexpr int64_t kTasks = 64;
+// What a thread keeps from one call to the next, in floats.
+constexpr int64_t kKeptFloats = 2 * kPartialFloats;
+constexpr int64_t kAlign = 64;
+
+struct Free {
+  void operator()(float* memory) const { std::free(memory); }
+};
+
+struct Block {
+  std::unique_ptr<float, Free> memory;
+  int64_t size = 0;
+};
+
+thread_local Block kept;
+
+}  // namespace
+
+Workspace::Workspace(int64_t floats) {
+  if (floats <= kept.size) return;
+  kept = Block{};
+  kept.memory.reset(static_cast<float*>(std::aligned_alloc(kAlign, ceil_div(floats * 4, kAlign) * kAlign)));
+  if (kept.memory == nullptr) throw std::bad_alloc();
+  kept.size = floats;
+}
+
+Workspace::~Workspace() {
+  if (kept.size > kKeptFloats) kept = Block{};
+}
+
+float* Workspace::data() const {
+  return kept.memory.get();
+}
+
+void check_offsets(const std::string& op, const int32_t* offsets, int64_t k, int64_t n) {
+  int64_t before = 0;
+  for (int64_t c = 0; c <= k; ++c) {
+    if (offsets[c] < before || offsets[c] > n) {
+      throw std::invalid_argument(op + ": offsets must rise from 0 or more to at most the number of rows, " +
+                                  std::to_string(n) + ", got " + std::to_string(offsets[c]) + " for cell " +
+                                  std::to_string(c));
+    }
+    before = offsets[c];
+  }
+}
+
+RowTasks split_rows(const int32_t* offsets, int64_t k, int64_t n, RowLimits limits, int64_t unit, int64_t partial) {
+  int64_t target = std::clamp(n / kTasks, limits.fewest, limits.most);
+  if (partial > 0) target = std::max(target, n / std::max<int64_t>(kPartialFloats / partial, 1));
+  RowTasks result;
+  result.first_partial.assign(k + 1, 0);
+  int64_t partials = 0;
+  for (int64_t c = 0; c < k; ++c) {
+    const int64_t begin = offsets[c], rows = offsets[c + 1] - begin;
+    const int64_t count = ceil_div(rows, target);
+    const int64_t size = count > 1 ? ceil_div(ceil_div(rows, count), unit) * unit : rows;
+    for (int64_t start = 0; start < rows; start += size) {
+      result.tasks.push_back({c, begin + start, begin + std::min(rows, start + size), count > 1 ? partials++ : -1});
+    }
+    result.first_partial[c + 1] = partials;
+  }
+  return result;
+}
+
+}  // namespace voronerf

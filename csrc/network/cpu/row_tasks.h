@@ -1,0 +1,76 @@
+// What the operations over rows sorted by cell share: their tasks, and the memory of a call. A task is a cell and a
+// range of its rows. Which tasks there are depends on the sizes alone, and partial weight gradients are summed in the
+// order of the rows, so results do not depend on the number of threads or on which thread took what.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <string>
+#include <vector>
+
+#include "common/parallel.h"
+
+namespace voronerf {
+
+struct RowTask {
+  int64_t cell, begin, end;
+  int64_t partial;  // index of its partial; -1: the cell's only task
+};
+
+struct RowTasks {
+  std::vector<RowTask> tasks;
+  std::vector<int64_t> first_partial;  // [k+1] for each cell
+
+  int64_t partials(int64_t cell) const { return first_partial[cell + 1] - first_partial[cell]; }
+};
+
+// Rows of a task: at least enough to pay for packing the weights, at most so few that all threads are busy to the end.
+struct RowLimits {
+  int64_t fewest, most;
+};
+// Partial weight gradients of one call, in floats: wide networks get longer tasks instead of more memory.
+constexpr int64_t kPartialFloats = int64_t{1} << 24;
+
+// Throws std::invalid_argument unless offsets [k+1] rise from 0 or more to at most n.
+void check_offsets(const std::string& op, const int32_t* offsets, int64_t k, int64_t n);
+
+// Tasks of n rows; those of a cell that is cut are whole multiples of `unit`, but for its last. `partial`, the floats
+// of one partial, bounds how many there are; 0 for a call that has none.
+RowTasks split_rows(const int32_t* offsets, int64_t k, int64_t n, RowLimits limits, int64_t unit, int64_t partial);
+
+// Memory for one call, aligned to a cache line. It belongs to the calling thread and is kept from one call to the next
+// until the thread ends, since a fresh page costs a microsecond at its first touch; a block larger than the partials of
+// a wide network and as much again goes back at the end of the call.
+class Workspace {
+ public:
+  explicit Workspace(int64_t floats);
+  ~Workspace();
+  Workspace(const Workspace&) = delete;
+  Workspace& operator=(const Workspace&) = delete;
+  float* data() const;
+};
+
+// What a thread does with its tasks: pack(cell, own, first) where a task's cell is not that of its last one (first:
+// there was none), ahead(cell) for the cell that is most likely its next, run(task, own). `own` is the thread's part of
+// `memory`, `stride` floats.
+template <typename Pack, typename Ahead, typename Run>
+void for_each_task(const RowTasks& tasks, float* memory, int64_t stride, int threads, const Pack& pack,
+                   const Ahead& ahead, const Run& run) {
+  const int64_t count = static_cast<int64_t>(tasks.tasks.size());
+  Items items(count);
+  parallel(static_cast<int>(std::min<int64_t>(threads, count)), [&](int thread) {
+    float* own = memory + thread * stride;
+    int64_t packed = -1;
+    for (int64_t i, end; items.take(i, end);) {
+      const RowTask& task = tasks.tasks[i];
+      if (task.cell != packed) pack(task.cell, own, packed < 0);
+      packed = task.cell;
+      // The other threads take as many tasks in the same time.
+      const int64_t next = i + threads;
+      if (next < count && tasks.tasks[next].cell != packed) ahead(tasks.tasks[next].cell);
+      run(task, own);
+    }
+  });
+}
+
+}  // namespace voronerf

@@ -1,0 +1,55 @@
+// Launchers of grouped_mlp on CUDA; contracts as in grouped_mlp.h. Offsets that fall or exceed n cannot be refused
+// without a host read: rows outside are not touched.
+#pragma once
+
+#include "network/cuda/grouped_mlp_cuda_plan.h"
+
+namespace voronerf {
+
+// Pointers of one call, all on the device; the kernels take it by value.
+struct MlpCudaData {
+  const float *positions, *directions;
+  const int32_t *direction_index, *order, *offsets;
+  int64_t n, k;
+  unsigned char* packed;   // in the workspace
+  int32_t* first_task;     // in the workspace, [k+1]
+  float* partials;         // in the workspace, null without gradients of parameters
+  float* out;              // forward
+  const float* grad_out;   // backward
+  float* grad_positions;   // null: not wanted
+  float* grad_directions;  // one row a sample, null: not wanted
+};
+
+struct MlpCudaParameters {
+  const float *weights[kMlpCudaLayers], *biases[kMlpCudaLayers];
+};
+
+struct MlpCudaParameterGradients {
+  float *weights[kMlpCudaLayers], *biases[kMlpCudaLayers];
+};
+
+// Threads of a block of a kernel with blocks for each cell and layer, and how many blocks each of those should have:
+// few cells need several.
+constexpr int kMlpLayerThreads = 256;
+unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements);
+
+// Properties of the current device.
+MlpCudaDevice mlp_cuda_device();
+
+void grouped_mlp_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
+                      unsigned char* workspace, void* stream);
+
+// gradients: null without those of parameters.
+void grouped_mlp_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
+                               const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream);
+
+// Steps around the kernel of rows: weights packed and tasks mapped before it, rows of no cell cleared, partials summed.
+void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t tasks, void* stream);
+void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
+                      void* stream);
+void mlp_cuda_zero_strays(const MlpCudaData& data, int width, float* rows, void* stream);
+void mlp_cuda_clear_gradient(const MlpCudaData& data, bool used, int width, float* gradient, void* stream);
+void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameterGradients& gradients,
+                     void* stream);
+
+}  // namespace voronerf

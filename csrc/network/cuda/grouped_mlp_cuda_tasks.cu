@@ -1,0 +1,180 @@
+// What grouped_mlp does before and after its rows on CUDA: every cell's weights are rounded and packed as the kernels
+// want them in shared memory, so that loading them there is one straight copy; the tasks of all cells are numbered, so
+// that a block finds its rows without the host having read the offsets; rows of no cell are cleared; and the partial
+// weight gradients of a cell's tasks are summed in their order, which makes them the same every time.
+#include <algorithm>
+
+#include "network/cuda/grouped_mlp_cuda_tasks.h"
+#include "network/cuda/grouped_mlp_cuda_tile.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kThreads = kMlpLayerThreads;
+constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels with blocks for each cell
+
+// Grid (k, layers, blocks of a layer).
+template <typename Products>
+__global__ void __launch_bounds__(kThreads)
+    mlp_pack_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameters parameters) {
+  using Element = typename Products::Element;
+  const int64_t cell = blockIdx.x;
+  const MlpCudaLayer& layer = plan.layers[blockIdx.y];
+  unsigned char* packed = data.packed + cell * plan.packed_bytes;
+  Element* to = reinterpret_cast<Element*>(packed) + layer.weight;
+  float* biases = reinterpret_cast<float*>(packed + sizeof(Element) * plan.packed_weights) + layer.bias;
+  const float* weight = parameters.weights[blockIdx.y] + cell * layer.width * layer.inputs;
+  const float* bias = parameters.biases[blockIdx.y];
+  const int pairs = layer.weight_stride / 2;
+  const int thread = blockIdx.z * kThreads + threadIdx.x, step = gridDim.z * kThreads;
+  for (int i = thread; i < layer.padded * pairs; i += step) {
+    const int row = i / pairs, column = 2 * (i - row * pairs);
+    float values[2] = {0.0f, 0.0f};
+    for (int s = 0; s < layer.source_count; ++s) {
+      const MlpCudaSource& source = layer.sources[s];
+      for (int part = 0; part < 2; ++part) {
+        const int feature = column + part - source.packed;
+        if (row < layer.width && feature >= 0 && feature < source.width) {
+          values[part] = weight[row * layer.inputs + source.column + feature];
+        }
+      }
+    }
+    Products::store(to + row * layer.weight_stride + column, values[0], values[1]);
+  }
+  for (int i = thread; i < layer.padded; i += step) {
+    biases[i] = bias == nullptr || i >= layer.width ? 0.0f : bias[cell * layer.width + i];
+  }
+}
+
+// One block.
+__global__ void __launch_bounds__(kScanThreads)
+    mlp_tasks_kernel(const MlpCudaData data, int64_t task_rows, int64_t tasks) {
+  number_tasks(data.k, tasks, data.first_task,
+               [&](int64_t cell) { return static_cast<int32_t>(ceil_div(mlp_cell_rows(data, cell), task_rows)); });
+}
+
+__global__ void __launch_bounds__(kThreads) mlp_strays_kernel(const MlpCudaData data, int width, float* rows) {
+  const int64_t first = data.offsets[0], last = data.offsets[data.k];
+  const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads;
+  for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < data.n; i += step) {
+    if (i >= first && i < last) continue;
+    const int64_t row = mlp_source_row(data, i);
+    for (int column = 0; column < width; ++column) rows[row * width + column] = 0.0f;
+  }
+}
+
+// Grid (k, layers, blocks of a layer).
+__global__ void __launch_bounds__(kThreads)
+    mlp_reduce_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameterGradients gradients) {
+  const int64_t cell = blockIdx.x;
+  const MlpCudaLayer& layer = plan.layers[blockIdx.y];
+  const int64_t first = data.first_task[cell], last = layer.live ? data.first_task[cell + 1] : first;
+  const auto sum = [&](int at) {
+    float total = 0.0f;
+    for (int64_t task = first; task < last; ++task) total += data.partials[task * plan.partial + at];
+    return total;
+  };
+  const int thread = blockIdx.z * kThreads + threadIdx.x, step = gridDim.z * kThreads;
+  float* weights = gradients.weights[blockIdx.y];
+  float* biases = gradients.biases[blockIdx.y];
+  for (int s = 0; s < layer.source_count; ++s) {
+    const MlpCudaSource& source = layer.sources[s];
+    for (int i = thread; i < layer.width * source.width; i += step) {
+      const int row = i / source.width, feature = i - row * source.width;
+      weights[(cell * layer.width + row) * layer.inputs + source.column + feature] =
+          sum(layer.partial + row * layer.partial_stride + source.packed + feature);
+    }
+  }
+  for (int i = thread; biases != nullptr && i < layer.width; i += step) {
+    biases[cell * layer.width + i] = sum(layer.partial_bias + i);
+  }
+}
+
+template <typename Products>
+void pack(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters, void* stream) {
+  int64_t pairs = 1;
+  for (int l = 0; l < plan.layer_count; ++l) {
+    pairs = std::max(pairs, int64_t{plan.layers[l].padded} * plan.layers[l].weight_stride / 2);
+  }
+  VN_LAUNCH(
+      (mlp_pack_kernel<Products>),
+      dim3(static_cast<unsigned>(data.k), plan.layer_count, mlp_cuda_layer_blocks(data.k, plan.layer_count, pairs)),
+      kThreads, 0, stream, plan, data, parameters);
+}
+
+}  // namespace
+
+unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements) {
+  const int64_t blocks = kBlocksPerMultiprocessor * mlp_cuda_device().multiprocessors;
+  const int64_t wanted = ceil_div(blocks, std::max<int64_t>(1, k * layers));
+  const int64_t useful = ceil_div(elements, int64_t{kThreads});
+  return static_cast<unsigned>(wanted < useful ? wanted : useful);
+}
+
+MlpCudaDevice mlp_cuda_device() {
+  int device = 0, major = 0, minor = 0;
+  int cache = 0;
+  MlpCudaDevice found{};
+  VN_CUDA_CHECK(cudaGetDevice(&device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&minor, cudaDevAttrComputeCapabilityMinor, device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.multiprocessors, cudaDevAttrMultiProcessorCount, device));
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&cache, cudaDevAttrL2CacheSize, device));
+  // Code for a lower architecture than the device's chooses its instructions by that.
+  cudaFuncAttributes compiled{};
+  VN_CUDA_CHECK(cudaFuncGetAttributes(&compiled, mlp_tasks_kernel));
+  found.capability = std::min(10 * major + minor, compiled.ptxVersion);
+  found.cache_bytes = cache;
+  return found;
+}
+
+void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t tasks, void* stream) {
+  VN_LAUNCH(mlp_tasks_kernel, 1, kScanThreads, 0, stream, data, task_rows, tasks);
+}
+
+void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
+                      void* stream) {
+  mlp_cuda_number_tasks(data, plan.task_rows, plan.tasks, stream);
+  switch (plan.precision) {
+    case MlpPrecision::bfloat16:
+      return pack<HalfProducts<true>>(plan, data, parameters, stream);
+    case MlpPrecision::float16:
+      return pack<HalfProducts<false>>(plan, data, parameters, stream);
+    case MlpPrecision::tf32:
+      return pack<FloatProducts<true>>(plan, data, parameters, stream);
+    case MlpPrecision::float32:
+      return pack<FloatProducts<false>>(plan, data, parameters, stream);
+  }
+}
+
+void mlp_cuda_zero_strays(const MlpCudaData& data, int width, float* rows, void* stream) {
+  if (data.n == 0 || rows == nullptr) return;
+  const int64_t blocks = ceil_div<int64_t>(data.n, kThreads);
+  VN_LAUNCH(mlp_strays_kernel, static_cast<unsigned>(blocks < 1024 ? blocks : 1024), kThreads, 0, stream, data, width,
+            rows);
+}
+
+// Rows of no cell, and inputs that nothing reads, have no gradient.
+void mlp_cuda_clear_gradient(const MlpCudaData& data, bool used, int width, float* gradient, void* stream) {
+  if (gradient == nullptr || data.n == 0) return;
+  if (used) return mlp_cuda_zero_strays(data, width, gradient, stream);
+  VN_CUDA_CHECK(cudaMemsetAsync(gradient, 0, sizeof(float) * data.n * width, static_cast<cudaStream_t>(stream)));
+}
+
+void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameterGradients& gradients,
+                     void* stream) {
+  int64_t weights = 1;
+  for (int l = 0; l < plan.layer_count; ++l) {
+    for (int s = 0; s < plan.layers[l].source_count; ++s) {
+      weights = std::max(weights, int64_t{plan.layers[l].width} * plan.layers[l].sources[s].width);
+    }
+  }
+  VN_LAUNCH(
+      mlp_reduce_kernel,
+      dim3(static_cast<unsigned>(data.k), plan.layer_count, mlp_cuda_layer_blocks(data.k, plan.layer_count, weights)),
+      kThreads, 0, stream, plan, data, gradients);
+}
+
+}  // namespace voronerf

@@ -1,0 +1,96 @@
+// Rays over threads: each is summed by one thread in the order of its samples, and the gradient of a background that
+// all share on a single one, so results do not depend on their number.
+#include "rays/composite.h"
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+#include "common/parallel.h"
+#include "rays/composite_isa.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kRays = 32;  // of a task
+
+void ray_forward(Isa isa, const CompositeInputs& in, const CompositeOutputs& out, int64_t ray, int64_t begin,
+                 int64_t end) {
+  VN_FOR_ISA(isa, composite_ray(in, out, ray, begin, end))
+}
+
+void ray_backward(Isa isa, const CompositeInputs& in, const CompositeGradients& gradients, int64_t ray, int64_t begin,
+                  int64_t end) {
+  VN_FOR_ISA(isa, composite_ray_backward(in, gradients, ray, begin, end))
+}
+
+void check(const CompositeInputs& in) {
+  if (in.offsets == nullptr) return;
+  int64_t before = 0;
+  for (int64_t i = 0; i <= in.r; ++i) {
+    if (in.offsets[i] < before || in.offsets[i] > in.m) {
+      throw std::invalid_argument("composite: ray_offsets must rise from 0 or more to at most the number of samples, " +
+                                  std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " +
+                                  std::to_string(i));
+    }
+    before = in.offsets[i];
+  }
+}
+
+int64_t first_sample(const CompositeInputs& in, int64_t ray) {
+  return in.offsets == nullptr ? ray * in.s : in.offsets[ray];
+}
+
+template <typename Run>
+void for_each_ray(const CompositeInputs& in, int threads, const Run& run) {
+  parallel_for(in.r, kRays, threads, [&](int64_t ray) { run(ray, first_sample(in, ray), first_sample(in, ray + 1)); });
+}
+
+// Samples of no ray.
+void zero_strays(const CompositeInputs& in, int64_t width, float* values) {
+  if (in.offsets == nullptr || values == nullptr) return;
+  std::fill(values, values + in.offsets[0] * width, 0.0f);
+  std::fill(values + in.offsets[in.r] * width, values + in.m * width, 0.0f);
+}
+
+// The background is seen with the weight that the samples of a ray leave.
+void background_backward(const CompositeInputs& in, const CompositeGradients& gradients) {
+  if (gradients.background == nullptr) return;
+  if (gradients.colour == nullptr) {
+    std::fill_n(gradients.background, in.background_per_ray ? in.r * in.c : in.c, 0.0f);
+  } else if (in.background_per_ray) {
+    for (int64_t i = 0; i < in.r * in.c; ++i) {
+      gradients.background[i] = gradients.left[i / in.c] * gradients.colour[i];
+    }
+  } else {
+    for (int64_t k = 0; k < in.c; ++k) {
+      double sum = 0.0;
+      for (int64_t ray = 0; ray < in.r; ++ray) {
+        sum += static_cast<double>(gradients.left[ray]) * gradients.colour[ray * in.c + k];
+      }
+      gradients.background[k] = static_cast<float>(sum);
+    }
+  }
+}
+
+}  // namespace
+
+void composite_cpu(const CompositeInputs& in, const CompositeOutputs& out, Isa isa, int threads) {
+  check(in);
+  zero_strays(in, 1, out.weights);
+  for_each_ray(in, threads,
+               [&](int64_t ray, int64_t begin, int64_t end) { ray_forward(isa, in, out, ray, begin, end); });
+}
+
+void composite_backward_cpu(const CompositeInputs& in, const CompositeGradients& gradients, Isa isa, int threads) {
+  check(in);
+  float* const of_samples[] = {gradients.sigma, gradients.depths, gradients.deltas};
+  for (float* values : of_samples) zero_strays(in, 1, values);
+  zero_strays(in, in.c, gradients.rgb);
+  for_each_ray(in, threads,
+               [&](int64_t ray, int64_t begin, int64_t end) { ray_backward(isa, in, gradients, ray, begin, end); });
+  background_backward(in, gradients);
+}
+
+}  // namespace voronerf

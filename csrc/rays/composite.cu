@@ -1,0 +1,259 @@
+// Volume rendering on CUDA, a warp a ray and 32 samples at a time: optical depths are scanned across the lanes, and
+// what the chunks before hold is carried in two floats, so that a ray of many samples keeps its digits without float64,
+// which most GPUs have little of. The formulas are those of composite_isa.cpp; like there, the backward pass goes along
+// the ray once, leaving the optical depth in front of each sample where the gradient of sigma is to be, and comes back
+// with the sum of what is behind.
+#include "bindings/launchers.h"
+#include "common/cuda_wrappers.h"
+#include "rays/composite.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kThreads = 128;
+constexpr int kWarps = kThreads / 32;
+constexpr int kChannels = 4;      // summed in one walk along the ray
+constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
+
+// A NaN stays one.
+__device__ float finite_density(float sigma) {
+  return sigma > kOpaque ? kOpaque : sigma;
+}
+
+// A sum in two floats.
+struct Carry {
+  float high = 0.0f, low = 0.0f;
+
+  __device__ float plus(float x) const { return high + (low + x); }
+  __device__ void add(float x) {
+    const float sum = high + x, part = sum - high;
+    const float lost = (high - (sum - part)) + (x - part);
+    high = sum;
+    // What is infinite or no number has no digits to lose.
+    if (lost == lost && fabsf(lost) < INFINITY) low += lost;
+  }
+};
+
+__device__ float sum_of_lanes(float x) {
+  for (int step = 16; step > 0; step /= 2) x += __shfl_xor_sync(kAllLanes, x, step);
+  return x;
+}
+
+// Sum over this lane and those before it (after it, backwards).
+__device__ float running_sum(float x, int lane) {
+  for (int step = 1; step < 32; step *= 2) {
+    const float other = __shfl_up_sync(kAllLanes, x, step);
+    if (lane >= step) x += other;
+  }
+  return x;
+}
+
+__device__ float running_sum_back(float x, int lane) {
+  for (int step = 1; step < 32; step *= 2) {
+    const float other = __shfl_down_sync(kAllLanes, x, step);
+    if (lane + step < 32) x += other;
+  }
+  return x;
+}
+
+struct Range {
+  int64_t begin, end;
+};
+
+// Samples of a ray. Offsets that fall or exceed m cannot be refused without a host read: nothing outside is touched.
+__device__ Range samples_of(const CompositeInputs& in, int64_t ray) {
+  if (in.offsets == nullptr) return {ray * in.s, (ray + 1) * in.s};
+  const int64_t first = in.offsets[ray], last = in.offsets[ray + 1];
+  const int64_t begin = first < 0 ? 0 : first > in.m ? in.m : first;
+  return {begin, last < begin ? begin : last > in.m ? in.m : last};
+}
+
+__device__ const float* background_of(const CompositeInputs& in, int64_t ray) {
+  return in.background == nullptr || !in.background_per_ray ? in.background : in.background + ray * in.c;
+}
+
+// Optical depth in front of each lane's sample; the carry moves to the end of the chunk.
+__device__ float depth_in_front(float optical, int lane, Carry& carry) {
+  const float through = running_sum(optical, lane);
+  float before = __shfl_up_sync(kAllLanes, through, 1);
+  if (lane == 0) before = 0.0f;
+  const float front = carry.plus(before);
+  carry.add(__shfl_sync(kAllLanes, through, 31));
+  return front;
+}
+
+__global__ void __launch_bounds__(kThreads) composite_kernel(CompositeInputs in, CompositeOutputs out) {
+  const int lane = threadIdx.x % 32;
+  const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
+  if (ray >= in.r) return;  // a whole warp
+  const Range range = samples_of(in, ray);
+  const float* background = background_of(in, ray);
+  float opacity = 0.0f, depth = 0.0f, left = 0.0f;
+  int64_t channel = 0;
+  do {  // four channels a walk; those after the first read the weights back
+    const int channels = static_cast<int>(in.c - channel < kChannels ? in.c - channel : kChannels);
+    float colour[kChannels] = {};
+    Carry carry;
+    for (int64_t start = range.begin; start < range.end; start += 32) {
+      const int64_t i = start + lane;
+      const bool active = i < range.end;
+      float weight = 0.0f;
+      if (channel == 0) {
+        const float optical = active ? finite_density(in.sigma[i]) * in.deltas[i] : 0.0f;
+        const float front = depth_in_front(optical, lane, carry);
+        weight = expf(-front) * -expm1f(-optical);
+        if (active) {
+          out.weights[i] = weight;
+          opacity += weight;
+          depth = fmaf(weight, in.depths[i], depth);
+        }
+      } else if (active) {
+        weight = out.weights[i];  // written by this very thread
+      }
+      for (int k = 0; k < kChannels; ++k) {
+        if (active && k < channels) colour[k] = fmaf(weight, in.rgb[i * in.c + channel + k], colour[k]);
+      }
+    }
+    if (channel == 0) left = expf(-carry.plus(0.0f));
+    for (int k = 0; k < kChannels; ++k) {
+      const float sum = sum_of_lanes(colour[k]);
+      if (lane == 0 && k < channels) {
+        out.colour[ray * in.c + channel + k] = background == nullptr ? sum : fmaf(left, background[channel + k], sum);
+      }
+    }
+    channel += kChannels;
+  } while (channel < in.c);
+  opacity = sum_of_lanes(opacity);
+  depth = sum_of_lanes(depth);
+  if (lane == 0) {
+    out.opacity[ray] = opacity;
+    out.depth[ray] = depth;
+  }
+}
+
+__global__ void __launch_bounds__(kThreads) composite_backward_kernel(CompositeInputs in, CompositeGradients g) {
+  const int lane = threadIdx.x % 32;
+  const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
+  if (ray >= in.r) return;  // a whole warp
+  const Range range = samples_of(in, ray);
+  const float* colour = g.colour == nullptr ? nullptr : g.colour + ray * in.c;
+  const float of_depth = g.depth == nullptr ? 0.0f : g.depth[ray];
+  const float of_opacity = g.opacity == nullptr ? 0.0f : g.opacity[ray];
+
+  Carry carry;
+  for (int64_t start = range.begin; start < range.end; start += 32) {
+    const int64_t i = start + lane;
+    const bool active = i < range.end;
+    const float optical = active ? finite_density(in.sigma[i]) * in.deltas[i] : 0.0f;
+    const float front = depth_in_front(optical, lane, carry);
+    if (active) g.sigma[i] = front;  // read again below, by this very thread
+  }
+  Carry behind;
+  const float* background = background_of(in, ray);
+  if (background != nullptr) {
+    const float left = expf(-carry.plus(0.0f));
+    if (lane == 0) g.left[ray] = left;
+    for (int64_t k = 0; colour != nullptr && k < in.c; ++k) behind.add(colour[k] * background[k] * left);
+  }
+  const int64_t chunks = ceil_div<int64_t>(range.end - range.begin, 32);
+  for (int64_t chunk = chunks; chunk-- > 0;) {
+    const int64_t i = range.begin + 32 * chunk + lane;
+    const bool active = i < range.end;
+    const float sigma = active ? in.sigma[i] : 0.0f, delta = active ? in.deltas[i] : 0.0f;
+    const float density = finite_density(sigma), optical = density * delta;
+    const float light = active ? expf(-g.sigma[i]) : 0.0f;
+    const float weight = light * -expm1f(-optical);
+    float own = of_opacity;
+    if (active) {
+      if (g.weights != nullptr) own += g.weights[i];
+      own = fmaf(of_depth, in.depths[i], own);
+      for (int64_t k = 0; colour != nullptr && k < in.c; ++k) own = fmaf(colour[k], in.rgb[i * in.c + k], own);
+    }
+    const float share = active ? own * weight : 0.0f;
+    const float rest = running_sum_back(share, lane);
+    float after = __shfl_down_sync(kAllLanes, rest, 1);
+    if (lane == 31) after = 0.0f;
+    const float of_optical = own * (light * expf(-optical)) - behind.plus(after);
+    behind.add(__shfl_sync(kAllLanes, rest, 0));
+    if (!active) continue;
+    g.sigma[i] = sigma <= kOpaque ? of_optical * delta : 0.0f;
+    if (g.deltas != nullptr) g.deltas[i] = of_optical * density;
+    if (g.depths != nullptr) g.depths[i] = of_depth * weight;
+    for (int64_t k = 0; g.rgb != nullptr && k < in.c; ++k) {
+      g.rgb[i * in.c + k] = colour == nullptr ? 0.0f : weight * colour[k];
+    }
+  }
+}
+
+// Samples of no ray weigh nothing: [0, offsets[0]) and [offsets[r], m).
+__global__ void __launch_bounds__(kThreads)
+    composite_strays(const int32_t* __restrict__ offsets, int64_t r, int64_t m, int64_t width, float* values) {
+  const int64_t first = offsets[0], last = offsets[r];
+  const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads;
+  for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < m; i += step) {
+    if (i >= first && i < last) continue;
+    for (int64_t k = 0; k < width; ++k) values[i * width + k] = 0.0f;
+  }
+}
+
+// The background is seen with the weight that the samples of a ray leave. A block a channel of a background that all
+// rays share, summed in an order that does not depend on the device.
+__global__ void __launch_bounds__(kThreads)
+    composite_shared_background(const float* __restrict__ left, const float* __restrict__ colour,
+                                float* __restrict__ background, int64_t r, int64_t c) {
+  VN_SHARED(sums, double[kThreads]);
+  const int64_t k = blockIdx.x;
+  double sum = 0.0;
+  for (int64_t ray = threadIdx.x; colour != nullptr && ray < r; ray += kThreads) {
+    sum += static_cast<double>(left[ray]) * static_cast<double>(colour[ray * c + k]);
+  }
+  sums[threadIdx.x] = sum;
+  for (unsigned half = kThreads / 2; half > 0; half /= 2) {
+    __syncthreads();
+    if (threadIdx.x < half) sums[threadIdx.x] += sums[threadIdx.x + half];
+  }
+  if (threadIdx.x == 0) background[k] = static_cast<float>(sums[0]);
+}
+
+__global__ void __launch_bounds__(kThreads)
+    composite_own_background(const float* __restrict__ left, const float* __restrict__ colour,
+                             float* __restrict__ background, int64_t r, int64_t c) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < r * c) background[i] = colour == nullptr ? 0.0f : left[i / c] * colour[i];
+}
+
+void zero_strays(const CompositeInputs& in, int64_t width, float* values, void* stream) {
+  if (in.offsets == nullptr || values == nullptr || in.m * width == 0) return;
+  const int64_t blocks = ceil_div<int64_t>(in.m, kThreads);
+  VN_LAUNCH(composite_strays, static_cast<unsigned>(blocks < 1024 ? blocks : 1024), kThreads, 0, stream, in.offsets,
+            in.r, in.m, width, values);
+}
+
+unsigned blocks_of_rays(int64_t r) {
+  return static_cast<unsigned>(ceil_div<int64_t>(r, kWarps));
+}
+
+}  // namespace
+
+void composite_cuda(const CompositeInputs& in, const CompositeOutputs& out, void* stream) {
+  zero_strays(in, 1, out.weights, stream);
+  if (in.r > 0) VN_LAUNCH(composite_kernel, blocks_of_rays(in.r), kThreads, 0, stream, in, out);
+}
+
+void composite_backward_cuda(const CompositeInputs& in, const CompositeGradients& gradients, void* stream) {
+  float* const of_samples[] = {gradients.sigma, gradients.depths, gradients.deltas};
+  for (float* values : of_samples) zero_strays(in, 1, values, stream);
+  zero_strays(in, in.c, gradients.rgb, stream);
+  if (in.r > 0) VN_LAUNCH(composite_backward_kernel, blocks_of_rays(in.r), kThreads, 0, stream, in, gradients);
+  if (gradients.background == nullptr || in.c == 0) return;
+  if (!in.background_per_ray) {
+    VN_LAUNCH(composite_shared_background, static_cast<unsigned>(in.c), kThreads, 0, stream, gradients.left,
+              gradients.colour, gradients.background, in.r, in.c);
+  } else if (in.r > 0) {
+    VN_LAUNCH(composite_own_background, static_cast<unsigned>(ceil_div<int64_t>(in.r * in.c, kThreads)), kThreads, 0,
+              stream, gradients.left, gradients.colour, gradients.background, in.r, in.c);
+  }
+}
+
+}  // namespace voronerf

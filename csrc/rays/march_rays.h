@@ -1,0 +1,43 @@
+// Samples of rays in the occupied cells of a grid: r rays, s strata each, m samples that are kept. What it computes is
+// said in voronerf/ops/march_rays.py, operation by operation in voronerf/reference/march_rays.py.
+//
+// Two calls, since the number of samples is known after the first: it leaves a bit for every stratum that is kept,
+// which the second reads instead of looking at the grid again.
+#pragma once
+
+#include <cstdint>
+
+#include "common/isa.h"
+
+namespace voronerf {
+
+struct MarchInputs {
+  const float *origins, *directions;  // [r,3]
+  const float *near, *far;            // [r]
+  const uint8_t* occupied;            // [x,y,z], 0 or 1
+  const float* box;                   // [2,3]
+  const float* uniforms;              // [r,s], or null for the middles
+  const int32_t* start;               // [r], or null for 0
+  int64_t r, s;
+  int64_t size[3];
+  bool disparity;
+  int64_t most;  // samples of a ray
+};
+
+// Strata of a word of the mask.
+constexpr int64_t kMarchWord = 32;
+
+static inline int64_t march_words(int64_t s) {
+  return (s + kMarchWord - 1) / kMarchWord;
+}
+
+// mask: [r, march_words(s)], bit i of word w for stratum 32 w + i. offsets: [r+1], none above capacity.
+void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, Isa isa,
+                          int threads);
+
+// rows: length of ray_index, depths, deltas and positions [rows,3], at least offsets[r]; what is beyond that becomes 0.
+void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,
+                         int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
+                         int threads);
+
+}  // namespace voronerf

@@ -1,0 +1,428 @@
+"""What the scripts under benchmarks/ share, and that the throughput table compares like with like."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import voronerf
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+CPU = torch.device("cpu")
+OPS = {
+    "nearest_centre",
+    "locate_cell",
+    "draw_cell",
+    "cell_sort",
+    "grouped_linear",
+    "grouped_mlp",
+    "frequency_encode",
+    "integrated_encode",
+    "composite",
+    "resample",
+    "routed_mlp",
+}
+NOT_DIFFERENTIABLE = {"march_rays", "update_occupancy", "camera_rays", "balance_centres", "select_heaviest"}
+OPS |= NOT_DIFFERENTIABLE
+COLUMNS = [
+    *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "median_ms", "iqr_ms", "throughput", "unit"),
+    *("percent_of_peak", "alternatives", "speedup_over_best", "max_error"),
+]
+
+
+def test_metadata_says_what_was_measured_where() -> None:
+    harness = runpy.run_path(str(BENCHMARKS / "harness.py"))
+    metadata = json.loads(json.dumps(harness["metadata"](benchmark="balance", seeds=3)))
+    assert (metadata["benchmark"], metadata["seeds"]) == ("balance", 3)
+    assert (metadata["voronerf"], metadata["torch"]) == (voronerf.__version__, torch.__version__)
+    assert metadata["threads"] == torch.get_num_threads() and metadata["machine"] and metadata["python"]
+    assert "available" in metadata["native"]
+
+
+@pytest.mark.parametrize("name", ["Makefile", "README.md", "CONTRIBUTING.md", "docs/performance.md"])
+def test_scripts_that_are_named_are_there(name: str) -> None:
+    path = BENCHMARKS.parent / name
+    for script in re.findall(r"benchmarks/\w+\.py", path.read_text()):
+        assert (BENCHMARKS.parent / script).is_file(), f"{name} names {script}"
+
+
+def test_balance_runs_as_a_script(tmp_path: Path) -> None:
+    path = tmp_path / "results" / "balance.json"
+    arguments = ["--cells", "4", "--seeds", "1", "--count", "300", "--json", str(path)]
+    command = [sys.executable, str(BENCHMARKS / "balance.py"), *arguments, "--methods", "published"]
+    subprocess.run(command, check=True, capture_output=True)
+    outcome = json.loads(path.read_text())
+    assert outcome["metadata"]["benchmark"] == "balance" and outcome["metadata"]["count"] == 300
+    (row,) = outcome["results"]
+    assert row["after"] < row["before"]
+
+
+# --- timing ---------------------------------------------------------------------------------------------------------
+
+
+def test_contenders_take_turns_and_slow_ones_are_capped(load: Callable[[str], Any]) -> None:
+    harness, cost, turns = load("harness"), {"fast": 0.25, "middle": 0.5, "slow": 2.5, "slowest": 2.5}, []
+
+    def stopwatch(run: Callable[[int], Any], first: int, count: int) -> float:
+        assert count == 1
+        run(first)
+        return cost[turns[-1][0]]
+
+    runs = {name: (lambda call, name=name: turns.append((name, call))) for name in cost}
+    timings = harness.measure(runs, dict.fromkeys(cost, 1.0), stopwatch, {"slowest": 99.0})
+    counts = {name: len(timing.seconds) for name, timing in timings.items()}
+    assert counts == {"fast": 4, "middle": 3, "slow": 1, "slowest": 1}
+    assert [name for name, timing in timings.items() if timing.capped] == ["slow", "slowest"]
+    assert timings["slowest"].seconds == [99.0] and all(name != "slowest" for name, _ in turns)
+    assert [name for name, _ in turns[3:7]] == ["fast", "middle", "fast", "middle"]
+    numbers = [call for name, call in turns if name == "fast"]
+    assert numbers == sorted(set(numbers)) and 0 not in numbers, "a timed call must not see the inputs before it"
+
+
+def test_short_calls_are_timed_in_batches_behind_an_untimed_one(load: Callable[[str], Any]) -> None:
+    harness, calls = load("harness"), []
+
+    def stopwatch(run: Callable[[int], Any], first: int, count: int) -> float:
+        for call in range(first, first + count):
+            run(call)
+        return 1e-3 * count
+
+    timing = harness.measure({"short": calls.append}, {"short": 0.015}, stopwatch)["short"]
+    assert timing.seconds == pytest.approx([1e-3] * 3) and not timing.capped
+    assert len(calls) == 1 + 3 * (1 + 5)
+    assert timing.median_ms == pytest.approx(1.0) and timing.iqr_ms == pytest.approx(0.0)
+
+
+@pytest.mark.skipif(not Path("/proc/stat").is_file(), reason="the kernel's counters are Linux's")
+def test_other_processes_are_noticed(load: Callable[[str], Any]) -> None:
+    import time
+
+    others = load("harness").Others()
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
+        deadline, most = time.monotonic() + 60, 0.0
+        while most <= 0.3 and time.monotonic() < deadline:
+            time.sleep(0.5)
+            most = max(most, others.cores() or 0.0)
+        process.kill()
+    assert most > 0.3
+
+
+def test_quartiles(load: Callable[[str], Any]) -> None:
+    timing = load("harness").Timing([0.001, 0.002, 0.003, 0.004, 0.1])
+    assert timing.median_ms == pytest.approx(3) and timing.iqr_ms == pytest.approx(2)
+    assert load("harness").Timing([0.5]).iqr_ms is None
+
+
+@pytest.mark.native
+def test_instruction_set_is_forced_and_put_back(load: Callable[[str], Any]) -> None:
+    from voronerf import native as _native
+
+    harness, before = load("harness"), _native._ISA
+    with harness.instruction_set("portable"):
+        assert _native._ISA == 0
+    assert before == _native._ISA
+    with pytest.raises(ValueError, match="no sse9"), harness.instruction_set("sse9"):
+        pass
+
+
+# --- the table ------------------------------------------------------------------------------------------------------
+
+
+def test_every_operation_has_rows_in_both_modes(load: Callable[[str], Any]) -> None:
+    throughput = load("throughput")
+    for arguments in ([], ["--quick"]):
+        cases = throughput.chosen_cases(throughput.parse(arguments))
+        assert {case.op for case in cases} == OPS
+        keys = [case.key for case in cases]
+        assert len(set(keys)) == len(keys)
+    both = {(case.op, case.direction) for case in throughput.chosen_cases(throughput.parse([]))}
+    differentiable = OPS - NOT_DIFFERENTIABLE - {"nearest_centre", "locate_cell", "draw_cell", "cell_sort", "resample"}
+    assert {op for op, direction in both if direction == "forward+backward"} == differentiable
+
+
+def test_cost_counts_products(load: Callable[[str], Any]) -> None:
+    networks = load("ops.networks")
+    w64d4 = networks.cost(networks.NETS["w64d4"])
+    hidden, head = 2 * 64 * 64 * 3, 2 * 64 * 4
+    assert w64d4.forward == 2 * 63 * 64 + hidden + head
+    assert w64d4.backward == w64d4.forward + hidden + head, "all weights, and the inputs of all layers but the first"
+    assert w64d4.again == w64d4.forward - head
+    nerf256 = networks.cost(networks.NETS["nerf256"]).forward
+    assert 1.18e6 < nerf256 < 1.19e6
+    # The layer behind the skip connection reads the encoding again, whose gradient nobody wants.
+    skip = networks.NETS["nerf64"].layers[5]
+    assert skip.inputs == ("positions", 4)
+
+
+@pytest.mark.parametrize("name", ["w64d4", "nerf64", "64-64"])
+@pytest.mark.parametrize("direction", ["forward", "forward+backward"])
+def test_alternatives_compute_the_same(load: Callable[[str], Any], name: str, direction: str) -> None:
+    alternatives, networks, case = load("ops.alternatives"), load("ops.networks"), load("ops.case")
+    features, net = networks.LAYERS.get(name) or (None, networks.NETS[name])
+    for dtype in (torch.float32, torch.bfloat16):
+        tolerance = load("ops.cases_network").TOLERANCE[dtype, direction]
+        batch = networks.make_batch(net, 300, 5, dtype, direction, CPU, features=features)
+        error, done = networks.network_error(batch), []
+        for backend in ("reference", "native"):
+            if voronerf.backends.missing(backend, CPU) is None:
+                contender = alternatives.ours(batch, backend)
+                assert error(contender.adapt(contender.run(0))) < tolerance, backend
+        for label, set_up in alternatives.alternatives(batch, compiled=False).items():
+            try:
+                contender = set_up()
+            except case.NotApplicable as reason:
+                assert label == "jax", f"{label}: {reason}"
+                continue
+            assert error(contender.adapt(contender.run(0))) < tolerance, f"{label}, {dtype}"
+            # A later call sees other samples and a dense gradient.
+            assert error(contender.adapt(contender.run(1))) > 0
+            done.append(label)
+        wanted = {"padded bmm", "F.grouped_mm", "oneDNN" if direction == "forward" else "torch loop, stacked"}
+        assert wanted <= set(done)
+
+
+@pytest.mark.parametrize("direction", ["forward", "forward+backward"])
+def test_routes_compute_the_same(load: Callable[[str], Any], direction: str) -> None:
+    route = load("ops.route")
+    for name in ("w64d4", "nerf64"):
+        work = route.route_work(name, 300, 5, torch.float32, direction, 1e-4, False, CPU)
+        contenders = {label: set_up() for label, set_up in work.alternatives.items()}
+        assert any("masks" in label for label in contenders)
+        contenders["ours"] = work.ours("reference")
+        contenders["separate"] = route.route_work(name, 300, 5, torch.float32, direction, 1e-4, True, CPU).ours(
+            "reference"
+        )
+        for label, contender in contenders.items():
+            assert work.error(contender.adapt(contender.run(0))) < 1e-4, f"{name}, {label}"
+
+
+def test_what_is_compared_is_right_in_every_small_case(load: Callable[[str], Any]) -> None:
+    lookup, sampling, case = load("ops.cases_lookup"), load("ops.cases_sampling"), load("ops.case")
+    marching = load("ops.cases_marching")
+    works = {
+        "nearest_centre": lookup._nearest_work(500, 7, torch.float32, False, CPU),
+        "locate_cell": lookup._locate_work(500, (4, 3), CPU),
+        "draw_cell": lookup._draw_work(500, 7, CPU),
+        "cell_sort": lookup._sort_work(500, 7, CPU),
+        "resample": sampling._resample_work(512, CPU),
+        "march_rays": marching._march_work(1 << 13, False, CPU),
+        "march_rays, jittered": marching._march_work(1 << 13, True, CPU),
+        "update_occupancy": marching._update_work(250, CPU),
+        "camera_rays": marching._camera_work(300, False, CPU),
+        "camera_rays, lens": marching._camera_work(300, True, CPU),
+        "balance_centres": marching._balance_work(600, 5, CPU),
+        "select_heaviest": marching._heaviest_work(2000, CPU),
+    }
+    for direction in ("forward", "forward+backward"):
+        for op in ("frequency_encode", "integrated_encode"):
+            works[f"{op}, {direction}"] = sampling._encode_work(op, 64, torch.float32, direction, False, CPU)
+        for packed in (False, True):
+            work = sampling._composite_work(512, packed, direction, False, CPU)
+            works[f"composite, packed {packed}, {direction}"] = work
+    for label, work in works.items():
+        contenders = {"reference": work.ours("reference")}
+        for name, set_up in work.alternatives.items():
+            try:
+                contenders[name] = set_up()
+            except case.NotApplicable as reason:
+                assert not name.startswith("torch"), f"{label}, {name}: {reason}"
+        assert len(contenders) > 1
+        for name, contender in contenders.items():
+            error = work.error(contender.adapt(contender.run(0)))
+            assert error <= work.tolerance, f"{label}, {name}: {error}"
+            contender.run(1)
+
+
+def test_wrong_answers_are_found(load: Callable[[str], Any]) -> None:
+    lookup, networks = load("ops.cases_lookup"), load("ops.networks")
+    work = lookup._nearest_work(500, 7, torch.float32, False, CPU)
+    right = work.ours("reference").run(0)
+    assert work.error(right) == 0 and work.error((right + 1) % 7) == 500 and work.error(right + 7) == float("inf")
+    work = lookup._sort_work(500, 7, CPU)
+    order, offsets = work.ours("reference").run(0)
+    assert work.error((order, offsets)) == 0 and work.error((order.flip(0), offsets)) > 0
+    marching = load("ops.cases_marching")
+    work = marching._march_work(1 << 13, True, CPU)
+    right = work.ours("reference").run(0)
+    assert work.error(right) < 1e-6 and work.error(right._replace(depths=right.depths * 1.1)) > 0.05
+    assert work.error(work.ours("reference").run(1)) > 0.1, "other rays"
+    work = marching._update_work(250, CPU)
+    density, occupied = work.ours("reference").run(0)
+    assert work.error((density, occupied)) < 1e-6 and work.error((density, ~occupied)) == float("inf")
+    work = marching._balance_work(600, 5, CPU)
+    assert work.error((marching._balance_work(600, 5, CPU).ours("reference").run(1)[0], None)) > work.tolerance
+    work = marching._heaviest_work(2000, CPU)
+    points, kept = work.ours("reference").run(0)
+    assert work.error((points, kept)) == 0 and work.error((points.flip(0), kept)) == float("inf")
+    batch = networks.make_batch(networks.NETS["mlp32"], 200, 3, torch.float32, "forward+backward", CPU)
+    error = networks.network_error(batch)
+    out, gradients = load("ops.alternatives").ours(batch, "reference").run(0)
+    assert error((out, gradients)) < 1e-5
+    assert error((out, (*gradients[:-1], gradients[-1] * 1.5))) > 0.1
+    assert error((out * torch.nan, None)) == float("inf")
+
+
+def test_rows_report_failures_losses_and_caps(load: Callable[[str], Any]) -> None:
+    throughput, case = load("throughput"), load("ops.case")
+
+    def absent() -> Any:
+        raise case.NotApplicable("not installed")
+
+    def broken() -> Any:
+        raise RuntimeError("first line\nsecond")
+
+    def sleeper(seconds: float) -> Any:
+        import time
+
+        return case.Contender(lambda call: time.sleep(seconds) or torch.ones(3))
+
+    work = case.Work(
+        lambda backend: sleeper(0.006),
+        {
+            "faster": lambda: sleeper(0.001),
+            "slow": lambda: sleeper(0.4),
+            "absent": absent,
+            "broken": broken,
+            "wrong": lambda: case.Contender(lambda call: torch.zeros(3)),
+        },
+        lambda found: case.relative_error(found, torch.ones(3)),
+        1e-3,
+        1e6,
+        "",
+    )
+    bench = throughput.Bench(CPU, quick=True, wanted=["reference"])
+    row_case = case.Case(
+        "cell_sort", "x", torch.int32, "forward", 10, 2, lambda device: work, backends=("reference", "native")
+    )
+    (row,) = bench.run(row_case)
+    assert set(COLUMNS) <= set(row) and row["backend"] == "reference"
+    assert row["alternatives"]["faster"] < row["median_ms"] and row["speedup_over_best"] < 1
+    assert row["alternatives"]["slow"] >= 400 and row["notes"]["slow"] == "capped"
+    assert row["alternatives"]["absent"] is None and row["notes"]["absent"] == "n/a: not installed"
+    assert row["notes"]["broken"] == "n/a: RuntimeError: first line"
+    assert row["alternatives"]["wrong"] is None and "error of 1 is above" in row["notes"]["wrong"]
+    assert row["percent_of_peak"] is None and row["max_error"] == 0 and row["first_call_ms"] >= 6
+    assert throughput.cold_starts([row]) == {}
+    rows = [{**row, "backend": "warp", "first_call_ms": row["median_ms"] + extra} for extra in (0, 3000)]
+    assert throughput.cold_starts(rows) == {"cell_sort": 3.0}
+    text = "\n".join(throughput.lines(row, last=True))
+    assert "n/a: not installed" in text and "capped" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--filter", "("], "--filter must be a regular expression, got '('"),
+        (["--filter", "no such row"], "--filter must leave a row, got 'no such row'"),
+        (["--backends", "cutlass"], "--backends must be of reference, native, warp, got 'cutlass'"),
+        (["--device", "tpu"], "--device must be cpu or cuda, got 'tpu'"),
+        (["--json", "."], "--json must name a file, got the folder ."),
+        (["--json", "Makefile/rows.json", "--filter", "resample"], "--json: "),
+        (["--fast"], "unrecognized arguments: --fast"),
+    ],
+)
+def test_bad_arguments_are_one_line(
+    load: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    monkeypatch.chdir(BENCHMARKS.parent)
+    with pytest.raises(SystemExit) as error:
+        load("throughput").main(arguments)
+    text = str(error.value)
+    assert text.startswith(f"throughput: error: {message}") and "\n" not in text
+
+
+def test_throughput_runs_as_a_script_and_table_reads_its_result(tmp_path: Path, load: Callable[[str], Any]) -> None:
+    path = tmp_path / "results" / "throughput.json"
+    script = str(BENCHMARKS / "throughput.py")
+    command = [sys.executable, script, "--quick", "--filter", "^resample", "--json", str(path), "--targets"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert "[1/1," in done.stderr and "not measured" in done.stdout
+    outcome = json.loads(path.read_text())
+    metadata = outcome["metadata"]
+    assert metadata["benchmark"] == "throughput" and metadata["quick"] is True and metadata["device"] == "cpu"
+    assert isinstance(metadata["missing"], list) and len(metadata["load"]) == 3
+    for row in outcome["results"]:
+        assert list(row)[: len(COLUMNS)] == COLUMNS
+        assert row["op"] == "resample" and row["unit"] == "GB/s" and row["median_ms"] > 0
+        assert row["alternatives"]["torch cumsum + searchsorted"] > 0 and row["max_error"] < 1e-2
+    table = load("table")
+    native = [row for row in outcome["results"] if row["backend"] == "native"]
+    for row in native:
+        assert f"`resample` {row['case']}" in table.markdown([row])[-1]
+    with pytest.raises(SystemExit, match=r"must be a result of throughput\.py"):
+        table.load(BENCHMARKS / "results" / "time_to_quality_lego.json")
+
+
+def _row(case: str, ms: float, alternatives: dict[str, float | None], **columns: Any) -> dict[str, Any]:
+    base = {"op": "grouped_mlp", "case": case, "backend": "native", "dtype": "float32", "direction": "forward"}
+    numbers = {"n": 1 << 18, "median_ms": ms, "alternatives": alternatives, "percent_of_peak": 80.0}
+    return {**base, **numbers, "bound": "float32", "speedup_over_best": None, **columns}
+
+
+def test_targets_read_the_rows(load: Callable[[str], Any]) -> None:
+    targets, n = load("ops.targets"), 1 << 18
+    rows = [
+        _row(f"w64d4 n={n} k=16", 20.0, {"torch loop": 60.0}, percent_of_peak=86.0),
+        _row(f"nerf64 n={n} k=16", 50.0, {"torch loop": 160.0}, percent_of_peak=84.0),
+        _row(f"nerf256 n={n} k=1", 600.0, {"torch loop": 1500.0, "oneDNN": 900.0, "jax": None}),
+        _row(f"mlp32 n={n} k=16", 6.0, {}),
+        _row(f"mlp32 n={n} k=4096", 12.0, {}),
+        _row(f"n={n} k=16", 0.131072, {"faiss flat": 4.0, "numpy": 0.1}, op="nearest_centre"),
+        _row(f"n={n} k=64", 1.0, {"faiss flat": None}, op="nearest_centre", backend="reference"),
+    ]
+    found = {
+        (target.what, target.unit): (value, targets.verdict(target, value)) for target, value in targets.reached(rows)
+    }
+    forward = "grouped_mlp forward, float32, "
+    assert found[forward + "w64d4", "% of peak"] == (86.0, "reached")
+    assert found[forward + "nerf64", "% of peak"] == (84.0, "missed")
+    assert found[forward + "mlp32", "% of peak"] == (None, "not measured")
+    assert found["grouped_mlp forward, mlp32, 4,096 cells", "% of the speed of 16 cells"] == (50.0, "missed")
+    assert found["nearest_centre, k = 16", "ns"] == (0.5, "reached")
+    assert found["nearest_centre, k = 16", "x faiss"][0] == pytest.approx(4.0 / 0.131072)
+    assert found["nearest_centre, k = 64", "ns"] == (None, "not measured"), "other backends do not count"
+    (compared,) = targets.comparisons(rows)
+    assert (compared.kernel, compared.architecture) == (1.5, 12.0)
+    assert "1.50 x by kernels" in targets.architecture_lines(rows)[0]
+    assert len(targets.target_lines(rows)) == 1 + len(targets.TARGETS) + len(targets.ELSEWHERE)
+    assert any("| 86.0 | reached |" in line for line in load("table").target_markdown(rows))
+
+
+def test_targets_name_rows_that_the_benchmark_has(load: Callable[[str], Any]) -> None:
+    """A target whose row is never measured could not be reached."""
+    targets, throughput = load("ops.targets"), load("throughput")
+    cases = throughput.chosen_cases(throughput.parse([]))
+    rows = [
+        {
+            **_row(case.case, 1.0, {"torch loop": 1.0, "faiss flat": 1.0}),
+            "op": case.op,
+            "dtype": str(case.dtype).removeprefix("torch."),
+            "direction": case.direction,
+            "executed_percent_of_peak": 1.0,
+        }
+        for case in cases
+    ]
+    frozen = (
+        {"nearest_centre, k = 4,096, frozen centres"} if load("ops.cases_lookup").frozen_lookup() is None else set()
+    )
+    assert {target.what for target, value in targets.reached(rows) if value is None} == frozen
+    for pattern in load("table").README:
+        known = "frozen" not in pattern or not frozen
+        assert not known or any(re.search(pattern, case.key) for case in cases), pattern
+
+
+def test_a_disturbed_limit_does_not_flatter(load: Callable[[str], Any]) -> None:
+    peaks = load("harness").Peaks(CPU)
+    assert peaks._keep("copy", 100.0) == ("copy", 100.0)
+    assert peaks._keep("copy", 95.0) == ("copy", 95.0)
+    assert peaks._keep("copy", 50.0) == ("copy", 100.0)
+    assert peaks.found == {"copy": 100.0}

@@ -1,0 +1,179 @@
+"""Blended cells: the weights against a slow search, their limits, and that nothing jumps."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from voronerf import VoronoiDiagram
+from voronerf.diagram.blending import Blend, blend_cells
+
+
+def diagram_of(kind: str, seed: int = 0) -> VoronoiDiagram:
+    generator = torch.Generator().manual_seed(seed)
+
+    def centres(k: int) -> torch.Tensor:
+        return torch.rand(k, 3, generator=generator) * 2 - 1
+
+    if kind == "one":
+        return VoronoiDiagram(centres(1))
+    if kind == "flat":
+        return VoronoiDiagram(centres(12))
+    if kind == "power":
+        return VoronoiDiagram(centres(12), weights=0.3 * torch.rand(12, generator=generator))
+    if kind == "same":
+        return VoronoiDiagram(centres(3).repeat(2, 1))
+    weights = 0.1 * torch.rand(4, generator=generator)
+    inner = VoronoiDiagram(centres(4), weights=weights)
+    nested, _ = VoronoiDiagram(centres(5)).refine({0: centres(3), 2: inner, 4: centres(2)})
+    deeper, _ = nested.refine({1: centres(3)})
+    return deeper
+
+
+KINDS = ("flat", "power", "same", "nested")
+
+
+def slow_leaves(diagram: VoronoiDiagram, x: torch.Tensor, margin: float) -> dict[int, float]:
+    """Weights of all leaves of one point, by the definition."""
+    offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
+    power = [0.0] * len(child) if diagram.power is None else diagram.power.tolist()
+    centres = diagram.centres.double().tolist()
+    point = x.double().tolist()
+    found: dict[int, float] = {}
+
+    def descend(node: int, weight: float) -> None:
+        rows = range(offsets[node], offsets[node + 1])
+        shares = {}
+        for i in rows:
+            inside = math.inf
+            for j in rows:
+                apart = math.dist(centres[i], centres[j])
+                lead = math.dist(point, centres[j]) ** 2 - power[j] - math.dist(point, centres[i]) ** 2 + power[i]
+                if i == j:
+                    continue
+                if apart == 0:
+                    inside = min(inside, math.inf if (lead, j) > (0, i) else -math.inf)
+                else:
+                    inside = min(inside, lead / (2 * apart))
+            shares[i] = min(max(0.5 + inside / (2 * margin), 0.0), 1.0)
+        for i in rows:
+            share = weight * shares[i] / sum(shares.values())
+            if share == 0:
+                continue
+            if child[i] < 0:
+                found[-1 - child[i]] = share
+            else:
+                descend(child[i], share)
+
+    descend(0, 1.0)
+    return found
+
+
+def weights_of(blend: Blend, diagram: VoronoiDiagram, points: torch.Tensor) -> torch.Tensor:
+    """[n, cells], the leaf that holds a point where it is in no margin."""
+    table = torch.zeros(points.shape[0], diagram.num_cells, dtype=points.dtype)
+    table[torch.arange(points.shape[0]), diagram.locate(points).long()] = 1
+    table[blend.rows] = 0
+    return table.index_put_((blend.rows, blend.cells.long()), blend.weights, accumulate=True)
+
+
+@pytest.mark.parametrize("margin", [0.02, 0.3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_against_the_definition(kind: str, margin: float) -> None:
+    diagram = diagram_of(kind)
+    points = torch.rand(300, 3, dtype=torch.float64) * 2.4 - 1.2
+    found = weights_of(blend_cells(diagram, points, margin, most=diagram.num_cells), diagram, points)
+    for point, row in zip(points, found):
+        expected = torch.zeros_like(row)
+        for leaf, weight in slow_leaves(diagram, point, margin).items():
+            expected[leaf] = weight
+        assert torch.allclose(row, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_entries_are_sorted_few_and_sum_to_one(kind: str) -> None:
+    diagram, points = diagram_of(kind), torch.rand(5000, 3) * 2.4 - 1.2
+    blend = blend_cells(diagram, points, 0.25, most=3)
+    assert blend.rows.numel() > 1000 and (blend.rows.diff() >= 0).all() and (blend.weights > 0).all()
+    assert (
+        blend.cells.dtype == torch.int32 and 0 <= int(blend.cells.min()) <= int(blend.cells.max()) < diagram.num_cells
+    )
+    sums = torch.zeros(5000).index_add_(0, blend.rows, blend.weights)
+    assert torch.allclose(sums[sums > 0], torch.ones(int((sums > 0).sum())), atol=1e-5)
+    assert int(blend.rows.bincount().max()) == 3
+    same_row = blend.rows.diff() == 0
+    assert (blend.weights.diff()[same_row] <= 0).all()
+    # the nearest leaf of a flat diagram is the heaviest
+    if diagram.depth == 1:
+        first = torch.cat([torch.tensor([True]), ~same_row])
+        assert torch.equal(blend.cells[first], diagram.locate(points[blend.rows[first]]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_points_beyond_the_margin_have_no_entry(kind: str) -> None:
+    diagram, margin = diagram_of(kind), 0.05
+    points = torch.rand(400, 3, dtype=torch.float64) * 2.4 - 1.2
+    inside = torch.zeros(400, dtype=torch.bool)
+    inside[blend_cells(diagram, points, margin).rows] = True
+    # Walking a margin into any direction changes the leaf of a point in a margin only.
+    steps = torch.nn.functional.normalize(torch.randn(2000, 3, dtype=torch.float64), dim=1) * margin
+    own = diagram.locate(points)
+    crosses = torch.stack([(diagram.locate(points[i] + steps) != own[i]).any() for i in range(400)])
+    assert not (crosses & ~inside).any()
+    assert inside.sum() > 20 and (~inside).sum() > 20
+
+
+@pytest.mark.parametrize("most", [2, 4])
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_jumps_across_borders(kind: str, most: int) -> None:
+    diagram, margin = diagram_of(kind), 0.1
+    start = torch.rand(40, 1, 3, dtype=torch.float64) * 2.4 - 1.2
+    end = torch.rand(40, 1, 3, dtype=torch.float64) * 2.4 - 1.2
+    count = 4000
+    line = start + (end - start) * torch.linspace(0, 1, count, dtype=torch.float64)[None, :, None]
+    points = line.reshape(-1, 3)
+    table = weights_of(blend_cells(diagram, points, margin, most=most), diagram, points)
+    jump = table.reshape(40, count, -1).diff(dim=1).abs().amax((1, 2))
+    crossings = (diagram.locate(points).reshape(40, count).diff(dim=1) != 0).sum()
+    assert crossings > 10
+    # A step is at most 4 / count long; u has the slope 1 / (2 M), which dividing by sums makes steeper. A point where
+    # more leaves meet than answer may be steep at any scale: a few of the lines may pass one by chance.
+    bound = 40 * (4 / count) / (2 * margin)
+    assert float(jump.median()) < bound and int((jump > 10 * bound).sum()) <= (3 if most == 2 else 0)
+
+
+def test_nothing_to_blend() -> None:
+    points = torch.rand(50, 3)
+    for diagram, margin in ((diagram_of("flat"), 0.0), (diagram_of("one"), 1.0)):
+        assert blend_cells(diagram, points, margin).rows.numel() == 0
+    assert blend_cells(diagram_of("nested"), points[:0], 0.1).cells.shape == (0,)
+    bad = torch.tensor([[math.nan, 0, 0], [math.inf, 0, 0]])
+    assert blend_cells(diagram_of("nested"), bad, 0.1).rows.numel() == 0
+    halves = blend_cells(diagram_of("flat"), points.half(), 0.1)
+    assert torch.equal(halves.cells, blend_cells(diagram_of("flat"), points.half().float(), 0.1).cells)
+
+
+def test_one_leaf_is_the_nearest() -> None:
+    diagram, points = diagram_of("flat"), torch.rand(500, 3) * 2 - 1
+    blend = blend_cells(diagram, points, 0.2, most=1)
+    assert torch.equal(blend.cells, diagram.locate(points[blend.rows])) and (blend.weights == 1).all()
+
+
+def test_large_batches_go_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    diagram, points = diagram_of("nested"), torch.rand(1000, 3) * 2 - 1
+    whole = blend_cells(diagram, points, 0.2)
+    monkeypatch.setattr("voronerf.diagram.blending._CHUNK_ELEMENTS", 500)
+    assert all(torch.equal(a, b) for a, b in zip(whole, blend_cells(diagram, points, 0.2)))
+
+
+def test_bad_arguments() -> None:
+    diagram = diagram_of("flat")
+    with pytest.raises(ValueError, match=r"points must be floating \[n, 3\], got torch.float32 \[2, 2\]"):
+        blend_cells(diagram, torch.zeros(2, 2), 0.1)
+    for margin in (-0.1, math.inf, math.nan):
+        with pytest.raises(ValueError, match="margin must be finite and at least 0, got"):
+            blend_cells(diagram, torch.zeros(2, 3), margin)
+    with pytest.raises(ValueError, match="most must be at least 1, got 0"):
+        blend_cells(diagram, torch.zeros(2, 3), 0.1, most=0)

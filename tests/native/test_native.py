@@ -1,0 +1,344 @@
+"""The compiled ops against the reference, exactly: ties, shifted scenes, every instruction set, any thread count."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.reference.cell_sort import cell_sort as reference_sort
+from voronerf.reference.locate_cell import locate_cell as reference_locate
+from voronerf.reference.nearest_centre import distances
+from voronerf.reference.nearest_centre import nearest_centre as reference_nearest
+
+pytestmark = pytest.mark.native
+
+if backends.missing("native", torch.device("cpu")) is None:
+    from voronerf import _C
+    from voronerf import native as _native
+
+ISAS = ("portable", "avx2", "avx512")
+CELLS = (1, 2, 15, 16, 17, 255, 256, 257, 4096)
+# Around the lanes and tiles of every instruction set and the block of a task.
+ROWS = (0, 1, 3, 7, 8, 9, 15, 17, 31, 33, 63, 64, 65, 129)
+BLOCK = 2048
+DTYPES = (torch.float32, torch.float64)
+
+
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    index = ISAS.index(request.param)
+    if not _C.isa_supported(index):
+        pytest.skip(f"this processor has no {request.param}")
+    monkeypatch.setattr(_native, "_ISA", index)
+    return request.param
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def chosen(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Cells, checked against the definition: at the float64 minimum, and the reference's very index."""
+    cells = _native.nearest_centre(points, centres, weights=weights)
+    assert cells.dtype == torch.int32
+    table = distances(points, centres, weights)
+    own = table.gather(1, cells.long()[:, None])[:, 0]
+    least = table.amin(dim=1)
+    bound = 8 * torch.finfo(torch.float64).eps * (least.abs() + (0 if weights is None else weights.abs().max()))
+    assert (own <= least + bound).all()
+    assert torch.equal(cells, reference_nearest(points, centres, weights=weights))
+    return cells
+
+
+@pytest.mark.parametrize("k", CELLS)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nearest_of_random_points(isa: str, dtype: torch.dtype, k: int) -> None:
+    rows = (1, 65) if k == 4096 else ROWS
+    for shift in (0.0, 1000.0):
+        centres = (4 * torch.rand(k, 3, dtype=dtype) - 2) + shift
+        weights = torch.rand(k, dtype=dtype) - 0.5
+        for n in rows:
+            points = (4 * torch.rand(n, 3, dtype=dtype) - 2) + shift
+            chosen(points, centres) if n else _native.nearest_centre(points, centres)
+            chosen(points, centres, weights) if n else _native.nearest_centre(points, centres, weights=weights)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nearest_breaks_ties_to_the_lowest_index(isa: str, dtype: torch.dtype) -> None:
+    for k in (2, 16, 17, 257):
+        centres = torch.randint(-2, 3, (k, 3)).to(dtype)
+        points = torch.randint(-4, 5, (BLOCK + 1, 3)).to(dtype) / 2
+        weights = torch.randint(0, 3, (k,)).to(dtype)
+        for power in (None, weights):
+            cells = chosen(points, centres, power)
+            table = distances(points, centres, power)
+            ties = table == table.amin(dim=1, keepdim=True)
+            assert (ties.sum(dim=1) > 1).any()
+            assert torch.equal(cells.long(), ties.int().argmax(dim=1))
+
+
+def test_nearest_decides_in_float64_what_float32_cannot(isa: str) -> None:
+    """Two centres whose distances differ by less than float32 resolves, at every lane and either way round."""
+    points = torch.zeros(200, 3)
+    near = torch.nextafter(torch.tensor(1.0), torch.tensor(0.0)).item()
+    for sign in (1.0, -1.0):
+        centres = torch.tensor([[1.0, 1e-5, 0.0], [sign, 0.0, 0.0], [0.0, near, 4e-4]])
+        assert chosen(points, centres).eq(1).all()
+        assert chosen(points, centres.flip(0)).eq(1).all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-20, 1e-22])
+def test_nearest_on_bisectors(isa: str, scale: float) -> None:
+    """Points as close to a border as float32 can put them; at the small scales the squares underflow in float32."""
+    for _ in range(20):
+        centres = 2 * torch.rand(2, 3, dtype=torch.float64) - 1
+        along = centres[1] - centres[0]
+        points = 2 * torch.rand(500, 3, dtype=torch.float64) - 1
+        points -= ((points - centres.mean(dim=0)) @ along / along.square().sum())[:, None] * along
+        cells = chosen((points * scale).float(), (centres * scale).float())
+        assert 0 < cells.sum() < 500
+
+
+def test_nearest_far_from_the_origin_and_at_the_ends_of_the_range(isa: str) -> None:
+    for scale in (1e-42, 1e-38, 1e-30, 1e-19, 1e18, 1e19, 1e20, 3e38):
+        points, centres = (2 * torch.rand(70, 3) - 1) * scale, (2 * torch.rand(33, 3) - 1) * scale
+        chosen(points, centres)
+        chosen(points, centres, weights=torch.rand(33) * scale)
+    centres, weights = torch.tensor([[2e19, 0, 0], [1.5e19, 0, 0]]), torch.tensor([3e38, 0.0])
+    chosen(torch.zeros(17, 3), centres, weights)
+
+
+def test_nearest_sends_non_finite_points_to_cell_0(isa: str) -> None:
+    for bad in (torch.nan, torch.inf, -torch.inf):
+        for dtype in DTYPES:
+            points = torch.rand(67, 3, dtype=dtype)
+            points[::5, 1] = bad
+            centres = torch.rand(20, 3, dtype=dtype)
+            assert _native.nearest_centre(points, centres)[::5].eq(0).all()
+            assert torch.equal(_native.nearest_centre(points, centres), reference_nearest(points, centres))
+
+
+def test_nearest_of_mixed_and_half_types_and_strided_tensors(isa: str) -> None:
+    points, centres, weights = torch.rand(100, 6)[:, ::2], torch.rand(3, 40).T, torch.rand(80)[::2]
+    assert not points.is_contiguous()
+    chosen(points, centres, weights)
+    for dtype in (torch.float16, torch.bfloat16, torch.float64):
+        chosen(points.to(dtype), centres)
+        chosen(points, centres.to(dtype), weights)
+
+
+def test_threads_do_not_change_a_bit(threads: None) -> None:
+    points, centres, cells = torch.rand(10 * BLOCK + 1, 3), torch.rand(50, 3), torch.randint(0, 50, (10 * BLOCK + 1,))
+    tree = random_tree((4, 3))
+    results = []
+    for count in (1, 2, 3):
+        torch.set_num_threads(count)
+        sort = _native.cell_sort(cells.int(), 50)
+        results.append((_native.nearest_centre(points, centres), *sort, _native.locate_cell(points, **tree)))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 5000])
+@pytest.mark.parametrize("n", [0, 1, 2, 33, 2047, 2048, 2049, 50_001])
+def test_sort(n: int, k: int) -> None:
+    # Half of the cells stay empty, one holds half of the rows.
+    cells = torch.randint(0, max(1, k // 2), (n,), dtype=torch.int32)
+    cells[torch.rand(n) < 0.5] = k - 1
+    order, offsets = _native.cell_sort(cells, k)
+    expected_order, expected_offsets = reference_sort(cells, k)
+    assert torch.equal(order, expected_order)
+    assert torch.equal(offsets, expected_offsets)
+    assert (order.dtype, offsets.dtype) == (torch.int32, torch.int32)
+
+
+def test_sort_of_a_strided_tensor() -> None:
+    cells = torch.randint(0, 9, (101, 2), dtype=torch.int32)[:, 0]
+    assert all(torch.equal(a, b) for a, b in zip(_native.cell_sort(cells, 9), reference_sort(cells, 9)))
+
+
+@pytest.mark.parametrize("bad", [-1, 7, 2**31 - 1, -(2**31)])
+@pytest.mark.parametrize("row", [0, 4000, 9999])
+def test_sort_refuses_cells_out_of_range(bad: int, row: int) -> None:
+    cells = torch.randint(0, 7, (10_000,), dtype=torch.int32)
+    cells[row] = bad
+    with pytest.raises(ValueError, match=rf"cell_sort: cells must lie in 0 to 6, got values from .*{bad}"):
+        _native.cell_sort(cells, 7)
+
+
+def random_tree(sizes: tuple[int, ...], uneven: bool = True) -> dict[str, Tensor | int]:
+    """A tree with `sizes` children at each level, every third centre (if uneven) a leaf already."""
+    rows: list[list[Tensor]] = [[]]
+    child: list[list[int]] = [[]]
+    level, leaves = [0], 0
+    for depth, size in enumerate(sizes):
+        below = []
+        for diagram in level:
+            for i in range(size):
+                rows[diagram].append(torch.rand(3))
+                if depth == len(sizes) - 1 or (uneven and i % 3 == 2):
+                    leaves += 1
+                    child[diagram].append(-leaves)
+                else:
+                    below.append(len(rows))
+                    child[diagram].append(len(rows))
+                    rows.append([])
+                    child.append([])
+        level = below
+    counts = torch.tensor([0] + [len(own) for own in rows])
+    return {
+        "centres": torch.stack([row for own in rows for row in own]),
+        "child_offsets": counts.cumsum(0).int(),
+        "child": torch.tensor([c for own in child for c in own], dtype=torch.int32),
+        "depth": len(sizes),
+    }
+
+
+@pytest.mark.parametrize("sizes", [(1,), (5,), (16, 16), (3, 1, 4), (2, 2, 2, 2)])
+@pytest.mark.parametrize("uneven", [False, True])
+def test_locate(isa: str, sizes: tuple[int, ...], uneven: bool) -> None:
+    tree = random_tree(sizes, uneven)
+    weights = torch.rand(tree["centres"].shape[0]) / 10
+    for n in (0, 1, 33, BLOCK - 1, BLOCK + 1):
+        for dtype in DTYPES:
+            points = torch.rand(n, 3, dtype=dtype)
+            if n > 30:
+                points[30] = torch.nan
+            for power in (None, weights):
+                leaves = _native.locate_cell(points, **tree, weights=power)
+                assert torch.equal(leaves, reference_locate(points, **tree, weights=power))
+
+
+def test_locate_breaks_ties_as_nearest_centre_does(isa: str) -> None:
+    tree = random_tree((8, 8), uneven=False)
+    tree["centres"] = torch.randint(-2, 3, tree["centres"].shape).float()
+    points = torch.randint(-4, 5, (3000, 3)).float() / 2
+    assert torch.equal(_native.locate_cell(points, **tree), reference_locate(points, **tree))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depth": 1}, "depth must be the number of levels of the tree, got 1, which is too few"),
+        ({"child": [1, 7, -1, -2, -3, -4]}, "child must name a diagram"),
+        ({"child_offsets": [0, 2, 2, 6]}, "child_offsets must increase"),
+        ({"child_offsets": [0, 2, 4, 5]}, "child_offsets must go from 0 to the number of centres"),
+    ],
+)
+def test_locate_refuses_unsound_tables(change: dict[str, object], message: str) -> None:
+    tree = random_tree((2, 2), uneven=False)
+    tables = {name: value if name == "depth" else torch.tensor(value).int() for name, value in change.items()}
+    with pytest.raises(ValueError, match=f"locate_cell: {message}"):
+        _native.locate_cell(torch.rand(10, 3), **{**tree, **tables})
+
+
+@pytest.mark.cuda
+def test_locate_on_cuda_stays_inside_unsound_tables() -> None:
+    points = torch.rand(100, 3)
+    tree = random_tree((2, 2), uneven=False)
+    sound = _native.locate_cell(points, **tree)
+    second = reference_nearest(points, tree["centres"][:2]) == 1
+    for change in ({"child": [1, 7, -1, -2, -3, -4]}, {"child_offsets": [0, 2, 4, 9]}, {"child_offsets": [0, 2, 4, 4]}):
+        tables = {**tree, **{name: torch.tensor(value).int() for name, value in change.items()}}
+        on_device = {name: value.cuda() if isinstance(value, Tensor) else value for name, value in tables.items()}
+        leaves = _native.locate_cell(points.cuda(), **on_device).cpu()
+        assert (leaves[second] < 0).all() and torch.equal(leaves[~second], sound[~second])
+
+
+def test_ops_pass_opcheck_and_compile_whole() -> None:
+    points, centres, weights = torch.rand(50, 3), torch.rand(7, 3), torch.rand(7)
+    cells, tree = torch.randint(0, 7, (50,), dtype=torch.int32), random_tree((3, 2))
+    ops = torch.ops.voronerf
+    torch.library.opcheck(ops.nearest_centre.default, (points, centres, weights))
+    torch.library.opcheck(ops.nearest_centre.default, (points[:0], centres, None))
+    torch.library.opcheck(ops.cell_sort.default, (cells, 7))
+    located = (points, tree["centres"], tree["child_offsets"], tree["child"], tree["depth"], None)
+    torch.library.opcheck(ops.locate_cell.default, located)
+
+    def run(points: Tensor, centres: Tensor) -> tuple[Tensor, ...]:
+        cells = _native.nearest_centre(points * 2, centres)
+        return (cells + 1, *_native.cell_sort(cells, 7), _native.locate_cell(points, **tree))
+
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    assert all(torch.equal(a, b) for a, b in zip(compiled(points, centres), run(points, centres)))
+
+
+def test_gradients_stop_at_the_cells() -> None:
+    points = torch.rand(5, 3, requires_grad=True)
+    cells = _native.nearest_centre(points, torch.rand(4, 3, requires_grad=True))
+    assert not cells.requires_grad
+
+
+def run_python(code: str, **environment: str) -> None:
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment})
+    assert result.returncode == 0, result.stderr
+
+
+def test_one_openmp_runtime_and_a_forced_instruction_set() -> None:
+    code = """
+import torch
+from voronerf import native as _native
+assert _native.describe()["instruction set"] == "portable"
+_native.nearest_centre(torch.rand(10000, 3), torch.rand(9, 3))
+names = ("libgomp", "libiomp", "libomp")
+loaded = {line.split()[-1] for line in open("/proc/self/maps") if line.split()[-1].split("/")[-1].startswith(names)}
+assert len(loaded) == 1 or (not loaded and not _native._C.openmp), loaded
+"""
+    run_python(code, OMP_NUM_THREADS="2", VORONERF_ISA="portable")
+
+
+def test_an_unknown_instruction_set_is_an_error_whatever_the_backend() -> None:
+    code = """
+import torch
+from voronerf import backends
+try:
+    backends.resolve("nearest_centre", backend="auto", device=torch.device("cpu"), dtype=torch.float32)
+except ValueError as error:
+    assert str(error).startswith("VORONERF_ISA must be one this processor supports (portable"), error
+    assert str(error).endswith("got 'sse9'"), error
+else:
+    raise SystemExit("nothing was raised")
+"""
+    run_python(code, VORONERF_ISA="sse9")
+
+
+@pytest.mark.parametrize(
+    ("architectures", "runs", "fails"),
+    [
+        (["75", "80", "90"], [75, 80, 86, 89, 90, 100, 120], [70, 72]),
+        (["90a"], [90], [80, 89, 100, 103]),
+        (["80", "90a"], [80, 86, 90], [75, 100]),
+    ],
+)
+def test_devices_of_a_cuda_build(architectures: list[str], runs: list[int], fails: list[int]) -> None:
+    assert all(_native._runs_on(architectures, capability) for capability in runs)
+    assert not any(_native._runs_on(architectures, capability) for capability in fails)
+
+
+def test_peak_of_each_kind(isa: str) -> None:
+    fp32 = _native.measure_peak("float32", threads=1)
+    assert fp32 > 1e9 and _native.measure_peak("copy", isa=isa, threads=2) > 1e8
+    if isa != "avx512":
+        with pytest.raises(ValueError, match=r"^measure_peak: kind must be one that the instruction set has, got bfl"):
+            _native.measure_peak("bfloat16", isa=isa)
+    elif "avx512_bf16" in Path("/proc/cpuinfo").read_text():
+        assert _native.measure_peak("bfloat16", threads=1) > 1.2 * fp32
+
+
+def test_peak_errors() -> None:
+    with pytest.raises(ValueError, match=r"^measure_peak: kind must be one of float32, bfloat16, copy, got 'fp32'"):
+        _native.measure_peak("fp32")
+    with pytest.raises(ValueError, match=r"^measure_peak: isa must be one of portable, avx2, avx512, got 'sse'"):
+        _native.measure_peak("copy", isa="sse")

@@ -1,0 +1,254 @@
+"""composite of the compiled module: what the tests of every backend (tests/ops/test_composite.py) leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from tolerances import assert_as_exact
+from torch import Tensor
+
+from voronerf.ops import composite
+
+pytestmark = pytest.mark.native
+
+INF = float("inf")
+PARTS = ("colour", "opacity", "depth", "weights")
+
+
+@pytest.fixture(params=["portable", "avx2", "avx512"])
+def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    native = pytest.importorskip("voronerf.native")
+    number = native.ISAS.index(request.param)
+    if not native._C.isa_supported(number):
+        pytest.skip(f"{request.param}: not supported by this processor")
+    monkeypatch.setattr(native, "_ISA", number)
+    return request.param
+
+
+@pytest.fixture
+def threads() -> Iterator[tuple[int, ...]]:
+    before = torch.get_num_threads()
+    yield (1, 2, 3)
+    torch.set_num_threads(before)
+
+
+def scene(counts: list[int], c: int = 3, background: str = "ray", outside: tuple[int, int] = (0, 0)) -> dict:
+    """Float64 arguments of rays with so many samples each, packed; `outside` before and after them are of no ray."""
+    m, r = sum(counts) + sum(outside), len(counts)
+    double = torch.float64
+    return {
+        "sigma": 5 * torch.rand(m, dtype=double) * (torch.rand(m) > 0.3),
+        "rgb": torch.rand(m, c, dtype=double),
+        "depths": torch.rand(m, dtype=double),
+        "deltas": torch.rand(m, dtype=double) / 2,
+        "ray_offsets": torch.tensor([outside[0], *counts]).cumsum(0).int(),
+        "background": {"ray": torch.rand(r, c, dtype=double), "all": torch.rand(c, dtype=double), "": None}[background],
+    }
+
+
+def dense(r: int, s: int, c: int = 3, background: str = "ray") -> dict:
+    packed = scene([s] * r, c, background)
+    shapes = {"sigma": (r, s), "rgb": (r, s, c), "depths": (r, s), "deltas": (r, s)}
+    return {**packed, **{name: packed[name].view(shape) for name, shape in shapes.items()}, "ray_offsets": None}
+
+
+def leaves_of(given: dict, dtype: torch.dtype) -> tuple[dict, list[Tensor]]:
+    """The arguments in a dtype, and those of them that have gradients."""
+    cast = {
+        name: tensor.to(dtype).requires_grad_() if tensor is not None and tensor.is_floating_point() else tensor
+        for name, tensor in given.items()
+    }
+    return cast, [tensor for tensor in cast.values() if tensor is not None and tensor.requires_grad]
+
+
+def evaluate(given: dict, dtype: torch.dtype, backend: str, parts: tuple[str, ...] = PARTS) -> list[Tensor]:
+    """All outputs, and the gradients of a weighted sum of some of them."""
+    cast, leaves = leaves_of(given, dtype)
+    result = composite(**cast, backend=backend)
+    chosen = [getattr(result, part) for part in parts]
+    slopes = [torch.linspace(-1, 1.5, part.numel(), dtype=torch.float64).view_as(part).to(dtype) for part in chosen]
+    gradients = torch.autograd.grad(chosen, leaves, slopes, allow_unused=True, materialize_grads=True)
+    return [*(part.detach() for part in result), *gradients]
+
+
+def assert_close(given: dict, parts: tuple[str, ...] = PARTS) -> None:
+    exact, plain = (evaluate(given, dtype, "reference", parts) for dtype in (torch.float64, torch.float32))
+    for found, same, right in zip(evaluate(given, torch.float32, "native", parts), plain, exact):
+        assert_as_exact(found, same, right)
+
+
+@pytest.mark.parametrize("background", ["ray", "all", ""])
+@pytest.mark.parametrize("c", [1, 2, 3, 4, 19])
+def test_channels_and_backgrounds(isa: str, c: int, background: str) -> None:
+    assert_close(dense(5, 17, c, background))
+    assert_close(scene([0, 9, 1, 0, 40], c, background, outside=(3, 2)))
+
+
+@pytest.mark.parametrize("s", [0, 1, 2, 3, 4, 5, 15, 16, 17, 31, 33, 63, 64, 127, 128, 129, 300])
+def test_any_number_of_samples(isa: str, s: int) -> None:
+    assert_close(dense(3, s))
+
+
+@pytest.mark.parametrize("counts", [[], [0], [0, 0], [1], [1, 0, 1], [700, 0, 3], [1] * 50])
+def test_any_number_of_rays(isa: str, counts: list[int]) -> None:
+    assert_close(scene(counts))
+    assert_close(scene(counts, background="all", outside=(7, 1)))
+
+
+@pytest.mark.parametrize("parts", [("colour",), ("opacity",), ("depth",), ("weights",), ("depth", "weights")])
+def test_gradients_of_some_outputs(parts: tuple[str, ...]) -> None:
+    assert_close(dense(4, 21), parts)
+    assert_close(dense(4, 21, 2, "all"), parts)
+
+
+def test_only_the_gradients_asked_for() -> None:
+    cast, leaves = leaves_of(dense(6, 21), torch.float32)
+    full = torch.autograd.grad(sum(part.sum() for part in composite(**cast, backend="native")), leaves)
+    for chosen in ([0], [1], [2], [3], [4], [0, 1], [1, 2, 4]):
+        for index, tensor in enumerate(leaves):
+            tensor.requires_grad_(index in chosen)
+        total = sum(part.sum() for part in composite(**cast, backend="native"))
+        some = torch.autograd.grad(total, [leaves[index] for index in chosen])
+        assert all(torch.equal(full[index], gradient) for index, gradient in zip(chosen, some))
+
+
+@pytest.mark.parametrize("c", [3, 2])
+def test_same_bits_for_any_number_of_threads(isa: str, threads: tuple[int, ...], c: int) -> None:
+    results = []
+    packed = scene([0, 5000, 1, 9000, *[70] * 100], c, "all", outside=(5, 9))
+    many = dense(40_000, 2, c, "all")  # whose shared background has a gradient worth splitting
+    for count in threads:
+        torch.set_num_threads(count)
+        found = [evaluate(given, torch.float32, "native") for given in (packed, many)]
+        results.append([tensor for tensors in found for tensor in tensors])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_a_long_ray_keeps_its_digits() -> None:
+    given = scene([100_001])
+    given["sigma"] /= 10_000
+    assert_close(given)
+
+
+@pytest.mark.parametrize("density", [50.0, 80.0, 87.0, 90.0, 1e4, 1e30, 3e38, INF])
+def test_huge_densities(isa: str, density: float) -> None:
+    given = dense(3, 40)
+    given["sigma"][:, 5::7] = density
+    given["deltas"][:] = 0.5
+    given["deltas"][:, 5] = 0
+    expected, found = (evaluate(given, torch.float32, backend) for backend in ("reference", "native"))
+    for want, got in zip(expected, found):
+        assert got.isfinite().all()
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
+    assert (found[3][:, 13:] < 1e-10).all()
+
+
+def test_every_output_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Allocations come poisoned, between guards that must survive."""
+    native = pytest.importorskip("voronerf.native.composite")
+    guards: list[Tensor] = []
+
+    def poisoned(tensor: Tensor) -> Tensor:
+        memory = torch.full((tensor.numel() + 64,), float("nan"))
+        guards.extend((memory[:32], memory[tensor.numel() + 32 :]))
+        return memory[32 : tensor.numel() + 32].view(tensor.shape)
+
+    cases = [scene([0, 50, 13, 0, 200], 3, "ray", (4, 6)), scene([3, 0, 9], 2, "all", (1, 1)), dense(3, 5, 4, "all")]
+    cases += [dense(2, 0), scene([0, 0], 3, "all", (2, 3))]
+    wanted = [evaluate(given, torch.float32, "native", ("colour",)) for given in cases]
+    for name in ("_allocate", "_allocate_gradients"):
+        real = getattr(native, name)
+        monkeypatch.setattr(native, name, lambda *a, real=real: type(real(*a))(poisoned(each) for each in real(*a)))
+    found = [evaluate(given, torch.float32, "native", ("colour",)) for given in cases]
+    for want, got in zip(wanted, found):
+        assert all(torch.equal(a, b) for a, b in zip(want, got))
+        assert not any(tensor.isnan().any() for tensor in got)
+    assert len(guards) > 40 and all(guard.isnan().all() for guard in guards)
+    assert (found[0][3][:4] == 0).all() and (found[0][4][-6:] == 0).all() and (found[0][5][:4] == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_storage(dtype: torch.dtype) -> None:
+    cast, leaves = leaves_of(dense(3, 20), dtype)
+    result = composite(**cast, backend="native")
+    gradients = torch.autograd.grad(sum(part.float().sum() for part in result), leaves)
+    assert all(tensor.dtype == dtype for tensor in (*result, *gradients))
+    wide = {name: None if tensor is None else tensor.float() for name, tensor in cast.items()}
+    for part, want in zip(result, composite(**wide, backend="native")):
+        torch.testing.assert_close(part.float(), want, rtol=torch.finfo(dtype).eps, atol=1e-6)
+
+
+def test_float64_is_left_to_the_reference() -> None:
+    cast, _ = leaves_of(dense(2, 3), torch.float64)
+    assert composite(**cast).colour.dtype == torch.float64
+
+
+def test_non_contiguous() -> None:
+    given, _ = leaves_of(dense(4, 9), torch.float32)
+    strided = {
+        name: None if tensor is None else tensor.transpose(0, 1).contiguous().transpose(0, 1)
+        for name, tensor in given.items()
+    }
+    for part, want in zip(composite(**strided, backend="native"), composite(**given, backend="native")):
+        assert torch.equal(part, want)
+    leaf = torch.rand(4, 9, requires_grad=True)
+    result = composite(**{**given, "sigma": leaf}, backend="native")
+    expanded, same = (
+        torch.autograd.grad(result.weights, leaf, slope, retain_graph=True)[0]
+        for slope in (torch.ones(1, 1).expand(4, 9), torch.ones(4, 9))
+    )
+    assert torch.equal(expanded, same)
+
+
+@pytest.mark.parametrize("form", ["dense", "packed"])
+@pytest.mark.parametrize("parts", [("colour",), ("depth",), PARTS])
+def test_second_derivatives(form: str, parts: tuple[str, ...]) -> None:
+    given = dense(3, 6) if form == "dense" else scene([3, 0, 6], 2, "all", (1, 1))
+    results = {}
+    for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
+        cast, leaves = leaves_of(given, dtype)
+        result = composite(**cast, backend=backend)
+        total = sum(getattr(result, part).square().sum() for part in parts)
+        firsts = torch.autograd.grad(total, leaves, create_graph=True, allow_unused=True, materialize_grads=True)
+        penalty = sum((first * first).sum() for first in firsts)
+        results[backend] = torch.autograd.grad(penalty, leaves, allow_unused=True, materialize_grads=True)
+    for want, got in zip(results["reference"], results["native"]):
+        torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-5 * (1 + float(want.abs().max())))
+
+
+@pytest.mark.parametrize("form", ["dense", "packed"])
+def test_opcheck(form: str) -> None:
+    native = pytest.importorskip("voronerf.native.composite")
+    cast, _ = leaves_of(dense(3, 5) if form == "dense" else scene([3, 0, 5], 2, "all", (1, 1)), torch.float32)
+    inputs = tuple(cast.values())
+    torch.library.opcheck(native._forward, inputs)
+    result = composite(**cast, backend="native")
+    slopes = [torch.rand_like(part).requires_grad_() for part in result]
+    torch.library.opcheck(native._backward, (*slopes, *inputs, [True] * 5))
+    wanted = [True, True, False, False, True]
+    torch.library.opcheck(native._backward, (slopes[0], None, None, None, *inputs, wanted))
+
+
+def test_compiles_whole() -> None:
+    cast, leaves = leaves_of(dense(5, 7), torch.float32)
+
+    @torch.compile(fullgraph=True)
+    def loss(sigma: Tensor, rgb: Tensor) -> Tensor:
+        result = composite(**{**cast, "sigma": sigma, "rgb": rgb}, backend="native")
+        return result.colour.square().sum() + result.depth.sum()
+
+    compiled = torch.autograd.grad(loss(cast["sigma"], cast["rgb"]), leaves[:2])
+    result = composite(**cast, backend="native")
+    eager = torch.autograd.grad(result.colour.square().sum() + result.depth.sum(), leaves[:2])
+    for got, want in zip(compiled, eager):
+        torch.testing.assert_close(got, want)
+
+
+def test_offsets_that_do_not_rise() -> None:
+    given, _ = leaves_of(scene([5, 8]), torch.float32)
+    for bad in ([0, 9, 5], [0, 5, 14], [-1, 5, 13]):
+        with pytest.raises(ValueError, match=r"^composite: ray_offsets must rise from 0 or more to at most .* 13, got"):
+            composite(**{**given, "ray_offsets": torch.tensor(bad, dtype=torch.int32)}, backend="native")

@@ -1,0 +1,169 @@
+"""grouped_linear of the compiled module: storage types, forms of rows, instruction sets, against float64."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from voronerf.reference import specification
+
+native = pytest.importorskip("voronerf.native.grouped_linear")
+
+ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
+# Rows of every form: pairs or none, whole vectors of 16 or 32 or none, more than a panel; o over and under a granule.
+WIDTHS = ((63, 64), (64, 63), (64, 64), (48, 16), (16, 48), (1, 1), (3, 90), (90, 4), (256, 32), (32, 129))
+# Of a tile of 96 rows: none, one, a whole one, one and more; rows of no cell before and after.
+OFFSETS = (2, 2, 3, 99, 99, 298, 300)
+ROWS = 303
+
+
+@pytest.fixture(params=["portable", "avx2", "avx512"])
+def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Every instruction set that this processor has."""
+    module = native._native
+    index = module.ISAS.index(request.param)
+    if not module._C.isa_supported(index):
+        pytest.skip(f"this processor has no {request.param}")
+    monkeypatch.setattr(module, "_ISA", index)
+    return str(request.param)
+
+
+def inputs(i: int, o: int, dtype: torch.dtype, *, seed: int = 0) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
+    k = len(OFFSETS) - 1
+    made = (draw(ROWS, i), draw(k, o, i) / i**0.5, draw(k, o), draw(ROWS, o))
+    return [tensor.to(dtype) for tensor in made]
+
+
+def evaluate(run, x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, activation: str) -> list[Tensor]:  # type: ignore[no-untyped-def]
+    """Output, then the gradients of x, weight and bias."""
+    leaves = [tensor.detach().requires_grad_() for tensor in (x, weight, bias) if tensor is not None]
+    offsets = torch.tensor(OFFSETS, dtype=torch.int32)
+    y = run(leaves[0], offsets, leaves[1], None if bias is None else leaves[2], activation=activation)
+    return [y.detach(), *torch.autograd.grad(y, leaves, g)]
+
+
+def compare(x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, activation: str) -> None:
+    """Within rounding of float64 on the values as stored: the results', and the operands' of products."""
+    if activation == "relu":  # off the kink, where two right implementations may differ
+        raised = None if bias is None else bias.double()
+        y = evaluate(specification.grouped_linear, x.double(), weight.double(), raised, g.double(), "none")[0]
+        g = torch.where(y.abs() < 0.05, 0, g)
+    wide = [None if tensor is None else tensor.double() for tensor in (x, weight, bias, g)]
+    exact = evaluate(specification.grouped_linear, *wide, activation)
+    found = evaluate(native.grouped_linear, x, weight, bias, g, activation)
+    step = torch.finfo(x.dtype).eps
+    for got, want in zip(found, exact):
+        assert got.dtype == x.dtype
+        scale = float(want.abs().max())
+        torch.testing.assert_close(got.double(), want, rtol=step, atol=(4e-6 if step < 1e-5 else step) * scale)
+    assert not found[0][: OFFSETS[0]].any() and not found[0][OFFSETS[-1] :].any()
+    assert not found[1][: OFFSETS[0]].any() and not found[1][OFFSETS[-1] :].any()
+    assert not found[2][0].any() and not found[2][3].any()  # cells without rows
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize(("i", "o"), WIDTHS)
+def test_widths(i: int, o: int, dtype: torch.dtype, isa: str) -> None:
+    compare(*inputs(i, o, dtype), "none")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_activations(activation: str, dtype: torch.dtype, isa: str) -> None:
+    for i, o in ((63, 64), (64, 21)):
+        x, weight, _, g = inputs(i, o, dtype)
+        compare(x, weight, None, g, activation)
+    compare(*inputs(64, 32, dtype), activation)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+def test_strided_and_unaligned(dtype: torch.dtype) -> None:
+    x, weight, bias, g = inputs(64, 32, dtype)
+    expected = evaluate(native.grouped_linear, x, weight, bias, g, "sigmoid")
+    shifted = torch.empty(x.numel() + 1, dtype=dtype)[1:].view_as(x).copy_(x)  # bfloat16: at an odd half of a float
+    spread = torch.empty(*g.shape, 2, dtype=dtype)[..., 0].copy_(g)
+    flipped = weight.transpose(1, 2).contiguous().transpose(1, 2)
+    for form in (shifted, x.t().contiguous().t(), x.repeat(1, 2)[:, :64]):
+        found = evaluate(native.grouped_linear, form, flipped, bias, spread, "sigmoid")
+        for got, want in zip(found, expected):
+            assert torch.equal(got, want)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+def test_results_do_not_depend_on_threads(dtype: torch.dtype) -> None:
+    n, k = 5000, 3
+    x, weight, bias = torch.randn(n, 33).to(dtype), torch.randn(k, 40, 33).to(dtype), torch.randn(k, 40).to(dtype)
+    offsets, before = torch.tensor([0, 4000, 4100, n], dtype=torch.int32), torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            leaves = [tensor.clone().requires_grad_() for tensor in (x, weight, bias)]
+            y = native.grouped_linear(leaves[0], offsets, *leaves[1:], activation="softplus")
+            results.append([y, *torch.autograd.grad(y.float().square().sum(), leaves)])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_only_what_is_wanted() -> None:
+    x, weight, bias, g = inputs(20, 12, torch.float32)
+    full = evaluate(native.grouped_linear, x, weight, bias, g, "relu")
+    offsets = torch.tensor(OFFSETS, dtype=torch.int32)
+    for at, want in enumerate(full[1:]):
+        given = [tensor.clone() for tensor in (x, weight, bias)]
+        given[at].requires_grad_()
+        y = native.grouped_linear(given[0], offsets, *given[1:], activation="relu")
+        assert torch.equal(torch.autograd.grad(y, given[at], g)[0], want)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+def test_what_is_no_number_stays_in_its_row(dtype: torch.dtype) -> None:
+    x, weight, bias, _ = inputs(63, 64, dtype)
+    offsets = torch.tensor(OFFSETS, dtype=torch.int32)
+    clean = native.grouped_linear(x, offsets, weight, bias, activation="relu")
+    x[50], x[51, 0] = torch.nan, torch.inf
+    found = native.grouped_linear(x, offsets, weight, bias, activation="relu")
+    assert found[50].isnan().all() and not found[51].isfinite().all()
+    rest = [row for row in range(ROWS) if row not in (50, 51)]
+    assert torch.equal(found[rest], clean[rest])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+def test_opcheck(dtype: torch.dtype) -> None:
+    x, weight, bias, g = inputs(5, 3, dtype)
+    offsets = torch.tensor(OFFSETS, dtype=torch.int32)
+    leaves = [tensor.requires_grad_() for tensor in (x, weight, bias)]
+    ops = torch.ops.voronerf
+    torch.library.opcheck(ops.grouped_linear_native, (leaves[0], offsets, *leaves[1:], "sigmoid"))
+    torch.library.opcheck(ops.grouped_linear_native, (leaves[0], offsets, leaves[1], None, "none"))
+    checks = ("test_schema", "test_faketensor", "test_autograd_registration")
+    given = (g, leaves[0], offsets, *leaves[1:], "sigmoid", [True, True])
+    torch.library.opcheck(ops.grouped_linear_native_backward, given, test_utils=checks)
+
+
+def test_large_results_ask_for_huge_pages() -> None:
+    """Of a fresh process, whose allocator has nothing to give again."""
+    if not sys.platform.startswith("linux"):
+        pytest.skip("Linux alone has transparent huge pages")
+    path = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+    if not path.exists() or "[never]" in path.read_text():
+        pytest.skip("huge pages are switched off here")
+    program = """
+import resource, torch
+from voronerf import native as _native
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+before = faults()
+out = _native.fresh(torch.empty(1 << 24)).zero_()
+print(faults() - before, int(out.count_nonzero()))
+"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert int(found[0]) < 2000 and found[1] == "0"  # 16,384 small pages

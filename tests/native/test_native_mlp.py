@@ -1,0 +1,539 @@
+"""grouped_mlp and grouped_linear of the compiled module against the float64 reference."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from voronerf.layers import MLP, Layer
+from voronerf.ops import grouped_linear, grouped_mlp
+
+pytestmark = pytest.mark.native
+
+# Largest error against float64, in units of the largest value: twice that of the float32 reference, and this.
+FLOOR = 3e-6
+
+
+def chain(width: int, depth: int, out: int = 4, activation: str = "softplus", octaves: int | None = 4) -> MLP:
+    hidden = [Layer(("positions" if i == 0 else i - 1,), width, activation) for i in range(depth)]
+    return MLP((*hidden, Layer((depth - 1 if depth else "positions",), out)), (depth,), octaves, None)
+
+
+def nerf(width: int, depth: int, activation: str = "softplus") -> MLP:
+    """NeRF with a skip after the first layer, a density head and a view branch."""
+    trunk = [Layer(("positions",), width, activation), Layer(("positions", 0), width, activation)]
+    trunk += [Layer((i - 1,), width, activation) for i in range(2, depth)]
+    heads = [
+        Layer((depth - 1,), 1),
+        Layer((depth - 1,), width),
+        Layer((depth + 1, "directions"), max(width // 2, 1), activation),
+        Layer((depth + 2,), 3),
+    ]
+    return MLP((*trunk, *heads), (depth + 3, depth), 4, 2)
+
+
+NETWORKS = {
+    "one layer": MLP((Layer(("positions",), 5),), (0,), None),
+    "width 1": chain(1, 2, out=1),
+    "width 3": chain(3, 2, out=63, octaves=None),
+    "width 32": chain(32, 3, octaves=10),
+    "width 63": chain(63, 2, out=5),
+    "width 64": chain(64, 4, octaves=10),
+    "width 90": chain(90, 2, out=90, octaves=None),
+    "width 200": chain(200, 1, out=48),
+    "nerf 64": nerf(64, 3),
+    "nerf 18": nerf(18, 2),
+    "integrated": MLP(nerf(33, 2).layers, nerf(33, 2).outputs, 16, 2, "integrated"),
+    "sigmoid": chain(20, 2, activation="sigmoid"),
+    "sine": chain(20, 2, activation="sine"),
+    # Few outputs of whole vectors of inputs: in one piece and concatenated, read by other layers, with activations.
+    "heads": MLP(
+        (
+            Layer(("positions",), 64, "softplus"),
+            Layer((0,), 32, "sine"),
+            Layer((0, 1, 0), 2, "sigmoid"),
+            Layer((1, 2), 32, "softplus"),
+            Layer((3, 1), 1, "softplus"),
+            Layer((3, 4), 4),
+            Layer((3, 0), 3),
+        ),
+        (6, 2, 5, 4),
+        3,
+    ),
+    # Sources repeated, more than fit one product, outputs that other layers read, and a layer that nothing reads.
+    "graph": MLP(
+        (
+            Layer(("positions", "directions", "positions"), 7, "sine"),
+            Layer((0, 0, "directions"), 33, "softplus"),
+            Layer((1,), 4, "sigmoid"),
+            Layer((0, 1, 0, 1, "positions", 0, "directions", 1, 0, 0), 17, "softplus"),
+            Layer((3, 0), 2, "sigmoid"),
+        ),
+        (4, 1, 4),
+        1,
+        None,
+    ),
+}
+
+
+def arguments(layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, p: int = 3, q: int = 3) -> dict:
+    """Float64 arguments of grouped_mlp for cells of the given sizes; rays 0: a direction for each sample."""
+    n, k = sum(counts), len(counts)
+    p = 6 if layers.integrated else p
+    uniform = torch.distributions.Uniform(torch.tensor(-1.0, dtype=torch.float64), 1.0)
+    shapes = layers.weight_shapes(p, q)
+    given = {
+        "positions": uniform.sample((n, p)),
+        "offsets": torch.tensor([0, *counts]).cumsum(0).int(),
+        "weights": [uniform.sample((k, o, i)) * (3 / i) ** 0.5 for o, i in shapes],
+        "biases": [uniform.sample((k, o)) if bias else None for o, _ in shapes],
+        "layers": layers,
+    }
+    if layers.integrated:
+        given["positions"][:, 3:].square_()
+    if layers.uses_directions:
+        given["directions"] = uniform.sample((rays or n, q))
+        given["direction_index"] = torch.randint(rays, (n,), dtype=torch.int32) if rays else None
+    return given
+
+
+def tensors(given: dict) -> list[Tensor]:
+    """The floating-point tensors of arguments, in one order."""
+    found = [given["positions"], given.get("directions"), *given["weights"], *given["biases"]]
+    return [tensor for tensor in found if tensor is not None]
+
+
+def cast(given: dict, dtype: torch.dtype) -> dict:
+    def one(tensor: Tensor | None) -> Tensor | None:
+        return None if tensor is None else tensor.detach().to(dtype).requires_grad_()
+
+    changed = {key: one(given[key]) for key in ("positions", "directions") if key in given}
+    lists = {key: [one(tensor) for tensor in given[key]] for key in ("weights", "biases")}
+    return {**given, **changed, **lists}
+
+
+def evaluate(given: dict, dtype: torch.dtype, backend: str) -> list[Tensor]:
+    """Output and all gradients."""
+    given = cast(given, dtype)
+    out = grouped_mlp(**given, backend=backend)
+    slopes = torch.linspace(-1, 1.5, out.numel(), dtype=torch.float64).view_as(out).to(dtype)
+    return [out.detach(), *torch.autograd.grad(out, tensors(given), slopes, materialize_grads=True)]
+
+
+def assert_close(given: dict) -> None:
+    exact = evaluate(given, torch.float64, "reference")
+    plain = evaluate(given, torch.float32, "reference")
+    native = evaluate(given, torch.float32, "native")
+    for index, (want, usual, got) in enumerate(zip(exact, plain, native)):
+        assert got.shape == want.shape and got.dtype == torch.float32
+        scale = float(want.abs().max()) if want.numel() else 1.0
+        error, allowed = float(_largest(got - want)), 2 * float(_largest(usual - want)) + FLOOR * scale
+        assert error <= allowed, f"tensor {index}: error {error:.2e}, allowed {allowed:.2e}"
+
+
+def _largest(x: Tensor) -> Tensor:
+    return x.abs().max() if x.numel() else x.new_zeros(())
+
+
+@pytest.fixture(params=["portable", "avx2", "avx512"])
+def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    native = pytest.importorskip("voronerf.native")
+    number = native.ISAS.index(request.param)
+    if not native._C.isa_supported(number):
+        pytest.skip(f"{request.param}: not supported by this processor")
+    monkeypatch.setattr(native, "_ISA", number)
+    yield request.param
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_matches_float64(name: str, isa: str) -> None:
+    assert_close(arguments(NETWORKS[name], [0, 61, 1, 0, 100, 7, 0]))
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2, 5, 6, 7, 11, 12, 13, 47, 48, 49, 95, 96, 97, 500, 2500])
+def test_any_number_of_rows(rows: int) -> None:
+    assert_close(arguments(nerf(16, 2), [rows], rays=5))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("name", ["heads", "nerf 64", "graph", "width 63"])
+def test_a_row_does_not_depend_on_its_place(name: str, dtype: torch.dtype, isa: str) -> None:
+    given = cast(arguments(NETWORKS[name], [41]), dtype)
+    together = grouped_mlp(**given, backend="native").detach()
+    for row in (0, 3, 4, 17, 40):
+        one = {**given, "positions": given["positions"][row : row + 1], "offsets": torch.tensor([0, 1]).int()}
+        if "directions" in given:
+            one["directions"] = given["directions"][row : row + 1]
+        assert torch.equal(grouped_mlp(**one, backend="native")[0], together[row])
+
+
+def test_relu_on_few_outputs(isa: str) -> None:
+    layers = MLP((Layer(("positions",), 32, "softplus"), Layer((0,), 4, "relu"), Layer((0,), 1, "relu")), (1, 2), 2)
+    given = arguments(layers, [50], bias=False)
+    got, want = (grouped_mlp(**cast(given, torch.float32), backend=backend) for backend in ("native", "reference"))
+    assert 0.2 < float((want > 0).float().mean()) < 0.8
+    torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("counts", [[0, 0, 0], [3000, 1, 0, 2], [1] * 300, [0] * 150 + [2000] + [0, 3] * 70])
+def test_any_imbalance(counts: list[int]) -> None:
+    assert_close(arguments(nerf(20, 2), counts, rays=9))
+
+
+@pytest.mark.parametrize("o", [1, 3, 4, 5, 16, 17, 33, 48, 63, 64, 65, 90, 130])
+@pytest.mark.parametrize("i", [1, 3, 4, 5, 63, 90])
+def test_linear_of_odd_sizes(i: int, o: int, isa: str) -> None:
+    layers = MLP((Layer(("positions",), o),), (0,), None)
+    assert_close(arguments(layers, [7, 0, 25], p=i))
+
+
+@pytest.mark.parametrize("activation", ["none", "relu", "softplus", "sigmoid", "sine"])
+@pytest.mark.parametrize("bias", [True, False])
+def test_grouped_linear(activation: str, bias: bool) -> None:
+    x, weight = torch.randn(50, 9, dtype=torch.float64), torch.randn(4, 6, 9, dtype=torch.float64)
+    offsets = torch.tensor([2, 20, 20, 31, 44], dtype=torch.int32)
+    given = [x, weight, torch.randn(4, 6, dtype=torch.float64)][: 3 if bias else 2]
+    results = {}
+    for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
+        a = [tensor.to(dtype).requires_grad_() for tensor in given]
+        y = grouped_linear(a[0], offsets, *a[1:], activation=activation, backend=backend)
+        slopes = torch.linspace(-1, 1, y.numel(), dtype=dtype).view_as(y)
+        results[backend] = [y.detach(), *torch.autograd.grad(y, a, slopes)]
+    for want, got in zip(results["reference"], results["native"]):
+        torch.testing.assert_close(got.double(), want, rtol=1e-5, atol=1e-5)
+    assert (results["native"][0][:2] == 0).all() and (results["native"][0][44:] == 0).all()
+
+
+def test_without_biases_and_with_relu_off_the_kink() -> None:
+    # A ReLU whose input is within rounding of 0 may differ between two correct implementations; integers are not.
+    layers = chain(12, 2, activation="relu", octaves=None)
+    given = arguments(layers, [30, 41], bias=False)
+    given["positions"] = given["positions"].mul(8).round() + 0.5
+    given["weights"] = [weight.mul(8).round() * 2 + 1 for weight in given["weights"]]
+    native, exact = evaluate(given, torch.float32, "native"), evaluate(given, torch.float64, "reference")
+    for got, want in zip(native, exact):
+        torch.testing.assert_close(got.double(), want, rtol=1e-6, atol=1e-6 * float(want.abs().max()))
+
+
+def test_relu_gradients_agree_on_most_entries() -> None:
+    given = arguments(nerf(64, 4, activation="relu"), [700, 0, 300], rays=40)
+    native, exact = evaluate(given, torch.float32, "native"), evaluate(given, torch.float64, "reference")
+    for got, want in zip(native, exact):
+        assert float((got - want).abs().median()) <= 1e-5 * float(want.abs().max())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("o", [2, 40])
+def test_relu_stops_an_infinite_gradient_and_passes_what_is_not_a_number(o: int, dtype: torch.dtype, isa: str) -> None:
+    weight = torch.ones(1, o, 1)
+    weight[0, 1::2] = -1  # inactive for a positive x
+    x, offsets = torch.tensor([[1.0], [2.0], [torch.nan]]), torch.tensor([0, 3], dtype=torch.int32)
+    slopes = torch.tensor([[torch.inf], [1.0], [1.0]])
+    heads = torch.ones(1, 1, o)
+    active = Layer(("positions",), o, "relu")
+    # ReLU as the last layer, and as one that another reads.
+    for layers, weights in ((MLP((active,), (0,)), [weight]), (MLP((active, Layer((0,), 1)), (1,)), [weight, heads])):
+        results = []
+        for backend in ("native", "reference"):
+            leaves = [tensor.to(dtype).requires_grad_() for tensor in (x, weights[0], torch.zeros(1, o))]
+            rest = [tensor.to(dtype) for tensor in weights[1:]]
+            biases = [leaves[2], *[None] * len(rest)]
+            y = grouped_mlp(leaves[0], offsets, [leaves[1], *rest], biases, layers=layers, backend=backend)
+            results.append([y.detach(), *torch.autograd.grad(y, leaves, slopes.to(dtype).expand_as(y))])
+        for got, want in zip(*results):
+            torch.testing.assert_close(got, want, equal_nan=True)
+        positions, bias = results[0][1], results[0][3][0]
+        assert positions[0] == torch.inf and positions[1] == o // 2 and positions[2].isfinite()
+        assert (bias[::2] == torch.inf).all() and (bias[1::2] == 1).all()
+
+
+def test_same_bits_for_any_number_of_threads(isa: str) -> None:
+    given = arguments(nerf(40, 2), [5000, 3, 0, 900], rays=50)
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(evaluate(given, torch.float32, "native"))
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_several_python_threads_at_once() -> None:
+    given = [arguments(nerf(24, 2), [300 + 50 * i, 7], rays=11) for i in range(4)]
+    alone = [evaluate(one, torch.float32, "native") for one in given]
+    together: list[list[Tensor]] = [[] for _ in given]
+
+    def work(i: int) -> None:
+        for _ in range(3):
+            together[i] = evaluate(given[i], torch.float32, "native")
+
+    workers = [threading.Thread(target=work, args=(i,)) for i in range(len(given))]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert all(torch.equal(a, b) for one, other in zip(alone, together) for a, b in zip(one, other))
+
+
+def test_every_output_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Allocations come poisoned, between guards that must survive."""
+    guards: list[Tensor] = []
+
+    def poisoned(shape: tuple[int, ...]) -> Tensor:
+        size = torch.Size(shape).numel()
+        memory = torch.full((size + 64,), float("nan"))
+        guards.extend((memory[:32], memory[size + 32 :]))
+        return memory[32 : size + 32].view(shape)
+
+    native = pytest.importorskip("voronerf.native.grouped_mlp")
+    given = arguments(NETWORKS["graph"], [0, 50, 13, 0], rays=4)
+    given["positions"] = torch.cat([given["positions"], torch.ones(6, 3, dtype=torch.float64)])  # rows of no cell
+    given["direction_index"] = torch.cat([given["direction_index"], torch.zeros(6, dtype=torch.int32)])
+    want = evaluate(given, torch.float32, "native")
+    allocate, allocate_gradients = native._allocate, native._allocate_gradients
+    monkeypatch.setattr(native, "_allocate", lambda *a: poisoned(allocate(*a).shape))
+    monkeypatch.setattr(
+        native, "_allocate_gradients", lambda *a: [poisoned(tensor.shape) for tensor in allocate_gradients(*a)]
+    )
+    got = evaluate(given, torch.float32, "native")
+    assert all(torch.equal(a, b) for a, b in zip(want, got))
+    assert len(guards) > 10 and all(guard.isnan().all() for guard in guards)
+    assert (got[0][-6:] == 0).all() and (got[1][-6:] == 0).all()
+
+
+def test_memory_only_for_the_gradients_asked_for() -> None:
+    native = pytest.importorskip("voronerf.native.grouped_mlp")
+    x, tensor, empty = torch.zeros(9, 3), torch.zeros(2, 4, 3), torch.Size([0])
+    sizes = [result.shape for result in native._allocate_gradients(x, [tensor] * 2, [tensor] * 2, x, [False] * 3)]
+    assert sizes == [empty] * 6
+    sizes = [result.shape for result in native._allocate_gradients(x, [tensor], [tensor], None, [True, False, True])]
+    assert sizes == [tensor.shape] * 2 + [empty] * 2
+
+
+def test_only_the_gradients_asked_for() -> None:
+    given = cast(arguments(nerf(16, 2), [20, 30], rays=7), torch.float32)
+    everything = tensors(given)
+    full = torch.autograd.grad(grouped_mlp(**given, backend="native").sum(), everything)
+    for chosen in ([0], [1], [0, 1], [3], [2, len(everything) - 1]):
+        for index, tensor in enumerate(everything):
+            tensor.requires_grad_(index in chosen)
+        some = torch.autograd.grad(grouped_mlp(**given, backend="native").sum(), [everything[i] for i in chosen])
+        assert all(torch.equal(full[i], gradient) for i, gradient in zip(chosen, some))
+
+
+@pytest.mark.parametrize("where", ["positions", "weights", "directions"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 3e38])
+def test_what_is_not_finite_stays_where_it_is(where: str, value: float) -> None:
+    given = arguments(nerf(17, 2, activation="relu"), [20, 30, 10], rays=8)
+    plain = grouped_mlp(**cast(given, torch.float32), backend="native")
+    target = given["weights"][0] if where == "weights" else given[where]
+    target[1].view(-1)[0] = value
+    changed = cast(given, torch.float32)
+    got, want = (grouped_mlp(**changed, backend=backend) for backend in ("native", "reference"))
+    assert torch.equal(got.isnan(), want.isnan()) or value == 3e38
+    untouched = want.isfinite() & ~(want != grouped_mlp(**cast(given, torch.float32), backend="reference"))
+    assert (got[untouched].isfinite()).all()
+    if where == "weights":
+        assert torch.equal(got[:20], plain[:20]) and torch.equal(got[50:], plain[50:])
+
+
+def test_large_positions() -> None:
+    given = arguments(chain(8, 1, octaves=10), [40])
+    given["positions"] = (given["positions"] * 1000).float().double()
+    given["positions"][3] = 1e20
+    got, want = (evaluate(given, torch.float32, backend)[0] for backend in ("native", "reference"))
+    torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5 * float(want[:3].abs().max()))
+
+
+def test_float16_storage() -> None:
+    given = cast(arguments(nerf(16, 2), [20, 30], rays=7), torch.float16)
+    out = grouped_mlp(**given, backend="native")
+    gradients = torch.autograd.grad(out.float().sum(), tensors(given))
+    assert out.dtype == torch.float16 and all(gradient.dtype == torch.float16 for gradient in gradients)
+    want = grouped_mlp(**cast(given, torch.float32), backend="native")
+    torch.testing.assert_close(out.float(), want, rtol=2e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_bfloat16_storage(name: str, isa: str) -> None:
+    """Errors in the Euclidean norm: at most 1.5 times those of the reference with the same storage."""
+    given = arguments(NETWORKS[name], [0, 61, 1, 0, 250, 7, 0])
+    given = {**given, **{key: cast(given, torch.bfloat16)[key] for key in ("weights", "biases")}}
+    exact = evaluate(given, torch.float64, "reference")
+    stored = [evaluate(given, torch.bfloat16, backend) for backend in ("reference", "native")]
+    for index, (want, usual, got) in enumerate(zip(exact, *stored)):
+        assert got.shape == want.shape and got.dtype == torch.bfloat16
+        error, allowed = float((got - want).norm()), 1.5 * float((usual - want).norm()) + 2e-3 * float(want.norm())
+        assert error <= allowed, f"tensor {index}: error {error:.2e}, allowed {allowed:.2e}"
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2, 5, 47, 48, 95, 96, 97, 501])
+def test_bfloat16_with_any_number_of_rows(rows: int) -> None:
+    given = arguments(nerf(33, 2), [rows], rays=5)
+    want, got = evaluate(given, torch.float32, "native"), evaluate(given, torch.bfloat16, "native")
+    for exact, stored in zip(want, got):
+        assert float((stored - exact).norm()) <= 0.2 * float(exact.norm())
+
+
+def test_bfloat16_same_bits_for_any_number_of_threads() -> None:
+    given, before, results = arguments(nerf(40, 2), [5000, 3, 0, 900], rays=50), torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(evaluate(given, torch.bfloat16, "native"))
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_bfloat16_keeps_what_is_not_finite_in_its_row() -> None:
+    given = arguments(nerf(17, 2), [20, 30], rays=50)
+    given["direction_index"] = torch.arange(50, dtype=torch.int32)
+    given["positions"][3] = float("inf")
+    given["directions"][30] = float("nan")
+    out = grouped_mlp(**cast(given, torch.bfloat16), backend="native")
+    spoiled = torch.zeros(50, dtype=torch.bool)
+    spoiled[3] = True
+    assert torch.equal(out[:, 3].isnan(), spoiled)
+    spoiled[30] = True
+    assert torch.equal(out[:, 0].isnan(), spoiled)
+
+
+def test_autocast() -> None:
+    given = cast(arguments(nerf(16, 2), [20, 30]), torch.float32)
+    want = grouped_mlp(**given, backend="native")
+    with torch.autocast("cpu", torch.bfloat16):
+        out = grouped_mlp(**given, backend="native")
+    assert out.dtype == torch.bfloat16
+    torch.testing.assert_close(out.float(), want, rtol=0, atol=0.02 * float(want.detach().abs().max()))
+    gradients = torch.autograd.grad(out.float().sum(), tensors(given))
+    assert all(gradient.dtype == torch.float32 for gradient in gradients)
+
+
+def test_float64_positions_are_encoded_in_float64() -> None:
+    given = arguments(chain(8, 1, octaves=10), [40])
+    given["positions"] += 100
+    exact = evaluate(given, torch.float64, "reference")[0]
+    mixed = {**cast(given, torch.float32), "positions": given["positions"]}
+    got = grouped_mlp(**mixed, backend="native").detach()
+    assert float((got - exact).abs().max()) <= 1e-5 * float(exact.abs().max())
+
+
+def test_non_contiguous() -> None:
+    given = cast(arguments(nerf(16, 2), [20, 30]), torch.float32)
+    want = grouped_mlp(**given, backend="native")
+    strided = {
+        **given,
+        "positions": given["positions"].t().contiguous().t(),
+        "directions": given["directions"].repeat(1, 2)[:, :3],
+        "weights": [weight.transpose(1, 2).contiguous().transpose(1, 2) for weight in given["weights"]],
+    }
+    assert torch.equal(grouped_mlp(**strided, backend="native"), want)
+
+
+def test_second_derivatives() -> None:
+    results = {}
+    given = arguments(nerf(6, 2), [5, 0, 8], rays=4)
+    for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
+        leaves = cast(given, dtype)
+        out = grouped_mlp(**leaves, backend=backend)
+        firsts = torch.autograd.grad((out * out).sum(), tensors(leaves), create_graph=True)
+        penalty = sum((first * first).sum() for first in firsts)
+        results[backend] = torch.autograd.grad(penalty, tensors(leaves))
+    for want, got in zip(results["reference"], results["native"]):
+        torch.testing.assert_close(got.double(), want, rtol=1e-3, atol=1e-5 * float(want.abs().max()))
+
+
+def test_opcheck() -> None:
+    native = pytest.importorskip("voronerf.native.grouped_mlp")
+    given = cast(arguments(nerf(6, 2), [5, 0, 8], rays=4), torch.float32)
+    passed = [given[name] for name in ("positions", "weights", "biases", "layers", "directions")]
+    table = native.network(*passed).table
+    shared = (given["positions"], given["offsets"], given["weights"], given["biases"], table)
+    directions = (given["directions"], given["direction_index"])
+    torch.library.opcheck(native._forward, (*shared, *directions))
+    gradient = torch.randn(13, 4, requires_grad=True)
+    order = torch.randperm(13, dtype=torch.int32)
+    torch.library.opcheck(native._backward, (gradient, *shared, *directions, order, [True, True, True]))
+    assert native._layers(table, given["weights"]) == given["layers"]
+
+
+def test_compiles_whole() -> None:
+    given = cast(arguments(nerf(8, 2), [9, 0, 4], rays=3), torch.float32)
+
+    @torch.compile(fullgraph=True)
+    def loss(positions: Tensor, weights: list[Tensor]) -> Tensor:
+        return grouped_mlp(**{**given, "positions": positions, "weights": weights}, backend="native").square().sum()
+
+    leaves = [given["positions"], *given["weights"]]
+    compiled = torch.autograd.grad(loss(given["positions"], given["weights"]), leaves)
+    eager = torch.autograd.grad(grouped_mlp(**given, backend="native").square().sum(), leaves)
+    for got, want in zip(compiled, eager):
+        torch.testing.assert_close(got, want)
+
+
+def test_compiles_for_any_size() -> None:
+    given = cast(arguments(nerf(8, 2), [9, 0, 4], rays=3), torch.float32)
+
+    @torch.compile(fullgraph=True, dynamic=True, backend="aot_eager")
+    def loss(positions: Tensor, offsets: Tensor, index: Tensor, weights: list[Tensor]) -> Tensor:
+        changed = {"positions": positions, "offsets": offsets, "direction_index": index, "weights": weights}
+        return grouped_mlp(**{**given, **changed}, backend="native").square().sum()
+
+    leaves = [given["positions"], *given["weights"]]
+    compiled = torch.autograd.grad(
+        loss(given["positions"], given["offsets"], given["direction_index"], given["weights"]), leaves
+    )
+    eager = torch.autograd.grad(grouped_mlp(**given, backend="native").square().sum(), leaves)
+    for got, want in zip(compiled, eager):
+        torch.testing.assert_close(got, want)
+
+
+def test_linear_compiles_for_any_size() -> None:
+    @torch.compile(fullgraph=True, dynamic=True, backend="aot_eager")
+    def run(x: Tensor, offsets: Tensor, weight: Tensor) -> Tensor:
+        return grouped_linear(x, offsets, weight, activation="relu", backend="native")
+
+    for n, k, o, i in ((9, 2, 5, 4), (14, 3, 7, 6)):
+        x, weight = torch.randn(n, i, requires_grad=True), torch.randn(k, o, i, requires_grad=True)
+        offsets = torch.linspace(0, n, k + 1).int()
+        got, want = (each(x, offsets, weight) for each in (run, functools.partial(grouped_linear, activation="relu")))
+        torch.testing.assert_close(got, want)
+        for a, b in zip(*(torch.autograd.grad(y.square().sum(), [x, weight]) for y in (got, want))):
+            torch.testing.assert_close(a, b)
+
+
+def test_errors() -> None:
+    given = cast(arguments(nerf(6, 2), [5, 8], rays=4), torch.float32)
+    for bad in ([0, 9, 5], [0, 5, 14], [-1, 5, 13]):
+        with pytest.raises(ValueError, match=r"^grouped_mlp: offsets must rise"):
+            grouped_mlp(**{**given, "offsets": torch.tensor(bad, dtype=torch.int32)}, backend="native")
+    for bad_index in (4, -1):
+        index = given["direction_index"].clone()
+        index[3] = bad_index
+        for backend in ("native", "reference"):
+            with pytest.raises(ValueError, match=rf"^grouped_mlp: direction_index must be 0 to 3, got {bad_index}$"):
+                grouped_mlp(**{**given, "direction_index": index}, backend=backend)
+
+
+def test_a_plan_without_features_is_refused() -> None:
+    native = pytest.importorskip("voronerf.native.grouped_mlp")
+    offsets, weight = torch.tensor([0, 5], dtype=torch.int32), torch.zeros(1, 2, 0)
+    linear = pytest.importorskip("voronerf.native.grouped_linear")
+    with pytest.raises(RuntimeError, match="grouped_linear: a layer must have inputs and outputs"):
+        linear.grouped_linear(torch.zeros(5, 0), offsets, weight)
+    with pytest.raises(RuntimeError, match="grouped_mlp: every layer must have outputs, and inputs from sources"):
+        native.grouped_mlp(torch.zeros(5, 0), offsets, [weight], [None], layers=chain(2, 0, out=2))
+
+
+def test_float64_is_left_to_the_reference() -> None:
+    given = cast(arguments(nerf(6, 2), [5, 8]), torch.float64)
+    assert grouped_mlp(**given).dtype == torch.float64

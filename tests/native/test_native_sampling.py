@@ -1,0 +1,247 @@
+"""The encodings and resample of the compiled module: what the tests of the operations leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from tolerances import assert_as_exact
+from torch import Tensor
+
+from voronerf.ops import frequency_encode, integrated_encode, resample
+
+pytestmark = pytest.mark.native
+
+HALVES = (torch.float16, torch.bfloat16)
+# Around the rows of a tile.
+ROWS = (0, 1, 2, 31, 32, 33, 100)
+
+
+@pytest.fixture(params=["portable", "avx2", "avx512"])
+def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    native = pytest.importorskip("voronerf.native")
+    number = native.ISAS.index(request.param)
+    if not native._C.isa_supported(number):
+        pytest.skip(f"{request.param}: not supported by this processor")
+    monkeypatch.setattr(native, "_ISA", number)
+    return request.param
+
+
+@pytest.fixture
+def threads() -> Iterator[tuple[int, ...]]:
+    before = torch.get_num_threads()
+    yield (1, 2, 3)
+    torch.set_num_threads(before)
+
+
+def points(n: int, d: int = 3) -> Tensor:
+    return 4 * torch.rand(n, d, dtype=torch.float64) - 2
+
+
+def encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], list[Tensor]]]:
+    """Both encodings, each with float64 inputs."""
+    return [
+        (lambda x, backend: frequency_encode(x, octaves, backend=backend), [points(n)]),
+        (lambda x, backend: frequency_encode(x, octaves, include_input=False, backend=backend), [points(n)]),
+        (
+            lambda x, variances, backend: integrated_encode(x, variances, octaves, backend=backend),
+            [points(n), torch.rand(n, 3, dtype=torch.float64) / 10],
+        ),
+    ]
+
+
+def evaluate(run: Callable[..., Tensor], inputs: list[Tensor], dtype: torch.dtype, backend: str) -> list[Tensor]:
+    """Result and gradients."""
+    leaves = [tensor.to(dtype).requires_grad_() for tensor in inputs]
+    out = run(*leaves, backend=backend)
+    slopes = torch.linspace(-1, 1.5, out.numel(), dtype=torch.float64).view_as(out).to(dtype)
+    return [out.detach(), *torch.autograd.grad(out, leaves, slopes)]
+
+
+def assert_close(run: Callable[..., Tensor], inputs: list[Tensor]) -> None:
+    inputs = [tensor.float().double() for tensor in inputs]
+    exact, plain = (evaluate(run, inputs, dtype, "reference") for dtype in (torch.float64, torch.float32))
+    for found, same, right in zip(evaluate(run, inputs, torch.float32, "native"), plain, exact):
+        assert_as_exact(found, same, right)
+
+
+@pytest.mark.parametrize("n", ROWS)
+def test_any_number_of_rows(isa: str, n: int) -> None:
+    for run, inputs in encodings(n):
+        assert_close(run, inputs)
+
+
+@pytest.mark.parametrize("include_input", [True, False])
+@pytest.mark.parametrize("octaves", [1, 2, 3, 10, 16])
+@pytest.mark.parametrize("d", [1, 2, 3, 4, 5, 8, 9, 16, 17, 40])
+def test_any_number_of_features(isa: str, d: int, octaves: int, include_input: bool) -> None:
+    assert_close(
+        lambda x, backend: frequency_encode(x, octaves, include_input=include_input, backend=backend), [points(35, d)]
+    )
+
+
+def test_without_octaves(isa: str) -> None:
+    x = torch.rand(40, 3, requires_grad=True)
+    encoded = frequency_encode(x, 0, backend="native")
+    assert torch.equal(encoded, x)
+    assert torch.equal(torch.autograd.grad(encoded.sum(), x)[0], torch.ones(40, 3))
+    nothing = frequency_encode(x, 0, include_input=False, backend="native")
+    assert nothing.shape == (40, 0)
+    assert torch.equal(torch.autograd.grad(nothing.sum(), x)[0], torch.zeros(40, 3))
+
+
+@pytest.mark.parametrize("value", [3e3, 1e5, 1e9, 1e30, float("inf"), -float("inf"), float("nan")])
+def test_large_angles_and_what_is_not_finite(isa: str, value: float) -> None:
+    x = points(70).float()
+    x[33, 1] = value
+    for run, inputs in encodings(70, 8):
+        inputs = [x, *(tensor.float() for tensor in inputs[1:])]
+        got, want = (run(*inputs, backend=backend) for backend in ("native", "reference"))
+        torch.testing.assert_close(got, want, rtol=0, atol=1e-6, equal_nan=True)
+
+
+def test_large_variances(isa: str) -> None:
+    means, variances = (
+        torch.rand(6, 3),
+        torch.tensor([0.0, 1e-3, 170.0, 200.0, 1e30, float("inf")])[:, None].expand(6, 3),
+    )
+    results = [evaluate(run, [means, variances], torch.float32, "native") for run, _ in encodings(0)[2:]]
+    expected = evaluate(encodings(0)[2][0], [means, variances], torch.float32, "reference")
+    for got, want in zip(results[0], expected):
+        assert got.isfinite().all()
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
+
+
+def test_same_bits_for_any_number_of_threads(isa: str, threads: tuple[int, ...]) -> None:
+    cases = encodings(1000)
+    weights, edges = torch.rand(300, 40), torch.rand(300, 41).cumsum(1)
+    uniforms = torch.rand(300, 50)
+    results = []
+    for count in threads:
+        torch.set_num_threads(count)
+        found = [tensor for run, inputs in cases for tensor in evaluate(run, inputs, torch.float32, "native")]
+        results.append([*found, resample(weights, edges, 50, uniforms=uniforms, backend="native")])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_every_output_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Allocations and workspaces come poisoned, between guards that must survive."""
+    native = pytest.importorskip("voronerf.native.sampling")
+    guards: list[Tensor] = []
+
+    def poisoned(tensor: Tensor) -> Tensor:
+        memory = torch.full((tensor.numel() + 64,), float("nan"))
+        guards.extend((memory[:32], memory[tensor.numel() + 32 :]))
+        return memory[32 : tensor.numel() + 32].view(tensor.shape)
+
+    def run_all() -> list[Tensor]:
+        found = [tensor for run, inputs in cases for tensor in evaluate(run, inputs, torch.float32, "native")]
+        return [*found, resample(weights, edges, 9, backend="native")]
+
+    cases = [case for n in (0, 1, 33, 70) for case in encodings(n, 5)]
+    cases.append((lambda x, backend: frequency_encode(x, 3, backend=backend), [points(35, 20)]))
+    weights, edges = torch.rand(7, 5), torch.rand(7, 6).cumsum(1)
+    wanted = run_all()
+    for name in ("_allocate", "_allocate_depths", "_workspace"):
+        real = getattr(native, name)
+        monkeypatch.setattr(native, name, lambda *a, real=real: poisoned(real(*a)))
+    gradients = native._allocate_gradients
+    monkeypatch.setattr(native, "_allocate_gradients", lambda *a: [poisoned(each) for each in gradients(*a)])
+    found = run_all()
+    assert all(torch.equal(a, b) for a, b in zip(wanted, found))
+    assert len(guards) > 100 and all(guard.isnan().all() for guard in guards)
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+def test_half_gradients(dtype: torch.dtype) -> None:
+    for run, inputs in encodings(20, 3):
+        wide = [tensor.to(dtype).float() for tensor in inputs]
+        found, want = evaluate(run, wide, dtype, "native"), evaluate(run, wide, torch.float32, "native")
+        assert all(tensor.dtype == dtype for tensor in found)
+        for got, right in zip(found, want):
+            scale = float(right.abs().max())
+            torch.testing.assert_close(got.float(), right, rtol=0, atol=2 * torch.finfo(dtype).eps * scale)
+
+
+def test_float64_is_left_to_the_reference() -> None:
+    x = points(5)
+    assert frequency_encode(x, 2).dtype == integrated_encode(x, x.abs(), 2).dtype == torch.float64
+    assert resample(x.abs(), points(5, 4).cumsum(1), 2).dtype == torch.float64
+
+
+def test_non_contiguous_gradients() -> None:
+    for run, inputs in encodings(20):
+        leaves = [tensor.float().requires_grad_() for tensor in inputs]
+        out = run(*leaves, backend="native")
+        expanded, same = (
+            torch.autograd.grad(out, leaves, slope, retain_graph=True)
+            for slope in (torch.ones(1, 1).expand_as(out), torch.ones_like(out))
+        )
+        assert all(torch.equal(a, b) for a, b in zip(expanded, same))
+
+
+def test_second_derivatives() -> None:
+    for run, inputs in encodings(7, 2):
+        results = {}
+        for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
+            leaves = [tensor.to(dtype).requires_grad_() for tensor in inputs]
+            firsts = torch.autograd.grad(run(*leaves, backend=backend).pow(3).sum(), leaves, create_graph=True)
+            results[backend] = torch.autograd.grad(sum(first.square().sum() for first in firsts), leaves)
+        for want, got in zip(results["reference"], results["native"]):
+            torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-5 * float(want.abs().max()))
+
+
+@pytest.mark.parametrize("octaves", [0, 2])
+def test_opcheck(octaves: int) -> None:
+    native = pytest.importorskip("voronerf.native.sampling")
+    x, variances = torch.rand(5, 3, requires_grad=True), torch.rand(5, 3, requires_grad=True)
+    for inputs in ((x, None, octaves, True), (x, None, octaves, False), (x, variances, octaves, False)):
+        torch.library.opcheck(native._encode, inputs)
+        gradient = torch.rand(5, 3 * (2 * octaves + inputs[3]), requires_grad=True)
+        torch.library.opcheck(native._encode_backward, (gradient, *inputs))
+    weights, edges = torch.rand(4, 3), torch.rand(4, 4).cumsum(1)
+    for uniforms in (None, torch.rand(4, 6)):
+        torch.library.opcheck(native._resample, (weights, edges, 6, uniforms))
+
+
+def test_compiles_whole() -> None:
+    weights, edges = torch.rand(5, 4), torch.rand(5, 5).cumsum(1)
+
+    def loss(x: Tensor, variances: Tensor) -> Tensor:
+        depths = resample(weights, edges, 3, backend="native")
+        plain = frequency_encode(x, 3, backend="native").square().sum()
+        return plain + (integrated_encode(x, variances, 2, backend="native") ** 3).sum() + depths.sum()
+
+    leaves = [torch.rand(9, 3, requires_grad=True), torch.rand(9, 3, requires_grad=True)]
+    compiled, eager = torch.compile(loss, fullgraph=True)(*leaves), loss(*leaves)
+    torch.testing.assert_close(compiled, eager)
+    for got, want in zip(torch.autograd.grad(compiled, leaves), torch.autograd.grad(eager, leaves)):
+        torch.testing.assert_close(got, want)
+
+
+@pytest.mark.parametrize(("r", "s", "count"), [(1, 1, 1), (7, 1, 5), (9, 33, 2), (40, 64, 65)])
+@pytest.mark.parametrize("given", [False, True])
+def test_depths_of_the_reference(r: int, s: int, count: int, given: bool) -> None:
+    weights = (torch.rand(r, s) * (torch.rand(r, s) > 0.4)).float()
+    edges = (0.1 + torch.rand(r, s + 1)).cumsum(1)
+    uniforms = torch.rand(r, count) if given else None
+    found = resample(weights, edges, count, uniforms=uniforms, backend="native")
+    wide = None if uniforms is None else uniforms.double()
+    exact = resample(weights.double(), edges.double(), count, uniforms=wide, backend="reference")
+    torch.testing.assert_close(found.double(), exact, rtol=1e-6, atol=0)
+
+
+def test_uniforms_at_and_beyond_the_ends() -> None:
+    weights, edges = torch.tensor([[0.0, 1.0, 0.0, 1.0, 0.0]]), torch.arange(6.0)[None]
+    uniforms = torch.tensor([[2.0, 1.0, 0.5, 0.0, -1.0]])
+    assert resample(weights, edges, 5, uniforms=uniforms, backend="native").tolist() == [[1, 1, 3, 4, 4]]
+    uniforms = torch.tensor([[0.75, float("nan"), 0.25]])
+    depths = resample(weights, edges, 3, uniforms=uniforms, backend="native")[0]
+    assert depths[:2].tolist() == [1.5, 3.5] and depths[2].isnan()
+
+
+def test_masses_whose_sum_overflows_float32() -> None:
+    weights, edges = torch.full((1, 4), 3e38), torch.arange(5.0)[None]
+    assert resample(weights, edges, 4, backend="native").tolist() == [[0.5, 1.5, 2.5, 3.5]]

@@ -1,0 +1,244 @@
+"""What a routed field must equal: a loop over the cells, with a mask and a module of its own for each.
+
+A `Case` is a field, arguments as its codebase passes them, and what the router has to be told. Modules of distinct
+cells come from the case itself, so the loop shares no code with the router. Letters: n samples, k cells.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.util
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf import VoronoiRouter
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+K = 5
+
+
+def example(name: str) -> ModuleType:
+    """The script of that name in `examples/`, imported."""
+    full = f"examples_{name}"
+    if full not in sys.modules:
+        spec = importlib.util.spec_from_file_location(full, EXAMPLES / f"{name}.py")
+        assert spec is not None and spec.loader is not None
+        sys.modules[full] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[full])
+    return sys.modules[full]
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A field and how it is called.
+
+    Attributes:
+        name: of the test.
+        make: a fresh field with random parameters, float32.
+        arguments: leading shape -> (args, kwargs), float32.
+        positions: the arguments -> positions [..., 3].
+        lead: leading shape of the samples: (n,), or (rays, samples).
+        options: of the router.
+        given: whether positions are passed at the call.
+        method: what is called.
+        one_pass: the module and each of its functions run once for all cells; else they may run cell by cell.
+        rank: dimensions of a sample's tensors as the loop passes them; 3 is [m, 1, d].
+        smooth: whether second derivatives are compared.
+    """
+
+    name: str
+    make: Callable[[], nn.Module]
+    arguments: Callable[[tuple[int, ...]], tuple[tuple[Any, ...], dict[str, Any]]]
+    positions: Callable[..., Tensor]
+    lead: tuple[int, ...] = (61,)
+    options: dict[str, Any] = dataclasses.field(default_factory=lambda: {"coords": "first3"})
+    given: bool = False
+    method: str = "forward"
+    one_pass: bool = True
+    rank: int = 2
+    smooth: bool = False
+
+    def __str__(self) -> str:
+        return self.name
+
+    def modules(self, dtype: torch.dtype = torch.float32) -> list[nn.Module]:
+        """A module of its own for each of K cells, every parameter random, biases too."""
+        return [randomised(self.make()).to(dtype) for _ in range(K)]
+
+    def call(self, module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """The field's method on a module or a router."""
+        function = module if self.method == "forward" else getattr(module, self.method)
+        if self.given and isinstance(module, VoronoiRouter):
+            kwargs = {**kwargs, "coords": self.positions(*args, **kwargs)}
+        return function(*args, **kwargs)
+
+
+def randomised(module: nn.Module) -> nn.Module:
+    """Moves every trainable parameter, so that none is zero or one by initialisation."""
+    with torch.no_grad():
+        for parameter in module.parameters():
+            if parameter.requires_grad:
+                parameter += 0.1 * torch.randn_like(parameter)
+    return module
+
+
+def mapped(tree: Any, function: Callable[[Tensor], Any]) -> Any:
+    """Arguments with every tensor replaced, in tuples, lists, dicts and dataclasses."""
+    if isinstance(tree, Tensor):
+        return function(tree)
+    if isinstance(tree, dict):
+        return {key: mapped(value, function) for key, value in tree.items()}
+    if isinstance(tree, (tuple, list)):
+        parts = [mapped(value, function) for value in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
+    if dataclasses.is_dataclass(tree) and not isinstance(tree, type):
+        return dataclasses.replace(
+            tree, **{f.name: mapped(getattr(tree, f.name), function) for f in dataclasses.fields(tree)}
+        )
+    return tree
+
+
+def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """(path, value) of everything in an output that is no container; the path names the containers' types."""
+    kind = type(tree).__name__
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            yield from leaves(value, f"{path}/{kind}[{key}]")
+    elif isinstance(tree, (tuple, list)):
+        for index, value in enumerate(tree):
+            yield from leaves(value, f"{path}/{kind}[{index}]")
+    elif dataclasses.is_dataclass(tree) and not isinstance(tree, type):
+        for f in dataclasses.fields(tree):
+            yield from leaves(getattr(tree, f.name), f"{path}/{kind}.{f.name}")
+    else:
+        yield path, tree
+
+
+def tensors(tree: Any) -> dict[str, Tensor]:
+    """The tensors of an output by path; everything else by its path and text, so that structures compare."""
+    return {path if isinstance(v, Tensor) else f"{path}={v!r}": v for path, v in leaves(tree)}
+
+
+def prepared(case: Case, dtype: torch.dtype, lead: tuple[int, ...] | None = None) -> tuple[Any, Any, list[Tensor]]:
+    """Arguments of a dtype, and the floating tensors among them as leaves that take a gradient."""
+    inputs: list[Tensor] = []
+
+    def take(tensor: Tensor) -> Tensor:
+        if not tensor.is_floating_point():
+            return tensor
+        inputs.append(tensor.detach().to(dtype).clone().requires_grad_())
+        return inputs[-1]
+
+    args, kwargs = mapped(case.arguments(case.lead if lead is None else lead), take)
+    return args, kwargs, inputs
+
+
+def nearest(case: Case, centres: Tensor, args: Any, kwargs: Any) -> Tensor:
+    """Cell of each sample, int64 [n]."""
+    positions = case.positions(*args, **kwargs).detach().reshape(-1, 3).double()
+    return (positions[:, None] - centres.double()).square().sum(-1).argmin(1)
+
+
+def loop(case: Case, modules: list[nn.Module], centres: Tensor, args: Any, kwargs: Any) -> dict[str, Tensor]:
+    """Outputs by path, each sample evaluated by the module of its nearest centre, one cell after the other."""
+    cells, lead = nearest(case, centres, args, kwargs), case.lead
+    n = cells.shape[0]
+
+    def rows(index: Tensor) -> Callable[[Tensor], Tensor]:
+        def take(tensor: Tensor) -> Tensor:
+            if tensor.dim() >= len(lead) and tensor.shape[: len(lead)] == lead:
+                flat = tensor.reshape(n, *tensor.shape[len(lead) :])
+            elif len(lead) == 2 and tensor.shape[0] == lead[0]:  # a row for each ray
+                return tensor.repeat_interleave(lead[1], 0)[index]
+            else:
+                return tensor
+            return flat[index][:, None] if case.rank == 3 else flat[index]
+
+        return take
+
+    order, parts = [], []
+    for cell in cells.unique().tolist():
+        index = (cells == cell).nonzero()[:, 0]
+        order.append(index)
+        part = tensors(case.call(modules[cell], *mapped((args, kwargs), rows(index))))
+        parts.append({key: v.squeeze(1) if case.rank == 3 and isinstance(v, Tensor) else v for key, v in part.items()})
+    inverse = torch.cat(order).argsort()
+    result = {}
+    for key, first in parts[0].items():
+        if isinstance(first, Tensor):
+            joined = torch.cat([part[key] for part in parts])[inverse]
+            result[key] = joined.reshape(*lead, *joined.shape[1:])
+        else:
+            result[key] = first
+    return result
+
+
+def routed(case: Case, modules: list[nn.Module], centres: Tensor) -> VoronoiRouter:
+    """A router whose cells are the given modules."""
+    return VoronoiRouter.from_modules(modules, centres, **case.options)
+
+
+def close(
+    found: dict[str, Any], expected: dict[str, Any], *, rtol: float | None = None, atol: float | None = None
+) -> None:
+    """Same structure, same shapes and dtypes, same numbers."""
+    assert list(found) == list(expected)
+    for key, value in expected.items():
+        if isinstance(value, Tensor):
+            torch.testing.assert_close(found[key], value, rtol=rtol, atol=atol, msg=lambda m, key=key: f"{key}: {m}")
+
+
+def scalar(outputs: dict[str, Any]) -> Tensor:
+    """A loss that weighs every number of the outputs differently, the same each time it is called."""
+    generator = torch.Generator().manual_seed(7)
+    parts = []
+    for value in outputs.values():
+        if isinstance(value, Tensor) and value.is_floating_point():
+            weights = torch.randn(value.shape, generator=generator, dtype=torch.float64).to(value.dtype)
+            parts.append((value * weights).sum())
+    return torch.stack(parts).sum()
+
+
+def gradients_of_cells(
+    modules: list[nn.Module], loss: Tensor, inputs: list[Tensor]
+) -> tuple[dict[str, Tensor], list[Tensor]]:
+    """Gradients of a loop's loss: of the parameters, stacked [k, ...] by name, and of the inputs."""
+    names = [name for name, p in modules[0].named_parameters() if p.requires_grad]
+    wanted = [module.get_parameter(name) for module in modules for name in names]
+    found = torch.autograd.grad(loss, [*wanted, *inputs], allow_unused=True, retain_graph=True)
+    filled = [torch.zeros_like(p) if g is None else g for p, g in zip([*wanted, *inputs], found)]
+    parameters = {name: torch.stack(filled[i : len(wanted) : len(names)]) for i, name in enumerate(names)}
+    return parameters, filled[len(wanted) :]
+
+
+def gradients_of_router(
+    router: VoronoiRouter, names: list[str], loss: Tensor, inputs: list[Tensor]
+) -> tuple[dict[str, Tensor], list[Tensor]]:
+    """The same of the router's loss."""
+    wanted = [router.module.get_parameter(name) for name in names]
+    found = torch.autograd.grad(loss, [*wanted, *inputs], allow_unused=True, retain_graph=True)
+    filled = [torch.zeros_like(p) if g is None else g for p, g in zip([*wanted, *inputs], found)]
+    return dict(zip(names, filled)), filled[len(wanted) :]
+
+
+class Counter:
+    """Counts a module class's calls of a method, and the rows of each; the first argument holds the samples."""
+
+    def __init__(self, monkeypatch: Any, cls: type[nn.Module], method: str) -> None:
+        self.rows: list[int] = []
+        original = getattr(cls, method)
+
+        @functools.wraps(original)
+        def counted(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
+            found = [v for _, v in leaves((args, kwargs)) if isinstance(v, Tensor)]
+            self.rows.append(found[0].shape[0])
+            return original(module, *args, **kwargs)
+
+        monkeypatch.setattr(cls, method, counted)

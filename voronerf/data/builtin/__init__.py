@@ -1,0 +1,7 @@
+"""Scenes computed from formulas, so that everything runs with no download."""
+
+from voronerf.data.builtin.opaque import builtin_scene
+from voronerf.data.builtin.rich import rich_scene
+from voronerf.data.builtin.translucent import translucent_scene
+
+__all__ = ["builtin_scene", "rich_scene", "translucent_scene"]

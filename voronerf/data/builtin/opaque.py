@@ -1,0 +1,178 @@
+"""The built-in scene: ray-cast from formulas, so that everything runs with no download.
+
+A mosaic plinth carries a sphere, a box, a drum and a column with a ring and a globe, among a circle of marbles: fine
+texture spread over space, sharp edges, hard shadows (which views share) and highlights (which move with the view).
+Images have alpha, by supersampling. Units, axes and camera distance are those of Blender synthetic scenes.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from voronerf.data.builtin.opaque_solids import SOLIDS
+from voronerf.data.builtin.solids import Array, Rows, Solid, first_hits, normalised, slab, turned
+from voronerf.data.scene import Scene, Split
+from voronerf.rendering.cameras import Cameras, look_at
+
+TRAIN_VIEWS, TEST_VIEWS = 100, 25
+DISTANCE = 4.0
+ANGLE_X = 0.6911112  # horizontal field of view of the Blender scenes, radians
+NEAR, FAR = 2.0, 6.0
+SUPERSAMPLES = 3  # on each side of a pixel
+LIGHT = normalised(np.array(((0.45, -0.55, 0.70),), dtype=np.float32))
+AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.46, 0.64, 0.50
+BAND = 1 << 15  # rays at a time, so that their arrays stay in the cache
+# from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity, [r, 4]
+See = Callable[[Array, Array], Array]
+# from origins and unit directions, [r, 3] or one [1, 3] for all, to distances [r] and numbers of solids [r]
+Hits = Callable[[Array, Array], tuple[Array, Rows]]
+LIFT = 2e-3  # a shadow's ray starts this far above the surface
+
+
+def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS) -> Scene:
+    """Computes the scene.
+
+    Args:
+        size: of the square images, pixels.
+        train_views: spread over the upper hemisphere on a spherical Fibonacci lattice.
+        test_views: on an orbit that rises and falls twice, apart from the training views.
+    """
+    train, test = builtin_cameras("builtin_scene", size, train_views, test_views)
+    box = bounds()
+    train_split = render_views(train, "train", see, box=box, supersamples=SUPERSAMPLES)
+    test_split = render_views(test, "test", see, box=box, supersamples=SUPERSAMPLES)
+    return Scene("builtin", train_split, test_split, NEAR, FAR, torch.from_numpy(box), "linear", "white")
+
+
+def builtin_cameras(caller: str, size: int, train_views: int, test_views: int) -> tuple[Cameras, Cameras]:
+    """The cameras of the training and of the test views of a built-in scene.
+
+    Raises:
+        ValueError: a size or number of views below 1; names ``caller``.
+    """
+    if size < 1:
+        raise ValueError(f"{caller}: size must be >= 1, got {size}")
+    if train_views < 1 or test_views < 1:
+        raise ValueError(f"{caller}: there must be at least one view, got {train_views} and {test_views}")
+    height = (torch.arange(train_views) + 0.5) / train_views
+    golden = math.pi * (3 - math.sqrt(5))
+    train = _cameras(torch.asin(0.02 + 0.96 * height), golden * torch.arange(train_views), size)
+    turn = 2 * math.pi * torch.arange(test_views) / test_views
+    return train, _cameras(torch.deg2rad(28 + 16 * torch.sin(2 * turn)), turn + 0.05, size)
+
+
+def bounds(solids: Sequence[Solid] = SOLIDS) -> Array:
+    """The box that holds all solids, [2, 3]."""
+    boxes = np.stack([solid.bounds() for solid in solids])
+    return np.stack((boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)))
+
+
+def cast(
+    origin: Array, directions: Array, solids: Sequence[Solid] = SOLIDS, hits: Hits | None = None
+) -> tuple[Array, Array]:
+    """First hits of rays from one point, and their light.
+
+    Args:
+        origin: [1, 3].
+        directions: [r, 3], unit.
+        solids: what there is.
+        hits: finds the first of them on a ray; default: `first_hits`.
+
+    Returns:
+        (colour [r, 3] in 0..1, zero where nothing is hit; depth [r], infinite there).
+    """
+    if hits is None:
+        hits = functools.partial(first_hits, solids)
+    depth, which = hits(origin, directions)
+    rows = np.isfinite(depth).nonzero()[0]
+    which, seen_along = which[rows], directions[rows]
+    points = origin + depth[rows, None] * seen_along
+    normals, albedo = np.zeros_like(points), np.zeros_like(points)
+    gloss, sharpness = np.zeros(len(rows), dtype=np.float32), np.ones(len(rows), dtype=np.float32)
+    for index in np.unique(which):
+        solid, mine = solids[index], (which == index).nonzero()[0]
+        normals[mine], albedo[mine] = solid.surface(points[mine])
+        gloss[mine], sharpness[mine] = solid.gloss, solid.sharpness
+    colour = np.zeros_like(directions)
+    colour[rows] = _shade(points, normals, albedo, gloss, sharpness, seen_along, hits)
+    return colour, depth
+
+
+def _shade(
+    points: Array, normals: Array, albedo: Array, gloss: Array, sharpness: Array, directions: Array, hits: Hits
+) -> Array:
+    """Sky light from above, one lamp far away with hard shadows, Phong highlights."""
+    facing = np.maximum((normals * LIGHT).sum(axis=-1), 0)
+    lit = (facing > 0).nonzero()[0]
+    start = points[lit] + np.float32(LIFT) * normals[lit]
+    lamp = (facing > 0).astype(np.float32)
+    lamp[lit[np.isfinite(hits(start, LIGHT)[0])]] = 0.0
+    ambient = AMBIENT_DOWN + (AMBIENT_UP - AMBIENT_DOWN) * (0.5 + 0.5 * normals[:, 2])
+    mirrored = 2 * facing[:, None] * normals - LIGHT
+    highlight = gloss * np.maximum(-(mirrored * directions).sum(axis=-1), 0) ** sharpness
+    light = (ambient + DIFFUSE * facing * lamp)[:, None]
+    return np.clip(albedo * light + (highlight * lamp)[:, None], 0, 1).astype(np.float32)
+
+
+def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
+    around = torch.stack((elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()), dim=-1)
+    poses = look_at(DISTANCE * around, torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
+    focal = 0.5 * size / math.tan(0.5 * ANGLE_X)
+    return Cameras(poses, torch.tensor((focal, focal, size / 2, size / 2)).repeat(len(poses), 1), size, size)
+
+
+def see(origin: Array, directions: Array, solids: Sequence[Solid] = SOLIDS, hits: Hits | None = None) -> Array:
+    """First hits of rays from one point as premultiplied colour and coverage, [r, 4]; arguments as of `cast`."""
+    colour, depth = cast(origin, directions, solids, hits)
+    return np.concatenate((colour, np.isfinite(depth)[:, None]), axis=-1, dtype=np.float32)
+
+
+def render_views(cameras: Cameras, name: str, see: See, *, box: Array, supersamples: int) -> Split:
+    """All images, a view a thread, each with an alpha channel.
+
+    Args:
+        cameras: their poses, all with one focal length and the principal point in the middle.
+        name: of the split, which its images are named after.
+        see: from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity [r, 4] in 0..1.
+        box: [2, 3] that holds everything; ``see`` is asked about the rays that meet it.
+        supersamples: rays on each side of a pixel, which is their average.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        numbers = range(len(cameras))
+        images = list(pool.map(lambda index: _image(cameras, index, see, box, supersamples), numbers))
+    names = tuple(f"{name}_{index:03d}" for index in range(len(cameras)))
+    return Split(cameras, torch.from_numpy(np.stack(images)), names)
+
+
+def _image(cameras: Cameras, index: int, see: See, box: Array, fine: int) -> NDArray[np.uint8]:
+    """One image: fine^2 rays a pixel, a band of rows at a time; averages premultiplied colour and opacity."""
+    size = cameras.width
+    pose: Array = cameras.poses[index].numpy()
+    focal = float(cameras.intrinsics[index, 0])
+    steps = ((np.arange(size * fine, dtype=np.float32) + np.float32(0.5)) / fine - size / 2) / np.float32(focal)
+    middle, half = (box[0] + box[1]) / 2, tuple((box[1] - box[0]).tolist())
+    image = np.zeros((size, size, 4), dtype=np.uint8)
+    band = max(1, BAND // (size * fine * fine))
+    for first in range(0, size, band):
+        rows = steps[first * fine : (first + band) * fine]
+        u, v = np.meshgrid(steps, rows)
+        local = np.stack((u.ravel(), -v.ravel(), np.full(u.size, -1, dtype=np.float32)), axis=-1)
+        directions = normalised(turned(local, pose[:3, :3].T))
+        origin = pose[None, :3, 3]
+        start = np.broadcast_to(origin - middle, directions.shape)
+        inside = slab(start, directions, (half[0] / 2, half[1] / 2, half[2] / 2))[2].nonzero()[0]
+        rgba = np.zeros((u.size, 4), dtype=np.float32)
+        rgba[inside] = see(origin, directions[inside])
+        pixels = rgba.reshape(len(rows) // fine, fine, size, fine, 4).mean(axis=(1, 3))
+        pixels[..., :3] /= np.maximum(pixels[..., 3:], np.float32(1e-6))
+        image[first : first + band] = np.rint(pixels * 255).clip(0, 255).astype(np.uint8)
+    return image

@@ -1,0 +1,17 @@
+"""Voronoi diagrams of space: nested look-up, balancing, subdivision, blending across borders, and the kept samples."""
+
+from voronerf.diagram.balance import Balance, balance, imbalance
+from voronerf.diagram.reservoir import SampleReservoir
+from voronerf.diagram.subdivision import Split, split_diagram
+from voronerf.diagram.voronoi import VoronoiDiagram, uniform_centres
+
+__all__ = [
+    "Balance",
+    "SampleReservoir",
+    "Split",
+    "VoronoiDiagram",
+    "balance",
+    "imbalance",
+    "split_diagram",
+    "uniform_centres",
+]

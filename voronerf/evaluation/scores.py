@@ -1,0 +1,73 @@
+"""Scores of a trained field on the test views."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from voronerf.data import Scene
+from voronerf.evaluation.lpips import Lpips
+from voronerf.evaluation.metrics import psnr, ssim
+from voronerf.rendering.renderer import RenderedImage, Renderer
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """PSNR in dB, SSIM and LPIPS (None without its weights) of one view, on the scene's background (white)."""
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+
+
+def view_numbers(count: int, views: int | None) -> list[int]:
+    """``views`` of ``count`` test views, evenly spread from the first; all of them for None."""
+    if views is None or views >= count:
+        return list(range(count))
+    return [i * count // views for i in range(views)]
+
+
+def render_view(renderer: Renderer, scene: Scene, view: int, *, heaviest: bool = True) -> RenderedImage:
+    """One test view as the renderer sees it, samples at the middle of their strata, those in empty cells left out."""
+    device = renderer.device
+    return renderer.train(False).image(
+        scene.test.cameras.to(device),
+        view,
+        near=scene.near,
+        far=scene.far,
+        box=None if scene.box is None else scene.box.to(device),
+        background=scene.background_colour(device),
+        heaviest=heaviest,
+    )
+
+
+def evaluate(
+    renderer: Renderer, scene: Scene, *, views: int | None = None, lpips: Lpips | None = None
+) -> list[ViewScore]:
+    """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all)."""
+    scores = []
+    for view in view_numbers(len(scene.test.names), views):
+        image = render_view(renderer, scene, view, heaviest=False)
+        target = scene.test.truth(view, scene.background_colour()).to(renderer.device)
+        colour = image.colour.clamp(0, 1)
+        perceived = None if lpips is None else float(lpips(colour, target))
+        name = scene.test.names[view]
+        scores.append(ViewScore(name, float(psnr(colour, target)), float(ssim(colour, target)), perceived))
+    return scores
+
+
+def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
+    """Means per image, as the literature's tables have them, and the PSNR of the mean squared error over all views.
+
+    The latter, "psnr_of_mean_error", is what the paper's curves show; it is never above the mean of the PSNRs. "lpips"
+    is None unless every view has one.
+    """
+    perceived = [s.lpips for s in scores if s.lpips is not None]
+    error = sum(10 ** (-s.psnr / 10) for s in scores) / len(scores)
+    return {
+        "psnr": sum(s.psnr for s in scores) / len(scores),
+        "ssim": sum(s.ssim for s in scores) / len(scores),
+        "lpips": sum(perceived) / len(scores) if len(perceived) == len(scores) else None,
+        "psnr_of_mean_error": math.inf if error == 0 else -10 * math.log10(error),
+    }
