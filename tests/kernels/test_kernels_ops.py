@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_native_composite import PARTS, dense, evaluate, leaves_of, scene
+from composite_cases import PARTS, dense, evaluate, leaves_of, scene
 from torch import Tensor
 
 from voronerf.ops import centre_grid, composite, frequency_encode, integrated_encode, march_rays, resample
