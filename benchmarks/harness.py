@@ -86,18 +86,18 @@ class Timing:
 
 
 class Stopwatch:
-    """Seconds that calls take: by the clock on the CPU, between events of the stream on CUDA."""
+    """Seconds that calls take: by ``clock`` on the CPU, between events of the stream on CUDA."""
 
-    def __init__(self, device: torch.device) -> None:
-        self.cuda = device.type == "cuda"
+    def __init__(self, device: torch.device, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.cuda, self.clock = device.type == "cuda", clock
 
     def __call__(self, run: Run, first: int, count: int) -> float:
         """Seconds of calls ``first`` to ``first + count``, together."""
         if not self.cuda:
-            start = time.perf_counter()
+            start = self.clock()
             for call in range(first, first + count):
                 run(call)
-            return time.perf_counter() - start
+            return self.clock() - start
         begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
         torch.cuda.synchronize()
         begin.record()
@@ -230,6 +230,17 @@ def _cuda_peak(kind: str, device: torch.device) -> float:
         work = 2.0 * 8192**3
         seconds = [stopwatch(lambda _: a @ a, 0, 1) for _ in range(8)]
     return work / min(seconds[1:])
+
+
+@contextlib.contextmanager
+def threads(count: int | None) -> Iterator[None]:
+    """As many threads inside the block; None leaves them as they are."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(before if count is None else count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager

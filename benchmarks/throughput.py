@@ -3,6 +3,7 @@
     python benchmarks/throughput.py                                   everything, about twelve minutes on two cores
     python benchmarks/throughput.py --quick                           every operation once, under a minute
     python benchmarks/throughput.py --filter '^grouped_mlp/w64d4.*bfloat16' --targets
+    python benchmarks/throughput.py --foreign --filter 'siren .*k=16'  the router around fields of other codebases
     python benchmarks/throughput.py --json benchmarks/results/throughput.json
     python benchmarks/table.py benchmarks/results/throughput.json     the JSON as Markdown
 
@@ -30,7 +31,8 @@ from typing import Any, NoReturn
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 
 import torch
-from harness import Others, Peaks, Stopwatch, Timing, instruction_set, measure, metadata
+from harness import Others, Peaks, Stopwatch, Timing, instruction_set, measure, metadata, threads
+from ops import cases_foreign as cases_foreign
 from ops import cases_lookup as cases_lookup
 from ops import cases_marching as cases_marching
 from ops import cases_network as cases_network
@@ -74,6 +76,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--targets", action="store_true", help="what the rows reach of what the project set out to show"
     )
+    parser.add_argument("--foreign", action="store_true", help="the rows of fields of other codebases instead")
     parser.add_argument("--list", action="store_true", help="print op/case/dtype/direction of the rows and stop")
     options = parser.parse_args(arguments)
     for name in options.backends:
@@ -91,6 +94,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """The cases that the options leave."""
     every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases(), *cases_marching.cases()]
+    if options.foreign:
+        every = cases_foreign.cases()
     if options.filter is not None:
         try:
             pattern = re.compile(options.filter)
@@ -135,11 +140,11 @@ class Bench:
         names = [
             name
             for name in case.backends
-            if name in self.wanted and backends.why_not(case.op, name, self.device, case.dtype) is None
+            if name in self.wanted and backends.why_not(case.needs or case.op, name, self.device, case.dtype) is None
         ]
         if not names:
             return []
-        with instruction_set(case.isa):
+        with instruction_set(case.isa), threads(case.threads):
             rows = self._measure(case, names, case.build(self.device))
         self.rows += rows
         return rows
@@ -164,7 +169,8 @@ class Bench:
         limits = {name: self.limits["ours" if name in names else "alternative"] for name in contenders}
         runs = {name: contender.run for name, contender in contenders.items()}
         others = Others()
-        timings = measure(runs, limits, self.stopwatch, warm)
+        stopwatch = Stopwatch(self.device, time.process_time) if case.threads == 1 else self.stopwatch
+        timings = measure(runs, limits, stopwatch, warm)
         disturbed = others.cores()
         after = before if self.quick or not work.bound else self.peaks(work.bound)
         peak = max((found for found in (before, after) if found), key=lambda found: found[1], default=None)
@@ -221,10 +227,11 @@ class Bench:
             "direction": case.direction,
             "n": case.n,
             "k": case.k,
+            "threads": case.threads or torch.get_num_threads(),
             "median_ms": timing.median_ms,
             "iqr_ms": timing.iqr_ms,
-            "throughput": rate * 1e-9,
-            "unit": "GB/s" if work.bound == "copy" else "GFLOP/s",
+            "throughput": rate * (1e-9 if work.bound else 1e-6),
+            "unit": {"copy": "GB/s", "": "Msample/s"}.get(work.bound, "GFLOP/s"),
             "percent_of_peak": None if peak is None else 100 * rate / peak[1],
             "alternatives": alternatives,
             "speedup_over_best": None if best is None else best / timing.median_ms,
@@ -301,7 +308,8 @@ def main(arguments: list[str] | None = None) -> None:
         progress(f"[{number}/{len(cases)}, {time.perf_counter() - start:.0f} s] {case.key}")
         rows = bench.run(case)
         if not rows:
-            reasons = [backends.why_not(case.op, name, bench.device, case.dtype) for name in case.backends]
+            op = case.needs or case.op
+            reasons = [backends.why_not(op, name, bench.device, case.dtype) for name in case.backends]
             progress(f"    left out: {'; '.join(filter(None, reasons)) or 'not among --backends'}")
         for row in rows:
             print("\n".join(lines(row, last=row is rows[-1])), flush=True)

@@ -46,7 +46,7 @@ class Work:
         error: result of call 0 -> largest error against float64: relative to the largest entry for floats, the number
             of wrong ones for integers.
         tolerance: largest error with which an alternative still counts as having done the work.
-        amount: operations, or bytes read and written, of a call at the least.
+        amount: operations, or bytes read and written, of a call at the least; samples where there is no bound.
         bound: which limit of the machine the amount is compared with: "float32", "bfloat16" or "copy"; "" for none.
         executed: operations of a call with what is computed again, where that is more than ``amount``.
     """
@@ -75,6 +75,9 @@ class Case:
         backends: whose rows there are; those that cannot run are reported and left out.
         quick: part of --quick.
         isa: instruction set forced on the native backend; None is the best one.
+        threads: of the row; None leaves the process's own number. A row of one thread is timed by its CPU time, which
+            other processes disturb less.
+        needs: the op whose backends the row has; empty for ``op`` itself.
     """
 
     op: str
@@ -87,6 +90,8 @@ class Case:
     backends: tuple[str, ...] = ("native",)
     quick: bool = False
     isa: str | None = None
+    threads: int | None = None
+    needs: str = ""
 
     @property
     def key(self) -> str:

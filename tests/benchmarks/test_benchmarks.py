@@ -149,6 +149,25 @@ def test_every_operation_has_rows_in_both_modes(load: Callable[[str], Any]) -> N
     assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 
+def test_foreign_fields_have_rows_of_their_own(load: Callable[[str], Any]) -> None:
+    throughput, fields = load("throughput"), load("ops.cases_foreign").FIELDS
+    cases, quick = (throughput.chosen_cases(throughput.parse(["--foreign", *more])) for more in ([], ["--quick"]))
+    assert len({case.key for case in cases}) == len(cases) and {case.op for case in cases} == {"foreign"}
+    assert len(quick) == len(fields) == len({case.case.split(" n=")[0] for case in cases})
+    assert {(case.n, case.k, case.threads) for case in quick} == {(1024, 16, 1)}
+
+
+@pytest.mark.parametrize("name", ["nerf-pytorch w64", "appearance", "siren laplacian", "nerfacto table", "k-planes"])
+def test_foreign_contenders_compute_what_masks_do(load: Callable[[str], Any], name: str) -> None:
+    foreign = load("ops.cases_foreign")
+    for direction in ("forward", "forward+backward"):
+        work = foreign.foreign_work(foreign.FIELDS[name], 300, 5, direction, CPU)
+        contender = work.ours("reference")
+        first, second = (contender.adapt(contender.run(call)) for call in (0, 1))
+        assert work.error(first) < work.tolerance < work.error(second), "another call sees other samples"
+        assert work.error(work.alternatives["masks"]().run(0)[:1]) == 0
+
+
 def test_cost_counts_products(load: Callable[[str], Any]) -> None:
     networks = load("ops.networks")
     w64d4 = networks.cost(networks.NETS["w64d4"])

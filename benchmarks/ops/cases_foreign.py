@@ -1,0 +1,272 @@
+"""Cases of VoronoiRouter around fields of other codebases (``foreign_fields.py``). n samples, k cells.
+
+A row's own time is that of the router as it comes, whose forward runs on grouped layers. Beside it: the fused router,
+the loop over boolean masks with a module for each cell, that loop with its modules compiled, and one module for all
+samples. The loop over masks is also what results and gradients are compared with. The lookup of the cells is given to
+the loop as the library's own.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ops import foreign_fields as fields
+from ops.alternatives import compile_now
+from ops.case import BACKWARD, FORWARD, Case, Contender, NotApplicable, Work, generator, relative_error, uniform_points
+from voronerf import VoronoiRouter, ops
+
+Arguments = tuple[Tensor, ...]
+Call = Callable[..., Tensor]
+TOLERANCE = 1e-2
+"""Largest error against the loop over masks: units of ReLU that rounding turns change gradients by some per mille."""
+SMALL, MIDDLE, LARGE = 1 << 10, 1 << 16, 1 << 18
+COMPILED = (MIDDLE, 16)
+"""(n, k) at which the loop is compiled as well, which may take a minute."""
+
+
+def positions(x: Tensor) -> Arguments:
+    """The positions alone."""
+    return (x,)
+
+
+def encoded(x: Tensor) -> Arguments:
+    """Encoded positions and directions side by side, as nerf-pytorch gives them to its network."""
+    return (torch.cat([fields.frequencies(x, 10), fields.frequencies(_directions(x), 4)], -1),)
+
+
+def encoded_and_image(x: Tensor) -> Arguments:
+    """Likewise, and the number of the image that a sample belongs to."""
+    return (*encoded(x), torch.arange(x.shape[0]).div(64, rounding_mode="floor") % 100)
+
+
+def with_directions(x: Tensor) -> Arguments:
+    """Positions and directions."""
+    return x, _directions(x)
+
+
+def _directions(x: Tensor) -> Tensor:
+    return nn.functional.normalize(torch.randn(x.shape, generator=generator(3)), dim=1)
+
+
+def values(call: Call, arguments: Arguments) -> list[Tensor]:
+    """What the field returns."""
+    return [call(*arguments)]
+
+
+def normals(call: Call, arguments: Arguments) -> list[Tensor]:
+    """Signed distances and their gradients, of which an eikonal loss is made."""
+    x = arguments[0].detach().requires_grad_()
+    with torch.enable_grad():
+        distance = call(x)
+        (normal,) = torch.autograd.grad(distance.sum(), x, create_graph=True)
+    return [distance, normal]
+
+
+def laplacian(call: Call, arguments: Arguments) -> list[Tensor]:
+    """The Laplacian of the first output."""
+    x = arguments[0].detach().requires_grad_()
+    with torch.enable_grad():
+        (slope,) = torch.autograd.grad(call(x)[:, 0].sum(), x, create_graph=True)
+        rows = [torch.autograd.grad(slope[:, i].sum(), x, create_graph=True)[0][:, i] for i in range(3)]
+    return [torch.stack(rows).sum(0)]
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field with what its rows need.
+
+    Attributes:
+        make: a new module.
+        arguments: positions [n, 3] -> arguments of its forward.
+        evaluate: what is computed of a call.
+        most: largest number of samples; second derivatives and splines keep several GiB beyond.
+        most_cells: largest number of cells; larger tables would not fit.
+    """
+
+    make: Callable[[], nn.Module]
+    arguments: Callable[[Tensor], Arguments] = positions
+    evaluate: Callable[[Call, Arguments], list[Tensor]] = values
+    most: int = LARGE
+    most_cells: int = 256
+
+
+FIELDS = {
+    "nerf-pytorch w64": Field(fields.NeRF, encoded),
+    "nerf-pytorch w256": Field(functools.partial(fields.NeRF, 256), encoded, most=MIDDLE, most_cells=16),
+    "appearance": Field(fields.AppearanceNeRF, encoded_and_image),
+    "nerfacc": Field(fields.VanillaField, with_directions),
+    "siren": Field(fields.Siren),
+    "siren laplacian": Field(fields.Siren, evaluate=laplacian, most=MIDDLE),
+    "sdf eikonal": Field(fields.SignedDistance, evaluate=normals, most=MIDDLE),
+    "nerfacto table": Field(fields.HashTable),
+    "hashnerf 2^14": Field(fields.HashEmbedder),
+    "hashnerf 2^19": Field(functools.partial(fields.HashEmbedder, 1 << 19, 4), most_cells=16),
+    "tensorf": Field(fields.TensorField),
+    "k-planes": Field(fields.KPlanes),
+    "kan": Field(fields.KAN, most=MIDDLE),
+}
+
+
+def cases() -> list[Case]:
+    """One row for each field, number of samples and cells, direction and number of threads."""
+    found = []
+    for name, field in FIELDS.items():
+        for n in (SMALL, MIDDLE, LARGE):
+            for k in (16, 256):
+                for direction in (FORWARD, BACKWARD):
+                    for threads in (1, 2):
+                        if n > field.most or k > field.most_cells:
+                            continue
+                        work = functools.partial(foreign_work, field, n, k, direction)
+                        quick = (n, k, direction, threads) == (SMALL, 16, BACKWARD, 1)
+                        label = f"{name} n={n} k={k} threads={threads}"
+                        needs, dtype = "grouped_linear", torch.float32
+                        found.append(
+                            Case(
+                                "foreign",
+                                label,
+                                dtype,
+                                direction,
+                                n,
+                                k,
+                                work,
+                                quick=quick,
+                                threads=threads,
+                                needs=needs,
+                            )
+                        )
+    return found
+
+
+class Batch:
+    """Modules, samples and gradients of a case, and what the loop over masks makes of the first samples.
+
+    Args:
+        field: whose rows.
+        n: samples.
+        k: cells.
+        direction: forward, or with backward.
+    """
+
+    def __init__(self, field: Field, n: int, k: int, direction: str) -> None:
+        self.field, self.n, self.k, self.training = field, n, k, direction == BACKWARD
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            self.modules = [field.make() for _ in range(k)]
+        self.centres = uniform_points(k, 1000, torch.device("cpu"))
+        points = [uniform_points(n, seed, torch.device("cpu")) for seed in range(2)]
+        self.arguments = [field.arguments(x) for x in points]
+        self.gradients: list[Tensor] = []
+        self.expected: list[Tensor] = []
+
+    def step(self, call: Call, parameters: Sequence[Tensor], number: int) -> list[Tensor]:
+        """Results of a call, and with gradients those of the parameters."""
+        arguments = self.arguments[number % 2]
+        if not self.training:
+            with torch.no_grad():
+                return self.field.evaluate(call, arguments)
+        results = self.field.evaluate(call, arguments)
+        if not self.gradients:
+            self.gradients = [torch.randn(result.shape, generator=generator(5)) for result in results]
+        found = torch.autograd.grad(results, parameters, self.gradients, allow_unused=True)
+        return [
+            *[result.detach() for result in results],
+            *[torch.zeros_like(p) if g is None else g for p, g in zip(parameters, found)],
+        ]
+
+    def stacked(self, found: list[Tensor]) -> list[Tensor]:
+        """Results and gradients of leaves of each cell -> results and gradients [k, ...]."""
+        if not self.training:
+            return found
+        each = len(list(self.modules[0].parameters()))
+        results, leaves = found[: len(found) - each * self.k], found[len(found) - each * self.k :]
+        return [*results, *[torch.stack(leaves[i::each]) for i in range(each)]]
+
+    def masks(self, compiled: bool = False) -> Contender:
+        """The loop that one would write: each cell's module on its samples, results put back where they belong."""
+        parameters = [parameter for module in self.modules for parameter in module.parameters()]
+        calls: Sequence[Call] = self.modules
+        if compiled:
+            calls = self._compiled()
+
+        def call(*arguments: Tensor) -> Tensor:
+            cells = ops.nearest_centre(arguments[0][:, :3].detach().contiguous(), self.centres)
+            parts, rows = [], []
+            for cell, module in enumerate(calls):
+                mask = cells == cell
+                if mask.any():
+                    rows.append(mask.nonzero()[:, 0])
+                    parts.append(module(*[argument[mask] for argument in arguments]))
+            together = torch.cat(parts)
+            return torch.empty_like(together).index_copy(0, torch.cat(rows), together)
+
+        return Contender(lambda number: self.step(call, parameters, number), self.stacked)
+
+    def _compiled(self) -> list[Call]:
+        """One program for all cells, with the parameters as arguments."""
+        if (self.n, self.k) != COMPILED:
+            raise NotApplicable(f"compiled at n={COMPILED[0]}, k={COMPILED[1]} alone, which takes up to a minute")
+        torch.compiler.reset()
+        template = self.modules[0]
+
+        def call(parameters: dict[str, Tensor], *arguments: Tensor) -> Tensor:
+            result: Tensor = torch.func.functional_call(template, parameters, arguments)
+            return result
+
+        program = torch.compile(call, dynamic=True)
+        return [functools.partial(program, dict(module.named_parameters())) for module in self.modules]
+
+    def compiled(self) -> Contender:
+        """The loop over masks with compiled modules."""
+        contender = self.masks(compiled=True)
+        compile_now(lambda: contender.run(1))
+        return contender
+
+    def routed(self, **options: Any) -> Contender:
+        """The router."""
+        router = VoronoiRouter.from_modules(self.modules, self.centres, coords="first3", **options)
+        parameters = list(router.parameters())
+        return Contender(lambda number: self.step(router, parameters, number))
+
+    def single(self) -> Contender:
+        """One module without cells, which computes something else: only its time counts."""
+        module = self.modules[0]
+        parameters = list(module.parameters())
+        return Contender(lambda number: self.step(module, parameters, number), lambda _: [])
+
+    def error(self, found: list[Tensor]) -> float:
+        """Largest difference from the loop over masks, relative to the largest entry of each tensor."""
+        if not self.expected:
+            contender = self.masks()
+            self.expected = contender.adapt(contender.run(0))
+        return max((relative_error(a, b) for a, b in zip(found, self.expected)), default=0.0)
+
+
+def foreign_work(field: Field, n: int, k: int, direction: str, device: torch.device) -> Work:
+    """The case of a field.
+
+    Raises:
+        NotApplicable: on another device than the CPU.
+    """
+    if device.type != "cpu":
+        raise NotApplicable("measured on the CPU")
+    batch = Batch(field, n, k, direction)
+    return Work(
+        ours=lambda backend: batch.routed(backend=backend),
+        alternatives={
+            "fused": lambda: batch.routed(fuse=True),
+            "masks": batch.masks,
+            "torch.compile of masks": batch.compiled,
+            "one module": batch.single,
+        },
+        error=batch.error,
+        tolerance=TOLERANCE,
+        amount=float(n),
+        bound="",
+    )

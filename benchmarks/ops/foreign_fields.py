@@ -1,0 +1,305 @@
+"""Stand-ins for the fields of other codebases, each written in the style of the code that it stands for.
+
+None knows of cells. n samples; R components of a plane; T entries of a table, f features of an entry.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+def frequencies(x: Tensor, octaves: int) -> Tensor:
+    """``x``, then a sine and a cosine of each octave: [n, d] -> [n, d * (1 + 2 * octaves)]."""
+    waves = [wave(x * 2.0**octave) for octave in range(octaves) for wave in (torch.sin, torch.cos)]
+    return torch.cat([x, *waves], -1)
+
+
+class NeRF(nn.Module):
+    """nerf-pytorch: eight layers on encoded positions and directions, a skip connection behind the fifth."""
+
+    def __init__(self, width: int = 64, points: int = 63, views: int = 27) -> None:
+        super().__init__()
+        self.points, self.views = points, views
+        self.pts_linears = nn.ModuleList(
+            [nn.Linear(points, width)] + [nn.Linear(width + (points if i == 4 else 0), width) for i in range(7)]
+        )
+        self.views_linears = nn.ModuleList([nn.Linear(views + width, width // 2)])
+        self.feature_linear, self.alpha_linear = nn.Linear(width, width), nn.Linear(width, 1)
+        self.rgb_linear = nn.Linear(width // 2, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        points, views = torch.split(x, [self.points, self.views], dim=-1)
+        h = points
+        for i, layer in enumerate(self.pts_linears):
+            h = F.relu(layer(h))
+            if i == 4:
+                h = torch.cat([points, h], -1)
+        alpha, h = self.alpha_linear(h), torch.cat([self.feature_linear(h), views], -1)
+        for layer in self.views_linears:
+            h = F.relu(layer(h))
+        return torch.cat([self.rgb_linear(h), alpha], -1)
+
+
+class AppearanceNeRF(nn.Module):
+    """nerf_pl's NeRF-W: a code for each image beside the direction."""
+
+    def __init__(self, width: int = 64, images: int = 100, code: int = 48) -> None:
+        super().__init__()
+        self.embedding_a = nn.Embedding(images, code)
+        for i in range(8):
+            size = 63 if i == 0 else width + 63 if i == 4 else width
+            setattr(self, f"xyz_encoding_{i + 1}", nn.Sequential(nn.Linear(size, width), nn.ReLU(True)))
+        self.xyz_encoding_final = nn.Linear(width, width)
+        self.dir_encoding = nn.Sequential(nn.Linear(width + 27 + code, width // 2), nn.ReLU(True))
+        self.static_sigma = nn.Sequential(nn.Linear(width, 1), nn.Softplus())
+        self.static_rgb = nn.Sequential(nn.Linear(width // 2, 3), nn.Sigmoid())
+
+    def forward(self, x: Tensor, image: Tensor) -> Tensor:
+        points, views = torch.split(x, [63, 27], dim=-1)
+        h = points
+        for i in range(8):
+            if i == 4:
+                h = torch.cat([points, h], 1)
+            h = getattr(self, f"xyz_encoding_{i + 1}")(h)
+        sigma = self.static_sigma(h)
+        h = torch.cat([self.xyz_encoding_final(h), views, self.embedding_a(image)], 1)
+        return torch.cat([self.static_rgb(self.dir_encoding(h)), sigma], 1)
+
+
+class VanillaField(nn.Module):
+    """nerfacc's field: encoders of its own, a base with a skip connection, density and colour heads."""
+
+    scales: Tensor
+
+    def __init__(self, width: int = 64, depth: int = 4) -> None:
+        super().__init__()
+        self.register_buffer("scales", torch.tensor([2.0**i for i in range(10)]))
+        sizes = [63] + [width + (63 if i == 2 else 0) for i in range(1, depth)]
+        self.hidden_layers = nn.ModuleList([nn.Linear(size, width) for size in sizes])
+        self.hidden_activation = nn.ReLU()
+        self.sigma_layer, self.bottleneck_layer = nn.Linear(width, 1), nn.Linear(width, width)
+        self.rgb_hidden, self.rgb_layer = nn.Linear(width + 27, width // 2), nn.Linear(width // 2, 3)
+
+    def encode(self, x: Tensor, octaves: int) -> Tensor:
+        xb = torch.reshape(x[..., None, :] * self.scales[:octaves, None], [*x.shape[:-1], octaves * 3])
+        return torch.cat([x, torch.sin(torch.cat([xb, xb + 0.5 * math.pi], dim=-1))], dim=-1)
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        x = inputs = self.encode(x, 10)
+        for i, layer in enumerate(self.hidden_layers):
+            if i == 2:
+                x = torch.cat([x, inputs], dim=-1)
+            x = self.hidden_activation(layer(x))
+        sigma = F.relu(self.sigma_layer(x))
+        x = torch.cat([self.bottleneck_layer(x), self.encode(condition, 4)], dim=-1)
+        rgb = torch.sigmoid(self.rgb_layer(self.hidden_activation(self.rgb_hidden(x))))
+        return torch.cat([rgb, sigma], dim=-1)
+
+
+class Sine(nn.Module):
+    """A SIREN layer, ``sin(30 * (W x + b))``."""
+
+    def __init__(self, inputs: int, outputs: int, first: bool) -> None:
+        super().__init__()
+        self.linear, self.omega = nn.Linear(inputs, outputs), 30.0
+        bound = 1 / inputs if first else math.sqrt(6 / inputs) / self.omega
+        nn.init.uniform_(self.linear.weight, -bound, bound)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.sin(self.omega * self.linear(x))
+
+
+class Siren(nn.Module):
+    """SIREN: four sine layers and a linear one."""
+
+    def __init__(self, width: int = 64, outputs: int = 4) -> None:
+        super().__init__()
+        layers = [Sine(3 if i == 0 else width, width, i == 0) for i in range(4)]
+        self.net = nn.Sequential(*layers, nn.Linear(width, outputs))
+        nn.init.uniform_(self.net[4].weight, -math.sqrt(6 / width) / 30, math.sqrt(6 / width) / 30)
+
+    def forward(self, coords: Tensor) -> Tensor:
+        return cast(Tensor, self.net(coords))
+
+
+class SignedDistance(nn.Module):
+    """NeuS's SDF network: softplus layers on encoded positions, a skip connection, an init near a sphere."""
+
+    def __init__(self, width: int = 64, depth: int = 4, skip: int = 2) -> None:
+        super().__init__()
+        self.depth, self.skip = depth, skip
+        for i in range(depth + 1):
+            inputs = 39 if i == 0 else width
+            outputs = 1 if i == depth else width - 39 if i + 1 == skip and width > 39 else width
+            layer = nn.Linear(inputs, outputs)
+            nn.init.normal_(layer.weight, 0.0, math.sqrt(2) / math.sqrt(outputs))
+            setattr(self, f"lin{i}", layer)
+        self.activation = nn.Softplus(beta=100)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        x = inputs = frequencies(inputs, 6)
+        for i in range(self.depth + 1):
+            if i == self.skip:
+                x = torch.cat([x, inputs], 1) / math.sqrt(2)
+            x = getattr(self, f"lin{i}")(x)
+            if i < self.depth:
+                x = self.activation(x)
+        return x
+
+
+class HashTable(nn.Module):
+    """nerfacto's hash encoding in torch, ``table[index]`` for the eight corners of all levels, and a small head."""
+
+    scalings: Tensor
+    offsets: Tensor
+
+    def __init__(self, entries: int = 1 << 14, levels: int = 16, width: int = 64) -> None:
+        super().__init__()
+        self.entries, self.levels = entries, levels
+        growth = math.exp((math.log(1024) - math.log(16)) / (levels - 1))
+        self.register_buffer("scalings", torch.floor(16 * growth ** torch.arange(levels)))
+        self.register_buffer("offsets", torch.arange(levels) * entries)
+        self.hash_table = nn.Parameter((torch.rand(entries * levels, 2) * 2 - 1) * 1e-1)
+        self.head = nn.Sequential(nn.Linear(levels * 2, width), nn.ReLU(), nn.Linear(width, 4))
+
+    def hash_fn(self, corner: Tensor) -> Tensor:
+        corner = corner * torch.tensor([1, 2654435761, 805459861], device=corner.device)
+        x = torch.bitwise_xor(corner[..., 0], corner[..., 1])
+        x = torch.bitwise_xor(x, corner[..., 2])
+        return x % self.entries + self.offsets
+
+    def forward(self, positions: Tensor) -> Tensor:
+        positions = (positions + 1) / 2
+        scaled = positions[..., None, :] * self.scalings.view(-1, 1)
+        c, f = torch.ceil(scaled).type(torch.int32), torch.floor(scaled).type(torch.int32)
+        offset = scaled - f
+        corners = []
+        for corner in range(8):
+            x, y, z = [(c if corner >> axis & 1 else f)[..., axis : axis + 1] for axis in range(3)]
+            corners.append(self.hash_table[self.hash_fn(torch.cat([x, y, z], dim=-1))])
+        for axis in range(3):
+            w = offset[..., axis : axis + 1]
+            corners = [a * (1 - w) + b * w for a, b in zip(corners[::2], corners[1::2])]
+        return cast(Tensor, self.head(torch.flatten(corners[0], start_dim=-2, end_dim=-1)))
+
+
+class HashEmbedder(nn.Module):
+    """HashNeRF's encoding: one ``nn.Embedding`` for each level, looked up at eight corners, and a small head."""
+
+    def __init__(self, entries: int = 1 << 14, levels: int = 16, width: int = 64) -> None:
+        super().__init__()
+        self.entries, self.levels = entries, levels
+        self.growth = math.exp((math.log(512) - math.log(16)) / (levels - 1))
+        self.embeddings = nn.ModuleList([nn.Embedding(entries, 2) for _ in range(levels)])
+        for table in self.embeddings:
+            nn.init.uniform_(table.weight, a=-0.1, b=0.1)
+        self.head = nn.Sequential(nn.Linear(levels * 2, width), nn.ReLU(), nn.Linear(width, 4))
+
+    def hash(self, coords: Tensor) -> Tensor:
+        xor = coords[..., 0] * 1 ^ coords[..., 1] * 2654435761 ^ coords[..., 2] * 805459861
+        return torch.tensor(self.entries - 1, device=coords.device) & xor
+
+    def forward(self, x: Tensor) -> Tensor:
+        x, levels = (x + 1) / 2, []
+        box = torch.tensor([[[i, j, k] for i in [0, 1] for j in [0, 1] for k in [0, 1]]], device=x.device)
+        for i in range(self.levels):
+            scaled = x * math.floor(16 * self.growth**i)
+            bottom = torch.floor(scaled).int()
+            weights = scaled - bottom
+            voxel = self.embeddings[i](self.hash(bottom.unsqueeze(1) + box))
+            for axis in range(3):
+                half, w = voxel.shape[1] // 2, weights[:, axis][:, None, None]
+                voxel = voxel[:, :half] * (1 - w) + voxel[:, half:] * w
+            levels.append(voxel[:, 0])
+        return cast(Tensor, self.head(torch.cat(levels, dim=-1)))
+
+
+class TensorField(nn.Module):
+    """TensoRF's vector-matrix factors, planes and lines read by ``F.grid_sample``."""
+
+    def __init__(self, size: int = 64, components: int = 16, width: int = 64) -> None:
+        super().__init__()
+        self.mat_mode, self.vec_mode = [[0, 1], [0, 2], [1, 2]], [2, 1, 0]
+        self.plane = nn.ParameterList([nn.Parameter(0.1 * torch.randn(1, components, size, size)) for _ in range(3)])
+        self.line = nn.ParameterList([nn.Parameter(0.1 * torch.randn(1, components, size, 1)) for _ in range(3)])
+        self.basis_mat = nn.Linear(3 * components, 27, bias=False)
+        self.render = nn.Sequential(nn.Linear(27, width), nn.ReLU(), nn.Linear(width, 4))
+
+    def forward(self, xyz: Tensor) -> Tensor:
+        plane = torch.stack([xyz[..., mode] for mode in self.mat_mode]).detach().view(3, -1, 1, 2)
+        line = torch.stack([xyz[..., mode] for mode in self.vec_mode])
+        line = torch.stack((torch.zeros_like(line), line), dim=-1).detach().view(3, -1, 1, 2)
+        planes, lines = [], []
+        for i in range(3):
+            planes.append(F.grid_sample(self.plane[i], plane[[i]], align_corners=True).view(-1, *xyz.shape[:1]))
+            lines.append(F.grid_sample(self.line[i], line[[i]], align_corners=True).view(-1, *xyz.shape[:1]))
+        features = self.basis_mat((torch.cat(planes) * torch.cat(lines)).T)
+        return cast(Tensor, self.render(features))
+
+
+class KPlanes(nn.Module):
+    """K-Planes: products of plane features at several resolutions, read by ``F.grid_sample``, and a small head."""
+
+    def __init__(self, sizes: tuple[int, ...] = (32, 64), components: int = 16, width: int = 64) -> None:
+        super().__init__()
+        self.grids = nn.ModuleList(
+            nn.ParameterList([nn.Parameter(torch.rand(1, components, size, size) * 0.4 + 0.1) for _ in range(3)])
+            for size in sizes
+        )
+        self.sigma_net = nn.Sequential(nn.Linear(len(sizes) * components, width), nn.ReLU(), nn.Linear(width, 4))
+
+    def forward(self, pts: Tensor) -> Tensor:
+        features = []
+        for grids in self.grids:
+            product: Tensor | float = 1.0
+            for plane, pair in zip(grids, ((0, 1), (0, 2), (1, 2))):
+                coords = pts[..., pair].view(1, -1, 1, 2)
+                found = F.grid_sample(plane, coords, align_corners=True, mode="bilinear", padding_mode="border")
+                product = product * found.view(1, plane.shape[1], -1).transpose(-1, -2).squeeze(0)
+            features.append(product)
+        return cast(Tensor, self.sigma_net(torch.cat(features, dim=-1)))
+
+
+class SplineLayer(nn.Module):
+    """A KAN layer: a cubic B-spline for each pair of input and output, contracted by ``einsum``."""
+
+    grid: Tensor
+
+    def __init__(self, inputs: int, outputs: int, intervals: int = 5, order: int = 3) -> None:
+        super().__init__()
+        self.order = order
+        knots = torch.arange(-order, intervals + order + 1) * (2 / intervals) - 1
+        self.register_buffer("grid", knots.expand(inputs, -1).contiguous())
+        self.base_weight = nn.Parameter(torch.randn(outputs, inputs) / math.sqrt(inputs))
+        self.spline_weight = nn.Parameter(torch.randn(outputs, inputs, intervals + order) * 0.3 / math.sqrt(inputs))
+
+    def b_splines(self, x: Tensor) -> Tensor:
+        x, grid = x.unsqueeze(-1), self.grid
+        bases = ((x >= grid[:, :-1]) & (x < grid[:, 1:])).to(x.dtype)
+        for k in range(1, self.order + 1):
+            left = (x - grid[:, : -(k + 1)]) / (grid[:, k:-1] - grid[:, : -(k + 1)]) * bases[:, :, :-1]
+            right = (grid[:, k + 1 :] - x) / (grid[:, k + 1 :] - grid[:, 1:-k]) * bases[:, :, 1:]
+            bases = left + right
+        return bases
+
+    def forward(self, x: Tensor) -> Tensor:
+        base = F.linear(F.silu(x), self.base_weight)
+        return base + torch.einsum("nig,oig->no", self.b_splines(x), self.spline_weight)
+
+
+class KAN(nn.Module):
+    """Three spline layers."""
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList([SplineLayer(3, width), SplineLayer(width, width), SplineLayer(width, 4)])
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.layers:
+            x = layer(x)
+        return x
