@@ -9,9 +9,13 @@ is compiled stays in Warp's cache, whose place is the environment variable WARP_
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import os
 import pkgutil
+import tempfile
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -30,12 +34,36 @@ _VERSION: str = getattr(wp, "__version__", None) or wp.config.version
 if tuple(int(part) for part in _VERSION.split(".")[:2]) < MINIMUM:
     raise BackendUnavailable(f"NVIDIA Warp {_VERSION} is too old; {_REMEDY}")
 
+
+#: Printed by Warp's C++ to the process's standard error on every machine without a GPU; no option turns it off.
+_NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
+
+
+@contextlib.contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Passes on what is written to file descriptor 2 meanwhile, except for Warp's line about the missing driver."""
+    try:
+        before = os.dup(2)
+    except OSError:  # there is no standard error
+        yield
+        return
+    with tempfile.TemporaryFile() as written, os.fdopen(before, "wb") as stderr:
+        os.dup2(written.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(before, 2)
+            written.seek(0)
+            stderr.writelines(line for line in written if not line.startswith(_NO_DRIVER))
+
+
 # The banner and the notes on compilation, silenced unless someone has asked for more. Older releases say `quiet`.
 if not hasattr(wp.config, "log_level"):
     wp.config.quiet = True
 elif wp.config.log_level == wp.LOG_INFO:
     wp.config.log_level = wp.LOG_WARNING
-wp.init()
+with _without_driver_warning():
+    wp.init()
 
 
 def missing(device: torch.device) -> str | None:

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # From the bottom up; a module may import its own layer and those below.
 LAYERS = (
-    {"backends", "checks", "files", "layers"},
+    {"backends", "checks", "compiler", "files", "layers"},
     {
         "native",
         "_C",
@@ -32,7 +32,7 @@ LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
 # What a layer may import from outside, where that is limited.
 OUTSIDE = {"kernels": {"warp", "torch"}}
 STANDARD_OF_KERNELS = {
-    "__future__", "typing", "collections", "contextlib", "functools", "importlib", "pkgutil", "time",
+    "__future__", "typing", "collections", "contextlib", "functools", "importlib", "os", "pkgutil", "tempfile", "time",
 }  # fmt: skip
 STANDARD_OF_ISA_FILES = {"cstdint", "cstddef", "immintrin.h"}
 

@@ -24,6 +24,8 @@ from typing import Any
 
 import torch
 
+from voronerf.compiler import constant_result
+
 BACKENDS = ("reference", "native", "warp")
 ORDER = {"cpu": ("native", "reference"), "cuda": ("native", "warp", "reference")}
 OPS = (
@@ -258,7 +260,7 @@ def _describe(module: str) -> dict[str, Any]:
 
 
 # torch.compile runs this while tracing and keeps the answer; the function is then found by a look-up it can trace.
-@torch.compiler.assume_constant_result
+@constant_result
 def _choose(op: str, backend: str, device: str, index: int | None, dtype: torch.dtype) -> str:
     return _choose_once(op, backend, device, index, dtype)
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
+from voronerf.compiler import constant_result
 from voronerf.layers import MLP
 from voronerf.ops.network import check_network
 from voronerf.reference.routed_mlp import Operations
@@ -191,7 +192,7 @@ def _operations(device: torch.device, weights: torch.dtype, coords: Tensor | Non
 
 
 # torch.compile runs this while tracing and keeps the answer.
-@torch.compiler.assume_constant_result
+@constant_result
 def _is_composed(device: str, index: int | None, dtype: torch.dtype) -> bool:
     where = torch.device(device) if index is None else torch.device(device, index)
     return all(backends.why_not(_OP, backend, where, dtype) is not None for backend in ("native", "warp"))

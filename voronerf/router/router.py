@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.backends import BACKENDS
+from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import split_diagram
 from voronerf.router.arguments import accepted_names
@@ -257,7 +258,7 @@ class VoronoiRouter(nn.Module):
             kwargs, coords = {**kwargs, "coords": coords}, None
         return self._route(name, args, kwargs, coords)
 
-    @torch.compiler.disable
+    @not_compiled
     def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """One call of a method of the module. ``torch.compile`` leaves it as it is and goes on behind it."""
         with _ONE_AT_A_TIME:

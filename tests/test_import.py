@@ -1,0 +1,37 @@
+"""What ``import voronerf`` costs and says."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+USE = """
+import sys, torch, voronerf
+assert voronerf.nearest_centre(torch.rand(5, 3), torch.rand(4, 3), backend=sys.argv[1]).shape == (5,)
+router = voronerf.VoronoiRouter(voronerf.NeRF(8, 1), torch.rand(4, 3), backend=sys.argv[1])
+router(torch.rand(5, 3), torch.rand(5, 3))[1].sum().backward()
+"""
+
+
+@pytest.mark.op("grouped_mlp")
+def test_nothing_is_printed(backend: str) -> None:
+    """Neither by Python nor by the C++ of Warp, which has lines of its own to write where there is no GPU."""
+    run = subprocess.run([sys.executable, "-c", USE, backend], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
+@pytest.mark.warp
+def test_other_errors_still_reach_stderr_while_warp_starts() -> None:
+    code = "import os, warp; warp.init = lambda: os.write(2, b'trouble\\n'); import voronerf.kernels"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "trouble\n" in run.stderr and "CUDA driver" not in run.stderr
+
+
+def test_compilers_and_kernels_are_not_imported() -> None:
+    """Each of them takes about as long as torch itself."""
+    heavy = "torch._dynamo torch._inductor warp matplotlib rich tyro"
+    code = f"import sys, voronerf; print(*(name for name in '{heavy}'.split() if name in sys.modules))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == ""

@@ -1,0 +1,36 @@
+"""Marks for ``torch.compile`` that do not import it.
+
+The decorators of ``torch.compiler`` import all of torch's compiler, which takes as long as importing torch itself.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def constant_result(function: Callable[P, R]) -> Callable[P, R]:
+    """``torch.compiler.assume_constant_result``: the compiler runs the function while tracing and keeps its result."""
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]  # all that torch's own decorator does
+    return function
+
+
+def not_compiled(function: Callable[P, R]) -> Callable[P, R]:
+    """``torch.compiler.disable``, applied at the first call: the compiler runs the function as it is."""
+
+    @functools.wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        disabled = getattr(function, "_not_compiled", None)
+        if disabled is None:
+            disabled = torch.compiler.disable(function)
+            function._not_compiled = disabled  # type: ignore[attr-defined]
+        result: R = disabled(*args, **kwargs)
+        return result
+
+    return run
