@@ -21,7 +21,7 @@ SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
-.PHONY: demo test bench paper check cuda-check gpu-check emulate-cuda sanitize clean
+.PHONY: demo test bench paper docs check cuda-check gpu-check emulate-cuda sanitize clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -47,6 +47,10 @@ check: $(VENV)/.built
 	@$(BIN)/clang-format --dry-run --Werror $$(find csrc -type f)
 	@$(BIN)/pytest -q tests/test_layers.py
 
+# The documentation with every option and the API reference: open build/site/index.html. Warnings are errors.
+docs: $(VENV)/.built $(VENV)/.docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 cuda-check:
 	@$(PYTHON) .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
 
@@ -70,6 +74,10 @@ clean:
 $(VENV)/.installed: requirements-ci.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-ci.txt
+	@touch $@
+
+$(VENV)/.docs: requirements-docs.txt $(VENV)/.installed
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.txt
 	@touch $@
 
 $(VENV)/.built: $(VENV)/.installed $(SOURCES)

@@ -1,6 +1,6 @@
 """A result of throughput.py as Markdown, so that tables in documents can be made again from the committed JSON.
 
-python benchmarks/table.py benchmarks/results/throughput.json                    the rows that the README shows
+python benchmarks/table.py benchmarks/results/throughput.json                    the rows that docs/performance.md shows
 python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   any others
 python benchmarks/table.py benchmarks/results/throughput.json --targets          what was to be shown, and is
 """
@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from ops.targets import ELSEWHERE, Row, comparisons, reached, verdict
 
-README = (
+SHOWN = (
     r"^nearest_centre/n=262144 k=(16|512|4096 frozen)/float32",
     r"^locate_cell/16x16 n=262144/",
     r"^cell_sort/n=262144 k=256/",
@@ -28,7 +28,7 @@ README = (
     r"^composite/dense n=262144/",
     r"^routed_mlp/(w64d4|mlp32) n=262144 k=(16|256)/",
 )
-"""Rows of the README's table, by op/case/dtype/direction."""
+"""Rows of the table in docs/performance.md, by op/case/dtype/direction."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -130,7 +130,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--targets", action="store_true", help="the table of what was to be shown")
     options = parser.parse_args(arguments)
     try:
-        patterns = [re.compile(text) for text in options.rows or README]
+        patterns = [re.compile(text) for text in options.rows or SHOWN]
     except re.error as error:
         fail(f"--rows must be a regular expression, got {options.rows!r}: {error}")
     outcome = load(options.file)

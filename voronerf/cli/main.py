@@ -26,6 +26,16 @@ EXPECTED = (
     *(MemoryError, torch.OutOfMemoryError),
 )
 
+#: What ``voronerf NAME`` runs; arguments and docstring of each function are its options and its help.
+COMMANDS: dict[str, Callable[..., int]] = {
+    "train": commands.train,
+    "eval": commands.evaluate_run,
+    "render": commands.render,
+    "info": commands.info,
+    "preload": commands.preload,
+    "demo": demo.demo,
+}
+
 
 def main(args: list[str] | None = None) -> int:
     """Runs one command.
@@ -40,14 +50,7 @@ def main(args: list[str] | None = None) -> int:
     warnings.showwarning = _show_warning
     try:
         return tyro.extras.subcommand_cli_from_dict(
-            {
-                "train": _train_command(sys.argv[1:] if args is None else args),
-                "eval": commands.evaluate_run,
-                "render": commands.render,
-                "info": commands.info,
-                "preload": commands.preload,
-                "demo": demo.demo,
-            },
+            {**COMMANDS, "train": _train_command(sys.argv[1:] if args is None else args)},
             prog="voronerf",
             description="Adaptive Voronoi NeRFs: one small network per Voronoi cell, trained and run as one.",
             args=args,

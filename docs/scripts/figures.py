@@ -1,0 +1,153 @@
+"""Draws the figures of docs/method.md with the library itself, into docs/images/method.
+
+python docs/scripts/figures.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import torch
+from matplotlib.patches import Rectangle
+from torch import Tensor
+
+from voronerf import VoronoiDiagram, VoronoiRouter, balance, cell_sort, split_diagram
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+OUT = Path(__file__).resolve().parents[1] / "images" / "method"
+COLOURS = plt.get_cmap("tab20").colors
+SIZE = 500  # pixels along a side of a drawn plane
+
+
+def main() -> None:
+    """Draws every figure."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    points, importance = samples()
+    draw_balance(points, importance)
+    draw_nested(points, importance)
+    draw_sort()
+    draw_blend()
+
+
+def samples() -> tuple[Tensor, Tensor]:
+    """Samples in the plane z = 0, and their importance: a disc, and a detail of it that weighs more."""
+    generator = torch.Generator().manual_seed(1)
+    disc = torch.rand(8000, 2, generator=generator) * 2 - 1
+    disc = disc[disc.norm(dim=1) < 0.85][:2000]
+    detail = torch.tensor([0.35, 0.3]) + 0.14 * torch.randn(1000, 2, generator=generator)
+    flat = torch.cat([disc, detail])
+    points = torch.cat([flat, torch.zeros(len(flat), 1)], 1)
+    importance = torch.cat([torch.full((2000,), 0.3), torch.ones(1000)])
+    return points, importance
+
+
+def plane() -> Tensor:
+    """[SIZE, SIZE, 3]: the points of the drawn square."""
+    line = torch.linspace(-1, 1, SIZE)
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    return torch.stack([x, y, torch.zeros_like(x)], -1)
+
+
+def show_cells(axes: plt.Axes, colours: Tensor, cells: Tensor, *, lines: float = 1.0) -> None:
+    """Paints each pixel in the colour of its cell, pale, with the borders in white."""
+    picture = colours[cells.long()] * 0.55 + 0.45
+    axes.imshow(picture, extent=(-1, 1, -1, 1), origin="lower", interpolation="nearest")
+    line = torch.linspace(-1, 1, SIZE)
+    for cell in cells.unique().tolist():
+        axes.contour(line, line, (cells == cell).float(), levels=[0.5], colors="white", linewidths=lines)
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def palette(count: int) -> Tensor:
+    """[count, 3] colours."""
+    return torch.tensor([COLOURS[i % len(COLOURS)] for i in range(count)])
+
+
+def draw_balance(points: Tensor, importance: Tensor) -> None:
+    """Random centres and balanced ones, and the importance in every cell."""
+    k = 16
+    figure, axes = plt.subplots(2, 2, figsize=(8, 5.6), height_ratios=[3, 1], constrained_layout=True)
+    for column, steps in enumerate((0, 500)):
+        result = balance(points, importance, k, steps=steps, generator=torch.Generator().manual_seed(18))
+        above, below = axes[:, column]
+        show_cells(above, palette(k), result.diagram().locate(plane()))
+        above.scatter(*points[::3, :2].T, s=2, c="#333333", linewidths=0)
+        above.scatter(*result.centres[:, :2].T, s=60, c=palette(k), edgecolors="black", zorder=3)
+        above.set_title("centres drawn from the samples" if steps == 0 else "after 500 steps of balancing")
+        share = result.after / result.after.max()
+        below.bar(range(k), share, color=palette(k).numpy())
+        below.set_ylim(0, 1.05)
+        below.set_xticks([])
+        below.set_ylabel("importance / largest")
+        below.set_title(f"standard deviation {result.imbalance_after:.4f}", fontsize=10)
+    figure.savefig(OUT / "balance.png", dpi=110)
+    plt.close(figure)
+
+
+def draw_nested(points: Tensor, importance: Tensor) -> None:
+    """A diagram of four cells, and the same with four cells in each."""
+    figure, axes = plt.subplots(1, 2, figsize=(8, 4.2), constrained_layout=True)
+    diagram = VoronoiDiagram(torch.zeros(1, 3))
+    for axis, title in zip(axes, ("4 cells", "4 x 4 cells")):
+        generator = torch.Generator().manual_seed(6)
+        diagram = split_diagram(diagram, points, importance, 4, min_samples=1, generator=generator).diagram
+        parents = palette(4)[diagram.paths()[:, 0]]
+        own = 0.75 + 0.5 * (diagram.paths()[:, -1:] % 4) / 3 if diagram.depth > 1 else 1.0
+        cells = diagram.locate(plane())
+        show_cells(axis, (parents * own).clamp(0, 1), cells, lines=0.8)
+        axis.scatter(*points[::4, :2].T, s=2, c="#333333", linewidths=0)
+        axis.set_title(title)
+    figure.savefig(OUT / "nested.png", dpi=110)
+    plt.close(figure)
+
+
+def draw_sort() -> None:
+    """Samples in the order of the batch, and sorted by cell beside the offsets and the stacked weights."""
+    cells = torch.tensor([2, 0, 1, 0, 2, 2, 1, 0, 2, 0], dtype=torch.int32)
+    order, offsets = cell_sort(cells, 3)
+    figure, axis = plt.subplots(figsize=(8, 3.1), constrained_layout=True)
+    colours = palette(3)
+    rows = (("samples as they come", 2.2, cells, None), ("sorted by cell", 0.9, cells[order.long()], order))
+    for title, y, row, labels in rows:
+        axis.text(-0.3, y + 0.32, title, ha="right", va="center")
+        for x, cell in enumerate(row.tolist()):
+            axis.add_patch(Rectangle((x, y), 0.9, 0.65, color=tuple(colours[cell].tolist())))
+            axis.text(x + 0.45, y + 0.32, str(x if labels is None else int(labels[x])), ha="center", va="center")
+    for cell in range(3):
+        first, last = int(offsets[cell]), int(offsets[cell + 1])
+        axis.plot([first, last - 0.1], [0.72, 0.72], color=tuple(colours[cell].tolist()), lw=3)
+        label = f"network {cell}: weight[{cell}]"
+        axis.text((first + last - 0.1) / 2, 0.35, label, ha="center", va="center", fontsize=9)
+    axis.text(-0.3, 0.35, f"offsets = {offsets.tolist()}", ha="right", va="center")
+    axis.set_xlim(-4.2, 10.1)
+    axis.set_ylim(0, 3)
+    axis.axis("off")
+    figure.savefig(OUT / "sort.png", dpi=110)
+    plt.close(figure)
+
+
+def draw_blend() -> None:
+    """What a router answers along a line through two cells, without and with blending."""
+    router = VoronoiRouter(torch.nn.Linear(3, 1), torch.tensor([[-0.5, 0, 0], [0.5, 0, 0]]), coords="first3").eval()
+    with torch.no_grad():
+        for parameter, values in zip(router.parameters(), ((0.0, 0.0), (0.2, 0.8))):
+            parameter.copy_(torch.tensor(values).reshape(2, *[1] * (parameter.dim() - 1)).expand_as(parameter))
+        x = torch.linspace(-0.3, 0.3, 601)
+        points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], 1)
+        figure, axis = plt.subplots(figsize=(8, 2.4), constrained_layout=True)
+        for margin in (0.0, 0.1):
+            router.blend = margin
+            axis.plot(x, router(points)[:, 0], label=f"blend={margin}")
+    axis.set_xlabel("position; the border between the two cells is at 0")
+    axis.set_ylabel("output")
+    axis.legend()
+    figure.savefig(OUT / "blend.png", dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()

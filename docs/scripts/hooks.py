@@ -1,0 +1,21 @@
+"""Fills the pages of the site that come from the code: every option of the command line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import options
+
+MARKER = "<!-- options -->"
+
+
+def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
+    """Puts the tables of options in the place of the marker."""
+    if page.file.src_uri == "options.md":
+        assert MARKER in markdown, f"docs/options.md must hold {MARKER}"
+        return markdown.replace(MARKER, options.markdown())
+    return markdown

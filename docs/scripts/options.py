@@ -1,0 +1,115 @@
+"""Tables of every option of the command line, read from the functions and the dataclass behind it."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from voronerf.cli.main import COMMANDS
+from voronerf.training.config import TrainConfig
+
+#: Headings above the settings of `voronerf train`, each before the setting that it names.
+SECTIONS = {
+    "data": "Scene, run and machine",
+    "budget": "Length of the training",
+    "field": "Network",
+    "cells": "Cells",
+    "rays": "Samples along the rays",
+    "lr": "Optimiser",
+    "evaluations": "Evaluation and pictures",
+}
+HEADER = ["| option | values | default | |", "|---|---|---|---|"]
+
+
+def markdown() -> str:
+    """The page's tables, a section for each command."""
+    lines = []
+    for name, function in COMMANDS.items():
+        summary, _, arguments = inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")
+        lines += [f"## voronerf {name}", "", summary, ""]
+        lines += train_tables() if name == "train" else table(function, arguments)
+    return "\n".join(lines) + "\n"
+
+
+def train_tables() -> list[str]:
+    """The settings of a training run under their headings."""
+    unknown = set(SECTIONS) - {field.name for field in dataclasses.fields(TrainConfig)}
+    if unknown:
+        raise ValueError(f"options: SECTIONS must name settings of TrainConfig, got {', '.join(sorted(unknown))}")
+    texts, kinds, lines = field_docs(TrainConfig), get_type_hints(TrainConfig), []
+    for field in dataclasses.fields(TrainConfig):
+        if field.name in SECTIONS:
+            lines += ["", f"### {SECTIONS[field.name]}", "", *HEADER]
+        lines.append(row(f"--{dashed(field.name)}", kinds[field.name], field.default, texts[field.name]))
+    return [*lines, ""]
+
+
+def table(function: Callable[..., Any], arguments: str) -> list[str]:
+    """The arguments of a command."""
+    texts, kinds = dict(argument_docs(arguments)), get_type_hints(function)
+    lines = []
+    for name, parameter in inspect.signature(function).parameters.items():
+        positional = parameter.kind is parameter.POSITIONAL_ONLY
+        label = name.upper() if positional else f"--{dashed(name)}"
+        lines.append(row(label, kinds[name], parameter.default, texts[name]))
+    return [*HEADER, *lines, ""] if lines else ["No options.", ""]
+
+
+def row(label: str, kind: Any, default: Any, text: str) -> str:
+    """One line of a table."""
+    shown = "" if default in (None, inspect.Parameter.empty) else f"`{words(default)}`"
+    if isinstance(default, bool):
+        label, shown = f"{label}` or `{label.replace('--', '--no-')}", "on" if default else "off"
+    text = re.sub(r"(?<![`\w])(--[a-z][a-z-]+)", r"`\1`", " ".join(text.split()))
+    return f"| `{label}` | {values(kind)} | {shown} | {escape(text)} |"
+
+
+def values(kind: Any) -> str:
+    """What an option takes, from its type."""
+    parts = [part for part in get_args(kind) if part is not type(None)]
+    if get_origin(kind) is Literal:
+        return ", ".join(f"`{word}`" for word in get_args(kind))
+    if get_origin(kind) is tuple:
+        return f"{values(parts[0])}s"
+    if parts:
+        return " or ".join(map(values, parts))
+    return {int: "integer", float: "number", str: "text", bool: "", "Path": "path"}.get(kind, "path")
+
+
+def words(default: Any) -> str:
+    """A default as one types it."""
+    return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
+
+
+def field_docs(kind: type) -> dict[str, str]:
+    """The strings that stand below the fields of a dataclass."""
+    (tree,) = ast.parse(inspect.getsource(kind)).body
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for before, after in zip(tree.body, tree.body[1:]):
+        if isinstance(before, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            assert isinstance(before.target, ast.Name)
+            found[before.target.id] = str(after.value.value)
+    return found
+
+
+def argument_docs(arguments: str) -> Iterator[tuple[str, str]]:
+    """Names and texts of a docstring's arguments."""
+    for block in re.split(r"\n(?= {4}\w+:)", arguments):
+        name, _, text = block.strip().partition(":")
+        if name:
+            yield name, text
+
+
+def dashed(name: str) -> str:
+    """A setting's name on the command line."""
+    return name.replace("_", "-")
+
+
+def escape(text: str) -> str:
+    """Text inside of a table's cell."""
+    return text.replace("|", "\\|").replace("<", "&lt;")

@@ -1,0 +1,59 @@
+"""The pages: Python in them runs, the options they name exist, their files are there."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+RUNNABLE = ("README.md", "docs/quickstart.md", "docs/method.md")
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+
+
+def blocks(name: str) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", (ROOT / name).read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("name", RUNNABLE)
+def test_python_on_a_page_runs(name: str) -> None:
+    found = blocks(name)
+    assert found, f"{name} has no Python"
+    for number, code in enumerate(found, 1):
+        exec(compile(code, f"{name}, block {number}", "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_linked_files_are_there(name: str) -> None:
+    # contributing.md and changelog.md show files of the root, which are checked as such by GitHub's readers.
+    for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", (ROOT / name).read_text()):
+        assert ((ROOT / name).parent / target).is_file(), f"{name} links {target}"
+
+
+def test_every_option_of_every_command_is_on_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs/scripts"))
+    import options
+
+    from voronerf.cli.main import COMMANDS
+    from voronerf.training.config import TrainConfig
+
+    text = options.markdown()
+    for command in COMMANDS:
+        assert f"## voronerf {command}\n" in text
+    for field in dataclasses.fields(TrainConfig):
+        assert f"\n| `--{field.name.replace('_', '-')}`" in text, field.name
+    assert "\n| `RUN` |" in text and "\n| `--frames` |" in text
+    sys.modules.pop("options")
+
+
+@pytest.mark.parametrize("name", [name for name in PAGES if "changelog" not in name])
+def test_options_on_a_page_exist(name: str) -> None:
+    from voronerf.training.config import TrainConfig
+
+    known = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(TrainConfig)}
+    for line in re.findall(r"voronerf train( [^`\n|]*)", (ROOT / name).read_text()):
+        for option in re.findall(r"(?<!\w)--[a-z-]+", line):
+            assert option in known, f"{name}: voronerf train has no {option}"
