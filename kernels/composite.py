@@ -18,14 +18,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.kernels._launch import array, launch
-from voronerf.reference.composite import Composite
-from voronerf.reference.second_derivatives import (
+from voronerf.derivatives import (
     composite_backward_backward,
     composite_backward_setup,
     composite_forward_backward,
     composite_forward_setup,
 )
+from voronerf.kernels._launch import array, launch
+from voronerf.reference.composite import Composite
 
 wp.set_module_options({"enable_backward": False})
 

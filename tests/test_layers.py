@@ -18,6 +18,7 @@ LAYERS = (
         "_C",
         "kernels",
         "reference",
+        "derivatives",
     },
     {"ops"},
     {"diagram"},

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from voronerf import native as _native
-from voronerf.reference.composite import Composite
-from voronerf.reference.second_derivatives import (
+from voronerf.derivatives import (
     composite_backward_backward,
     composite_backward_setup,
     composite_forward_backward,
     composite_forward_setup,
 )
+from voronerf.reference.composite import Composite
 
 
 def composite(

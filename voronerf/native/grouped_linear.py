@@ -3,8 +3,8 @@
 On CUDA it is a network of one layer (``grouped_mlp.py``). Forward and backward, functional both. float32 and
 bfloat16 are read and written as they are stored; float16 and float64 are cast to float32 on the way in and back on the
 way out. With bfloat16 storage products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16),
-and float32 ones elsewhere; sums are float32 always. Second derivatives come from the reference formula. Shapes and
-dtypes have been validated by ``voronerf.ops``.
+and float32 ones elsewhere; sums are float32 always. Derivatives of every order are products of the same two ops. Shapes
+and dtypes have been validated by ``voronerf.ops``.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ import torch
 from torch import Tensor
 
 from voronerf import native as _native
+from voronerf.derivatives import asked_for
 from voronerf.layers import ACTIVATIONS
 from voronerf.native import grouped_mlp as _native_mlp
-from voronerf.reference.grouped_linear import grouped_linear as _reference
-from voronerf.reference.second_derivatives import aliases, second_derivatives
 
 _STORED = (torch.float32, torch.bfloat16)
 
@@ -109,38 +108,77 @@ def _(
 
 def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     x, offsets, weight, bias, ctx.activation = inputs
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(x, offsets, weight, bias)
 
 
-def _forward_backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-    needs = ctx.needs_input_grad
-    results = _backward(gradient, *ctx.saved_tensors, ctx.activation, [needs[0], needs[2] or needs[3]])
-    to_x, to_weight, to_bias = (result if need else None for result, need in zip(results, (needs[0], *needs[2:4])))
-    return to_x, None, to_weight, to_bias, None
+def _forward_backward(ctx: Any, gradient: Tensor | None) -> tuple[Tensor | None, ...]:
+    if gradient is None:
+        return (None,) * 5
+    x, offsets, weight, bias = ctx.saved_tensors
+    to_x, _, to_weight, to_bias = asked_for(ctx, ctx.saved_tensors)
+    results = _backward(gradient, x, offsets, weight, bias, ctx.activation, [to_x, to_weight or to_bias])
+    found = [result if want else None for result, want in zip(results, (to_x, to_weight, to_bias))]
+    return found[0], None, *found[1:], None
 
 
 def _backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
     *tensors, ctx.activation, ctx.wanted = inputs
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*tensors)
 
 
-def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | None, ...]:
-    """Derivative of the gradients, through the reference formula."""
+def _backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tuple[Tensor | None, ...]:
+    """Derivative of the gradients, by the two ops themselves, so that every order exists.
+
+    With z = W x + b and h = gradient * act'(z) the gradients are W^T h, sum h x^T and sum h.
+    """
     gradient, x, offsets, weight, bias = ctx.saved_tensors
-    leaves, graph = aliases((x, weight, bias, gradient))
-    with torch.enable_grad():
-        x, weight, bias, gradient = leaves
-        assert x is not None and weight is not None
-        with torch.autocast(x.device.type, enabled=False):
-            out = _reference(x, offsets, weight, bias, activation=ctx.activation)
-        chosen = (ctx.wanted[0], ctx.wanted[1], ctx.wanted[1])
-        pairs = [
-            (leaf, cotangent)
-            for leaf, cotangent, want in zip(leaves, cotangents, chosen)
-            if want and leaf is not None and cotangent is not None
-        ]
-        to_x, to_weight, to_bias, to_gradient = second_derivatives([(out, gradient)], pairs, leaves, graph)
-    return to_gradient, to_x, None, to_weight, to_bias, None, None
+    to_gradient, to_x, _, to_weight, to_bias = asked_for(ctx, ctx.saved_tensors)
+    chosen = (ctx.wanted[0], ctx.wanted[1], ctx.wanted[1])
+    of_x, of_weight, of_bias = (each if want else None for each, want in zip(cotangents, chosen))
+
+    h, slope, curvature = gradient, None, None
+    if ctx.activation != "none":
+        slope, curvature = _derivatives(ctx.activation, _forward(x, offsets, weight, bias, "none"))
+        h = gradient * slope
+    of_h = None
+    if to_gradient or (curvature is not None and (to_x or to_weight or to_bias)):
+        if of_x is not None:
+            of_h = _forward(of_x, offsets, weight, None, "none")
+        if of_weight is not None or of_bias is not None:
+            given = torch.zeros_like(weight) if of_weight is None else of_weight
+            of_h = _add(of_h, _forward(x, offsets, given, of_bias, "none"))
+    of_gradient = of_h if of_h is None or slope is None else of_h * slope
+
+    found: list[Tensor | None] = [None, None, None]
+    if to_x and of_weight is not None:
+        found[0] = _backward(h, x, offsets, of_weight, None, "none", [True, False])[0]
+    if to_weight and of_x is not None:
+        found[1] = _backward(h, of_x, offsets, weight, None, "none", [False, True])[1]
+    if of_h is not None and curvature is not None and (to_x or to_weight or to_bias):
+        through = of_h * gradient * curvature
+        more = _backward(through, x, offsets, weight, bias, "none", [to_x, to_weight or to_bias])
+        wanted = (to_x, to_weight, to_bias)
+        found = [_add(one, other) if want else None for one, other, want in zip(found, more, wanted)]
+    return of_gradient, found[0], None, found[1], found[2], None, None
+
+
+def _derivatives(activation: str, z: Tensor) -> tuple[Tensor, Tensor | None]:
+    """First and second derivative of an activation at ``z``; None for a second one that is 0."""
+    if activation == "relu":
+        return (z > 0).to(z.dtype), None
+    if activation == "sine":
+        return z.cos(), -z.sin()
+    s = z.sigmoid()
+    if activation == "softplus":
+        return s, s * (1 - s)
+    assert activation == "sigmoid"
+    return s * (1 - s), s * (1 - s) * (1 - 2 * s)
+
+
+def _add(one: Tensor | None, other: Tensor) -> Tensor:
+    return other if one is None else one + other
 
 
 _forward.register_autograd(_forward_backward, setup_context=_forward_setup)

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from voronerf import native as _native
+from voronerf.derivatives import aliases, second_derivatives
 from voronerf.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_mlp import grouped_mlp as _reference
-from voronerf.reference.second_derivatives import aliases, second_derivatives
 from voronerf.reference.specification import encode_positions
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from voronerf import native as _native
-from voronerf.reference.second_derivatives import (
+from voronerf.derivatives import (
     encode_backward_backward,
     encode_backward_setup,
     encode_gradients,

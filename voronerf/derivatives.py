@@ -17,6 +17,28 @@ from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.integrated_encode import integrated_encode
 
 
+def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
+    """For each tensor that an op took (None where an optional one is absent): will its gradient be used?
+
+    ``ctx.needs_input_grad`` says which inputs require a gradient, not which the caller has asked for: in
+    ``torch.autograd.grad(y, x, create_graph=True)`` the gradients of the weights would be computed and dropped, half of
+    the products of an eikonal loss. torch's own layers ask the engine, and so does this.
+    """
+    edges = iter(ctx.next_functions)
+    return [tensor is not None and _runs(next(edges)[0]) for tensor in inputs]
+
+
+def _runs(node: Any) -> bool:
+    # torch has no public name for this question; without the answer every gradient is computed.
+    ask = getattr(torch._C, "_will_engine_execute_node", None)
+    if node is None or ask is None:
+        return node is not None
+    try:
+        return bool(ask(node))
+    except RuntimeError:
+        return True  # the engine refuses to answer for leaves that torch.autograd.grad was asked for
+
+
 def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:
     """Tensors to differentiate by within the derivative of a backward op, and whether that is differentiated again.
 
