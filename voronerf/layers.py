@@ -28,6 +28,13 @@ class Layer:
         inputs: sources concatenated in this order: "positions", "directions", or the index of an earlier layer.
         width: output features.
         activation: one of ``ACTIVATIONS``, applied to the sum of product and bias.
+
+    Examples:
+        >>> from voronerf import Layer
+        >>> Layer(("positions",), 64, "relu")  # reads the (encoded) position
+        Layer(inputs=('positions',), width=64, activation='relu')
+        >>> Layer((0, "directions"), 32, "relu").width  # reads layer 0 and the view direction
+        32
     """
 
     inputs: tuple[int | str, ...]
@@ -51,6 +58,14 @@ class MLP:
     Raises:
         ValueError: a table that cannot be evaluated: no layers or outputs, a source that is not an earlier layer, a
             width below 1, an unknown activation or encoding, negative octaves, the integrated encoding without octaves.
+
+    Examples:
+        >>> from voronerf import MLP, Layer
+        >>> table = MLP((Layer(("positions",), 64, "relu"), Layer((0,), 4)), outputs=(1,), position_octaves=10)
+        >>> table.weight_shapes(3)  # [o, i] of each layer, for positions of three features
+        [(64, 63), (4, 64)]
+        >>> table.out_features
+        4
     """
 
     layers: tuple[Layer, ...]

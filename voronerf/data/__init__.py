@@ -25,6 +25,12 @@ def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
 
     Raises:
         SceneError: one line that names what is wrong with which file.
+
+    Examples:
+        >>> from voronerf.data import load_scene
+        >>> scene = load_scene("builtin", downscale=20)  # or a folder
+        >>> scene.name, len(scene.train), len(scene.test), scene.train.images.shape[1:]
+        ('builtin', 100, 25, torch.Size([5, 5, 4]))
     """
     if downscale < 1:
         raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")

@@ -25,6 +25,13 @@ class Split:
         cameras: c cameras.
         images: uint8 [c, h, w, 3] opaque, or [c, h, w, 4] with straight (not premultiplied) alpha.
         names: of the images, for tables and file names.
+
+    Examples:
+        >>> from voronerf.data import load_scene
+        >>> test = load_scene("builtin", downscale=20).test
+        >>> image = test.truth(0, background=None)  # float32 in 0..1
+        >>> image.shape, len(test) == len(test.names)
+        (torch.Size([5, 5, 3]), True)
     """
 
     cameras: Cameras
@@ -56,6 +63,12 @@ class Scene:
         box: float32 [2, 3], lowest and highest corner of an axis-aligned box that holds everything, or None if unknown.
         spacing: of samples along a ray that suits the scene, "linear" or "disparity".
         background: "white": seen through whatever is transparent; None: an opaque capture, there is no background.
+
+    Examples:
+        >>> from voronerf.data import load_scene
+        >>> scene = load_scene("builtin", downscale=20)
+        >>> scene.box.shape, scene.spacing, scene.background
+        (torch.Size([2, 3]), 'linear', 'white')
     """
 
     name: str

@@ -30,6 +30,15 @@ class Balance:
         after: float64 [k], importance per cell with the returned ones.
         imbalance_before: std(W / max W) of `before`.
         imbalance_after: the same of `after`.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import balance
+        >>> result = balance(torch.rand(500, 3), torch.ones(500), 4)
+        >>> int(result.after.sum())  # the importance of all cells together
+        500
+        >>> result.diagram()
+        VoronoiDiagram(Voronoi, cells=4, depth=1)
     """
 
     centres: Tensor
@@ -52,6 +61,14 @@ def imbalance(weights: Tensor) -> float:
 
     Raises:
         ValueError: wrong shape, or no positive value.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import imbalance
+        >>> imbalance(torch.tensor([2.0, 2.0, 2.0]))
+        0.0
+        >>> imbalance(torch.tensor([4.0, 0.0]))
+        0.5
     """
     if weights.dim() != 1 or weights.numel() == 0:
         raise ValueError(f"imbalance: weights must have shape [k] with k >= 1, got {list(weights.shape)}")
@@ -111,6 +128,17 @@ def balance(
         ValueError: a wrong shape, an unknown choice, a value that is not finite, a negative importance, no importance
             at all, fewer than one cell, or more cells than distinct samples.
         TypeError: points or importance that are not floating-point.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import balance
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> points, importance = torch.rand(2000, 3, generator=generator), torch.rand(2000, generator=generator)
+        >>> result = balance(points, importance, 8, generator=generator)
+        >>> result.centres.shape
+        torch.Size([8, 3])
+        >>> result.imbalance_after < 0.1 * result.imbalance_before
+        True
     """
     check_samples("balance", points, importance)
     _check_choice("method", method, ("published", "transport"))

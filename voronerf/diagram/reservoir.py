@@ -27,6 +27,18 @@ class SampleReservoir:
         capacity: number of samples asked for.
         batches: number of batches that share it.
         quota: samples kept of each batch.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import SampleReservoir
+        >>> reservoir = SampleReservoir(capacity=4, batches=2)  # the 2 heaviest samples of each of the last 2 batches
+        >>> points = torch.arange(9.0).reshape(3, 3)
+        >>> reservoir.add(points, torch.tensor([0.1, 0.7, 0.5]))
+        >>> kept, importance = reservoir.samples()
+        >>> importance
+        tensor([0.7000, 0.5000])
+        >>> len(reservoir)
+        2
     """
 
     def __init__(self, capacity: int = 10_000, batches: int = 100, *, device: torch.device | str = "cpu") -> None:

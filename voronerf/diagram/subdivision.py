@@ -24,6 +24,14 @@ class Split:
         diagram: the refined diagram; the given one where no cell could be split.
         parents: int64 [num_cells], for each cell of `diagram` the cell of the given diagram that it lies in.
         balances: the cells of the given diagram that were split -> how their centres were balanced.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import VoronoiDiagram, split_diagram
+        >>> points = torch.rand(100, 3)
+        >>> split = split_diagram(VoronoiDiagram(torch.zeros(1, 3)), points, torch.ones(100), 2)
+        >>> split.diagram.num_cells, list(split.balances)  # cell 0 was split
+        (2, [0])
     """
 
     diagram: VoronoiDiagram
@@ -75,6 +83,21 @@ def split_diagram(
         ValueError: samples that `balance` refuses, an unknown choice, a cell out of range or named twice, or more cells
             than samples (k exceeds the number of samples in all).
         TypeError: points or importance are not floating.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import VoronoiDiagram, split_diagram
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> points, importance = torch.rand(1000, 3, generator=generator), torch.rand(1000, generator=generator)
+        >>> coarse = VoronoiDiagram(torch.zeros(1, 3))
+        >>> split = split_diagram(coarse, points, importance, 4, generator=generator)
+        >>> split.diagram
+        VoronoiDiagram(Voronoi, cells=4, depth=1)
+        >>> split.parents
+        tensor([0, 0, 0, 0])
+        >>> nested = split_diagram(split.diagram, points, importance, 4, generator=generator)
+        >>> nested.diagram
+        VoronoiDiagram(Voronoi, cells=16, depth=2)
     """
     check_samples("split_diagram", points, importance)
     if k < 1:

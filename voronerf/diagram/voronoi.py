@@ -44,6 +44,22 @@ class VoronoiDiagram(nn.Module):
         power: float32 [m] power weights in squared scene units, or None for a plain Voronoi diagram.
         depth: number of levels; 1 for a flat diagram.
         num_cells: number of leaves.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import VoronoiDiagram
+        >>> diagram = VoronoiDiagram(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]))
+        >>> diagram.locate(torch.tensor([[0.2, 0, 0], [0.9, 5, 0]]))
+        tensor([0, 1], dtype=torch.int32)
+        >>> nested, parents = diagram.refine({1: torch.tensor([[0.8, 0, 0], [1.2, 0, 0]])})
+        >>> nested
+        VoronoiDiagram(Voronoi, cells=3, depth=2)
+        >>> parents  # the old cell of each new one
+        tensor([0, 1, 1])
+        >>> nested.paths()  # the cell on each level; -1 where a branch ends sooner
+        tensor([[ 0, -1],
+                [ 1,  0],
+                [ 1,  1]])
     """
 
     centres: Tensor
@@ -363,6 +379,14 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
 
     Raises:
         ValueError: k < 1, a wrong shape, a value that is not finite, or a highest corner below the lowest.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import uniform_centres
+        >>> box = torch.tensor([[0.0, 0, 0], [2.0, 1, 1]])
+        >>> uniform_centres(box, 2)
+        tensor([[0.5000, 0.5000, 0.5000],
+                [1.5000, 0.5000, 0.5000]])
     """
     if k < 1:
         raise ValueError(f"uniform_centres: k must be at least 1, got {k}")

@@ -12,7 +12,13 @@ from voronerf.layers import MLP, Layer
 
 
 def density_table(width: int, depth: int, position_octaves: int = 6, position_encoding: str = "frequency") -> MLP:
-    """The layer table of :class:`DensityField`, whose arguments these are."""
+    """The layer table of :class:`DensityField`, whose arguments these are.
+
+    Examples:
+        >>> from voronerf.fields import density_table
+        >>> density_table(width=32, depth=2).out_features
+        1
+    """
     trunk = [Layer(("positions",) if i == 0 else (i - 1,), width, "relu") for i in range(depth)]
     return MLP(
         (*trunk, Layer((depth - 1,), 1)),
@@ -36,6 +42,13 @@ class DensityField(nn.Module):
 
     Raises:
         ValueError: For a width or depth below 1.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.fields import DensityField
+        >>> black, density = DensityField()(torch.rand(10, 3))
+        >>> density.shape
+        torch.Size([10])
     """
 
     def __init__(

@@ -16,6 +16,15 @@ class KiloNeRF(NeRF):
         width: Channels of every hidden layer.
         depth: Trunk layers.
         **options: The further arguments of :class:`NeRF`.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import VoronoiRouter
+        >>> from voronerf.fields import KiloNeRF
+        >>> router = VoronoiRouter(KiloNeRF(), torch.rand(512, 3))  # 512 networks of width 32
+        >>> colour, density = router(torch.rand(1000, 3), torch.tensor([[0.0, 0, 1]]).expand(1000, 3))
+        >>> colour.shape, density.shape
+        (torch.Size([1000, 3]), torch.Size([1000]))
     """
 
     def __init__(self, width: int = WIDTH, depth: int = DEPTH, **options: object) -> None:

@@ -19,6 +19,15 @@ class MipNeRF(NeRF):
         depth: Hidden layers before the heads.
         position_octaves: Frequencies of the integrated encoding, at least 1.
         **options: The further arguments of :class:`NeRF`.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.fields import MipNeRF
+        >>> field = MipNeRF(width=32, depth=2)
+        >>> gaussians = torch.cat([torch.rand(10, 3), torch.full((10, 3), 1e-4)], dim=1)  # mean and diagonal variance
+        >>> colour, density = field(gaussians, torch.tensor([[0.0, 0, 1]]).expand(10, 3))
+        >>> colour.shape, density.shape
+        (torch.Size([10, 3]), torch.Size([10]))
     """
 
     def __init__(self, width: int = 64, depth: int = 8, *, position_octaves: int = OCTAVES, **options: object) -> None:

@@ -32,6 +32,14 @@ def nerf_table(
 
     Raises:
         ValueError: For a width, depth or skip out of range.
+
+    Examples:
+        >>> from voronerf.fields import nerf_table
+        >>> table = nerf_table(width=64, depth=8)
+        >>> table.weight_shapes(3, 3)[0]  # 3 features and 10 octaves: 63 inputs
+        (64, 63)
+        >>> table.out_features  # colour and density
+        4
     """
     if width < 2:
         raise ValueError(f"NeRF: width must be at least 2, got {width}")
@@ -93,6 +101,18 @@ class NeRF(nn.Module):
 
     Raises:
         ValueError: For a width, depth, skip or scale out of range.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF
+        >>> field = NeRF(width=64, depth=4)
+        >>> positions, directions = torch.rand(10, 3), torch.nn.functional.normalize(torch.rand(10, 3), dim=-1)
+        >>> colour, density = field(positions, directions)
+        >>> colour.shape, density.shape
+        (torch.Size([10, 3]), torch.Size([10]))
+        >>> per_ray = directions[:2]  # two rays of five samples each
+        >>> ray_index = torch.arange(2, dtype=torch.int32).repeat_interleave(5)
+        >>> colour, density = field(positions, per_ray, ray_index)
     """
 
     def __init__(

@@ -46,6 +46,16 @@ def balance_centres(
         ValueError: shapes, devices, counts or an unknown backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import balance_centres
+        >>> samples = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [9.0, 0, 0]])
+        >>> masses = torch.ones(4, dtype=torch.float64)
+        >>> centres = torch.tensor([[0.0, 0, 0], [9.0, 0, 0]])
+        >>> moved, weights = balance_centres(samples, masses, centres, steps=100)
+        >>> weights  # 3 and 1 before
+        tensor([2., 2.], dtype=torch.float64)
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "samples", samples, ("m", 3), sizes)

@@ -41,6 +41,17 @@ def camera_rays(
         ValueError: shapes, devices or an unknown backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import camera_rays
+        >>> poses = torch.eye(4)[None]  # at the origin, looking along -z
+        >>> intrinsics = torch.tensor([[100.0, 100.0, 50.0, 50.0]])
+        >>> x, y = torch.tensor([50.0, 150.0]), torch.tensor([50.0, 50.0])
+        >>> origins, directions = camera_rays(poses, intrinsics, x, y)
+        >>> directions.round(decimals=4)
+        tensor([[ 0.0000,  0.0000, -1.0000],
+                [ 0.7071,  0.0000, -0.7071]])
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "poses", poses, ("c", 4, 4), sizes)

@@ -37,6 +37,17 @@ def cast_solids(
         ValueError: shapes, devices or an unknown backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import cast_solids
+        >>> kinds = torch.tensor([0], dtype=torch.int32)  # a sphere
+        >>> frames = torch.cat([torch.eye(3), torch.zeros(1, 3)])[None]
+        >>> sizes = torch.ones(1, 3)
+        >>> origins = torch.tensor([[0.0, 0, 5], [3.0, 0, 5]])
+        >>> directions = torch.tensor([[0.0, 0, -1], [0.0, 0, -1]])
+        >>> cast_solids(kinds, frames, sizes, origins, directions)
+        (tensor([4., inf]), tensor([ 0, -1], dtype=torch.int32))
     """
     sizes_of: dict[str, int] = {}
     check_shape(_OP, "kinds", kinds, ("s",), sizes_of)

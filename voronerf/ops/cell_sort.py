@@ -31,6 +31,19 @@ def cell_sort(cells: Tensor, k: int, *, backend: str = "auto") -> tuple[Tensor, 
             ``offsets[k]``, rows that belong to no cell.)
         TypeError: dtype.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import cell_sort
+        >>> cells = torch.tensor([2, 0, 2, 0], dtype=torch.int32)
+        >>> order, offsets = cell_sort(cells, 3)
+        >>> order
+        tensor([1, 3, 0, 2], dtype=torch.int32)
+        >>> offsets
+        tensor([0, 2, 2, 4], dtype=torch.int32)
+        >>> x = torch.tensor([10, 11, 12, 13])
+        >>> x[order]  # cells 0, 0, 2, 2; cell 1 is empty
+        tensor([11, 13, 10, 12])
     """
     check_shape(_OP, "cells", cells, ("n",))
     check_dtype(_OP, "cells", cells, INDEX)

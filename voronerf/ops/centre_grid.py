@@ -22,6 +22,14 @@ class CentreGrid:
         centres: float32 or float64 [k, 3], a copy of those the grid was made from.
         weights: [k] in the same dtype, or None.
         tables: the lists and the way to them; csrc/geometry/centre_grid.h says what is in them.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import centre_grid
+        >>> centres = torch.eye(3)
+        >>> grid = centre_grid(centres)
+        >>> grid.belongs_to(centres, None), grid.belongs_to(centres + 1, None)
+        (True, False)
     """
 
     centres: Tensor
@@ -68,6 +76,14 @@ def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str 
         ValueError: shapes, devices, an unknown backend, or a value that is not finite.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import centre_grid, nearest_centre
+        >>> centres = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
+        >>> grid = centre_grid(centres)
+        >>> nearest_centre(centres[:4] + 1e-4, centres, grid=grid)
+        tensor([0, 1, 2, 3], dtype=torch.int32)
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "centres", centres, ("k", 3), sizes)

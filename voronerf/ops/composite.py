@@ -48,6 +48,16 @@ def composite(
         ValueError: shapes, devices or an unknown backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import composite
+        >>> sigma = torch.tensor([[0.0, float("inf"), 1.0]])  # one ray: air, a wall, what is behind it
+        >>> rgb = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]]])
+        >>> depths, deltas = torch.tensor([[1.0, 2.0, 3.0]]), torch.ones(1, 3)
+        >>> result = composite(sigma, rgb, depths, deltas)
+        >>> result.colour, result.depth, result.weights
+        (tensor([[1., 0., 0.]]), tensor([2.]), tensor([[0., 1., 0.]]))
     """
     sizes: dict[str, int] = {}
     samples = ("r", "s") if ray_offsets is None else ("m",)

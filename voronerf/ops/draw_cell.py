@@ -58,6 +58,17 @@ def draw_cell(
             refused.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import draw_cell
+        >>> centres = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
+        >>> child_offsets = torch.tensor([0, 2], dtype=torch.int32)  # a flat diagram
+        >>> child = torch.tensor([-1, -2], dtype=torch.int32)
+        >>> points = torch.tensor([[0.5, 0, 0], [0.5, 0, 0], [0.1, 0, 0]])
+        >>> uniforms = torch.tensor([[0.8], [0.2], [0.2]])  # the first two points lie on the border
+        >>> draw_cell(points, centres, child_offsets, child, uniforms, temperature=0.1, depth=1)
+        tensor([0, 1, 0], dtype=torch.int32)
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "points", points, ("n", 3), sizes)

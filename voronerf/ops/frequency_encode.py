@@ -29,6 +29,13 @@ def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, bac
         ValueError: shape, octaves or an unknown backend.
         TypeError: dtype.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import frequency_encode
+        >>> x = torch.tensor([[1.0]])
+        >>> frequency_encode(x, 2).round(decimals=4)  # x, sin x, cos x, sin 2x, cos 2x
+        tensor([[ 1.0000,  0.8415,  0.5403,  0.9093, -0.4161]])
     """
     check_shape(_OP, "x", x, ("n", "d"))
     check_dtype(_OP, "x", x)

@@ -50,6 +50,17 @@ def grouped_linear(
         ValueError: shapes, devices, an unknown activation or backend; on the CPU also offsets that fall or exceed n.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import grouped_linear
+        >>> x = torch.tensor([[1.0], [2.0], [3.0]])
+        >>> offsets = torch.tensor([0, 2, 3], dtype=torch.int32)  # rows 0 and 1 belong to cell 0, row 2 to cell 1
+        >>> weight = torch.tensor([[[10.0]], [[-1.0]]])  # [k, o, i] = [2, 1, 1]
+        >>> grouped_linear(x, offsets, weight).flatten()
+        tensor([10., 20., -3.])
+        >>> grouped_linear(x, offsets, weight, activation="relu").flatten()
+        tensor([10., 20.,  0.])
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "x", x, ("n", "i"), sizes)

@@ -54,6 +54,18 @@ def grouped_mlp(
             or exceed n, and a direction_index outside 0 to r - 1.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import MLP, Layer, grouped_mlp
+        >>> table = MLP((Layer(("positions",), 16, "relu"), Layer((0,), 4)), outputs=(1,), position_octaves=6)
+        >>> weights = [torch.ones(2, o, i) / i for o, i in table.weight_shapes(3)]  # two cells
+        >>> biases = [torch.zeros(2, layer.width) for layer in table.layers]
+        >>> positions = torch.zeros(5, 3)
+        >>> offsets = torch.tensor([0, 3, 5], dtype=torch.int32)
+        >>> out = grouped_mlp(positions, offsets, weights, biases, layers=table)
+        >>> out.shape
+        torch.Size([5, 4])
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "positions", positions, ("n", "p"), sizes)

@@ -30,6 +30,15 @@ def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend
         ValueError: shapes, devices, octaves or an unknown backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import integrated_encode
+        >>> means = torch.tensor([[1.0, 0.0, 0.0]])
+        >>> integrated_encode(means, torch.zeros(1, 3), 1).round(decimals=4)  # a point: sin, then cos
+        tensor([[0.8415, 0.0000, 0.0000, 0.5403, 1.0000, 1.0000]])
+        >>> integrated_encode(means, torch.full((1, 3), 4.0), 1).round(decimals=4)  # a wide Gaussian: closer to 0
+        tensor([[0.1139, 0.0000, 0.0000, 0.0731, 0.1353, 0.1353]])
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "means", means, ("n", 3), sizes)

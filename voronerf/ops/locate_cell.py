@@ -50,6 +50,16 @@ def locate_cell(
             they are refused.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import locate_cell
+        >>> centres = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.8, 0, 0], [1.2, 0, 0]])
+        >>> child_offsets = torch.tensor([0, 2, 4], dtype=torch.int32)  # two diagrams: rows 0 and 1, rows 2 and 3
+        >>> child = torch.tensor([-1, 1, -2, -3], dtype=torch.int32)  # diagram 1 refines centre 1; the rest are leaves
+        >>> points = torch.tensor([[0.1, 0, 0], [0.9, 0, 0], [1.3, 0, 0]])
+        >>> locate_cell(points, centres, child_offsets, child, depth=2)
+        tensor([0, 1, 2], dtype=torch.int32)
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "points", points, ("n", 3), sizes)

@@ -74,6 +74,19 @@ def march_rays(
         ValueError: shapes, devices, counts, an unknown spacing or backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import march_rays
+        >>> origins, directions = torch.tensor([[-1.0, 0.5, 0.5]]), torch.tensor([[1.0, 0.0, 0.0]])
+        >>> near, far = torch.zeros(1), torch.tensor([4.0])
+        >>> occupied = torch.tensor([False, True]).reshape(2, 1, 1)  # the second half of the box
+        >>> box = torch.tensor([[0.0, 0, 0], [2.0, 1, 1]])
+        >>> march = march_rays(origins, directions, near, far, occupied, box, 8)
+        >>> march.depths  # two of eight strata
+        tensor([2.2500, 2.7500])
+        >>> march.ray_offsets
+        tensor([0, 2], dtype=torch.int32)
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "origins", origins, ("r", 3), sizes)

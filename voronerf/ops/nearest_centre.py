@@ -40,6 +40,16 @@ def nearest_centre(
         ValueError: shapes, devices, an unknown backend, or a grid of other centres or weights.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import nearest_centre
+        >>> points = torch.tensor([[0.1, 0.0, 0.0], [0.9, 0.0, 0.0], [0.4, 0.0, 0.0]])
+        >>> centres = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        >>> nearest_centre(points, centres)
+        tensor([0, 1, 0], dtype=torch.int32)
+        >>> nearest_centre(points, centres, weights=torch.tensor([0.0, 0.5]))  # the second cell is larger
+        tensor([0, 1, 1], dtype=torch.int32)
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "points", points, ("n", 3), sizes)

@@ -34,6 +34,14 @@ def resample(
         ValueError: shapes, devices, count or an unknown backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import resample
+        >>> weights = torch.tensor([[0.0, 1.0, 0.0]])  # all of the mass lies between 2 and 3
+        >>> edges = torch.tensor([[1.0, 2.0, 3.0, 4.0]])
+        >>> resample(weights, edges, 4)
+        tensor([[2.1250, 2.3750, 2.6250, 2.8750]])
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "weights", weights, ("r", "s"), sizes)

@@ -74,6 +74,19 @@ def routed_mlp(
             to r - 1.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import MLP, Layer, routed_mlp
+        >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))  # one linear layer, no encoding
+        >>> weights = [torch.tensor([[[1.0, 0, 0]], [[100.0, 0, 0]]])]
+        >>> positions = torch.tensor([[0.9, 0, 0], [0.1, 0, 0], [0.8, 0, 0]])
+        >>> centres = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
+        >>> out, cells = routed_mlp(positions, weights, [None], layers=table, centres=centres)
+        >>> cells
+        tensor([1, 0, 1], dtype=torch.int32)
+        >>> out.flatten().round(decimals=4)  # in the order of the positions
+        tensor([90.0000,  0.1000, 80.0000])
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "positions", positions, ("n", "p"), sizes)

@@ -30,6 +30,14 @@ def select_heaviest(points: Tensor, importance: Tensor, count: int, *, backend: 
         ValueError: shapes, devices, count or an unknown backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import select_heaviest
+        >>> points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]])
+        >>> heaviest, importance = select_heaviest(points, torch.tensor([0.5, 3.0, 2.0]), 2)
+        >>> heaviest[:, 0], importance
+        (tensor([1., 2.]), tensor([3., 2.]))
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "points", points, ("n", 3), sizes)

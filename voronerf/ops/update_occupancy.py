@@ -35,6 +35,15 @@ def update_occupancy(
         ValueError: shapes, devices, a decay out of range, cells out of range where they are read, an unknown backend.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import update_occupancy
+        >>> density = torch.tensor([4.0, 4.0, 4.0]).reshape(3, 1, 1)
+        >>> cells = torch.tensor([0, 1], dtype=torch.int32)  # cells that were looked at
+        >>> density, occupied = update_occupancy(density, cells, torch.tensor([9.0, 0.0]), decay=0.5, threshold=3.0)
+        >>> density.flatten(), occupied.flatten()
+        (tensor([9., 2., 4.]), tensor([ True, False,  True]))
     """
     sizes: dict[str, int] = {}
     check_shape(_OP, "density", density, ("x", "y", "z"), sizes)

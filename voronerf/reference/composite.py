@@ -19,6 +19,15 @@ class Composite(NamedTuple):
         opacity: [r], the sum of the weights.
         depth: [r], the sum of weight times depth: not divided by the opacity.
         weights: like sigma, each sample's contribution.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import composite
+        >>> result = composite(torch.ones(1, 4), torch.ones(1, 4, 3), torch.arange(4.0)[None], torch.ones(1, 4))
+        >>> result.opacity.round(decimals=4)  # 1 - exp(-4)
+        tensor([0.9817])
+        >>> result.colour.shape, result.depth.shape, result.weights.shape
+        (torch.Size([1, 3]), torch.Size([1]), torch.Size([1, 4]))
     """
 
     colour: Tensor

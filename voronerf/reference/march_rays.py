@@ -22,6 +22,16 @@ class March(NamedTuple):
         deltas: [m], length of the sample's stratum.
         positions: [m, 3], where the samples are.
         stop: int32 [r], the stratum with which each ray would go on: s where the whole ray has been walked.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import march_rays
+        >>> ray = torch.tensor([[-1.0, 0.5, 0.5]]), torch.tensor([[1.0, 0.0, 0.0]])
+        >>> ends = torch.zeros(1), torch.tensor([4.0])
+        >>> box = torch.tensor([[0.0, 0, 0], [2.0, 1, 1]])
+        >>> march = march_rays(*ray, *ends, torch.ones(2, 1, 1, dtype=torch.bool), box, 8)
+        >>> march.positions[:, 0], march.ray_index
+        (tensor([0.2500, 0.7500, 1.2500, 1.7500]), tensor([0, 0, 0, 0], dtype=torch.int32))
     """
 
     ray_offsets: Tensor

@@ -40,6 +40,13 @@ class Rays:
         origins: float32 [r, 3].
         directions: float32 [r, 3], unit length.
         radii: float32 [r], radius at distance 1 of the cone that a ray stands for, or None.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Rays
+        >>> rays = Rays(torch.zeros(2, 3), torch.tensor([[0.0, 0, -1], [0.0, 1, 0]]))
+        >>> len(rays), rays[:1].directions
+        (2, tensor([[ 0.,  0., -1.]]))
     """
 
     origins: Tensor
@@ -69,6 +76,20 @@ class Cameras:
         width: of every image, in pixels.
         height: of every image, in pixels.
         distortion: float32 [c, 4], (k1, k2, p1, p2) as OpenCV defines them, or None for none.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Cameras
+        >>> intrinsics = torch.tensor([[100.0, 100.0, 50.0, 40.0]])
+        >>> cameras = Cameras(torch.eye(4)[None], intrinsics, width=100, height=80)  # at the origin, looking along -z
+        >>> len(cameras), cameras.forward
+        (1, tensor([[-0., -0., -1.]]))
+        >>> rays = cameras.image_rays(0)
+        >>> len(rays)
+        8000
+        >>> pixels, depth = cameras.project(torch.tensor([[0.0, 0.0, -2.0]]), 0)
+        >>> pixels, depth
+        (tensor([[50., 40.]]), tensor([2.]))
     """
 
     poses: Tensor
@@ -194,6 +215,12 @@ def focus_point(cameras: Cameras) -> Tensor | None:
 
     Returns:
         None where there is no such point in front of the cameras: axes that are nearly parallel, or look outwards.
+
+    Examples:
+        >>> from voronerf.rendering import focus_point, orbit_cameras
+        >>> cameras = orbit_cameras(8, radius=3.0, elevation=30.0, width=64, height=64, focal=70.0, centre=(1, 0, 0))
+        >>> focus_point(cameras).round(decimals=4).abs()
+        tensor([1., 0., 0.])
     """
     origins, forward = cameras.origins.double(), cameras.forward.double()
     across = torch.eye(3, dtype=torch.float64, device=origins.device) - forward[:, :, None] * forward[:, None, :]
@@ -242,6 +269,15 @@ def orbit_cameras(
         focal: pixels; the principal point is the middle of the image.
         centre: looked at.
         start: azimuth of the first camera, degrees.
+
+    Examples:
+        >>> from voronerf.rendering import orbit_cameras
+        >>> cameras = orbit_cameras(4, radius=2.0, elevation=0.0, width=64, height=64, focal=70.0)
+        >>> cameras.origins.round(decimals=3).abs()
+        tensor([[2., 0., 0.],
+                [0., 2., 0.],
+                [2., 0., 0.],
+                [0., 2., 0.]])
     """
     if count < 1:
         raise ValueError(f"orbit_cameras: count must be >= 1, got {count}")
@@ -258,7 +294,14 @@ def orbit_cameras(
 
 
 def turntable_cameras(cameras: Cameras, count: int) -> Cameras:
-    """An orbit like the given cameras: around their focus, at their mean distance, elevation and focal length."""
+    """An orbit like the given cameras: around their focus, at their mean distance, elevation and focal length.
+
+    Examples:
+        >>> from voronerf.rendering import orbit_cameras, turntable_cameras
+        >>> seen = orbit_cameras(3, radius=2.0, elevation=20.0, width=64, height=64, focal=70.0)
+        >>> len(turntable_cameras(seen, 60))
+        60
+    """
     centre = focus_point(cameras)
     if centre is None:
         centre = (cameras.origins + cameras.forward).mean(0)

@@ -21,6 +21,15 @@ class Contraction:
 
     Raises:
         ValueError: a centre of another shape, or a radius that is not positive and finite.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Contraction
+        >>> contraction = Contraction(torch.zeros(3), radius=1.0)
+        >>> contraction.points(torch.tensor([[0.5, 0, 0], [2.0, 0, 0], [100.0, 0, 0]])).round(decimals=4)
+        tensor([[0.5000, 0.0000, 0.0000],
+                [1.5000, 0.0000, 0.0000],
+                [1.9900, 0.0000, 0.0000]])
     """
 
     centre: Tensor

@@ -32,6 +32,18 @@ class Marched(NamedTuple):
         ray_index: int32 [m], the ray of each sample.
         density: [m].
         deltas: [m], length of each sample's stratum.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import OccupancyGrid
+        >>> from voronerf.rendering import Rays, render_marched
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 4, threshold=0.1)
+        >>> rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
+        >>> result = render_marched(fog, rays, torch.zeros(1), torch.full((1,), 4.0), grid, samples=8)
+        >>> result.positions[:, 2], result.ray_index  # the samples inside of the box
+        (tensor([-0.7500, -0.2500,  0.2500,  0.7500]), tensor([0, 0, 0, 0], dtype=torch.int32))
     """
 
     colour: Tensor
@@ -83,6 +95,19 @@ def render_marched(
         generator: of the jitter.
         spacing: of the strata, "linear" or "disparity".
         backend: of the ops.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import OccupancyGrid
+        >>> from voronerf.rendering import Rays, render_marched
+        >>> def ball(positions, directions, ray_index):  # of radius 0.5
+        ...     return torch.ones_like(positions), torch.where(positions.norm(dim=-1) < 0.5, 10.0, 0.0)
+        >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 8, threshold=1.0)
+        >>> grid.update(ball)
+        >>> rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
+        >>> result = render_marched(ball, rays, torch.zeros(1), torch.full((1,), 4.0), grid, samples=64)
+        >>> len(result.positions) < 20, result.opacity.round(decimals=2)
+        (True, tensor([1.]))
     """
     uniforms = None
     if jitter:
@@ -146,6 +171,18 @@ def render_until_opaque(
         heaviest: whether to look for each ray's heaviest sample, which costs a tenth of a picture; its place is the
             ray's far end otherwise.
         backend: of the ops.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import OccupancyGrid
+        >>> from voronerf.rendering import Rays, render_until_opaque
+        >>> def wall(positions, directions, ray_index):  # from z = 0 on
+        ...     return torch.ones_like(positions), torch.where(positions[:, 2] > 0, 1e9, 0.0)
+        >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 4, threshold=0.1)
+        >>> rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
+        >>> result = render_until_opaque(wall, rays, torch.zeros(1), torch.full((1,), 4.0), grid, samples=8)
+        >>> result.colour, result.depth
+        (tensor([[1., 1., 1.]]), tensor([2.2500]))
     """
     r = len(rays)
     colour, opacity, depth = torch.zeros_like(rays.origins), torch.zeros_like(near), torch.zeros_like(near)

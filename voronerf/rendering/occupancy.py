@@ -32,6 +32,18 @@ class OccupancyGrid:
         density: float32 [x, y, z], what each cell remembers.
         occupied: bool [x, y, z], density >= threshold.
         threshold: per world unit.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import OccupancyGrid
+        >>> def ball(positions, directions, ray_index):  # of radius 0.5
+        ...     return torch.ones_like(positions), torch.where(positions.norm(dim=-1) < 0.5, 10.0, 0.0)
+        >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 16, threshold=1.0)
+        >>> grid.share
+        1.0
+        >>> grid.update(ball)
+        >>> grid.share < 0.1
+        True
     """
 
     def __init__(

@@ -21,6 +21,16 @@ def intersect_box(
     Returns:
         (near [r], far [r], hit bool [r]). A ray that misses has hit False and far == near, so that its samples have no
         extent. A ray that only touches the box misses.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import intersect_box
+        >>> origins = torch.tensor([[-3.0, 0.5, 0.5], [-3.0, 2.0, 0.5]])
+        >>> directions = torch.tensor([[1.0, 0, 0], [1.0, 0, 0]])
+        >>> box = torch.tensor([[0.0, 0, 0], [1.0, 1, 1]])
+        >>> near, far, hit = intersect_box(origins, directions, box, 0.0, 10.0)
+        >>> near[hit], far[hit], hit
+        (tensor([3.]), tensor([4.]), tensor([ True, False]))
     """
     if directions.shape != origins.shape or origins.dim() != 2 or origins.shape[1] != 3:
         raise ValueError(

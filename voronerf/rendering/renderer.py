@@ -43,6 +43,16 @@ class RenderedImage(NamedTuple):
         depth: [h, w], as in `Rendered`.
         heaviest: [h, w, 3], position of each ray's heaviest sample: whose cell the pixel shows. Rays without samples
             have the point at their far end (opacity 0).
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Renderer, orbit_cameras
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> cameras = orbit_cameras(1, radius=2.0, elevation=0.0, width=4, height=3, focal=4.0)
+        >>> image = Renderer({"field": fog}, samples=8).image(cameras, 0, near=1.0, far=3.0, box=None, background=None)
+        >>> image.colour.shape, image.depth.shape
+        (torch.Size([3, 4, 3]), torch.Size([3, 4]))
     """
 
     colour: Tensor
@@ -83,6 +93,16 @@ class Renderer:
     Raises:
         ValueError: fields of other names, a second field without fine samples, several rounds without a proposal, a
             negative distortion, or occupancy with several passes, cones, a contraction or distortion.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF
+        >>> from voronerf.rendering import Rays, Renderer
+        >>> renderer = Renderer({"field": NeRF(width=16, depth=2)}, samples=8, fine_samples=8)
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> first, second = renderer.render(rays, 1.0, 3.0)
+        >>> first.weights.shape, second.colour.shape  # the second pass asks at the points of both
+        (torch.Size([5, 8]), torch.Size([5, 3]))
     """
 
     def __init__(
@@ -339,6 +359,16 @@ def render_image(
         chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples of
             a ray, 131,072.
         backend: of the ops.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import orbit_cameras, render_image
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> cameras = orbit_cameras(1, radius=2.0, elevation=0.0, width=4, height=3, focal=4.0)
+        >>> image = render_image(fog, cameras, 0, near=1.0, far=3.0, samples=8)
+        >>> image.opacity[0, 0].round(decimals=4)  # 1 - exp(-0.5 * 2)
+        tensor(0.6321)
     """
     renderer = Renderer({"field": field}, samples=samples, spacing=spacing, occupancy=occupancy, backend=backend)
     return renderer.image(

@@ -40,6 +40,13 @@ def stratified_depths(
 
     Raises:
         ValueError: shapes, an unknown spacing, no samples.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import stratified_depths
+        >>> depths, deltas, edges = stratified_depths(torch.tensor([1.0]), torch.tensor([3.0]), 4, jitter=False)
+        >>> depths, edges
+        (tensor([[1.2500, 1.7500, 2.2500, 2.7500]]), tensor([[1.0000, 1.5000, 2.0000, 2.5000, 3.0000]]))
     """
     if near.dim() != 1 or near.shape != far.shape:
         raise ValueError(

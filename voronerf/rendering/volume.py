@@ -31,6 +31,16 @@ class Rendered(NamedTuple):
         rgb: [r, s, 3], each sample's colour.
         depths: [r, s], distance of each sample.
         edges: [r, s + 1], where the part of the ray that it stands for begins and ends.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Rays, render_rays
+        >>> def wall(positions, directions, ray_index):  # from z = 1 on
+        ...     return torch.ones_like(positions), torch.where(positions[:, 2] > 1, 1e9, 0.0)
+        >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
+        >>> result = render_rays(wall, rays, 0.0, 2.0, samples=8)
+        >>> result.depth, result.weights.shape
+        (tensor([1.1250]), torch.Size([1, 8]))
     """
 
     colour: Tensor
@@ -69,6 +79,16 @@ def render_rays(
         generator: of the jitter.
         spacing: of the strata, "linear" or "disparity".
         backend: of the composite op.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Rays, render_rays
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
+        >>> result = render_rays(fog, rays, 0.0, 2.0, samples=64)
+        >>> result.opacity.round(decimals=4)  # 1 - exp(-0.5 * 2)
+        tensor([0.6321])
     """
     near, far = per_ray(near, rays), per_ray(far, rays)
     depths, _, edges = stratified_depths(near, far, samples, jitter=jitter, spacing=spacing, generator=generator)

@@ -28,7 +28,16 @@ class ConfigError(Exception):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of a training run."""
+    """Settings of a training run.
+
+    Examples:
+        >>> from voronerf.training.config import TrainConfig
+        >>> config = TrainConfig(data="builtin", steps=1000, cells=(4, 4), width=32)
+        >>> config.final_cells
+        16
+        >>> TrainConfig.from_json(config.to_json()) == config
+        True
+    """
 
     data: str = "builtin"
     """Scene folder (Blender synthetic or transforms.json), or a scene computed from formulas: "builtin",

@@ -45,6 +45,12 @@ def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views
         size: of the square images, pixels.
         train_views: spread over the upper hemisphere on a spherical Fibonacci lattice.
         test_views: on an orbit that rises and falls twice, apart from the training views.
+
+    Examples:
+        >>> from voronerf.data import builtin_scene
+        >>> scene = builtin_scene(8)
+        >>> scene.train.cameras.width, len(scene.train), len(scene.test)
+        (8, 100, 25)
     """
     train, test = builtin_cameras("builtin_scene", size, train_views, test_views)
     box = bounds()

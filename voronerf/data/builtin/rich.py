@@ -57,6 +57,12 @@ def rich_scene(
     Raises:
         ValueError: a size or number of views below 1, or an unknown backend.
         BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> from voronerf.data import rich_scene
+        >>> scene = rich_scene(4)
+        >>> scene.train.images.shape[1:3]
+        torch.Size([4, 4])
     """
     train, test = builtin_cameras("rich_scene", size, train_views, test_views)
     box, hits = bounds(SOLIDS), caster(SOLIDS, backend)

@@ -148,6 +148,12 @@ def translucent_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_v
 
     Raises:
         ValueError: a size or number of views below 1.
+
+    Examples:
+        >>> from voronerf.data import translucent_scene
+        >>> scene = translucent_scene(4)
+        >>> scene.train.images.shape[1:3]
+        torch.Size([4, 4])
     """
     train, test = builtin_cameras("translucent_scene", size, train_views, test_views)
     box = bounds()

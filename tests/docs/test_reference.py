@@ -1,0 +1,68 @@
+"""The API reference: every public name is on a page, and has an example that runs."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+PAGES = Path(__file__).resolve().parents[2] / "docs" / "reference"
+PACKAGES = ("voronerf", *(f"voronerf.{name}" for name in ("ops", "diagram", "router", "fields", "rendering", "data")))
+PACKAGES += ("voronerf.evaluation", "voronerf.training")
+
+
+def resolve(path: str) -> Any:
+    """The object of a dotted name, where a module and a function of it may share a name."""
+    module, _, name = path.rpartition(".")
+    return getattr(importlib.import_module(module), name)
+
+
+def public_objects() -> dict[str, Any]:
+    """Every public class and function by the first name that it has."""
+    found: dict[int, tuple[str, Any]] = {}
+    for package in PACKAGES:
+        module = importlib.import_module(package)
+        for name in getattr(module, "__all__", ()):
+            found.setdefault(id(getattr(module, name)), (f"{package}.{name}", getattr(module, name)))
+    return dict(found.values())
+
+
+PUBLIC = {name: value for name, value in public_objects().items() if "Router" not in name and "Layered" not in name}
+
+
+def listed() -> dict[str, Any]:
+    lines = [line for page in PAGES.glob("*.md") for line in page.read_text().splitlines()]
+    return {line.split()[1]: resolve(line.split()[1]) for line in lines if line.startswith("::: ")}
+
+
+def test_every_public_name_is_in_the_reference_once() -> None:
+    shown = listed()
+    assert len(PUBLIC) > 50
+    missing = [name for name, value in PUBLIC.items() if not any(value is other for other in shown.values())]
+    assert not missing, f"add `::: NAME` to a page of docs/reference for {', '.join(missing)}"
+    assert len({id(value) for value in shown.values()}) == len(shown)
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_example_of_a_public_name_runs(name: str) -> None:
+    value = PUBLIC[name]
+    if not callable(value):
+        pytest.skip("a value")
+    if inspect.isclass(value) and issubclass(value, Exception):
+        assert value.__doc__
+        return
+    doc = inspect.getdoc(value) or ""
+    assert re.search(r"^Examples:\n\s+>>> ", doc, re.MULTILINE), f"{name} needs an example under 'Examples:'"
+    ran = 0
+    for test in doctest.DocTestFinder(recurse=True).find(value, name, globs={}):
+        torch.manual_seed(0)
+        outcome = doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS).run(test)
+        assert outcome.failed == 0, f"{test.name}: {outcome.failed} of {outcome.attempted} fail, see the output"
+        ran += outcome.attempted
+    assert ran
