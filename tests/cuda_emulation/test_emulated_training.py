@@ -25,9 +25,9 @@ def losses(out: Path, precision: str, *, on_device: bool) -> tuple[list[float], 
     with emulated() if on_device else contextlib.nullcontext():
         trainer = Trainer(config, builtin_scene(12))
         for trainer.step in range(STEPS):
-            if trainer._split_is_due():
-                trainer._split()
-            found.append(float(trainer._step()))
+            if trainer.split_is_due():
+                trainer.split()
+            found.append(float(trainer.train_step()))
     return found, trainer
 
 

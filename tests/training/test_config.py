@@ -7,19 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers import refuses
 
 from voronerf.training.config import CHOICES, RESUMABLE, ConfigError, TrainConfig, check_device, differences
-
-
-def test_defaults_are_usable() -> None:
-    config = TrainConfig()
-    assert config.budget == 480 and config.splits == (0.2,)
 
 
 @pytest.mark.parametrize(
     ("cells", "expected"), [((), ()), ((4,), (0.2,)), ((4, 4), (0.15, 0.5)), ((2, 2, 2), (0.15, 0.325, 0.5))]
 )
 def test_default_splits(cells: tuple[int, ...], expected: tuple[float, ...]) -> None:
+    assert TrainConfig().budget == 480 and TrainConfig().splits == (0.2,)
     assert TrainConfig(cells=cells).splits == pytest.approx(expected)
 
 
@@ -61,10 +58,7 @@ def test_json_of_something_else(text: str) -> None:
         ({"split_at": (0.1,), "split_at_steps": (7,)}, "give one of --split-at, --split-at-seconds and --split-at-st"),
         ({"max_cells": 32}, "--max-cells must come with --split worst, got 32"),
         ({"max_cells": 16, "split": "worst"}, "--max-cells must exceed the 16 cells of the first split, got 16"),
-        (
-            {"max_cells": 9, "split": "worst", "cells": (2, 2, 2)},
-            "--max-cells must come with one or two numbers of --c",
-        ),
+        ({"max_cells": 9, "split": "worst", "cells": (2, 2, 2)}, "--max-cells must come with one or two numbers of"),
         ({"max_cells": 9, "split": "worst", "cells": (2,), "split_at": (0.1,)}, "--split-at must have two fractions, "),
         ({"parameters": 0}, "--parameters must be at least 1, got 0"),
         ({"blend": -1.0}, "--blend must be a distance of 0 or more, got -1.0"),
@@ -105,38 +99,35 @@ def test_every_choice_of_words_is_checked() -> None:
             TrainConfig(**{name: "nonsense"})
 
 
-@pytest.mark.parametrize("name", ["meta", "mps"])
-def test_a_device_that_nothing_here_runs_on(name: str) -> None:
-    with pytest.raises(ConfigError, match=f"--device must be cpu or cuda, got '{name}'"):
-        check_device(name)
+@pytest.mark.parametrize(
+    ("name", "rule"),
+    [(name, "be cpu or cuda") for name in ("meta", "mps")]
+    + [(name, "name a device that is present") for name in ("gpu7", "cuda:99")],
+)
+def test_a_device_that_is_not_there(name: str, rule: str) -> None:
+    refuses(f"--device must {rule}, got '{name}'", check_device, name, error=ConfigError)
 
 
-@pytest.mark.parametrize("name", ["gpu7", "cuda:99"])
-def test_a_device_that_is_not_there(name: str) -> None:
-    with pytest.raises(ConfigError, match=f"--device must name a device that is present, got '{name}'"):
-        check_device(name)
-
-
-def test_wide_networks_learn_slower() -> None:
-    assert TrainConfig(width=256).lr == pytest.approx(0.005)
-    assert TrainConfig(width=16).lr == TrainConfig(width=64).lr == 0.02
-    assert TrainConfig(width=256, lr=0.3).lr == 0.3
+def test_defaults_of_the_architectures() -> None:
+    """Wide networks learn slower."""
+    for settings, expected in (
+        ({}, (64, 4, 0.02)),
+        ({"field": "kilonerf"}, (32, 2, 0.02)),
+        ({"field": "kilonerf", "width": 48, "depth": 3}, (48, 3, 0.02)),
+        ({"width": 16}, (16, 4, 0.02)),
+        ({"width": 256}, (256, 4, 0.005)),
+        ({"width": 256, "lr": 0.3}, (256, 4, 0.3)),
+    ):
+        config = TrainConfig(**settings)
+        assert (config.width, config.depth, config.lr) == pytest.approx(expected)
 
 
 def test_differences_name_what_cannot_change() -> None:
     assert {f.name for f in dataclasses.fields(TrainConfig)} >= RESUMABLE
     a = TrainConfig(steps=10)
     assert differences(a, dataclasses.replace(a, steps=20, out=Path("x"), resume=True)) == []
-    assert differences(a, dataclasses.replace(a, width=32, lr_final=0.5)) == [
-        "--width 64 -> 32",
-        "--lr-final 0.05 -> 0.5",
-    ]
-
-
-def test_defaults_of_the_architectures() -> None:
-    assert [(c.width, c.depth) for c in (TrainConfig(), TrainConfig(field="kilonerf"))] == [(64, 4), (32, 2)]
-    kilo = TrainConfig(field="kilonerf", width=48, depth=3)
-    assert (kilo.width, kilo.depth) == (48, 3)
+    changed = dataclasses.replace(a, width=32, lr_final=0.5)
+    assert differences(a, changed) == ["--width 64 -> 32", "--lr-final 0.05 -> 0.5"]
 
 
 def test_final_cells() -> None:

@@ -208,9 +208,9 @@ class Trainer:
         loss = None
         while self.fraction < 1 and self.seconds < until and not self.stopped:
             started = time.perf_counter()
-            if self._split_is_due():
-                self._split()
-            loss = self._step()
+            if self.split_is_due():
+                self.split()
+            loss = self.train_step()
             self.step += 1
             self.seconds += time.perf_counter() - started
             if self.device.type == "cpu" or self.step % READ_EVERY == 0:
@@ -247,8 +247,8 @@ class Trainer:
         """The work of a step: as it is, or from now on captured in a graph."""
         return GraphedStep(self._forward_backward, [self.draws]) if self.config.cuda_graph else self._forward_backward
 
-    def _step(self) -> Tensor:
-        """One step; returns its loss, which may not be computed yet."""
+    def train_step(self) -> Tensor:
+        """One step of :meth:`advance` without its count and clock; returns the loss, which may not be computed yet."""
         set_learning_rate(self.optimizer, self.learning_rate())
         for router in self.routers.values():
             router.temperature = self.temperature()
@@ -310,14 +310,15 @@ class Trainer:
             self.router, cells.to(self.device), decay=1.0, generator=self.generator, backend=self.config.backend
         )
 
-    def _split_is_due(self) -> bool:
+    def split_is_due(self) -> bool:
+        """Whether :meth:`advance` splits before the next step."""
         if self.level >= len(self.plan):
             return False
         planned = self.plan[self.level]
         # A split of the worst cell waits for samples where no cell holds enough, and is tried again.
         return self._now() >= planned.at - 1e-9 and (planned.most is None or self.step % SPLIT_EVERY == 0)
 
-    def _split(self) -> None:
+    def split(self) -> None:
         """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
         config, level, planned = self.config, self.level, self.plan[self.level]
         k = planned.children

@@ -1,0 +1,79 @@
+"""Runs that are stopped, loaded and resumed: bit for bit, and refused where they are another's."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+from helpers import same
+from tiny_runs import assert_resumes, scores, small, stopping, tensors
+
+import voronerf.training.trainer as trainer_module
+from voronerf.evaluation.scores import evaluate
+from voronerf.training.checkpoint import CheckpointError, load_checkpoint
+from voronerf.training.model import checkpoint_path, load_run, make_renderer, make_routers, restore_routers
+from voronerf.training.trainer import Trainer
+
+
+@pytest.mark.parametrize("stop_at", [5, 11, 17])
+def test_resume_is_bit_for_bit(tmp_path, scene, stop_at) -> None:
+    assert_resumes(tmp_path, scene, stop_at, assignment="stochastic")
+
+
+def test_resume_drops_evaluations_made_after_the_checkpoint(tmp_path, scene) -> None:
+    config = small(tmp_path)
+    stopping(config, scene, 14).run()
+    with open(tmp_path / "metrics.jsonl", "a") as file:
+        file.write(json.dumps({"step": 20, "psnr": 99.0}) + "\n")
+    Trainer(replace(config, resume=True), scene).run()
+    assert [step for step, _ in scores(tmp_path)] == [12, 24]
+
+
+def test_longer_resumed_runs_are_evaluated(tmp_path, scene) -> None:
+    config = small(tmp_path, steps=8, cells=(), evaluations=4)
+    Trainer(config, scene).run()
+    summary = Trainer(replace(config, steps=16, resume=True), scene).run()
+    assert [step for step, _ in scores(tmp_path)] == [2, 4, 6, 8, 12, 16]
+    assert scores(tmp_path)[-1][1] == summary["psnr"]
+
+
+def test_seeds_decide_everything(tmp_path, scene) -> None:
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        Trainer(small(tmp_path / name, seed=seed), scene).run()
+    a, b, c = (tensors(tmp_path / name) for name in "abc")
+    assert same(a, b) and not same(a, c)
+
+
+def test_a_loaded_run_renders_the_same(tmp_path, scene) -> None:
+    trainer = Trainer(small(tmp_path, cells=(3, 2)), scene)
+    trainer.run()
+    config, routers = load_run(tmp_path)
+    assert config == trainer.config
+    assert evaluate(make_renderer(config, scene, routers), scene, views=2) == evaluate(trainer.renderer, scene, views=2)
+    coarser = make_renderer(config, scene, routers, samples=3, backend="reference")
+    assert (coarser.samples, coarser.backend) == (3, "reference")
+    # Another configuration, another architecture.
+    with pytest.raises(CheckpointError, match=r"a checkpoint of another configuration: --width 8 -> 16; --lr"):
+        Trainer(replace(config, width=16, lr=1e-4, resume=True), scene)
+    checkpoint = load_checkpoint(checkpoint_path(tmp_path))
+    del checkpoint.tensors["router.module.density.weight"]
+    with pytest.raises(CheckpointError, match="another architecture"):
+        restore_routers(make_routers(config, "cpu"), checkpoint)
+
+
+def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch) -> None:
+    monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
+    found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8)
+    assert len(found["occupancy.density"].unique()) > 1
+
+
+def test_turns_leave_checkpoints(tmp_path, scene, monkeypatch) -> None:
+    ticks = iter(range(1000))
+    monkeypatch.setattr(trainer_module, "time", SimpleNamespace(perf_counter=lambda: 0.01 * next(ticks)))
+    trainer = Trainer(small(tmp_path, steps=100_000, checkpoint_every=0.05), scene)
+    while trainer.seconds < 0.15:
+        assert trainer.seconds >= 0.05 or not checkpoint_path(tmp_path).exists()
+        trainer.advance(trainer.seconds + 1e-4)  # a step
+    assert checkpoint_path(tmp_path).exists()
