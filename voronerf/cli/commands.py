@@ -41,7 +41,7 @@ def say(line: str) -> None:
 def train(config: TrainConfig) -> int:
     """Train a scene: coarse network, balanced Voronoi cells, cells trained further.
 
-    With --resume, what is not given is as it was in the run in --out.
+    With --resume, options that are not given keep their value from the run in --out.
     """
     check_device(config.device)
     scene = load_scene(config.data, downscale=config.downscale)

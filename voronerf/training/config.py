@@ -20,9 +20,9 @@ SamplingName = Literal["stratified", "hierarchical", "proposal"]
 
 
 class ConfigError(Exception):
-    """A setting that cannot be used; the message names it, the rule and the value.
+    """A setting that cannot be used. The message names the setting, the rule and the value.
 
-    No ValueError, because the command line's parser takes those for its own and explains them at length.
+    It is not a ValueError, because the parser of the command line would catch that and print a long explanation.
     """
 
 
@@ -40,12 +40,13 @@ class TrainConfig:
     """
 
     data: str = "builtin"
-    """Scene folder (Blender synthetic or transforms.json), or a scene computed from formulas: "builtin",
-    "builtin-rich" with hundreds of solids, or "builtin-translucent" with fog and glass."""
+    """Scene folder (Blender synthetic or transforms.json), or a built-in scene: "builtin", "builtin-rich" with hundreds
+    of solids, or "builtin-translucent" with fog and glass."""
     downscale: int = 1
-    """Factor by which the images are made smaller on load."""
+    """Factor by which the images are made smaller when they are loaded."""
     out: Path | None = None
-    """Run directory, without a run in it unless --resume; default: runs/SCENE, or the first free runs/SCENE-N."""
+    """Run directory, which must not hold a run unless --resume is given; default: runs/SCENE, or the first free
+    runs/SCENE-N."""
     resume: bool = False
     """Continue the run in --out from its last checkpoint."""
     seed: int = 0
@@ -56,116 +57,118 @@ class TrainConfig:
     """Backend of the operations: auto, native, warp or reference (see `voronerf info`)."""
 
     budget: float | None = None
-    """Training time in seconds, evaluation not counted; default 480, unless --steps is given."""
+    """Training time in seconds, without evaluation; default 480, unless --steps is given."""
     steps: int | None = None
-    """Training steps, instead of a time."""
+    """Number of training steps, instead of a time."""
 
     field: FieldName = "nerf"
-    """The networks: nerf, mipnerf (cones in the place of rays) or kilonerf (nerf in KiloNeRF's size)."""
+    """Kind of network: nerf, mipnerf (cones instead of rays) or kilonerf (nerf in the size of KiloNeRF's networks)."""
     width: int | None = None
     """Channels of the networks' hidden layers; default 64, kilonerf 32."""
     depth: int | None = None
     """Hidden layers before the heads; default 4, kilonerf 2."""
     parameters: int | None = None
-    """Parameters of all final cells' networks together: decides --width, the largest that stays below."""
+    """Upper limit for the number of parameters of all final cells together; --width becomes the largest that fits."""
     skips: tuple[int, ...] | None = None
-    """Trunk layers whose output is joined with the encoded position again; default: 4, as published, where there are
-    more than five layers, else none."""
+    """Trunk layers whose output is concatenated with the encoded position; default: 4, as published, for more than five
+    layers, else none."""
     position_octaves: int | None = None
-    """Frequencies of the position's encoding; default: until the finest wave spans two pixels of the training views,
-    for mipnerf two octaves beyond, where a pixel's cone leaves nothing of it (published: 16)."""
+    """Octaves of the positional encoding; default: until the finest wave spans two pixels of the training views, and
+    two more for mipnerf, whose cones leave nothing of finer ones (published: 16)."""
     direction_octaves: int = 4
-    """Frequencies of the view direction's encoding."""
+    """Octaves of the encoding of view directions."""
     view_directions: bool = True
     """Whether colour depends on the view direction."""
 
     cells: tuple[int, ...] = (16,)
-    """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, nothing is one network."""
+    """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, no number is one network."""
     split_at: tuple[float, ...] | None = None
     """When to split, as fractions of the run, one per level; default: 0.2, or evenly spaced from 0.15 to 0.5."""
     split_at_seconds: tuple[float, ...] | None = None
-    """The same in seconds of training, in the place of fractions."""
+    """When to split, in seconds of training."""
     split_at_steps: tuple[int, ...] | None = None
-    """The same in training steps."""
+    """When to split, in training steps."""
     split: Literal["all", "worst"] = "all"
     """On the levels below the first: split every cell, or only the one with the largest accumulated error."""
     max_cells: int | None = None
-    """With --split worst: go on splitting the worst cell until there are this many, evenly spaced between two times,
-    the first split (into the first number of --cells) and the last (the worst cell each time into the last number)."""
+    """With --split worst: split the worst cell again and again until there are this many cells. The first split makes
+    the first number of --cells, each later one divides the worst cell into the last number; the splits are evenly
+    spaced between the two times of --split-at."""
     centres: Literal["balanced", "random", "uniform"] = "balanced"
     """Centres of the new cells: balanced by importance, drawn from the samples, or a regular grid."""
     uniform_scale: float = 1.0
-    """How many times as large as the box of the kept samples, along each axis, the grid of --centres uniform is."""
+    """Size of the grid of --centres uniform along each axis, relative to the box of the kept samples."""
     balance: Literal["published", "transport"] = "published"
     """How centres are balanced: the paper's update, or power weights from optimal transport."""
     init: Literal["inherit", "random"] = "inherit"
     """New cells start as copies of their parent, or from random parameters."""
     assignment: Literal["nearest", "stochastic"] = "nearest"
-    """Samples go to the nearest cell, or while training to one drawn from the distances."""
+    """A sample goes to the nearest cell, or, while training, to one drawn by its distances to the centres."""
     temperature: float = 0.05
     """Temperature of the stochastic assignment, in scene units."""
     temperature_final: float = 1.0
-    """The same at the end, as a fraction of --temperature; it falls exponentially over the run."""
+    """Temperature at the end, as a fraction of --temperature; it falls exponentially over the run."""
     blend: float = 0.0
-    """Margin in scene units within which neighbouring cells are blended after training, in the final scores and
-    pictures; 0 is off."""
+    """Margin in scene units within which neighbouring cells are blended in the final scores and pictures; 0 is off.
+    Training does not blend."""
     reservoir: int = 10_000
-    """Importance samples kept for the next split."""
+    """Samples kept for the next split."""
     reservoir_batches: int = 500
-    """Batches over which the kept samples are spread, each giving the same number of its heaviest."""
+    """Number of latest batches that the kept samples come from; each gives the same number, its heaviest."""
     min_cell_samples: int = 64
-    """A cell holding fewer kept samples than this is not split further."""
+    """A cell with fewer kept samples is not split further."""
 
     rays: int = 1024
     """Rays per training step."""
     sampling: SamplingName = "stratified"
-    """Samples along a ray: stratified, or a second pass where the first found something: hierarchical, with the field
-    itself asked twice (nerf: a coarse and a fine network), or proposal, with a small density network asked first."""
+    """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
+    (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""
     samples: int | None = None
-    """Samples per ray, one in each of as many strata; default 64, of the first of two passes 32."""
+    """Samples per ray of the first pass, one in each stratum; default 64 for one pass, 32 for two."""
     fine_samples: int = 32
-    """Samples per ray of the second pass; nerf's fine network is asked about those of the first as well."""
+    """Samples per ray of the second pass; the fine network of nerf evaluates those of the first pass too."""
     split_proposal: bool = False
-    """Whether the proposal's density network has cells as well, or stays one for the whole scene."""
+    """Give the density network of --sampling proposal cells too; it is one network for the whole scene otherwise."""
     proposal_rounds: int = 1
-    """How often the proposal's network is asked, each time where it has found something (published: 2)."""
+    """How often the density network is evaluated, each time where it has found something (published: 2)."""
     proposal_anneal: float = 0.0
-    """Slope b of the annealing of mip-NeRF 360 (published: 10): after a fraction t of the run intervals are drawn from
-    the proposal's weights to the power of b t / ((b - 1) t + 1), evenly at first; 0 is without."""
+    """Slope b of the annealing of mip-NeRF 360 (published: 10): after a fraction t of the run, intervals are drawn from
+    the proposal's weights to the power of b t / ((b - 1) t + 1), so evenly at first; 0 is off."""
     distortion: float = 0.0
-    """Factor of a loss on weights spread along a ray (mip-NeRF 360; published: 0.01); 0 is without."""
+    """Factor of a loss on weights that are spread along a ray (mip-NeRF 360; published: 0.01); 0 is off."""
     contraction: Literal["none", "sphere"] = "none"
-    """Space as the networks see it: as it is, or all that is outside of a sphere drawn into one of twice its radius."""
+    """Space as the networks see it: unchanged, or with all points outside a sphere mapped into a shell of twice its
+    radius."""
     occupancy: bool = False
-    """Skip the samples in cells of space found empty, in training and in its pictures; needs a scene with a box."""
+    """Skip samples in empty space, in training and in pictures; needs a scene with a box."""
     occupancy_resolution: int = 64
-    """Cells of that grid along each axis."""
+    """Cells of the occupancy grid along each axis."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
-    """Products of the networks while training: float32, or bfloat16, or float16 with a scaled loss (a CPU's are float32
-    then, and only what networks answer is rounded); sums, parameters and moments are float32."""
+    """Products of the networks while training: float32, bfloat16, or float16 with a scaled loss. Sums, parameters and
+    moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
     cuda_graph: bool = False
-    """On CUDA: capture a whole step in a graph and replay it, anew after each split; without --occupancy."""
+    """On CUDA: capture a whole step in a graph and replay it; captured again after each split. Not with --occupancy."""
     lr: float | None = None
-    """Learning rate of Adam at the start; default: 0.02 up to width 64, beyond in inverse proportion to the width."""
+    """Learning rate of Adam at the start; default: 0.02 up to width 64, in inverse proportion to the width beyond."""
     lr_final: float = 0.05
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
     lr_split: float = 1.0
-    """Factor on the learning rate at each split, after which a cell's gradients come from fewer samples."""
+    """Factor on the learning rate at each split, after which the gradients of a cell come from fewer samples."""
     warmup: float = 0.02
     """Fraction of the run over which the learning rate rises from a hundredth of --lr."""
     background: Literal["random", "white"] = "random"
-    """Colour behind images with an alpha channel while training: a new one for every ray, or white as in evaluation."""
+    """Colour behind images with an alpha channel while training: random for every ray, or white as in evaluation."""
 
     evaluations: int = 8
-    """Evaluations during the run, evenly spaced; the last one comes at its end."""
+    """Evaluations during the run, evenly spaced; the last one is at the end."""
     eval_views: int = 20
-    """Test views of an evaluation during training, evenly spread; the final one uses --final-views."""
+    """Test views of an evaluation during training, evenly spread; the final evaluation uses --final-views."""
     final_views: int | None = None
     """Test views of the final evaluation; default all."""
     checkpoint_every: float = 60.0
     """Seconds between checkpoints."""
     panels: int = 4
-    """Test views drawn as picture panels at the end."""
+    """Test views drawn as panels at the end: truth, render, error, depth, cells."""
     lpips: Path | None = None
     """LPIPS weights for the final evaluation, a file or folder, or "off"; default: VORONERF_LPIPS, the folder lpips of
     VORONERF_DATA or beside the scene, the installed lpips package."""
@@ -235,13 +238,13 @@ class TrainConfig:
             raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
 
 
-#: Settings that are one of a few words, and these.
+#: Settings that take one of a few words, with these words.
 CHOICES: dict[str, tuple[str, ...]] = {
     name: get_args(kind) for name, kind in get_type_hints(TrainConfig).items() if get_origin(kind) is Literal
 }
-#: With what the occupancy grid works: it is asked about points of a single pass.
+#: The occupancy grid works for points in a single pass.
 OCCUPANCY_RULE = "come with --field nerf or kilonerf, --sampling stratified and --contraction none"
-#: Settings that JSON has as lists and as text.
+#: Settings that are lists in JSON, and settings that are text there.
 LISTS = frozenset({"cells", "split_at", "split_at_seconds", "split_at_steps", "skips"})
 PATHS = ("out", "lpips")
 #: Settings that may differ between a run and its continuation.
@@ -353,7 +356,7 @@ def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -
 
 
 def default_learning_rate(width: int) -> float:
-    """Adam's at the start: hidden layers want steps in inverse proportion to width (Yang et al. 2021, table 3)."""
+    """Adam's learning rate at the start, in inverse proportion to the width as in Yang et al. 2021, table 3."""
     return 0.02 * 64 / max(width, 64)
 
 
