@@ -7,13 +7,13 @@ and the question whether a tensor is on CUDA is answered with yes.
 from __future__ import annotations
 
 import functools
-import importlib.util
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 from unittest import mock
+
+from emulation_build import build, load
 
 from voronerf import native as _native
 
@@ -21,16 +21,7 @@ from voronerf import native as _native
 @functools.cache
 def module() -> ModuleType:
     """The emulated module, built if need be."""
-    here = os.path.dirname(__file__)
-    spec = importlib.util.spec_from_file_location("cuda_emulation_build", os.path.join(here, "build.py"))
-    assert spec is not None and spec.loader is not None
-    build = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(build)
-    spec = importlib.util.spec_from_file_location("voronerf_emulation", build.build())
-    assert spec is not None and spec.loader is not None
-    loaded = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loaded)
-    return loaded
+    return load(build())
 
 
 class _Both:

@@ -1,4 +1,4 @@
-"""Builds the emulated CUDA module: ``build.py [none|address|thread]`` prints where it is.
+"""Builds the emulated CUDA module: ``emulation_build.py [none|address|thread]`` prints where it is.
 
 The .cu files of csrc/ are compiled by g++ with emulation.h in place of CUDA; ninja redoes only what has changed. One
 module for each sanitizer, which are told nothing of the scheduler (emulation.cpp): it is what they must look through.
@@ -7,27 +7,20 @@ module for each sanitizer, which are told nothing of the scheduler (emulation.cp
 from __future__ import annotations
 
 import fcntl
+import importlib.util
 import platform
 import shlex
 import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from types import ModuleType
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 HERE = Path(__file__).resolve().parent
-SANITIZERS = {
-    "none": [],
-    "address": ["-fsanitize=address"],
-    "thread": ["-fsanitize=thread"],
-}
+SANITIZERS = {"none": [], "address": ["-fsanitize=address"], "thread": ["-fsanitize=thread"]}
 PLAIN = {
-    "emulation.cpp",
-    "module.cpp",
-    "index_maps.cpp",
-    "chain_layout.cpp",
-    "group_bindings.cpp",
-    "plans.cpp",
+    *("emulation.cpp", "module.cpp", "index_maps.cpp", "chain_layout.cpp", "group_bindings.cpp", "plans.cpp"),
     "bindings_cuda.cpp",
 }
 """Files with nothing to watch."""
@@ -82,6 +75,15 @@ def _build(out: Path, sanitizer: str) -> Path:
     result = subprocess.run(command, capture_output=True, text=True)
     if result.returncode != 0:
         raise RuntimeError(f"the emulated module does not compile:\n{result.stdout}{result.stderr}")
+    return module
+
+
+def load(path: str | Path) -> ModuleType:
+    """The module at a path, without torch, which takes a sanitizer minutes."""
+    spec = importlib.util.spec_from_file_location("voronerf_emulation", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
     return module
 
 

@@ -9,12 +9,12 @@ that every element of an output is written.
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from emulation_build import load
 
 GPU = (0, 0)
 """Device and stream."""
@@ -229,10 +229,7 @@ def network(n: int, k: int, offsets: np.ndarray) -> tuple[tuple[Any, ...], list[
 
 
 def main(path: str, kind: str = "usual") -> None:
-    spec = importlib.util.spec_from_file_location("voronerf_emulation", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load(path)
     usual = (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, resample, grouped_mlp)
     for run in (hostile,) if kind == "hostile" else usual:
         run(module)

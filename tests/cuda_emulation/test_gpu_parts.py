@@ -5,23 +5,24 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import itertools
-import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from emulated import emulated, module
+from helpers import read_json
+
+from voronerf.data import builtin_scene
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
 
-def program(name: str) -> ModuleType:
+def program(name):
     spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / "gpu" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     loaded = sys.modules[name] = importlib.util.module_from_spec(spec)  # its dataclasses look for it there
@@ -30,17 +31,17 @@ def program(name: str) -> ModuleType:
 
 
 @pytest.fixture
-def parts(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def parts(monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     return program("gpu_parts")
 
 
 @pytest.fixture
-def check() -> ModuleType:
+def check():
     return program("gpu_check")
 
 
-def test_every_small_case_is_right_on_the_emulated_device(parts: ModuleType) -> None:
+def test_every_small_case_is_right_on_the_emulated_device(parts):
     with emulated():
         for name, run in parts.small_cases("cpu"):
             try:
@@ -49,12 +50,12 @@ def test_every_small_case_is_right_on_the_emulated_device(parts: ModuleType) -> 
                 raise AssertionError(name) from error
 
 
-def test_steps_to_capture_are_right_on_the_emulated_device(parts: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_to_capture_are_right_on_the_emulated_device(parts, monkeypatch):
     ways = []
     with emulated() as loaded:
         entry = loaded.grouped_mlp_cuda
 
-        def forward(numbers: list[int], arguments: list[int], *others: object) -> None:
+        def forward(numbers, arguments, *others):
             sizes = arguments[5], arguments[7]
             ways.append(module().grouped_mlp_plan(numbers, numbers[4], *sizes, False)["by_layers"])
             entry(numbers, arguments, *others)
@@ -69,10 +70,8 @@ def test_steps_to_capture_are_right_on_the_emulated_device(parts: ModuleType, mo
     assert len(ways) == len(parts.captured_steps("cpu", 1)) == 6
 
 
-def test_a_wrong_result_is_told(
-    parts: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
-) -> None:
-    def wrong() -> None:
+def test_a_wrong_result_is_told(parts, monkeypatch, capsys, tmp_path):
+    def wrong():
         raise ValueError("not what it should be")
 
     monkeypatch.setattr(parts, "small_cases", lambda device: [("fine", lambda: None), ("bad", wrong)])
@@ -81,7 +80,7 @@ def test_a_wrong_result_is_told(
     said = capsys.readouterr().out
     assert "right  fine" in said and "WRONG  bad: ValueError: not what it should be" in said
     assert said.endswith("1 of 2 cases are right\n")
-    kept = json.loads((tmp_path / "small.json").read_text())["cases"]
+    kept = read_json(tmp_path / "small.json")["cases"]
     assert [(row["name"], row["right"], row["said"]) for row in kept] == [
         ("fine", True, ""),
         ("bad", False, "ValueError: not what it should be"),
@@ -113,7 +112,7 @@ sys.exit(gpu_parts.main(sys.argv[1:]))
 """
 
 
-def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path: Path) -> None:
+def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path):
     """In processes that truly start themselves anew, with a device that stays broken."""
     (tmp_path / "faults.py").write_text(AFTER_FAULTS.format(ci=str(ROOT / "benchmarks" / "gpu")))
     command = [sys.executable, "faults.py", "small", "out", "--case-seconds", "0.5"]
@@ -127,35 +126,30 @@ def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path: Path
         "right  last",
     ]
     assert result.stdout.endswith("3 of 5 cases are right\n") and result.returncode == 2
-    kept = json.loads((tmp_path / "out" / "small.json").read_text())["cases"]
-    assert [(row["name"], row["right"]) for row in kept] == [
-        ("first", True),
-        ("breaks", False),
-        ("between", True),
-        ("hangs", False),
-        ("last", True),
-    ]
+    kept = read_json(tmp_path / "out" / "small.json")["cases"]
+    names = [line.split()[1].removesuffix(":") for line in told]
+    assert [(row["name"], row["right"]) for row in kept] == list(zip(names, (True, False) * 2 + (True,), strict=False))
 
 
 @pytest.fixture
-def fake_cuda(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def fake_cuda(monkeypatch):
     """Graphs that keep what is called between the ends of a capture; a list of what was called outside of any."""
     called, capturing = [], []
 
     class Graph:
-        def __init__(self) -> None:
+        def __init__(self):
             self.calls: list[str] = []
 
-        def replay(self) -> None:
+        def replay(self):
             called.extend(self.calls)
 
     @contextlib.contextmanager
-    def graph(of: Graph) -> Iterator[None]:
+    def graph(of):
         capturing.append(of)
         yield
         capturing.pop()
 
-    def call() -> None:
+    def call():
         (capturing[-1].calls if capturing else called).append("call")
 
     called.append(call)
@@ -173,26 +167,24 @@ class Ticks:
 
     cuda = True
 
-    def __init__(self, called: list[str]) -> None:
+    def __init__(self, called):
         self.called = called
 
-    def __call__(self, run: Callable[[int], object], first: int, count: int) -> float:
+    def __call__(self, run, first, count):
         before = len(self.called)
         run(first)
         return 0.010 + 0.001 * (len(self.called) - before)
 
 
-def test_kernels_are_timed_without_the_host(parts: ModuleType, fake_cuda: list) -> None:
+def test_kernels_are_timed_without_the_host(parts, fake_cuda):
     call = fake_cuda.pop()
     found = parts.clock(call, Ticks(fake_cuda))
     assert found["graph"] == "captured" and found["launched"] == pytest.approx(0.011)
     assert found["seconds"] == pytest.approx((0.010 + 0.001 * parts.CALLS) / parts.CALLS)
 
 
-def test_what_cannot_be_captured_is_timed_as_it_is(
-    parts: ModuleType, fake_cuda: list, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(graph: object) -> None:
+def test_what_cannot_be_captured_is_timed_as_it_is(parts, fake_cuda, monkeypatch):
+    def refused(graph):
         raise RuntimeError("operation not permitted when stream is capturing")
 
     monkeypatch.setattr("torch.cuda.graph", refused)
@@ -203,44 +195,43 @@ def test_what_cannot_be_captured_is_timed_as_it_is(
 
 
 @pytest.mark.native
-def test_roofs(parts: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_roofs(parts, monkeypatch, tmp_path):
     """Every row is measured, on the CPU's kernels, and what a first process measured stays."""
     import harness  # of benchmarks/, to which gpu_parts.py has led
 
     monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
     again = parts.Again(("roofs",), case_seconds=60.0)
     assert parts.roofs(tmp_path, again, "cpu", 256) == 0
-    rows = json.loads((tmp_path / "roofs.json").read_text())["rows"]
+    rows = read_json(tmp_path / "roofs.json")["rows"]
     assert len(rows) == 33 and all(row["seconds"] > 0 and row["share"] > 0 for row in rows)
     again = parts.Again(("roofs",), start=32, failed=1, case_seconds=60.0)
     assert parts.roofs(tmp_path, again, "cpu", 256) == 1
-    after = json.loads((tmp_path / "roofs.json").read_text())["rows"]
+    after = read_json(tmp_path / "roofs.json")["rows"]
     assert after[:33] == rows and [row["name"] for row in after[33:]] == [rows[32]["name"]]
 
 
-def test_training(
-    parts: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training(parts, tmp_path, capsys, monkeypatch):
     # A step takes twenty milliseconds however busy the machine is.
     ticks = itertools.count()
     monkeypatch.setattr("voronerf.training.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0201 * next(ticks)))
+    monkeypatch.setattr("voronerf.data.load_scene", lambda *_, **__: builtin_scene(16))
+    small = {name: {**options, "width": 16, "samples": 16} for name, options in parts.TRAININGS.items()}
+    monkeypatch.setattr(parts, "TRAININGS", small)
     assert parts.training(tmp_path, "builtin", "cpu", 0.5) == 0
     ungraphed = [settings for settings in parts.TRAININGS.values() if "cuda_graph" not in settings]
     assert capsys.readouterr().out.count("PSNR") == len(ungraphed) == 2
-    kept = json.loads((tmp_path / "training.json").read_text())["trainings"]
+    kept = read_json(tmp_path / "training.json")["trainings"]
     assert [row["name"] for row in kept] == ["plain", "bf16"] and all(row["right"] and row["psnr"] > 0 for row in kept)
 
 
-def test_machine(parts: ModuleType, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
+def test_machine(parts, capsys, tmp_path):
     parts.main(["machine", str(tmp_path)])
     assert "missing: " in capsys.readouterr().out
-    kept = json.loads((tmp_path / "machine.json").read_text())
+    kept = read_json(tmp_path / "machine.json")
     assert kept["torch"] == torch.__version__ and isinstance(kept["missing"], list)
 
 
-def test_a_file_of_tests_that_hangs_fails_alone(
-    parts: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_file_of_tests_that_hangs_fails_alone(parts, tmp_path, capsys):
     (tmp_path / "conftest.py").write_text("def pytest_addoption(parser):\n    parser.addoption('--require')\n")
     bodies = {
         "hangs": "import time\ndef test_cuda():\n    time.sleep(600)\n",
@@ -252,22 +243,20 @@ def test_a_file_of_tests_that_hangs_fails_alone(
     for name, body in bodies.items():
         files.append(tmp_path / f"test_planted_{name}.py")
         files[-1].write_text(body)
-    assert parts.tests(tmp_path / "out", files, 20.0) == 2
+    assert parts.tests(tmp_path / "out", files, 10.0) == 2
     said = capsys.readouterr().out.splitlines()
     outcomes = {line.split()[1].removeprefix("test_planted_"): line for line in said if "  test_planted_" in line}
-    assert outcomes["hangs.py:"].startswith("FAILED  test_planted_hangs.py: stopped after 20 s")
+    assert outcomes["hangs.py:"].startswith("FAILED  test_planted_hangs.py: stopped after 10 s")
     assert list(outcomes)[-1] == "hangs.py:", "the others are told before it"
     assert outcomes["passes.py:"].startswith("passed") and "1 passed" in outcomes["passes.py:"]
     assert outcomes["wrong.py:"].startswith("FAILED") and outcomes["other.py:"].startswith("passed")
     assert said[-1] == "2 of 4 files passed"
-    kept = {row["name"]: row for row in json.loads((tmp_path / "out" / "tests.json").read_text())["files"]}
+    kept = {row["name"]: row for row in read_json(tmp_path / "out" / "tests.json")["files"]}
     assert kept["test_planted_passes.py"]["right"] and not kept["test_planted_hangs.py"]["right"]
     assert any(line.endswith("assert (1 + 1) == 3") for line in kept["test_planted_wrong.py"]["wrong"])
 
 
-def test_a_part_that_hangs_is_ended_with_all_that_it_started(
-    check: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_part_that_hangs_is_ended_with_all_that_it_started(check, monkeypatch, tmp_path):
     monkeypatch.setattr(check, "SHORTEST", 0.0)
     child = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
@@ -283,9 +272,7 @@ def test_a_part_that_hangs_is_ended_with_all_that_it_started(
     raise AssertionError("the child of the part still runs")
 
 
-def test_what_a_part_says_is_kept_whatever_it_is(
-    check: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_what_a_part_says_is_kept_whatever_it_is(check, monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONPATH", "/somewhere/else")
     script = "import os, sys; print(os.environ['PYTHONPATH'], os.environ['GIVEN'], flush=True); "
     script += r"sys.stdout.buffer.write(b'\xff\xfe not text\n')"
@@ -296,43 +283,34 @@ def test_what_a_part_says_is_kept_whatever_it_is(
     assert check.run("none", check.Part(["/not/there"], 20), tmp_path, 100.0)["outcome"] == "failed"
 
 
-def test_the_summary_has_all_that_a_part_has_found(
-    check: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path):
     """And nothing of an earlier run, nor less than it can where a part was ended in the middle of a line."""
     (tmp_path / "old.json").write_text('{"cases": ["of an earlier run"]}')
     write = "import sys; open(sys.argv[1], 'w').write(sys.argv[2]); print('done')"
-    known = {
-        "good": check.Part(
-            [sys.executable, "-c", write, str(tmp_path / "good.json"), '{"a": [1]}'], 20, (), tmp_path / "good.json"
-        ),
-        "torn": check.Part(
-            [sys.executable, "-c", write, str(tmp_path / "torn.json"), '{"a"'], 20, (), tmp_path / "torn.json"
-        ),
-        "old": check.Part([sys.executable, "-c", "pass"], 20, (), tmp_path / "old.json"),
-        "absent": check.Part("not here", 0),
-    }
+
+    def part(name, *program):
+        path = tmp_path / f"{name}.json"
+        return check.Part([sys.executable, "-c", program[0], str(path), *program[1:]], 20, (), path)
+
+    known = {"good": part("good", write, '{"a": [1]}'), "torn": part("torn", write, '{"a"'), "old": part("old", "pass")}
+    known["absent"] = check.Part("not here", 0)
     monkeypatch.setattr(check, "parts", lambda out, data: known)
     assert check.main(["--out", str(tmp_path), "--seconds", "400"]) == 0
-    kept = json.loads((tmp_path / "summary.json").read_text())["parts"]
+    kept = read_json(tmp_path / "summary.json")["parts"]
     assert kept["good"]["found"] == {"a": [1]} and kept["torn"]["found"].startswith("torn.json: ")
     assert kept["old"]["found"] is None and kept["absent"]["outcome"] == "left out"
 
 
-def test_the_summary_says_what_was_reached_and_what_is_wrong(check: ModuleType) -> None:
+def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
     row = {"limit": "copy", "seconds": 2e-5, "share": 0.5, "aim": None}
     timed = [{**row, "name": f"cell_sort k=16 by {way}"} for way in ("counting", "torch.sort")]
     timed += [{**row, "name": "cell_sort k=16 by radix", "seconds": 4e-5}]
     timed += [{**row, "name": "near", "aim": 0.6}, {**row, "name": "far", "aim": 0.4}]
     timed += [{**row, "name": f"far by {way}", "seconds": time} for way, time in (("tiles", 8e-5), ("wgmma", 1e-5))]
+    failed = {"name": "bf16", "right": False, "said": "no"}
     found = {
         "roofs": {"rows": timed, "cases": [{"name": "slow", "right": False, "said": "hangs"}]},
-        "training": {
-            "trainings": [
-                {"name": "plain", "right": True, "psnr": 21.5, "steps": 90},
-                {"name": "bf16", "right": False, "said": "no"},
-            ]
-        },
+        "training": {"trainings": [{"name": "plain", "right": True, "psnr": 21.5, "steps": 90}, failed]},
         "small": {"cases": [{"name": "fine", "right": True, "said": ""}]},
         "captured": "captured.json: torn",
         "tests": {"files": [{"name": "test_a.py", "right": False, "said": "1 failed"}]},
@@ -353,7 +331,7 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check: ModuleType) 
     assert check.highlights({}) == []
 
 
-def test_programs_of_a_bare_machine_import_what_it_has() -> None:
+def test_programs_of_a_bare_machine_import_what_it_has():
     """torch, and what comes with Python: pytest, tyro, rich and warp may be absent until the tests themselves run."""
     absent = ("pytest", "_pytest", "tyro", "rich", "warp", "scipy", "imageio_ffmpeg")
     code = f"""
@@ -363,7 +341,7 @@ for name in {absent!r}:
 sys.path[:0] = [{str(ROOT / "benchmarks" / "gpu")!r}]
 import gpu_parts, gpu_check
 gpu_parts.small_cases("cpu"), gpu_parts.captured_steps("cpu", 4)
-import harness, networks, case, throughput
+import harness, throughput, ops.networks, ops.case
 from voronerf.training.trainer import Trainer
 from voronerf.training.config import TrainConfig
 print("imported")
@@ -372,9 +350,7 @@ print("imported")
     assert result.stdout.endswith("imported\n"), result.stderr
 
 
-def test_the_sanitizer_sees_every_allocation(
-    check: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_sanitizer_sees_every_allocation(check, monkeypatch, tmp_path):
     tool = tmp_path / "compute-sanitizer"
     tool.write_text("#!/bin/sh\n")
     tool.chmod(0o755)

@@ -1,15 +1,14 @@
-"""Every CUDA kernel on the CPU, through the public functions, against the reference.
+"""Look-ups and sorts by the CUDA kernels on the CPU, with threads in three orders, against the reference.
 
-Sizes are small: a block of 256 threads is 256 fibers.
+Sizes are small: a block of 256 threads is 256 fibers. The tests of the operations themselves run in test_emulation.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from emulated import emulated
+from helpers import same
 
 import voronerf
 from voronerf import VoronoiDiagram
@@ -17,53 +16,42 @@ from voronerf import native as _native
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)
-def gpu(request: pytest.FixtureRequest) -> Iterator[None]:
+def gpu(request):
     torch.manual_seed(request.param)
     with emulated(seed=request.param):
         yield
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("n", "k"), [(0, 3), (1, 1), (300, 17), (270, 700)])
-def test_nearest_centre(n: int, k: int, dtype: torch.dtype) -> None:
-    # Integers: many ties, which go to the lowest index.
-    points = torch.randint(-3, 4, (n, 3)).to(dtype)
-    centres = torch.randint(-3, 4, (k, 3)).to(dtype)
-    for weights in (None, torch.randint(0, 3, (k,)).to(dtype)):
-        found = voronerf.nearest_centre(points, centres, weights=weights, backend="native")
-        expected = voronerf.nearest_centre(points, centres, weights=weights, backend="reference")
-        assert torch.equal(found, expected)
-
-
-def test_nearest_centre_of_points_that_are_no_numbers() -> None:
-    points = torch.tensor([[torch.nan, 0, 0], [torch.inf, 0, 0], [1e30, 0, 0], [1, 1, 1]])
-    centres = torch.tensor([[5.0, 0, 0], [1, 1, 1]])
-    assert voronerf.nearest_centre(points, centres, backend="native").tolist() == [0, 0, 0, 1]
+def both(op, *args, **options) -> tuple[torch.Tensor, torch.Tensor]:
+    return tuple(op(*args, backend=backend, **options) for backend in ("native", "reference"))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_locate_cell(dtype: torch.dtype) -> None:
+def test_look_ups(dtype: torch.dtype) -> None:
+    for n, k in ((0, 3), (1, 1), (300, 17), (270, 700)):
+        # Integers: many ties, which go to the lowest index.
+        points, centres = (torch.randint(-3, 4, (count, 3)).to(dtype) for count in (n, k))
+        for weights in (None, torch.randint(0, 3, (k,)).to(dtype)):
+            assert torch.equal(*both(voronerf.nearest_centre, points, centres, weights=weights))
+    odd = torch.tensor([[torch.nan, 0, 0], [torch.inf, 0, 0], [1e30, 0, 0], [1, 1, 1]], dtype=dtype)
+    centres = torch.tensor([[5.0, 0, 0], [1, 1, 1]], dtype=dtype)
+    assert voronerf.nearest_centre(odd, centres, backend="native").tolist() == [0, 0, 0, 1]
     diagram = VoronoiDiagram(torch.rand(4, 3, dtype=dtype))
     diagram, _ = diagram.refine({1: torch.rand(3, 3, dtype=dtype), 3: torch.rand(2, 3, dtype=dtype)})
-    points = torch.rand(300, 3, dtype=dtype)
-    arguments = points, diagram.centres, diagram.child_offsets, diagram.child
-    found = voronerf.locate_cell(*arguments, depth=diagram.depth, backend="native")
-    assert torch.equal(found, voronerf.locate_cell(*arguments, depth=diagram.depth, backend="reference"))
+    tables = diagram.centres, diagram.child_offsets, diagram.child
+    assert torch.equal(*both(voronerf.locate_cell, torch.rand(300, 3, dtype=dtype), *tables, depth=diagram.depth))
 
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_draw_cell(weighted: bool) -> None:
-    def weights(k: int) -> torch.Tensor | None:
-        return torch.rand(k) / 4 if weighted else None
+    def of(k: int) -> VoronoiDiagram:
+        return VoronoiDiagram(torch.rand(k, 3), weights=torch.rand(k) / 4 if weighted else None)
 
-    diagram = VoronoiDiagram(torch.rand(4, 3), weights=weights(4))
-    diagram, _ = diagram.refine({leaf: VoronoiDiagram(torch.rand(3, 3), weights=weights(3)) for leaf in (1, 3)})
+    diagram, _ = of(4).refine({1: of(3), 3: of(3)})
     points, uniforms = torch.rand(300, 3), torch.rand(300, 2)
     points[7], uniforms[8] = torch.nan, torch.nan
     arguments = points, diagram.centres, diagram.child_offsets, diagram.child, uniforms
-    options = {"temperature": 0.2, "depth": 2, "weights": diagram.power}
-    found = voronerf.draw_cell(*arguments, backend="native", **options)
-    expected = voronerf.draw_cell(*arguments, backend="reference", **options)
+    found, expected = both(voronerf.draw_cell, *arguments, temperature=0.2, depth=2, weights=diagram.power)
     # numbers within rounding of a border, of which there is one in 10,000
     assert int((found != expected).sum()) <= 1 and found[7] == 0
 
@@ -101,11 +89,8 @@ def test_cell_sort(n: int, k: int, way: str) -> None:
         return
     cells = torch.randint(0, k, (n,), dtype=torch.int32)
     cells[::7] = k - 1
-    expected = voronerf.cell_sort(cells, k, backend="reference")
-    assert all(torch.equal(found, exact) for found, exact in zip(sorted_by(way, cells, k), expected))
-    if way == "automatic":
-        found = voronerf.cell_sort(cells, k, backend="native")
-        assert all(torch.equal(part, exact) for part, exact in zip(found, expected))
+    found, expected = both(voronerf.cell_sort, cells, k)
+    assert same(sorted_by(way, cells, k), expected) and same(found, expected)
 
 
 @pytest.mark.parametrize("k", [3, 1022, 1023, 65_534, 65_535])

@@ -5,13 +5,11 @@ from __future__ import annotations
 import itertools
 
 import pytest
-import torch
-from emulated import module
-from emulated_networks import BRANCHED, GAUSSIANS, KIB, WIDE
+from emulated import emulated, module
+from emulated_networks import BRANCHED, GAUSSIANS, KIB, WIDE, check
+from network_plans import PRECISIONS, SHARED, SIZES, assert_covers, nerf, numbers, plan
 
 from voronerf.fields import density_table, nerf_table
-from voronerf.layers import MLP
-from voronerf.native import grouped_mlp as _native_mlp
 
 MIB = 1024 * KIB
 # Capability, shared memory that a block may ask for, multiprocessors, second-level cache.
@@ -26,34 +24,24 @@ GPUS = {
     "RTX 5090": (120, 99 * KIB, 170, 96 * MIB),
     "H200, code of sm_75": (75, 227 * KIB, 132, 50 * MIB),
 }
+OCTAVES = {"position_octaves": 10, "direction_octaves": 4}
 NETWORKS = {
-    "w64d4": nerf_table(64, depth=4, position_octaves=10, direction_octaves=4, view_directions=False),
-    "mlp32": nerf_table(32, depth=2, position_octaves=10, direction_octaves=4, view_directions=True),
-    "nerf64": nerf_table(64, depth=8, skips=(4,), position_octaves=10, direction_octaves=4, view_directions=True),
-    "nerf256": nerf_table(256, depth=8, skips=(4,), position_octaves=10, direction_octaves=4, view_directions=True),
-    "nerf1024": nerf_table(1024, depth=8, skips=(4,), position_octaves=10, direction_octaves=4, view_directions=True),
+    "w64d4": nerf_table(64, depth=4, view_directions=False, **OCTAVES),
+    "mlp32": nerf_table(32, depth=2, view_directions=True, **OCTAVES),
+    **{f"nerf{w}": nerf_table(w, depth=8, skips=(4,), view_directions=True, **OCTAVES) for w in (64, 256, 1024)},
     "density": density_table(32, depth=2, position_octaves=6, position_encoding="frequency"),
     "branched": BRANCHED,
     "wide": WIDE,
     "gaussians": GAUSSIANS,
 }
-SIZES = [(0, 1), (1, 1), (1, 4096), (1000, 7), (4_000_000, 16), (4_000_000, 256), (4_000_000, 4096), (2**31 - 1, 16)]
-PRECISIONS = ("float32", "bfloat16", "float16", "tf32")
-
-
-def numbers(layers: MLP) -> list[int]:
-    d = 6 if layers.integrated else 3
-    weights = [torch.zeros(1, o, i) for o, i in layers.weight_shapes(d, 3)]
-    seen = torch.zeros(1, 3) if layers.uses_directions else None
-    given = _native_mlp.network(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
-    return _native_mlp._numbers(given.table, given.positions, given.weights, given.directions)
+MORE = [*SIZES, (1, 4096), (4_000_000, 16), (4_000_000, 256), (2**31 - 1, 16)]
 
 
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("gpu", GPUS)
 def test_every_launch_can_be_made(gpu: str, network: str) -> None:
     table, device = numbers(NETWORKS[network]), GPUS[gpu]
-    for (n, k), precision, backward in itertools.product(SIZES, range(4), (False, True)):
+    for (n, k), precision, backward in itertools.product(MORE, range(4), (False, True)):
         plan = module().plan_for(table, precision, n, k, backward, device)
         x, y, z = plan["grid"]
         assert 0 < x < 2**31 and 0 < y < 65_536 and 0 < z < 65_536
@@ -93,3 +81,54 @@ def test_networks_of_the_benchmarks_are_fused(network: str, gpu: str) -> None:
     assert module().plan_for(table, precision, 1 << 22, 16, False, device)["chained"]
     if device[1] >= 163 * KIB:
         assert not module().plan_for(table, precision, 1 << 22, 16, True, device)["by_layers"]
+
+
+@pytest.mark.parametrize("capability", SHARED)
+def test_workspaces_of_tiles_cover_any_offsets(capability: int) -> None:
+    with emulated(capability=capability, shared_bytes=SHARED[capability]):
+        for (n, k), backward, precision in itertools.product(SIZES, (False, True), PRECISIONS):
+            found = plan(BRANCHED, n, k, precision=precision, backward=backward)
+            assert not found["by_layers"]
+            assert found["task_rows"] % 16 == 0 and 0 < found["shared_bytes"] <= SHARED[capability]
+            assert_covers(found, n, k)
+
+
+@pytest.mark.parametrize(("capability", "compiled"), [(90, 120), (75, 120), (90, 75), (80, 80)])
+def test_what_is_multiplied_is_what_the_kernels_were_compiled_for(capability: int, compiled: int) -> None:
+    """A newer device runs code for an older one, which does not have the newer one's instructions."""
+    modern = min(capability, compiled) >= 80
+    expected = {"float32": 0, "bfloat16": 1 if modern else 0, "float16": 2, "tf32": 3 if modern else 0}
+    for shared in (64 * KIB, KIB):
+        with emulated(capability=capability, compiled=compiled, shared_bytes=shared):
+            for precision, number in expected.items():
+                found = plan(BRANCHED, 100, 3, precision=precision)
+                assert found["precision"] == number and found["by_layers"] == (shared == KIB)
+            check(BRANCHED, [30, 5], 3, "bfloat16")
+
+
+def test_splits_fill_the_device_within_their_memory() -> None:
+    """A slab of sorted rows has few of the cells, whatever their number."""
+    loaded, most = module(), 512 << 20
+    loaded.multiprocessors(132)
+    try:
+        with emulated():
+            found = {k: plan(nerf(256, 8), k=k) for k in (1, 16, 4096)}
+    finally:
+        loaded.multiprocessors(2)
+    # Blocks of the largest gradient, 256 x (256 + 63): 4 x 3 tiles a cell, in two cells of a slab.
+    assert found[1]["splits"] == 64 and -(-8 * 132 // (16 * 12)) < found[16]["splits"] <= 8 * 132 // (2 * 12)
+    for each in found.values():
+        assert each["splits"] == 1 or each["splits"] * each["partial_bytes"] <= most
+        assert each["splits"] * each["partial_bytes"] <= each["workspace"]
+    assert found[4096]["splits"] == 1
+
+
+@pytest.mark.parametrize("shared", [64, 99, 227])
+def test_memory_of_layers_is_bounded(shared: int) -> None:
+    """Values of a slab keep within their share whatever the batch, and tiles cover any offsets."""
+    with emulated(shared_bytes=shared * KIB):
+        for width, (n, k) in itertools.product((64, 300, 4096), SIZES):
+            found = plan(nerf(width, 8), n, k)
+            assert found["slab"] % 64 == 0 and found["slab"] * found["slabs"] >= n
+            assert found["slab"] * found["bytes_of_row"] <= max(4 * 64 * KIB, 8 * 64 * found["bytes_of_row"])
+            assert found["tiles"] >= found["slab"] // 64 + k and 1 <= found["splits"] <= 64
