@@ -22,12 +22,11 @@ def balance_centres(
     global_norm: bool = False,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Moves centres `steps` times towards cells of equal mass, all centres at once; see ``voronerf.diagram.balance``.
+    """Moves all centres `steps` times towards cells of equal mass; see ``voronerf.diagram.balance``.
 
-    ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i``, where N(i) are the `neighbours`
-    closest centres, of those equally far the first, and all others where there are fewer (Elsner et al. 2023, section
-    4). Updates are computed in float64 and kept in float32, and the result is the same at every call. Not
-    differentiable.
+    ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i`` (Elsner et al. 2023, section 4). N(i)
+    are the `neighbours` closest centres, or all others if there are fewer; at equal distance, the first ones. Updates
+    are computed in float64 and stored in float32. The result is the same at every call. Not differentiable.
 
     Args:
         samples: float32 [m, 3], finite.
@@ -36,7 +35,7 @@ def balance_centres(
         steps: number of updates, >= 0.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
-        global_norm: norm_i is the largest W of all cells rather than of i and N(i).
+        global_norm: norm_i is the largest W of all cells, instead of the largest of i and N(i).
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

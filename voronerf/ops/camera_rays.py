@@ -21,7 +21,7 @@ def camera_rays(
     distortion: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Rays through positions in images, the distortion of the lens undone by Newton's method in float64.
+    """Rays through positions in images. Lens distortion is undone by Newton's method in float64.
 
     Not differentiable.
 
@@ -30,7 +30,7 @@ def camera_rays(
         intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
         x: float32 [b], to the right, in pixels; the centre of the first column is at 0.5.
         y: float32 [b], downwards.
-        camera: int32 [b], each in 0 to c - 1, which is not checked; None for the first camera throughout.
+        camera: int32 [b], the camera of each position, 0 to c - 1, not checked; None for the first camera.
         distortion: float32 [c, 4], OpenCV's (k1, k2, p1, p2), or None.
         backend: "auto", "reference" or "warp".
 

@@ -16,22 +16,23 @@ def cast_solids(
 ) -> tuple[Tensor, Tensor]:
     """The first solid on each ray, for ground truth computed from formulas.
 
-    A ray that starts inside of a solid, or of the box around a torus, does not see that one. Not differentiable.
+    A ray that starts inside a solid, or inside the bounding box of a torus, does not see that solid. Not
+    differentiable.
 
     Args:
-        kinds: int32 [s], 0 sphere, 1 box, 2 cylinder around z with flat ends, 3 torus around z; others are not checked.
+        kinds: int32 [s], 0 sphere, 1 box, 2 cylinder around z with flat ends, 3 torus around z; not checked.
         frames: float32 [s, 4, 3]: a rotation M in the first three rows, the solid's centre in the last. A point p of
             the world is (p - centre) @ M in the solid's own frame.
         sizes: float32 [s, 3], positive: a sphere's radius; a box's half sides; a cylinder's radius and half height; a
-            torus' radius of the ring and of the tube. What a kind does not have is not looked at.
+            torus' radius of the ring and of the tube. Unused entries are ignored.
         origins: float32 [r, 3].
         directions: float32 [r, 3], unit.
-        backend: "auto", "reference" or "warp". Warp finds the solids near a ray by a tree of their boxes, which makes
-            it the faster one for many solids on the CPU as well, on one thread.
+        backend: "auto", "reference" or "warp". Warp searches a tree of bounding boxes, so it is faster for many solids,
+            on the CPU too, where it uses one thread.
 
     Returns:
-        (depths float32 [r], infinite for a ray that hits nothing; solids int32 [r], -1 there). Of solids hit at the
-        same distance the first counts.
+        (depths float32 [r], infinite for a ray that hits nothing; solids int32 [r], -1 for such a ray). If several
+        solids are hit at the same distance, the first counts.
 
     Raises:
         ValueError: shapes, devices or an unknown backend.

@@ -16,12 +16,13 @@ _OP = "centre_grid"
 
 @dataclass(frozen=True, eq=False)
 class CentreGrid:
-    """Candidate lists of the cells of a grid over all of space, made by `centre_grid` and asked by `nearest_centre`.
+    """A grid over all of space with a list of candidate centres in each cell: made by `centre_grid`, for
+    `nearest_centre`.
 
     Attributes:
-        centres: float32 or float64 [k, 3], a copy of those the grid was made from.
+        centres: float32 or float64 [k, 3], a copy of the centres that the grid was made from.
         weights: [k] in the same dtype, or None.
-        tables: the lists and the way to them; csrc/geometry/centre_grid.h says what is in them.
+        tables: the lists and their index; csrc/geometry/centre_grid.h describes them.
 
     Examples:
         >>> import torch
@@ -56,14 +57,14 @@ class CentreGrid:
 
 
 def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str = "auto") -> CentreGrid:
-    """Prepares a search for the nearest of these centres: ``nearest_centre(points, centres, grid=grid)``.
+    """A grid that makes ``nearest_centre(points, centres, grid=grid)`` fast for many fixed centres.
 
-    Space is cut into cells, small among the centres and larger outside, and every cell gets a list of all centres that
-    are nearest to some point of it, so that a query compares a handful of centres. The answers are those without a
-    grid, to the last index. On two threads of an AVX-512 machine a query took 4 to 9 ns whatever k is, a search of all
-    centres 0.025 ns times k; 4,096 centres took 30 ms to prepare and 6 MB. So a grid pays from some 300 centres on that
-    stay where they are for 100,000 queries. Thousands of centres on one sphere, which are equally near to its middle,
-    are the worst case: 44 MB and several times the preparation.
+    Space is cut into grid cells, small among the centres and larger outside. Each has a list of all centres that are
+    nearest to some point in it, so a query compares only a few centres. The result is exactly the one without a grid.
+    On two threads of an AVX-512 machine, a query took 4 to 9 ns for any k, and a search of all centres 0.025 ns times
+    k. For 4,096 centres, making the grid took 30 ms and 6 MB. So it pays from about 300 centres on, if they stay fixed
+    for 100,000 queries. The worst case is thousands of centres on one sphere, all equally near to its middle: 44 MB,
+    and several times the time to make it.
 
     `VoronoiDiagram.locate` makes and keeps a grid by itself where it pays.
 

@@ -21,20 +21,21 @@ def composite(
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> Composite:
-    """Colour, opacity and depth of rays, from the density and colour of their samples.
+    """Volume rendering: colour, opacity and depth of rays, from the density and colour of their samples.
 
     ``weight_i = T_i (1 - exp(-sigma_i delta_i))`` with ``T_i = exp(-sum over j < i of sigma_j delta_j)``: Max 1995, and
-    Mildenhall et al. 2020, equation 3. Samples of a ray are in order of depth. Infinite density is opaque, unless its
-    delta is 0; a sample that is not a number spoils its own ray alone.
+    Mildenhall et al. 2020, equation 3. The samples of a ray are in order of depth. Infinite density is opaque, unless
+    its delta is 0. A NaN sample affects only its own ray.
 
     Args:
         sigma: density, per unit of length, at least 0: [r, s], or [m] packed.
         rgb: [r, s, c] or [m, c].
         depths: distance along the ray: [r, s] or [m].
-        deltas: length of ray each sample stands for, at least 0: [r, s] or [m].
+        deltas: length of the part of the ray that a sample stands for, at least 0: [r, s] or [m].
         ray_offsets: int32 [r + 1] for packed samples: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``,
-            which may be none. None for the dense form.
-        background: [c] or [r, c], added with weight 1 - opacity; None for none. A ray with no sample shows it alone.
+            possibly none. None for the dense form.
+        background: [c] or [r, c], added with weight 1 - opacity, or None. A ray without samples shows only the
+            background.
         backend: "auto", "reference", "native" or "warp".
 
     All floating-point arguments share one dtype, float16 to float64; sums are taken in float32 at least. Differentiable

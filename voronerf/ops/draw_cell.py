@@ -24,27 +24,27 @@ def draw_cell(
     weights: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """A leaf for every point, drawn level by level from the vector of its distances.
+    """A leaf for every point, drawn at random by its distances to the centres, level by level.
 
-    In the diagram reached so far, centre i is drawn with a probability in proportion to
+    On each level, centre i of the current diagram is drawn with a probability in proportion to
 
         exp(-d_i / temperature),    d_i = |x - c_i|,    with power weights d_i = sqrt(|x - c_i|^2 + max_j w_j - w_i),
 
-    by the inverse of the distribution: it is the first centre up to which the probabilities sum to at least 1 - u, u
-    being the point's number for that level. Equal numbers give equal leaves on all backends except where 1 - u lies
-    within rounding of such a sum. The arithmetic is float64 where points, centres or weights are, else float32,
-    and "native" and "warp" take float32 alone; what is less likely than the nearest centre by a factor of e^20 may
-    count as impossible. A point that is not finite, or whose squared distances overflow, takes the first centre at
+    by the inverse of the cumulative distribution: the first centre up to which the probabilities sum to at least 1 - u,
+    where u is the uniform number of the point for that level. Equal numbers give equal leaves on all backends, except
+    where 1 - u lies within rounding of such a sum. The arithmetic is float64 if points, centres or weights are, else
+    float32; "native" and "warp" support float32 only. A centre that is less likely than the nearest by a factor of e^20
+    may never be drawn. A point that is not finite, or whose squared distances overflow, goes to the first centre on
     every level. Not differentiable.
 
-    What is said of unsound tables in `locate_cell` holds here.
+    Tables that are not a tree are treated as in `locate_cell`.
 
     Args:
         points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are taken as float32.
         centres: [m, 3] floating point, finite, m >= 1; every diagram has at least one.
         child_offsets: int32 [g + 1], g >= 1, and
         child: int32 [m]: the tree, as in `locate_cell`.
-        uniforms: [n, depth] floating point, in 0 to 1; others are clamped, what is not a number counts as 0.
+        uniforms: [n, depth] floating point, in 0 to 1; other values are clamped, and NaN counts as 0.
         temperature: above 0, finite, in scene units.
         depth: levels of the tree, 1 for a flat diagram.
         weights: [m] floating point or None: power diagrams (squared scene units), finite.
@@ -54,8 +54,8 @@ def draw_cell(
         leaf int32 [n].
 
     Raises:
-        ValueError: shapes, devices, temperature, depth or an unknown backend; tables that are no tree, where they are
-            refused.
+        ValueError: shapes, devices, temperature, depth or an unknown backend; with "native" on the CPU also tables that
+            are not a tree.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 

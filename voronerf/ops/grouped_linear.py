@@ -29,15 +29,15 @@ def grouped_linear(
     activation: str = "none",
     backend: str = "auto",
 ) -> Tensor:
-    """``activation(W_c x + b_c)`` with the layer of each sample's cell c.
+    """A linear layer for each cell: ``activation(W_c x + b_c)``, where c is the cell of the sample.
 
     Gradients of every order to x, weight and bias. Products are accumulated in float32 at least. Under
     ``torch.autocast`` the arguments are cast to its dtype, float64 excepted, as for ``torch.nn.functional.linear``.
 
     Args:
         x: [n, i] floating point, sorted by cell, n < 2**31, i >= 1.
-        offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows of no cell (before
-            ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
+        offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
+            (before ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
         weight: [k, o, i], o >= 1, the dtype of x.
         bias: [k, o] or None.
         activation: "none", "relu", "softplus", "sigmoid" or "sine".

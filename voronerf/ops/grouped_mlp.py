@@ -25,25 +25,25 @@ def grouped_mlp(
     direction_index: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Every sample through the network of its cell, encodings included.
+    """Evaluates every sample by the network of its cell, encodings included.
 
-    The same as ``frequency_encode`` (or ``integrated_encode``) where ``layers`` gives octaves, then one
-    ``grouped_linear`` for each layer, with the sources that the table names concatenated. Gradients of every order to
-    positions, directions, weights and biases. Encodings are computed in float32 at least, and rounded to the dtype of
-    the weights; under ``torch.autocast`` layers run in its dtype.
+    Equivalent to ``frequency_encode`` (or ``integrated_encode``) where ``layers`` has octaves, followed by one
+    ``grouped_linear`` for each layer on the concatenation of its sources. Gradients of every order to positions,
+    directions, weights and biases. Encodings are computed in float32 at least, and rounded to the dtype of the weights.
+    Under ``torch.autocast``, layers run in its dtype.
 
     Args:
-        positions: [n, p] floating point, sorted by cell, n < 2**31; raw where the table gives octaves, else encoded;
-            p >= 1 where a layer reads them, as q >= 1 for directions; p = 6, mean and diagonal variance, for the
+        positions: [n, p] floating point, sorted by cell, n < 2**31; raw if the table has octaves, else already encoded.
+            p >= 1 if a layer reads them, like q >= 1 for directions. p = 6, mean and diagonal variance, for the
             integrated encoding.
-        offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows of no cell (before
-            ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
+        offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
+            (before ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
         weights: one [k, o, i] for each layer, all of one dtype; i as ``layers.input_width`` says.
         biases: one [k, o] or None for each layer.
         layers: the layer table.
         directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample. A direction is then
-            encoded once a ray rather than once a sample.
+            encoded once for each ray instead of once for each sample.
         backend: "auto", "reference" or "native".
 
     Returns:

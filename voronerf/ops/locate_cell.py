@@ -22,15 +22,15 @@ def locate_cell(
     weights: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Leaf of every point, going down from the root: at each level the nearest centre of the diagram the point is in.
+    """Leaf of every point in a tree of diagrams: on each level, the nearest centre of the diagram that holds the point.
 
     Diagram 0 is the root; diagram j owns rows ``child_offsets[j]`` to ``child_offsets[j + 1]`` of ``centres``. Exact,
     with ties to the lowest index, as ``nearest_centre``; a point that is not finite takes the first centre at every
     level. Trees may be uneven. Not differentiable.
 
-    On the CPU "native" refuses tables that are no tree of this depth: a diagram without centres, a child that is no
-    diagram, a walk longer than ``depth``. On CUDA, where telling would need a host read, it reads nothing outside the
-    tables, and a point whose walk leads out of them or ends at no leaf gets a negative number.
+    On the CPU, "native" raises for tables that are not a tree of this depth: a diagram without centres, a child that is
+    not a diagram, a path longer than ``depth``. On CUDA that would need a host read. There nothing outside the tables
+    is read, and a point whose path leaves the tables, or does not end at a leaf, gets a negative number.
 
     Args:
         points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are compared in float32.
@@ -46,8 +46,8 @@ def locate_cell(
         leaf int32 [n].
 
     Raises:
-        ValueError: shapes, devices, depth or an unknown backend; tables that are no tree, where
-            they are refused.
+        ValueError: shapes, devices, depth or an unknown backend; with "native" on the CPU also tables that are not a
+            tree.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 

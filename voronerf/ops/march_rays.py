@@ -38,32 +38,32 @@ def march_rays(
     capacity: int | None = None,
     backend: str = "auto",
 ) -> March:
-    """Stratified samples of rays, those in empty cells of a grid left out, packed for ``composite``.
+    """Stratified samples of rays without those in empty cells of a grid, packed for ``composite``.
 
-    Each ray is cut into ``samples`` strata between its near and its far end, with one sample in each, as
-    ``rendering.stratified_depths`` does; a sample is kept where its cell of the grid is occupied. Outside the box all
-    is empty. With every cell occupied the result is the stratified one, so what the grid changes is the cost alone.
+    Each ray is cut into ``samples`` strata between its near and its far end, with one sample in each, as in
+    ``rendering.stratified_depths``. A sample is kept if its cell of the grid is occupied. Space outside the box is
+    empty. If every cell is occupied, the result is the stratified one.
 
-    Rays can be walked piece by piece, so that those that have become opaque can be left: ``most`` samples at a time,
-    the ``stop`` of one call being the ``start`` of the next.
+    Rays can be walked piece by piece, to stop at opaque surfaces: ``most`` samples at a time, with the ``stop`` of one
+    call as the ``start`` of the next.
 
-    The number of samples depends on the values. Without ``capacity`` it is read on the host; with it the result has
-    that many rows, those beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays for which there is no room are
-    cut, as ``stop`` tells: this form can be captured in a CUDA graph and compiled. Not differentiable.
+    The number of samples depends on the values. Without ``capacity`` it is read on the host. With ``capacity`` the
+    result has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that do not fit are
+    cut, which ``stop`` shows. This form can be captured in a CUDA graph and compiled. Not differentiable.
 
     Args:
         origins: float32 or float64 [r, 3].
         directions: [r, 3], unit vectors.
-        near: [r], the beginning of the first stratum.
-        far: [r], the end of the last; a ray with far <= near has no samples.
+        near: [r], start of the first stratum.
+        far: [r], end of the last stratum; a ray with far <= near has no samples.
         occupied: bool [x, y, z], which cells of the box are not empty; x, y, z >= 1.
         box: [2, 3], lowest and highest corner, the second above the first.
         samples: strata of a ray, s, 1 to 65,535.
         uniforms: [r, s] in 0 to 1, the place of each sample in its stratum; None for the middles.
         spacing: of the strata, "linear" or "disparity" (equal steps of 1 / distance).
-        start: int32 [r], first stratum to be looked at, >= 0; None for 0.
-        most: samples of a ray, at least 1; None for all.
-        capacity: rows of the result, at least 1; None for as many as there are samples.
+        start: int32 [r], the first stratum to consider, >= 0; None for 0.
+        most: largest number of samples of a ray, at least 1; None for all.
+        capacity: rows of the result, at least 1; None for the number of samples.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

@@ -28,9 +28,10 @@ def nearest_centre(
     Args:
         points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are compared in float32.
         centres: [k, 3] floating point, finite, k >= 1.
-        weights: [k] floating point or None: a power diagram, larger weights have larger cells (squared scene units).
-        grid: made by ``centre_grid`` from these centres and weights, or None. Same answers, sooner where there are
-            hundreds of centres; see there. With a grid "native" is for the CPU alone.
+        weights: [k] floating point or None: a power diagram, in which larger weights give larger cells (squared scene
+            units).
+        grid: made by ``centre_grid`` from these centres and weights, or None. The result is the same, and faster for
+            hundreds of centres. With a grid, "native" runs on the CPU only.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
@@ -79,7 +80,7 @@ def nearest_centre(
 def _by_grid(points: Tensor, centres: Tensor, weights: Tensor | None, grid: CentreGrid, backend: str) -> Tensor:
     if not isinstance(grid, CentreGrid):
         raise TypeError(f"{_OP}: grid must be a CentreGrid, got {type(grid).__name__}")
-    # A compiled graph cannot compare values; for those it takes the caller's word.
+    # A compiled graph cannot compare values, so it trusts the caller.
     belongs = grid.fits if torch.compiler.is_compiling() else grid.belongs_to
     if not belongs(centres, weights):
         raise ValueError(f"{_OP}: grid must be made from these centres and weights, got that of others")

@@ -13,11 +13,11 @@ _OP = "resample"
 def resample(
     weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None, backend: str = "auto"
 ) -> Tensor:
-    """Depths drawn from the piecewise constant density in which bin i of a ray holds mass ``weights[:, i]``.
+    """Inverse-CDF sampling: depths from the piecewise constant density with mass ``weights[:, i]`` in bin i of a ray.
 
-    Inverse of the cumulative distribution, Mildenhall et al. 2020, section 5.2. Weights that are negative or not finite
-    count as 0; a ray whose weights are all 0 is drawn as though every bin weighed the same. Not differentiable: depths
-    carry no gradient to the weights, the edges or the uniforms.
+    Mildenhall et al. 2020, section 5.2. Weights that are negative or not finite count as 0. If all weights of a ray are
+    0, every bin counts the same. Not differentiable: depths carry no gradient to the weights, the edges or the
+    uniforms.
 
     Args:
         weights: [r, s] floating point, s >= 1; need not sum to 1.

@@ -37,31 +37,32 @@ def routed_mlp(
     direction_index: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Every sample through the network of the cell it lies in, results in the order of the samples.
+    """Evaluates every sample by the network of the cell it lies in; results are in the order of the samples.
 
-    The same as ``locate_cell``, ``cell_sort``, permuting the inputs, ``grouped_mlp``, and putting its rows back; the
-    native CPU implementation gathers and scatters rows inside the network's tiles, so that no permuted copy is made,
-    and keeps for the backward pass only the order (int32). Gradients of every order to positions, directions, weights
-    and biases, none through the choice of the cell. A sample whose coordinates are not finite goes to the first cell,
-    as in ``locate_cell``. A network of one cell (k = 1) needs no tables and is neither located nor sorted.
+    Equivalent to ``locate_cell``, ``cell_sort``, permuting the inputs, ``grouped_mlp``, and undoing the permutation.
+    The native CPU implementation gathers and scatters rows inside the tiles of the network: it makes no permuted copy,
+    and keeps only the order (int32) for the backward pass. Gradients of every order to positions, directions, weights
+    and biases; none through the choice of the cell. A sample whose coordinates are not finite goes to the first cell,
+    as in ``locate_cell``. A network of one cell (k = 1) needs no tables, and is neither located nor sorted.
 
     Args:
-        positions: [n, p] floating point, n < 2**31; what the table's layers read, as ``grouped_mlp`` takes it.
+        positions: [n, p] floating point, n < 2**31: the input of the layers, as in ``grouped_mlp``.
         weights: one [k, o, i] for each layer, all of one dtype.
         biases: one [k, o] or None for each layer.
         layers: the layer table.
-        centres: [m, 3], the tree's centres as ``locate_cell`` takes them; with neither ``child_offsets`` nor
-            ``child``, those of a flat diagram, [k, 3].
+        centres: [m, 3], the centres of the tree as in ``locate_cell``; without ``child_offsets`` and ``child``, the
+            centres of a flat diagram, [k, 3].
         child_offsets: int32 [g + 1], or None for a flat diagram.
         child: int32 [m], or None for a flat diagram. The leaves are the cells, 0 to k - 1.
         depth: levels of the tree.
         centre_weights: [m] or None: power diagrams.
-        cells: int32 [n], the cells themselves, 0 to k - 1, in the place of the tables: a stochastic assignment, or one
-            that is used again.
-        coords: [n, 3] floating point, where the samples are; None takes the first three features of the positions.
+        cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables: a stochastic assignment, or one
+            that is reused.
+        coords: [n, 3] floating point, the locations of the samples; None uses the first three features of the
+            positions.
         directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
-        backend: "auto", "reference" or "native". Where there is no fused implementation, "auto" is the separate
+        backend: "auto", "reference" or "native". If there is no fused implementation, "auto" calls the separate
             operations, each on the backend it chooses.
 
     Returns:
@@ -70,8 +71,8 @@ def routed_mlp(
 
     Raises:
         ValueError: shapes, devices, directions that are missing, both or neither of tables and cells, an unknown
-            backend; on the CPU also tables that are no tree, cells outside 0 to k - 1 and a direction_index outside 0
-            to r - 1.
+            backend; on the CPU also tables that are not a tree, cells outside 0 to k - 1 and a direction_index outside
+            0 to r - 1.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 

@@ -14,8 +14,8 @@ _OP = "select_heaviest"
 def select_heaviest(points: Tensor, importance: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
     """The `count` samples of largest importance, heaviest first; no device value is read on the host.
 
-    A sample counts if its importance is positive and finite and its point finite. Which of equally heavy samples comes
-    first is open. Not differentiable.
+    A sample counts if its importance is positive and finite and its point is finite. The order of equally heavy samples
+    is not specified. Not differentiable.
 
     Args:
         points: float32 [n, 3].
@@ -24,7 +24,8 @@ def select_heaviest(points: Tensor, importance: Tensor, count: int, *, backend: 
         backend: "auto", "reference" or "warp".
 
     Returns:
-        (points float32 [q, 3], importance float32 [q]) with q = min(count, n); rows for which no sample counts are 0.
+        (points float32 [q, 3], importance float32 [q]) with q = min(count, n); the last rows are 0 if fewer samples
+        count.
 
     Raises:
         ValueError: shapes, devices, count or an unknown backend.

@@ -14,16 +14,16 @@ _OP = "update_occupancy"
 def update_occupancy(
     density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """Densities that a grid remembers after some of its cells have been looked at, and which cells are occupied.
+    """Updates the densities of some cells of an occupancy grid, and says which cells are occupied.
 
-    A cell that was looked at gets the largest of the values found in it and ``decay`` times what it remembered (Mueller
-    et al. 2022, appendix C); the others keep what they have. Not differentiable.
+    An updated cell gets the largest of the values found in it and ``decay`` times its old density (Mueller et al. 2022,
+    appendix C). The other cells keep theirs. Not differentiable.
 
     Args:
         density: float32 [x, y, z], >= 0.
-        cells: int32 [q], flat numbers of the cells that were looked at, each in 0 to x * y * z - 1; one may be named
-            more than once. What is no cell is an error on the CPU, and undefined on CUDA, where it is not read.
-        values: float32 [q], the densities found, none NaN.
+        cells: int32 [q], flat numbers of the cells to update, 0 to x * y * z - 1; a cell may occur more than once.
+            Other numbers are an error on the CPU, and undefined on CUDA, where they are not checked.
+        values: float32 [q], the densities found, not NaN.
         decay: 0 to 1.
         threshold: density from which a cell counts as occupied.
         backend: "auto", "reference", "native" or "warp".
@@ -32,7 +32,7 @@ def update_occupancy(
         (density float32 [x, y, z], occupied bool [x, y, z]).
 
     Raises:
-        ValueError: shapes, devices, a decay out of range, cells out of range where they are read, an unknown backend.
+        ValueError: shapes, devices, a decay out of range, an unknown backend; on the CPU also cells out of range.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 
