@@ -28,14 +28,11 @@ from voronerf.data import builtin_scene
 from voronerf.evaluation.metrics import psnr
 from voronerf.evaluation.scores import render_view
 from voronerf.files import write_text
-from voronerf.router import VoronoiRouter
+from voronerf.run import open_run
 from voronerf.training.config import TrainConfig
-from voronerf.training.model import load_grid, load_run, make_renderer
-from voronerf.training.runs import read_metrics
+from voronerf.training.renderers import make_picture_grid
+from voronerf.training.run_directory import read_metrics, stored_config
 from voronerf.training.trainer import Trainer
-
-Run = tuple[Path, TrainConfig, Mapping[str, VoronoiRouter]]
-"""Directory, configuration and networks."""
 
 
 @dataclass(frozen=True)
@@ -90,22 +87,20 @@ def train(options: Options, folder: Path) -> dict[str, Trainer]:
     return trainers
 
 
-def render(
-    options: Options, runs: dict[str, tuple[Path, TrainConfig, Mapping[str, VoronoiRouter]]]
-) -> list[dict[str, Any]]:
+def render(options: Options, folders: Mapping[str, Path]) -> list[dict[str, Any]]:
     """Seconds and PSNR of test views, dense and through a grid in turn."""
     if options.views < 1:
         return []
     scene = builtin_scene(options.size, train_views=1, test_views=options.views)
     background = scene.background_colour()
     results = []
-    for name, (folder, config, routers) in runs.items():
-        renderer = make_renderer(config, scene, routers)
+    for name, folder in folders.items():
+        run = open_run(folder, scene=scene)
+        renderer, own = run.renderer, run.renderer.occupancy
         started = time.perf_counter()
-        grid = load_grid(folder, config, routers["field"], scene, wanted=True)
+        grid = own or make_picture_grid(run.config, scene, renderer.field)
         made_in = time.perf_counter() - started
-        assert grid is not None
-        ways = {"own grid": grid} if config.occupancy else {"dense": None, "grid": grid}
+        ways = {"dense": None, "grid": grid} if own is None else {"own grid": grid}
         seconds: dict[str, list[float]] = {way: [] for way in ways}
         scores: dict[str, list[float]] = {way: [] for way in ways}
         for repeat in range(options.repeats + 1):
@@ -140,10 +135,10 @@ def main() -> int:
     options = tyro.cli(Options, description=__doc__)
     with tempfile.TemporaryDirectory() as folder:
         trainers = {} if options.trained is not None else train(options, Path(folder))
-        fields = {name: (trainer.out, trainer.config, trainer.routers) for name, trainer in trainers.items()}
+        folders = {name: trainer.out for name, trainer in trainers.items()}
         if options.trained is not None:
-            fields[options.trained.name] = (options.trained, *load_run(options.trained))
-        pictures = render(options, fields)
+            folders[options.trained.name] = options.trained
+        pictures = render(options, folders)
         runs = [
             {
                 "run": name,
@@ -164,7 +159,7 @@ def main() -> int:
         print(f"rendering: {dense['seconds'] / grid['seconds']:.1f} x, {grid['psnr'] - dense['psnr']:+.3f} dB")
     how: dict[str, Any] = {"budget": options.budget, "share": options.share}
     if options.trained is not None:
-        config = fields[options.trained.name][1]
+        config = stored_config(options.trained)
         names = ("data", "downscale", "steps", "budget", "rays", "samples", "seed")
         how = {"trained": {name: getattr(config, name) for name in names}}
     outcome = {

@@ -26,7 +26,7 @@ from torch.profiler import ProfilerActivity, profile
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
 from voronerf.files import write_text
-from voronerf.training.config import FieldName, SamplingName, TrainConfig
+from voronerf.training.config import SamplingName, TrainConfig
 from voronerf.training.trainer import Trainer
 
 # What operators are for, by what their names hold; the first that fits. The time of a forward pass that is recorded for
@@ -50,7 +50,7 @@ class Options:
     """Factor by which the images are made smaller on load."""
     cells: int = 16
     """Cells; 1 is one network."""
-    field: FieldName = "nerf"
+    field: str = "nerf"
     """The networks, as for `voronerf train`."""
     sampling: SamplingName = "stratified"
     """Samples along a ray, likewise."""

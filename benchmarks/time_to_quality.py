@@ -24,10 +24,11 @@ from turns import take_turns
 
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
+from voronerf.evaluation.panels import write_panels
 from voronerf.evaluation.plots import plot_curves
 from voronerf.files import write_text
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.runs import read_metrics, write_panels
+from voronerf.training.run_directory import read_metrics
 from voronerf.training.trainer import Trainer
 
 
@@ -111,7 +112,7 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
         lr = trainer.config.lr
         results.append({"variant": name, "seed": seed, "lr": lr, **summary, "curve": read_metrics(trainer.out)})
         if options.panels is not None and seed == 0:
-            write_panels(trainer.renderer, scene, options.panels / name, views=3)
+            write_panels(trainer.renderer, trainer.router.diagram, scene, options.panels / name, views=3)
     description = metadata(
         benchmark="time_to_quality",
         scene=scene.name,

@@ -26,6 +26,7 @@ LAYERS = (
     {"data", "rendering", "fields"},
     {"evaluation"},
     {"training"},
+    {"run"},
     {"cli", "viewer"},
     {"__init__", "__main__"},
 )

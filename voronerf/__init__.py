@@ -1,6 +1,9 @@
 """Many small networks, one per Voronoi cell of space, as cheap to run and to train as one."""
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from voronerf.backends import BackendUnavailable
 from voronerf.diagram import (
@@ -36,6 +39,11 @@ from voronerf.ops import (
 from voronerf.rendering import OccupancyGrid
 from voronerf.router import VoronoiRouter
 
+if TYPE_CHECKING:
+    from voronerf.run import Run, open_run
+
+__version__ = "0.1.0"
+
 __all__ = [
     "MLP",
     "BackendUnavailable",
@@ -45,6 +53,7 @@ __all__ = [
     "Layer",
     "NeRF",
     "OccupancyGrid",
+    "Run",
     "SampleReservoir",
     "Split",
     "VoronoiDiagram",
@@ -62,9 +71,17 @@ __all__ = [
     "locate_cell",
     "march_rays",
     "nearest_centre",
+    "open_run",
     "resample",
     "routed_mlp",
     "split_diagram",
     "uniform_centres",
     "update_occupancy",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """``Run`` and ``open_run``, whose module needs what reads images and draws plots: imported when it is asked for."""
+    if name in ("Run", "open_run"):
+        return getattr(importlib.import_module("voronerf.run"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

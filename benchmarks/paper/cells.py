@@ -8,7 +8,7 @@ from paper.claims import Claim, Rows, gain_claim, order_claim
 from paper.runs import Variant, open_scene
 from paper.settings import Settings
 from voronerf.training.config import TrainConfig
-from voronerf.training.model import count_parameters, resolve_config
+from voronerf.training.networks import count_parameters, resolve_config
 
 SPLIT_TIMES, TYPICAL = (0.05, 0.1, 0.2, 0.4, 0.6), 0.2
 COUNTS = (4, 8, 12, 16, 32)

@@ -25,10 +25,10 @@ from paper.figures import stacked
 from paper.looks import held_out_view
 from paper.runs import default_scenes, open_scene
 from paper.settings import Settings
-from voronerf import SampleReservoir, VoronoiDiagram, VoronoiRouter, frequency_encode, split_diagram
+from voronerf import NeRF, SampleReservoir, VoronoiDiagram, VoronoiRouter, frequency_encode, split_diagram
 from voronerf.evaluation.panels import contact_sheet, palette, picture_of_colour, picture_of_error, save_picture
 from voronerf.files import write_text
-from voronerf.training.config import ConfigError, default_learning_rate
+from voronerf.training.config import ConfigError
 
 CHILDREN, LEVELS = 4, 3
 SPLITS = (0.15, 0.35, 0.55)  # of the budget, a level each
@@ -113,7 +113,7 @@ class ImageFit:
             field = ImageField(width, DEPTH, octaves_of(image))
         self.router = VoronoiRouter(field, VoronoiDiagram(torch.zeros(1, 3)), coords="first3", backend=backend)
         # the same rule for all widths as that of `voronerf train`
-        self.rate = RATE * default_learning_rate(width) / default_learning_rate(WIDTH)
+        self.rate = RATE * NeRF.learning_rate(width) / NeRF.learning_rate(WIDTH)
         self.optimizer = torch.optim.Adam(self.router.parameters(), lr=self.rate, betas=(0.9, 0.99), eps=1e-15)
         self.reservoir = SampleReservoir(10_000, 100)
         self.seconds, self.step = 0.0, 0

@@ -31,8 +31,8 @@ from voronerf.data import BUILTIN, BUILTIN_SIZE, Scene, load_scene
 from voronerf.evaluation.scores import evaluate, mean_scores
 from voronerf.files import write_text
 from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig
-from voronerf.training.model import checkpoint_path, resolve_config
-from voronerf.training.runs import read_metrics
+from voronerf.training.networks import resolve_config
+from voronerf.training.run_directory import checkpoint_path, read_metrics
 from voronerf.training.trainer import Trainer, TrainingError
 
 Row = dict[str, Any]

@@ -350,7 +350,7 @@ def test_matched_parameters(load: Load, settings: Any) -> None:
     assert len({v["parameters"] for v in variants.values() if "parameters" in v}) == 1
     assert variants["12 cells, matched"] == variants["12 cells"]
     run = load("paper.runs").make_run
-    model = importlib.import_module("voronerf.training.model")
+    model = importlib.import_module("voronerf.training.networks")
     scene = load("paper.runs").open_scene("builtin", settings)
     counts = {}
     for name in ("12 cells", "12 cells, matched", "4 cells, matched", "32 cells, matched", "one network, matched"):

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 from helpers import refuses
 
-from voronerf.training.config import CHOICES, RESUMABLE, ConfigError, TrainConfig, check_device, differences
+from voronerf.training.config import CHOICES, RESUMABLE, ConfigError, TrainConfig, differences
+from voronerf.training.config_checks import check_device
 
 
 @pytest.mark.parametrize(
@@ -92,7 +93,7 @@ def test_bad_settings(settings: dict[str, Any], message: str) -> None:
 
 
 def test_every_choice_of_words_is_checked() -> None:
-    names = "field sampling split centres balance init assignment contraction precision background"
+    names = "sampling split centres balance init assignment contraction precision background"
     assert set(CHOICES) == set(names.split())
     for name in CHOICES:
         with pytest.raises(ConfigError, match=f"--{name} must be .* or .*, got 'nonsense'"):

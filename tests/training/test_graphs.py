@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import voronerf.training.trainer as trainer_module
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.graphs import WARMUP, GraphedStep, set_learning_rate
-from voronerf.training.model import load_grid
+from voronerf.training.renderers import make_picture_grid
 from voronerf.training.trainer import Trainer
 
 aten = torch.ops.aten
@@ -218,4 +218,4 @@ def test_pictures_through_a_grid_of_a_run_that_was_graphed(tmp_path, scene) -> N
     trainer = Trainer(small(tmp_path, steps=2, cells=()), scene)
     trainer.run()
     config = replace(trainer.config, device="cuda", cuda_graph=True)
-    assert load_grid(tmp_path, config, trainer.router, scene, wanted=True) is not None
+    assert make_picture_grid(config, scene, trainer.renderer.field).occupied.any()

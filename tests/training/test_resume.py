@@ -11,9 +11,11 @@ from helpers import same
 from tiny_runs import assert_resumes, scores, small, stopping, tensors
 
 import voronerf.training.trainer as trainer_module
+from voronerf import open_run
 from voronerf.evaluation.scores import evaluate
 from voronerf.training.checkpoint import CheckpointError, load_checkpoint
-from voronerf.training.model import checkpoint_path, load_run, make_renderer, make_routers, restore_routers
+from voronerf.training.networks import make_routers, restore_routers
+from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.trainer import Trainer
 
 
@@ -49,10 +51,11 @@ def test_seeds_decide_everything(tmp_path, scene) -> None:
 def test_a_loaded_run_renders_the_same(tmp_path, scene) -> None:
     trainer = Trainer(small(tmp_path, cells=(3, 2)), scene)
     trainer.run()
-    config, routers = load_run(tmp_path)
+    run = open_run(tmp_path, scene=scene)
+    config = run.config
     assert config == trainer.config
-    assert evaluate(make_renderer(config, scene, routers), scene, views=2) == evaluate(trainer.renderer, scene, views=2)
-    coarser = make_renderer(config, scene, routers, samples=3, backend="reference")
+    assert evaluate(run.renderer, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
+    coarser = open_run(tmp_path, scene=scene, samples=3, backend="reference").renderer
     assert (coarser.samples, coarser.backend) == (3, "reference")
     # Another configuration, another architecture.
     with pytest.raises(CheckpointError, match=r"a checkpoint of another configuration: --width 8 -> 16; --lr"):

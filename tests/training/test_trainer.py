@@ -14,6 +14,7 @@ from helpers import read_json, same
 from tiny_runs import small, stopping, tensors
 
 import voronerf.training.trainer as trainer_module
+from voronerf import open_run
 from voronerf.backends import BackendUnavailable
 from voronerf.evaluation.scores import evaluate, mean_scores, render_view
 from voronerf.files import read_json_lines
@@ -23,17 +24,8 @@ from voronerf.rendering.renderer import Renderer
 from voronerf.training.batches import Batch
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.model import (
-    checkpoint_path,
-    count_parameters,
-    load_grid,
-    load_run,
-    make_renderer,
-    octaves_for,
-    resolve_config,
-    solve_width,
-)
-from voronerf.training.runs import choose_directory, held
+from voronerf.training.networks import count_parameters, octaves_for, resolve_config, solve_width
+from voronerf.training.run_directory import checkpoint_path, choose_directory, held
 from voronerf.training.trainer import Trainer, TrainingError
 
 
@@ -139,11 +131,8 @@ def test_the_final_scores_are_blended_as_the_pictures_are(tmp_path, scene) -> No
     blended = trainer.run()
     assert plain["steps"] == blended["steps"] and plain["psnr"] != blended["psnr"]
     assert blended["psnr"] == mean_scores(evaluate(trainer.renderer, scene, views=2))["psnr"]
-    config, routers = load_run(tmp_path / "blended")
-    assert config.blend == 0.3
-    for router in routers.values():
-        router.blend = 0.0
-    assert mean_scores(evaluate(make_renderer(config, scene, routers), scene, views=2))["psnr"] == plain["psnr"]
+    assert open_run(tmp_path / "blended", scene=scene).config.blend == 0.3
+    assert open_run(tmp_path / "blended", scene=scene, blend=0.0).evaluate(views=2)["psnr"] == plain["psnr"]
 
 
 def after_the_split(folder, scene, **settings) -> Trainer:
@@ -287,7 +276,7 @@ def test_parameters_decide_the_width(tmp_path, scene, field) -> None:
     assert summary["parameters"] == count_parameters(config) == sum(p.numel() for p in trainer.router.parameters())
     assert count_parameters(config) <= 30_000 < count_parameters(config, width + 1)
     assert config.lr == 0.02
-    assert load_run(tmp_path)[0] == config
+    assert open_run(tmp_path, scene=scene).config == config
     Trainer(replace(config, width=None, lr=None, resume=True), scene)
 
 
@@ -368,10 +357,9 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch) -> Non
     middle = float(trainer.occupancy.box[:, 2].mean())
     points = np.load(tmp_path / "samples" / "level-1.npz")["points"]
     assert summary["cells"] == 4 and len(points) > 0 and points[:, 2].max() < middle
-    config, routers = load_run(tmp_path)
-    grid = load_grid(tmp_path, config, routers["field"], scene, wanted=False)
+    loaded = open_run(tmp_path, scene=scene).renderer
+    grid = loaded.occupancy
     assert grid is not None and torch.equal(grid.occupied, trainer.occupancy.occupied)
-    loaded = make_renderer(config, scene, routers, occupancy=grid)
     assert trainer.renderer.occupancy is trainer.occupancy
     assert evaluate(loaded, scene, views=1) == evaluate(trainer.renderer, scene, views=1)
 
@@ -380,5 +368,4 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch) -> Non
 def test_training_on_a_gpu(tmp_path, scene) -> None:
     config = small(tmp_path, device="cuda", assignment="stochastic")
     assert Trainer(config, scene).run()["cells"] == 4
-    config, routers = load_run(tmp_path, device="cpu")
-    assert len(evaluate(make_renderer(config, scene, routers), scene, views=1)) == 1
+    assert len(open_run(tmp_path, scene=scene, device="cpu").evaluate(views=1)["views"]) == 1

@@ -10,20 +10,14 @@ import torch
 from helpers import read_json
 from tiny_runs import assert_resumes, small, stopping
 
+from voronerf import open_run
 from voronerf.cli import main
 from voronerf.data import builtin_scene
+from voronerf.evaluation.panels import write_panels
 from voronerf.evaluation.scores import evaluate, render_view
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.model import (
-    count_parameters,
-    load_run,
-    make_contraction,
-    make_renderer,
-    network_names,
-    resolve_config,
-    solve_width,
-)
-from voronerf.training.runs import write_panels
+from voronerf.training.networks import count_parameters, network_names, resolve_config, solve_width
+from voronerf.training.renderers import make_contraction
 from voronerf.training.trainer import Trainer
 
 HIERARCHICAL, PROPOSAL = {"sampling": "hierarchical"}, {"sampling": "proposal"}
@@ -68,11 +62,10 @@ def test_every_variant_with_every_kind_of_cells(tmp_path, scene, variant, cells)
         else:
             assert torch.equal(router.diagram.centres, trainer.router.diagram.centres)
             assert router.num_cells == config.final_cells
-    loaded, routers = load_run(tmp_path)
-    assert loaded == config
-    renderer = make_renderer(loaded, scene, routers)
-    assert evaluate(renderer, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
-    assert len(write_panels(renderer, scene, tmp_path / "images", views=1)) == 1
+    run = open_run(tmp_path, scene=scene)
+    assert run.config == config
+    assert evaluate(run.renderer, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
+    assert len(write_panels(run.renderer, run.diagram, scene, tmp_path / "images", views=1)) == 1
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

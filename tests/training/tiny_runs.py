@@ -13,7 +13,7 @@ from voronerf.data import Scene
 from voronerf.files import read_json_lines
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.config import TrainConfig
-from voronerf.training.model import checkpoint_path
+from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.trainer import Trainer
 
 SMALL: dict[str, Any] = {

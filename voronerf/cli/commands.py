@@ -6,7 +6,6 @@ import importlib
 import json
 import shlex
 import signal
-from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -20,14 +19,14 @@ from rich.table import Table
 from voronerf import backends
 from voronerf.cli.display import TrainingDisplay
 from voronerf.data import Scene, load_scene
-from voronerf.evaluation.lpips import find_lpips
+from voronerf.evaluation.panels import write_panels
 from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import write_text
 from voronerf.rendering.cameras import turntable_cameras
-from voronerf.rendering.renderer import Renderer
-from voronerf.training.config import ConfigError, TrainConfig, check_device
-from voronerf.training.model import load_grid, load_run, make_renderer
-from voronerf.training.runs import choose_directory, held, score_views, write_curve, write_panels
+from voronerf.run import open_run
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.config_checks import check_device
+from voronerf.training.run_directory import choose_directory, held, write_curve
 from voronerf.training.trainer import Trainer
 
 console = Console(soft_wrap=True)
@@ -81,7 +80,7 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene) -> dict[str, A
         say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}")
         return summary
     if config.panels:
-        write_panels(trainer.renderer, scene, out / "images", views=config.panels)
+        write_panels(trainer.renderer, trainer.router.diagram, scene, out / "images", views=config.panels)
     write_curve(out)
     say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
     return summary
@@ -123,12 +122,21 @@ def evaluate_run(
     if panels < 0:
         raise ConfigError(f"--panels must not be negative, got {panels}")
     check_counts(views=views, samples=samples, fine_samples=fine_samples, downscale=downscale)
-    config, renderer, scene = _load(run, data, downscale, samples, fine_samples, occupancy, blend, device, backend)
-    size = (scene.test.cameras.height, scene.test.cameras.width)
-    perceived, source = find_lpips(lpips or config.lpips, config.data, size)
+    opened = open_run(
+        run,
+        data=data,
+        downscale=downscale,
+        samples=samples,
+        fine_samples=fine_samples,
+        occupancy=occupancy,
+        blend=blend,
+        device=device,
+        backend=backend,
+    )
+    perceived, source = opened.find_lpips(lpips)
     if perceived is None:
         say(source)
-    result = score_views(renderer, scene, views=views, lpips=perceived)
+    result = opened.evaluate(views=views, lpips=perceived or "off")
     table = Table("view", "psnr [dB]", "ssim", "lpips")
     for view in result["views"]:
         table.add_row(escape(view["name"]), *_figures(view))
@@ -138,7 +146,7 @@ def evaluate_run(
     say(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB")
     write_text(run / "eval.json", json.dumps(result, indent=2) + "\n")
     if panels:
-        write_panels(renderer, scene, run / "images", views=panels)
+        write_panels(opened.renderer, opened.diagram, opened.scene, run / "images", views=panels)
     say(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""))
     return 0
 
@@ -176,21 +184,23 @@ def render(
         backend: Backend of the operations.
     """
     check_counts(frames=frames, fps=fps, samples=samples, fine_samples=fine_samples, downscale=downscale)
-    _, renderer, scene = _load(run, data, downscale, samples, fine_samples, occupancy, blend, device, backend)
+    opened = open_run(
+        run,
+        data=data,
+        downscale=downscale,
+        samples=samples,
+        fine_samples=fine_samples,
+        occupancy=occupancy,
+        blend=blend,
+        device=device,
+        backend=backend,
+    )
     path = out or run / "turntable.mp4"
     check_video(path)
-    cameras = turntable_cameras(scene.train.cameras, frames).to(device)
+    cameras = turntable_cameras(opened.scene.train.cameras, frames)
     pictures = []
     for frame in track(range(frames), description="rendering", console=console, disable=not console.is_terminal):
-        image = renderer.image(
-            cameras,
-            frame,
-            near=scene.near,
-            far=scene.far,
-            box=None if scene.box is None else scene.box.to(device),
-            background=scene.background_colour(device),
-            heaviest=False,
-        )
+        image = opened.render(cameras, frame, heaviest=False)
         pictures.append((image.colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu())
     write_video(path, torch.stack(pictures), fps)
     say(f"wrote {path}")
@@ -255,31 +265,3 @@ def _figures(score: dict[str, Any]) -> list[str]:
     """What a table shows of a score; a dash for what was not computed."""
     places = {"psnr": 2, "ssim": 4, "lpips": 4}
     return ["-" if score[name] is None else f"{score[name]:.{digits}f}" for name, digits in places.items()]
-
-
-def _load(
-    run: Path,
-    data: str | None,
-    downscale: int | None,
-    samples: int | None,
-    fine_samples: int | None,
-    occupancy: bool,
-    blend: float | None,
-    device: str,
-    backend: str,
-) -> tuple[TrainConfig, Renderer, Scene]:
-    check_device(device)
-    if blend is not None and not 0 <= blend < float("inf"):
-        raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
-    config, routers = load_run(run, device=device, backend=backend)
-    for router in routers.values():
-        router.blend = config.blend if blend is None else blend
-    config = replace(
-        config,
-        data=config.data if data is None else data,
-        downscale=config.downscale if downscale is None else downscale,
-    )
-    scene = load_scene(config.data, downscale=config.downscale)
-    grid = load_grid(run, config, routers["field"], scene, wanted=occupancy, backend=backend)
-    options: dict[str, Any] = {"samples": samples, "fine_samples": fine_samples, "occupancy": grid, "backend": backend}
-    return config, make_renderer(config, scene, routers, **options), scene

@@ -11,7 +11,7 @@ from voronerf.cli.commands import console, run_training, say
 from voronerf.data import BUILTIN_SIZE, Scene, load_scene
 from voronerf.evaluation.plots import plot_curves
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.runs import held, read_metrics
+from voronerf.training.run_directory import held, read_metrics
 
 
 def demo(

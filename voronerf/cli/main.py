@@ -18,7 +18,7 @@ from voronerf.backends import BackendUnavailable
 from voronerf.cli import commands, demo
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
-from voronerf.training.runs import stored_config
+from voronerf.training.run_directory import stored_config
 
 #: What a user can cause, told in one line. ValueError includes the project's own SceneError and CheckpointError.
 EXPECTED = (

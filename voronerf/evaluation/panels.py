@@ -16,7 +16,11 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from voronerf.data import Scene
+from voronerf.diagram import VoronoiDiagram
+from voronerf.evaluation.scores import render_view, view_numbers
 from voronerf.files import write_bytes
+from voronerf.rendering.renderer import Renderer
 
 # steps of hue, saturation and value: sequences that fill their range evenly however many are drawn (Roberts 2018)
 HUE_STEP, SATURATION_STEP, VALUE_STEP = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
@@ -150,3 +154,25 @@ def _mapped(values: Tensor, name: str) -> Tensor:
 def _on_white(picture: Tensor, opacity: Tensor) -> Tensor:
     share = opacity.clamp(0, 1)[..., None]
     return (picture * share + 255 * (1 - share)).round().to(torch.uint8)
+
+
+def write_panels(renderer: Renderer, diagram: VoronoiDiagram, scene: Scene, folder: Path, *, views: int) -> list[Path]:
+    """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
+    paths = []
+    background = scene.background_colour()
+    for view in view_numbers(len(scene.test), views):
+        image = render_view(renderer, scene, view)
+        # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
+        cells = diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)
+        cells = cells.reshape(image.opacity.shape)
+        path = folder / f"{scene.test.names[view]}.png"
+        save_panel(
+            path,
+            truth=scene.test.truth(view, background),
+            colour=image.colour.cpu(),
+            opacity=image.opacity.cpu(),
+            depth=image.depth.cpu(),
+            cells=cells.cpu(),
+        )
+        paths.append(path)
+    return paths

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from voronerf.data import Scene
 from voronerf.evaluation.lpips import Lpips
@@ -71,3 +72,11 @@ def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
         "lpips": sum(perceived) / len(scores) if len(perceived) == len(scores) else None,
         "psnr_of_mean_error": math.inf if error == 0 else -10 * math.log10(error),
     }
+
+
+def score_views(
+    renderer: Renderer, scene: Scene, *, views: int | None = None, lpips: Lpips | None = None
+) -> dict[str, Any]:
+    """Scores of test views, one by one and in the mean."""
+    scores = evaluate(renderer, scene, views=views, lpips=lpips)
+    return {**mean_scores(scores), "views": [asdict(score) for score in scores]}

@@ -4,5 +4,20 @@ from voronerf.fields.density import DensityField, density_table
 from voronerf.fields.kilonerf import KiloNeRF
 from voronerf.fields.mipnerf import MipNeRF
 from voronerf.fields.nerf import NeRF, nerf_table
+from voronerf.fields.registry import FIELDS, FieldType, register_field
 
-__all__ = ["DensityField", "KiloNeRF", "MipNeRF", "NeRF", "density_table", "nerf_table"]
+register_field("nerf")(NeRF)
+register_field("mipnerf")(MipNeRF)
+register_field("kilonerf")(KiloNeRF)
+
+__all__ = [
+    "FIELDS",
+    "DensityField",
+    "FieldType",
+    "KiloNeRF",
+    "MipNeRF",
+    "NeRF",
+    "density_table",
+    "nerf_table",
+    "register_field",
+]

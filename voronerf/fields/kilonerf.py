@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 from voronerf.fields.nerf import NeRF
 
 #: Channels and trunk layers of KiloNeRF's networks.
@@ -26,6 +28,8 @@ class KiloNeRF(NeRF):
         >>> colour.shape, density.shape
         (torch.Size([1000, 3]), torch.Size([1000]))
     """
+
+    training_defaults: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, width: int = WIDTH, depth: int = DEPTH, **options: object) -> None:
         super().__init__(width, depth, **{"view_width": width, **options})  # type: ignore[arg-type]

@@ -5,6 +5,8 @@ Letters: n samples, r rays. Positions are in scene units, directions are unit ve
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -115,6 +117,9 @@ class NeRF(nn.Module):
         >>> colour, density = field(positions, per_ray, ray_index)
     """
 
+    #: Half the published layers: cells are small, and what a cell shows is simpler than the scene.
+    training_defaults: ClassVar[dict[str, Any]] = {"depth": 4}
+
     def __init__(
         self,
         width: int = 64,
@@ -152,6 +157,11 @@ class NeRF(nn.Module):
         self.view = linears[depth + 2] if view_directions else None
         self.colour = linears[-1]
         self.reset_parameters()
+
+    @staticmethod
+    def learning_rate(width: int, **_: object) -> float:
+        """Adam's rate at the start, in inverse proportion to a large width (Yang et al. 2021, table 3)."""
+        return 0.02 * 64 / max(width, 64)
 
     def reset_parameters(self) -> None:
         """He initialisation of the ReLU layers (He et al. 2015), small heads, and a density that can grow."""

@@ -3,27 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-import torch
-
-from voronerf.backends import BACKENDS
+from voronerf.fields import FIELDS, FieldType
+from voronerf.training.config_checks import NETWORK_SETTINGS, ConfigError, check_config, check_field, parse_option
 from voronerf.training.schedule import PlannedSplit, TimeUnit, default_times, final_cells, plan_splits
 
-FieldName = Literal["nerf", "mipnerf", "kilonerf"]
 SamplingName = Literal["stratified", "hierarchical", "proposal"]
-
-
-class ConfigError(Exception):
-    """A setting that cannot be used. The message names the setting, the rule and the value.
-
-    It is not a ValueError, because the parser of the command line would catch that and print a long explanation.
-    """
 
 
 @dataclass(frozen=True)
@@ -61,8 +50,11 @@ class TrainConfig:
     steps: int | None = None
     """Number of training steps, instead of a time."""
 
-    field: FieldName = "nerf"
-    """Kind of network: nerf, mipnerf (cones instead of rays) or kilonerf (nerf in the size of KiloNeRF's networks)."""
+    field: str = "nerf"
+    """Kind of network: nerf, mipnerf (cones instead of rays), kilonerf (nerf in the size of KiloNeRF's networks), or
+    another name in `voronerf.fields.FIELDS`."""
+    field_options: tuple[str, ...] = ()
+    """Further options of the field, each as NAME=VALUE, such as density_scale=20."""
     width: int | None = None
     """Channels of the networks' hidden layers; default 64, kilonerf 32."""
     depth: int | None = None
@@ -75,8 +67,8 @@ class TrainConfig:
     position_octaves: int | None = None
     """Octaves of the positional encoding; default: until the finest wave spans two pixels of the training views, and
     two more for mipnerf, whose cones leave nothing of finer ones (published: 16)."""
-    direction_octaves: int = 4
-    """Octaves of the encoding of view directions."""
+    direction_octaves: int | None = None
+    """Octaves of the encoding of view directions; default 4."""
     view_directions: bool = True
     """Whether colour depends on the view direction."""
 
@@ -176,16 +168,27 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.budget is None and self.steps is None:
             object.__setattr__(self, "budget", 480.0)
-        small = self.field == "kilonerf"
-        if self.width is None:
-            object.__setattr__(self, "width", 32 if small else 64)
-        if self.depth is None:
-            object.__setattr__(self, "depth", 2 if small else 4)
         if self.samples is None:
             object.__setattr__(self, "samples", 64 if self.sampling == "stratified" else 32)
+        check_field(self)
+        for name in ("width", "depth", "direction_octaves"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, self.field_type.options.get(name))
         if self.lr is None and self.parameters is None:
-            object.__setattr__(self, "lr", default_learning_rate(int(self.width or 0)))
-        check_config(self)
+            object.__setattr__(self, "lr", self.field_type.learning_rate(self.network_options))
+        check_config(self, CHOICES)
+
+    @property
+    def field_type(self) -> FieldType:
+        """The field's row in the table of fields."""
+        return FIELDS[self.field]
+
+    @property
+    def network_options(self) -> dict[str, Any]:
+        """What the field is made with: the settings that it has options for, and ``field_options``."""
+        settings = {name: getattr(self, name) for name in NETWORK_SETTINGS if name in self.field_type.options}
+        given = {name: value for name, value in settings.items() if value is not None}
+        return given | dict(parse_option(text) for text in self.field_options)
 
     @property
     def split_unit(self) -> TimeUnit:
@@ -242,10 +245,8 @@ class TrainConfig:
 CHOICES: dict[str, tuple[str, ...]] = {
     name: get_args(kind) for name, kind in get_type_hints(TrainConfig).items() if get_origin(kind) is Literal
 }
-#: The occupancy grid works for points in a single pass.
-OCCUPANCY_RULE = "come with --field nerf or kilonerf, --sampling stratified and --contraction none"
 #: Settings that are lists in JSON, and settings that are text there.
-LISTS = frozenset({"cells", "split_at", "split_at_seconds", "split_at_steps", "skips"})
+LISTS = frozenset({"cells", "split_at", "split_at_seconds", "split_at_steps", "skips", "field_options"})
 PATHS = ("out", "lpips")
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
@@ -264,111 +265,6 @@ RESUMABLE = frozenset(
     }
     | {"checkpoint_every", "panels", "blend", "lpips"}
 )
-
-
-def check_config(config: TrainConfig) -> None:
-    """Raises ConfigError for the first setting that is out of range."""
-
-    def need(ok: bool, name: str, rule: str) -> None:
-        if not ok:
-            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {getattr(config, name)!r}")
-
-    if config.budget is not None and config.steps is not None:
-        raise ConfigError("give --budget SECONDS or --steps N, not both")
-    for name, words in CHOICES.items():
-        need(getattr(config, name) in words, name, f"be {', '.join(words[:-1])} or {words[-1]}")
-    need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
-    need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
-    for name in (
-        "downscale",
-        "rays",
-        "samples",
-        "fine_samples",
-        "proposal_rounds",
-        "depth",
-        "reservoir",
-        "reservoir_batches",
-        "evaluations",
-        "occupancy_resolution",
-    ):
-        need(getattr(config, name) >= 1, name, "be at least 1")
-    need(config.occupancy_resolution <= 512, "occupancy_resolution", "be at most 512")
-    need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
-    need((config.width or 0) >= 2, "width", "be at least 2")
-    need(config.parameters is None or config.parameters >= 1, "parameters", "be at least 1")
-    need(0 <= config.blend < float("inf"), "blend", "be a distance of 0 or more")
-    for name in ("position_octaves", "direction_octaves", "panels", "min_cell_samples"):
-        need((getattr(config, name) or 0) >= 0, name, "not be negative")
-    need(config.eval_views >= 1, "eval_views", "be at least 1")
-    need(config.final_views is None or config.final_views >= 1, "final_views", "be at least 1")
-    need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
-    need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
-    need(0 < config.lr_split < float("inf"), "lr_split", "be a positive factor")
-    need(0 <= config.warmup < 1, "warmup", "lie in [0, 1)")
-    need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
-    need(0 < config.temperature_final <= 1, "temperature_final", "lie in (0, 1]")
-    need(config.temperature_final == 1 or not config.cuda_graph, "temperature_final", "be 1 with --cuda-graph")
-    need(0 < config.uniform_scale < float("inf"), "uniform_scale", "be positive and finite")
-    uniform = config.centres == "uniform"
-    need(uniform or config.uniform_scale == 1, "uniform_scale", "be 1 without --centres uniform")
-    need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
-    largest = max(config.cells, default=0)
-    need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
-    need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
-    graphed = config.device.startswith("cuda") and not config.occupancy
-    need(graphed or not config.cuda_graph, "cuda_graph", "come with --device cuda and without --occupancy")
-    need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
-    _check_splits(config, need)
-    plain = config.field != "mipnerf" and config.sampling == "stratified" and config.contraction == "none"
-    need(plain or not config.occupancy, "occupancy", OCCUPANCY_RULE)
-    proposes = config.sampling == "proposal"
-    need(proposes or not config.split_proposal, "split_proposal", "come with --sampling proposal")
-    need(proposes or config.proposal_rounds == 1, "proposal_rounds", "be 1 without --sampling proposal")
-    need(proposes or config.proposal_anneal == 0, "proposal_anneal", "come with --sampling proposal")
-    anneal = config.proposal_anneal
-    need(anneal == 0 or 1 <= anneal < float("inf"), "proposal_anneal", "be 0, or a slope of at least 1")
-    need(anneal == 0 or not config.cuda_graph, "proposal_anneal", "be 0 with --cuda-graph")
-    need(0 <= config.distortion < float("inf"), "distortion", "be a factor of 0 or more")
-    need(not (config.distortion and config.occupancy), "distortion", "be 0 with --occupancy")
-
-
-def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -> None:
-    if config.max_cells is not None:
-        need(config.split == "worst", "max_cells", "come with --split worst")
-        need(len(config.cells) in (1, 2), "max_cells", "come with one or two numbers of --cells")
-        need(config.max_cells > config.cells[0], "max_cells", f"exceed the {config.cells[0]} cells of the first split")
-    given = [name for name in ("split_at", "split_at_seconds", "split_at_steps") if getattr(config, name) is not None]
-    if len(given) > 1:
-        raise ConfigError("give one of --split-at, --split-at-seconds and --split-at-steps, not several")
-    for name in given:
-        times, unit = getattr(config, name), {"split_at": "fraction", "split_at_seconds": "time"}.get(name, "number")
-        if config.max_cells is None:
-            rule = f"have one {unit} for each of the {len(config.cells)} levels of --cells"
-            need(len(times) == len(config.cells), name, rule)
-        else:
-            need(len(times) == 2, name, f"have two {unit}s, of the first and the last split, with --max-cells")
-        rising = all(a < b for a, b in itertools.pairwise(times))
-        end = 1.0 if name == "split_at" else config.budget if name == "split_at_seconds" else config.steps
-        inside = all(0 < at < (float("inf") if end is None else end) for at in times)
-        kind = "fractions" if name == "split_at" else "times" if name == "split_at_seconds" else "numbers"
-        bound = "above 0" if end is None else f"between 0 and {end:g}"
-        need(rising and inside, name, f"be rising {kind} {bound}")
-
-
-def default_learning_rate(width: int) -> float:
-    """Adam's learning rate at the start, in inverse proportion to the width as in Yang et al. 2021, table 3."""
-    return 0.02 * 64 / max(width, 64)
-
-
-def check_device(name: str) -> None:
-    """Raises ConfigError unless ``name`` is a torch device that is present."""
-    try:
-        if torch.device(name).type not in ("cpu", "cuda"):
-            raise ConfigError(f"--device must be cpu or cuda, got {name!r}")
-        float(torch.zeros((), device=name))
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"--device must name a device that is present, got {name!r}: {reason}") from None
 
 
 def differences(a: TrainConfig, b: TrainConfig) -> list[str]:

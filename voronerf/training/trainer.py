@@ -36,25 +36,18 @@ from voronerf.training.checkpoint import (
 )
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.graphs import GraphedStep, set_learning_rate
-from voronerf.training.model import (
-    HALVES,
-    OCCUPANCY_DECAY,
-    checkpoint_path,
-    make_grid,
-    make_optimizer,
-    make_renderer,
-    make_routers,
-    resolve_config,
-    restore_routers,
-    router_states,
-)
+from voronerf.training.networks import make_optimizer, make_routers, resolve_config, restore_routers, router_states
 from voronerf.training.progress import Progress, Stage, TrainingError
+from voronerf.training.renderers import OCCUPANCY_DECAY, make_grid, make_renderer
+from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.splitting import median, save_samples, split_by_samples
 
 #: Steps between looks at random cells, which bring back those that were thought empty, and the share looked at.
 OCCUPANCY_EVERY, OCCUPANCY_SHARE = 16, 1 / 32
 #: Steps on a device other than the CPU after which the host reads the loss, and with that waits for the device.
 READ_EVERY = 50
+#: What the networks' products are rounded to, by the configuration's precision; float32 is left alone.
+HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 #: Steps between tries to split the worst cell.
 SPLIT_EVERY = 5
 
@@ -109,7 +102,7 @@ class Trainer:
             self.draws = torch.Generator(self.device).manual_seed(config.seed)
         size = (scene.test.cameras.height, scene.test.cameras.width)
         self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, size)
-        self.batches = RayBatches(scene, self.device, cones=config.field == "mipnerf")
+        self.batches = RayBatches(scene, self.device, cones=config.field_type.cones)
         self.background = scene.background_colour(self.device)
         self.routers = make_routers(config, self.device)
         for router in self.routers.values():
@@ -307,7 +300,7 @@ class Trainer:
         cells = torch.randint(every, (count,), generator=self.generator, device=self.generator.device)
         self.router.eval()
         grid.update(
-            self.router, cells.to(self.device), decay=1.0, generator=self.generator, backend=self.config.backend
+            self.renderer.field, cells.to(self.device), decay=1.0, generator=self.generator, backend=self.config.backend
         )
 
     def split_is_due(self) -> bool:

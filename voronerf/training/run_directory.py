@@ -1,4 +1,4 @@
-"""Run directories: choosing one, and drawing what a trained run looks like."""
+"""Run directories: choosing one, keeping it to oneself, and the files in it."""
 
 from __future__ import annotations
 
@@ -6,20 +6,19 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from voronerf.data import Scene
-from voronerf.evaluation.lpips import Lpips
-from voronerf.evaluation.panels import save_panel
 from voronerf.evaluation.plots import plot_curves
-from voronerf.evaluation.scores import evaluate, mean_scores, render_view, view_numbers
 from voronerf.files import read_json_lines
-from voronerf.rendering.renderer import Renderer
-from voronerf.router import VoronoiRouter
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.model import checkpoint_path
+
+
+def checkpoint_path(run: Path) -> Path:
+    """Where a run directory keeps its last checkpoint."""
+    return run / "checkpoints" / "last.safetensors"
 
 
 def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
@@ -93,30 +92,6 @@ def stored_config(run: Path) -> TrainConfig | None:
     return replace(TrainConfig.from_json(path.read_text(), str(path)), out=run)
 
 
-def write_panels(renderer: Renderer, scene: Scene, folder: Path, *, views: int) -> list[Path]:
-    """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
-    router = renderer.field
-    assert isinstance(router, VoronoiRouter)
-    paths = []
-    background = scene.background_colour()
-    for view in view_numbers(len(scene.test), views):
-        image = render_view(renderer, scene, view)
-        # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
-        cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)
-        cells = cells.reshape(image.opacity.shape)
-        path = folder / f"{scene.test.names[view]}.png"
-        save_panel(
-            path,
-            truth=scene.test.truth(view, background),
-            colour=image.colour.cpu(),
-            opacity=image.opacity.cpu(),
-            depth=image.depth.cpu(),
-            cells=cells.cpu(),
-        )
-        paths.append(path)
-    return paths
-
-
 def read_metrics(run: Path) -> list[dict[str, Any]]:
     """The evaluations of a run, in order."""
     return read_json_lines(run / "metrics.jsonl")
@@ -130,9 +105,3 @@ def write_curve(run: Path) -> Path | None:
     path = run / "plots" / "psnr.png"
     plot_curves(path, {run.name: [(m["seconds"], m["psnr"]) for m in metrics]})
     return path
-
-
-def score_views(renderer: Renderer, scene: Scene, *, views: int | None, lpips: Lpips | None = None) -> dict[str, Any]:
-    """Scores of test views, one by one and in the mean."""
-    scores = evaluate(renderer, scene, views=views, lpips=lpips)
-    return {**mean_scores(scores), "views": [asdict(score) for score in scores]}

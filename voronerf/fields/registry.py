@@ -1,0 +1,152 @@
+"""The table of fields: which networks can be trained by name, and what each of them says about itself.
+
+A field is any ``nn.Module`` that maps positions [n, 3] and unit directions [n, 3] to a colour [n, 3] in 0..1 and a
+density [n] >= 0 per scene unit. Its class, or a function that makes it, is entered by :func:`register_field`. It may
+say more about itself by attributes, all of which can be left out:
+
+    inputs                   "points" (the default), or "gaussians": positions are [n, 6], means and variances
+    training_defaults        options that differ in training from the defaults of the constructor
+    learning_rate(**options) static method: Adam's rate at the start of a training; default ``LEARNING_RATE``
+    octaves(finest)          static method: position_octaves for images that show ``finest`` octaves; default all
+
+Its options are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is called with
+the directions [r, 3] of the rays, and with the row of them that belongs to each sample.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+from torch import nn
+
+Inputs = Literal["points", "gaussians"]
+Network = TypeVar("Network", bound=Callable[..., nn.Module])
+
+#: Adam's rate at the start for a field that says none: the optimiser's own default.
+LEARNING_RATE = 1e-3
+
+
+@dataclass(frozen=True)
+class FieldType:
+    """A row of the table.
+
+    Attributes:
+        name: What ``--field`` calls it.
+        network: The class, or the function, that makes the module.
+        inputs: What it is asked about: "points" [n, 3], or "gaussians" [n, 6].
+        options: Its options and their defaults in training; ``inspect.Parameter.empty`` for one that must be given.
+
+    Examples:
+        >>> from voronerf.fields import FIELDS
+        >>> kind = FIELDS["mipnerf"]
+        >>> kind.inputs, kind.cones, kind.options["width"]
+        ('gaussians', True, 64)
+        >>> kind.build({"width": 8, "depth": 2}).layers.out_features
+        4
+    """
+
+    name: str
+    network: Callable[..., nn.Module]
+    inputs: Inputs
+    options: Mapping[str, Any]
+
+    @property
+    def cones(self) -> bool:
+        """Whether its rays are cones, in the place of lines."""
+        return self.inputs == "gaussians"
+
+    def build(self, options: Mapping[str, Any]) -> nn.Module:
+        """A field with these options and the defaults of the others.
+
+        Raises:
+            ValueError: for an option without a value, and for what the constructor refuses.
+        """
+        given = {**getattr(self.network, "training_defaults", {}), **options}
+        missing = [name for name, value in {**self.options, **given}.items() if value is inspect.Parameter.empty]
+        if missing:
+            raise ValueError(f"field {self.name}: {', '.join(missing)} must be given")
+        try:
+            return self.network(**given)
+        except TypeError as error:
+            raise ValueError(f"field {self.name}: {error}") from error
+
+    def learning_rate(self, options: Mapping[str, Any]) -> float:
+        """Adam's rate at the start of a training with these options."""
+        rule: Callable[..., float] | None = getattr(self.network, "learning_rate", None)
+        return LEARNING_RATE if rule is None else rule(**{**self.options, **options})
+
+    def octaves(self, finest: int) -> int:
+        """Octaves of the position's encoding for images that show ``finest`` octaves of detail."""
+        rule: Callable[[int], int] | None = getattr(self.network, "octaves", None)
+        return finest if rule is None else rule(finest)
+
+
+FIELDS: dict[str, FieldType] = {}
+"""Every field that can be trained, by name."""
+
+
+def register_field(name: str) -> Callable[[Network], Network]:
+    """Enters a field into ``FIELDS``; a decorator. A name that is taken gets the new field.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.fields import FIELDS, register_field
+        >>> @register_field("tiny")
+        ... class Tiny(torch.nn.Module):
+        ...     def __init__(self, width: int = 16) -> None:
+        ...         super().__init__()
+        ...         self.layers = torch.nn.Sequential(
+        ...             torch.nn.Linear(6, width), torch.nn.ReLU(), torch.nn.Linear(width, 4)
+        ...         )
+        ...
+        ...     def forward(self, positions, directions):
+        ...         out = self.layers(torch.cat([positions, directions], -1))
+        ...         return torch.sigmoid(out[:, :3]), torch.nn.functional.softplus(out[:, 3])
+        >>> FIELDS["tiny"].options
+        {'width': 16}
+
+        Now ``TrainConfig(field="tiny", width=32)`` trains it. So does ``voronerf.cli.main`` with ``--field tiny``, in a
+        program that has run these lines.
+
+        >>> del FIELDS["tiny"]
+
+    Raises:
+        ValueError: for a name that is no word, or inputs that are neither points nor Gaussians.
+    """
+    if not name or not all(part.isalnum() for part in name.replace("_", "-").split("-")):
+        raise ValueError(f"register_field: name must be a word, got {name!r}")
+
+    def enter(network: Network) -> Network:
+        inputs: Any = getattr(network, "inputs", "points")
+        if inputs not in ("points", "gaussians"):
+            raise ValueError(f"register_field: inputs of {name} must be 'points' or 'gaussians', got {inputs!r}")
+        options = {**_options(network), **getattr(network, "training_defaults", {})}
+        FIELDS[name] = FieldType(name, network, inputs, options)
+        return network
+
+    return enter
+
+
+def _options(network: Callable[..., nn.Module]) -> dict[str, Any]:
+    """Named parameters and their defaults; those of the base classes too where ``**options`` passes them on."""
+    if not isinstance(network, type):
+        return _named(network)[0]
+    found: dict[str, Any] = {}
+    for base in network.__mro__:
+        if base is nn.Module:
+            break
+        if "__init__" in vars(base):
+            own, passes_on = _named(base.__init__)  # type: ignore[misc]
+            found = {**own, **found}
+            if not passes_on:
+                break
+    return found
+
+
+def _named(function: Callable[..., Any]) -> tuple[dict[str, Any], bool]:
+    parameters = list(inspect.signature(function).parameters.values())
+    by_name = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) and p.name != "self"]
+    return {p.name: p.default for p in by_name}, any(p.kind is p.VAR_KEYWORD for p in parameters)

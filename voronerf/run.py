@@ -1,0 +1,195 @@
+"""A trained run, opened from its directory: to look at it, to score it, to go on from it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from voronerf.data import Scene, load_scene
+from voronerf.diagram import VoronoiDiagram
+from voronerf.evaluation.lpips import Lpips, find_lpips
+from voronerf.evaluation.scores import score_views
+from voronerf.rendering.cameras import Cameras
+from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.renderer import RenderedImage, Renderer
+from voronerf.router import VoronoiRouter
+from voronerf.training.checkpoint import load_checkpoint
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.config_checks import check_device
+from voronerf.training.networks import make_routers, restore_routers
+from voronerf.training.renderers import make_picture_grid, make_renderer
+from voronerf.training.run_directory import checkpoint_path
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained run, which :func:`open_run` opens.
+
+    Attributes:
+        path: Its directory.
+        config: The settings it was trained with; ``data`` and ``downscale`` are those of ``scene``.
+        scene: Images and cameras, and the space that the field fills.
+        routers: The networks by name: "field", whose colours count, and "coarse" or "proposal" where it has them.
+        renderer: How rays become colours.
+
+    Examples:
+        >>> from voronerf import Run
+        >>> from voronerf.rendering import turntable_cameras
+        >>> def turntable(run: Run, frames: int) -> list:  # such as a viewer's
+        ...     cameras = turntable_cameras(run.scene.train.cameras, frames)
+        ...     return [run.render(cameras, frame).colour for frame in range(frames)]
+    """
+
+    path: Path
+    config: TrainConfig
+    scene: Scene
+    routers: dict[str, VoronoiRouter]
+    renderer: Renderer
+
+    @property
+    def router(self) -> VoronoiRouter:
+        """The router of the field."""
+        return self.routers["field"]
+
+    @property
+    def diagram(self) -> VoronoiDiagram:
+        """The cells of the field."""
+        return self.router.diagram
+
+    def render(self, camera: int | Cameras, index: int = 0, *, heaviest: bool = True) -> RenderedImage:
+        """A picture, without gradients and without randomness.
+
+        Args:
+            camera: The number of a test view, or cameras of any kind.
+            index: Which of several cameras.
+            heaviest: Whether the place that each pixel shows is wanted as well, which takes a little longer.
+
+        Returns:
+            Colour [h, w, 3] over the scene's background, opacity [h, w], depth [h, w] in scene units, and the heaviest
+            sample [h, w, 3] of each pixel's ray.
+
+        Raises:
+            IndexError: When there is no such camera.
+        """
+        scene, device = self.scene, self.renderer.device
+        cameras, index = (scene.test.cameras, camera) if isinstance(camera, int) else (camera, index)
+        if not 0 <= index < len(cameras.poses):
+            raise IndexError(f"render: there are {len(cameras.poses)} cameras, got number {index}")
+        return self.renderer.train(False).image(
+            cameras.to(device),
+            index,
+            near=scene.near,
+            far=scene.far,
+            box=None if scene.box is None else scene.box.to(device),
+            background=scene.background_colour(device),
+            heaviest=heaviest,
+        )
+
+    def find_lpips(self, weights: Path | str | None = None) -> tuple[Lpips | None, str]:
+        """The LPIPS network for this run's images, or None; and where it was found, or why it was not.
+
+        Args:
+            weights: A file or folder, or "off"; None looks where the training looked, see ``TrainConfig.lpips``.
+        """
+        weights = self.config.lpips if weights is None else Path(weights)
+        cameras = self.scene.test.cameras
+        return find_lpips(weights, self.config.data, (cameras.height, cameras.width))
+
+    def evaluate(self, *, views: int | None = None, lpips: Lpips | Path | str | None = None) -> dict[str, Any]:
+        """Scores on the test views, each and in the mean.
+
+        Args:
+            views: So many test views, evenly spread; None for all.
+            lpips: The network, or what :meth:`find_lpips` takes.
+
+        Returns:
+            "psnr" in dB, "ssim", "lpips" (None without its weights) and "psnr_of_mean_error" over all views, and
+            "views", a list with "name", "psnr", "ssim" and "lpips" of each.
+        """
+        if not isinstance(lpips, Lpips):
+            lpips, _ = self.find_lpips(lpips)
+        return score_views(self.renderer, self.scene, views=views, lpips=lpips)
+
+
+def open_run(
+    path: Path | str,
+    *,
+    scene: Scene | None = None,
+    data: str | None = None,
+    downscale: int | None = None,
+    samples: int | None = None,
+    fine_samples: int | None = None,
+    occupancy: bool = False,
+    blend: float | None = None,
+    device: str = "cpu",
+    backend: str = "auto",
+) -> Run:
+    """Opens a run that ``voronerf train`` or :class:`voronerf.training.trainer.Trainer` has written.
+
+    Args:
+        path: The run directory.
+        scene: The scene, where it is loaded already.
+        data: Scene folder, where it has moved since training.
+        downscale: Factor on the images; None for that of the training.
+        samples: Samples per ray, of the first pass where there are two; None for those of the training.
+        fine_samples: Samples per ray of the second pass; None for those of the training.
+        occupancy: Skip empty space, found by asking the field once. A run trained with occupancy always uses its own
+            grid, since its field has learnt nothing about what is empty.
+        blend: Margin in scene units within which neighbouring cells are blended; None for that of the training.
+        device: Torch device.
+        backend: Backend of the operations.
+
+    Raises:
+        CheckpointError: When there is no usable checkpoint.
+        ConfigError: For an argument that cannot be used, or a grid that is asked for where the run has no use for it.
+        SceneError: When the scene cannot be read.
+
+    Examples:
+        >>> import tempfile, voronerf  # a tiny run of the built-in scene, trained and opened again
+        >>> from pathlib import Path
+        >>> from voronerf.data import builtin_scene
+        >>> from voronerf.training.config import TrainConfig
+        >>> from voronerf.training.trainer import Trainer
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> scene = builtin_scene(16, train_views=4, test_views=2)
+        >>> config = TrainConfig(out=Path(folder.name), steps=20, cells=(4,), width=8, depth=1, rays=64)
+        >>> summary = Trainer(config, scene).run()
+        >>> run = voronerf.open_run(folder.name, scene=scene)
+        >>> run.diagram.num_cells
+        4
+        >>> picture = run.render(0)
+        >>> picture.colour.shape, picture.depth.shape
+        (torch.Size([16, 16, 3]), torch.Size([16, 16]))
+        >>> run.evaluate()["psnr"] == summary["psnr"]
+        True
+        >>> folder.cleanup()
+    """
+    path = Path(path)
+    check_device(device)
+    if blend is not None and not 0 <= blend < math.inf:
+        raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
+    file = checkpoint_path(path)
+    checkpoint = load_checkpoint(file)
+    config = TrainConfig.from_json(json.dumps(checkpoint.values["config"]), str(file))
+    routers = make_routers(config, device)
+    restore_routers(routers, checkpoint)
+    for router in routers.values():
+        router.backend = backend
+        router.blend = config.blend if blend is None else blend
+        router.eval()
+    config = replace(
+        config,
+        data=config.data if data is None else data,
+        downscale=config.downscale if downscale is None else downscale,
+    )
+    scene = load_scene(config.data, downscale=config.downscale) if scene is None else scene
+    renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
+    state = checkpoint.group("occupancy")
+    if state:
+        renderer.occupancy = OccupancyGrid.from_state(state, device=renderer.device)
+    elif occupancy:
+        renderer.occupancy = make_picture_grid(config, scene, renderer.field, backend=backend)
+    return Run(path, config, scene, routers, renderer)

@@ -1,0 +1,163 @@
+"""What the settings of a training run must be, and how a setting that cannot be used is refused."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from voronerf.backends import BACKENDS
+from voronerf.fields import FIELDS
+
+if TYPE_CHECKING:
+    from voronerf.training.config import TrainConfig
+
+#: The occupancy grid works for points in a single pass.
+OCCUPANCY_RULE = "come with --field {}, --sampling stratified and --contraction none"
+#: Settings that are options of a field where its class has an option of that name.
+NETWORK_SETTINGS = ("width", "depth", "skips", "position_octaves", "direction_octaves", "view_directions")
+
+
+class ConfigError(Exception):
+    """A setting that cannot be used. The message names the setting, the rule and the value.
+
+    It is not a ValueError, because the parser of the command line would catch that and print a long explanation.
+    """
+
+
+def check_field(config: TrainConfig) -> None:
+    """Raises ConfigError for a field that is not in the table, or a setting that it has no option for."""
+    if config.field not in FIELDS:
+        raise ConfigError(f"--field must be {either(list(FIELDS))}, got {config.field!r}")
+    options = config.field_type.options
+    for name in NETWORK_SETTINGS:
+        given = getattr(config, name)
+        if name not in options and given is not None and given is not True:  # view directions are asked for by default
+            raise ConfigError(f"--{name.replace('_', '-')} must not come with --field {config.field}, got {given!r}")
+    own = [name for name in options if name not in NETWORK_SETTINGS]
+    for text in config.field_options:
+        if "=" not in text:
+            raise ConfigError(f"--field-options must be NAME=VALUE, got {text!r}")
+        name, _ = parse_option(text)
+        if name in NETWORK_SETTINGS:
+            raise ConfigError(f"--field-options must not hold {name}, use --{name.replace('_', '-')}; got {text!r}")
+        if name not in own:
+            raise ConfigError(f"--field-options of {config.field} are {', '.join(own) or 'none'}; got {text!r}")
+
+
+def parse_option(text: str) -> tuple[str, Any]:
+    """``name=value`` as a name and a Python value; what is no literal is a string."""
+    name, _, value = text.partition("=")
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value
+
+
+def either(names: Sequence[str]) -> str:
+    """``a, b or c``."""
+    return " or ".join((", ".join(names[:-1]), names[-1])) if len(names) > 1 else names[0]
+
+
+def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> None:
+    """Raises ConfigError for the first setting that is out of range, or is none of its ``choices``."""
+
+    def need(ok: bool, name: str, rule: str) -> None:
+        if not ok:
+            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {getattr(config, name)!r}")
+
+    if config.budget is not None and config.steps is not None:
+        raise ConfigError("give --budget SECONDS or --steps N, not both")
+    for name, words in choices.items():
+        need(getattr(config, name) in words, name, f"be {either(words)}")
+    need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
+    need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
+    for name in (
+        "downscale",
+        "rays",
+        "samples",
+        "fine_samples",
+        "proposal_rounds",
+        "reservoir",
+        "reservoir_batches",
+        "evaluations",
+        "occupancy_resolution",
+    ):
+        need(getattr(config, name) >= 1, name, "be at least 1")
+    need(config.occupancy_resolution <= 512, "occupancy_resolution", "be at most 512")
+    need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
+    need(config.width is None or config.width >= 2, "width", "be at least 2")
+    need(config.depth is None or config.depth >= 1, "depth", "be at least 1")
+    need(config.parameters is None or config.parameters >= 1, "parameters", "be at least 1")
+    need(0 <= config.blend < float("inf"), "blend", "be a distance of 0 or more")
+    for name in ("position_octaves", "direction_octaves", "panels", "min_cell_samples"):
+        need((getattr(config, name) or 0) >= 0, name, "not be negative")
+    need(config.eval_views >= 1, "eval_views", "be at least 1")
+    need(config.final_views is None or config.final_views >= 1, "final_views", "be at least 1")
+    need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
+    need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
+    need(0 < config.lr_split < float("inf"), "lr_split", "be a positive factor")
+    need(0 <= config.warmup < 1, "warmup", "lie in [0, 1)")
+    need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
+    need(0 < config.temperature_final <= 1, "temperature_final", "lie in (0, 1]")
+    need(config.temperature_final == 1 or not config.cuda_graph, "temperature_final", "be 1 with --cuda-graph")
+    need(0 < config.uniform_scale < float("inf"), "uniform_scale", "be positive and finite")
+    uniform = config.centres == "uniform"
+    need(uniform or config.uniform_scale == 1, "uniform_scale", "be 1 without --centres uniform")
+    need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
+    largest = max(config.cells, default=0)
+    need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
+    need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
+    graphed = config.device.startswith("cuda") and not config.occupancy
+    need(graphed or not config.cuda_graph, "cuda_graph", "come with --device cuda and without --occupancy")
+    need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
+    _check_splits(config, need)
+    plain = not config.field_type.cones and config.sampling == "stratified" and config.contraction == "none"
+    points = [name for name, kind in FIELDS.items() if not kind.cones]
+    need(plain or not config.occupancy, "occupancy", OCCUPANCY_RULE.format(either(points)))
+    proposes = config.sampling == "proposal"
+    need(proposes or not config.split_proposal, "split_proposal", "come with --sampling proposal")
+    need(proposes or config.proposal_rounds == 1, "proposal_rounds", "be 1 without --sampling proposal")
+    need(proposes or config.proposal_anneal == 0, "proposal_anneal", "come with --sampling proposal")
+    anneal = config.proposal_anneal
+    need(anneal == 0 or 1 <= anneal < float("inf"), "proposal_anneal", "be 0, or a slope of at least 1")
+    need(anneal == 0 or not config.cuda_graph, "proposal_anneal", "be 0 with --cuda-graph")
+    need(0 <= config.distortion < float("inf"), "distortion", "be a factor of 0 or more")
+    need(not (config.distortion and config.occupancy), "distortion", "be 0 with --occupancy")
+
+
+def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -> None:
+    if config.max_cells is not None:
+        need(config.split == "worst", "max_cells", "come with --split worst")
+        need(len(config.cells) in (1, 2), "max_cells", "come with one or two numbers of --cells")
+        need(config.max_cells > config.cells[0], "max_cells", f"exceed the {config.cells[0]} cells of the first split")
+    given = [name for name in ("split_at", "split_at_seconds", "split_at_steps") if getattr(config, name) is not None]
+    if len(given) > 1:
+        raise ConfigError("give one of --split-at, --split-at-seconds and --split-at-steps, not several")
+    for name in given:
+        times, unit = getattr(config, name), {"split_at": "fraction", "split_at_seconds": "time"}.get(name, "number")
+        if config.max_cells is None:
+            rule = f"have one {unit} for each of the {len(config.cells)} levels of --cells"
+            need(len(times) == len(config.cells), name, rule)
+        else:
+            need(len(times) == 2, name, f"have two {unit}s, of the first and the last split, with --max-cells")
+        rising = all(a < b for a, b in itertools.pairwise(times))
+        end = 1.0 if name == "split_at" else config.budget if name == "split_at_seconds" else config.steps
+        inside = all(0 < at < (float("inf") if end is None else end) for at in times)
+        kind = "fractions" if name == "split_at" else "times" if name == "split_at_seconds" else "numbers"
+        bound = "above 0" if end is None else f"between 0 and {end:g}"
+        need(rising and inside, name, f"be rising {kind} {bound}")
+
+
+def check_device(name: str) -> None:
+    """Raises ConfigError unless ``name`` is a torch device that is present."""
+    try:
+        if torch.device(name).type not in ("cpu", "cuda"):
+            raise ConfigError(f"--device must be cpu or cuda, got {name!r}")
+        float(torch.zeros((), device=name))
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"--device must name a device that is present, got {name!r}: {reason}") from None
