@@ -1,7 +1,7 @@
 """Validators shared by every public operation.
 
 Each raises at once with a message of one form, "operation: argument must <rule>, got <what came>": ValueError for
-shapes and values, TypeError for dtypes and kinds. Only shapes, dtypes and devices are looked at: no element of a tensor
+shapes and values, TypeError for dtypes and kinds. Only shapes, dtypes and devices are checked. No element of a tensor
 is read, so that an operation can be traced by ``torch.compile`` and captured in a CUDA graph.
 
 Dimension letters in a rule ("n", "k+1") bind at their first use. Passing the same ``sizes`` dictionary to several
@@ -45,8 +45,8 @@ def check_shape(
     """
     check_tensor(op, name, tensor)
     known = {} if sizes is None else sizes
-    # Letters met for the first time; apart, since an error names those known before. A small network is run in the time
-    # of a few dozen checks, so that these look at each size once.
+    # Letters met for the first time, kept apart because an error names the ones known before. Each size is read once: a
+    # small network takes no longer than a few dozen checks.
     found: dict[str, int] = {}
     came = tensor.shape
     fits = len(came) == len(shape)
@@ -61,7 +61,7 @@ def check_shape(
             if not fits:
                 break
     if not fits:
-        # Here alone: torch.compile cannot turn a symbolic size into text.
+        # Only in case of an error, because torch.compile cannot turn a symbolic size into text.
         wanted = [str(entry) for entry in shape]
         letters = dict.fromkeys(entry.removesuffix("+1") for entry in wanted)
         values = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in known)

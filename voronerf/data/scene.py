@@ -1,4 +1,4 @@
-"""A scene: images with their cameras, and where to look for it in space.
+"""A scene: images with their cameras, and the space that it takes up.
 
 c images of h x w pixels. World units and axes as in `voronerf.rendering.cameras`.
 """
@@ -14,7 +14,7 @@ from voronerf.rendering.cameras import Cameras
 
 
 class SceneError(ValueError):
-    """Data that make no scene. The message is one line and names the file."""
+    """The data of a scene cannot be used. The message is one line and names the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +55,14 @@ class Scene:
     """Training and test views of the same space.
 
     Attributes:
-        name: short, fit for a folder's name.
-        train: views to learn from.
-        test: views held out.
-        near: distance along a ray before which there is nothing.
-        far: distance behind which there is nothing.
-        box: float32 [2, 3], lowest and highest corner of an axis-aligned box that holds everything, or None if unknown.
-        spacing: of samples along a ray that suits the scene, "linear" or "disparity".
-        background: "white": seen through whatever is transparent; None: an opaque capture, there is no background.
+        name: short, fit for the name of a folder.
+        train: views for training.
+        test: views held out for testing.
+        near: distance along a ray at which the scene begins.
+        far: distance along a ray at which the scene ends.
+        box: float32 [2, 3], lowest and highest corner of an axis-aligned box around everything, or None if unknown.
+        spacing: of the samples along a ray, "linear" or "disparity".
+        background: "white" behind transparent pixels; None for an opaque capture without a background.
 
     Examples:
         >>> from voronerf.data import load_scene

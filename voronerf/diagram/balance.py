@@ -1,12 +1,12 @@
-"""Balancing a Voronoi diagram: moving the centres until every cell holds the same importance.
+"""Balances a Voronoi diagram: moves the centres until every cell holds the same importance.
 
 Letters: m samples, k centres, W [k] the total importance of the samples in each cell.
 
 Source: Elsner et al. 2023, "Adaptive Voronoi NeRFs", section 4. The figure of merit is the paper's: the standard
 deviation (of the population: divided by k, not k - 1) of `W / max W`; 0 is perfect balance.
 
-All of it runs on the CPU, in a fixed order, so that the same samples and the same generator give the same diagram
-wherever the samples come from; ten thousand samples are too few for a GPU to matter. Coordinates are in scene units.
+Everything runs on the CPU in a fixed order, so the same samples and the same generator give the same diagram on every
+machine. For ten thousand samples a GPU would not help. Coordinates are in scene units.
 """
 
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ from voronerf.diagram.voronoi import VoronoiDiagram, uniform_centres
 
 @dataclass(frozen=True)
 class Balance:
-    """What balancing reached.
+    """The result of `balance`.
 
     Attributes:
         centres: float32 [k, 3], on the device of the samples.
         power: float32 [k] power weights, or None for a plain Voronoi diagram.
-        before: float64 [k], importance per cell with the first centres.
-        after: float64 [k], importance per cell with the returned ones.
+        before: float64 [k], importance of each cell with the first centres.
+        after: float64 [k], importance of each cell with the returned centres.
         imbalance_before: std(W / max W) of `before`.
-        imbalance_after: the same of `after`.
+        imbalance_after: std(W / max W) of `after`.
 
     Examples:
         >>> import torch
@@ -98,35 +98,35 @@ def balance(
     generator: torch.Generator | None = None,
     backend: str = "auto",
 ) -> Balance:
-    """Places k centres such that their Voronoi cells hold equal importance.
+    """Places k centres so that their Voronoi cells hold equal importance.
 
-    "published" draws first centres and repeats, `steps` times, for every centre i at once,
+    The method "published" draws the first centres and repeats, `steps` times, for all centres i at once,
 
         v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i,
 
-    N(i) being its `neighbours` closest centres (all the others where there are fewer). Light cells move towards heavy
-    neighbours and heavy cells away from light ones. `norm_i` is the largest W of i and N(i), as the paper's text says
-    ("neighbourhood"), or of all cells ("global"), the other reading of its formula.
+    where N(i) are its `neighbours` closest centres (all others if there are fewer). Light cells move towards heavy
+    neighbours, and heavy cells away from light ones. `norm_i` is the largest W of i and N(i), as the text of the paper
+    says ("neighbourhood"), or the largest of all cells ("global"), the other reading of its formula.
 
     Args:
         points: floating [m, 3], finite.
         importance: floating [m], finite, >= 0, not all 0.
         k: number of cells, 1 <= k <= number of distinct points.
         method: "published" (a plain Voronoi diagram) or "transport" (a power diagram).
-        steps: number of updates; 0 leaves the first centres where they are.
+        steps: number of updates; 0 keeps the first centres.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
         normalise: "neighbourhood" or "global".
-        init: the first centres. "random": distinct samples, all equally likely (the paper's, default of "published").
-            "weighted": distinct samples drawn one by one with probability proportional to importance (default of
-            "transport"). "uniform": `uniform_centres` over the bounding box of the samples.
-        uniform_scale: how many times as large along each axis, > 0, that box is made about its middle.
+        init: the first centres. "random": distinct samples, all equally likely (as in the paper; default of
+            "published"). "weighted": distinct samples drawn one by one with probability proportional to importance
+            (default of "transport"). "uniform": `uniform_centres` over the bounding box of the samples.
+        uniform_scale: factor > 0 on the size of that box about its middle.
         generator: CPU generator of the draws; None for torch's global one.
         backend: of the ops, see `voronerf.backends`.
 
     Raises:
         ValueError: a wrong shape, an unknown choice, a value that is not finite, a negative importance, no importance
-            at all, fewer than one cell, or more cells than distinct samples.
+            at all, k below 1, or more cells than distinct samples.
         TypeError: points or importance that are not floating-point.
 
     Examples:
@@ -206,8 +206,8 @@ def first_centres(
         box = torch.stack([samples.amin(0), samples.amax(0)])
         return uniform_centres(box if uniform_scale == 1 else box.mean(0).lerp(box, uniform_scale), k)
     # Sorting exponential variates divided by the weights draws without replacement in proportion to the weights
-    # (Efraimidis and Spirakis 2006). Of samples at one place only the first counts, as two centres at one place would
-    # make an empty cell.
+    # (Efraimidis and Spirakis 2006). Of several samples in one place only the first counts, because two centres in one
+    # place would make an empty cell.
     keys = torch.empty(samples.shape[0], dtype=torch.float64).exponential_(generator=generator)
     order = torch.argsort(keys / masses if init == "weighted" else keys, stable=True)
     place = torch.full((distinct.shape[0],), samples.shape[0], dtype=torch.int64)

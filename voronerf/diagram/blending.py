@@ -1,4 +1,4 @@
-"""Blending of neighbouring cells: which leaves answer for a point near their borders, and with what weights.
+"""Blending of neighbouring cells: which leaves contribute to a point near their borders, and with what weights.
 
 Letters: n points, m entries (a point and one of its leaves), k siblings, the centres of one diagram of a tree.
 
@@ -6,17 +6,18 @@ The border between siblings i and j is a plane, power weights included, and the 
 
     d_ij(x) = (|x - v_j|^2 - w_j - |x - v_i|^2 + w_i) / (2 |v_i - v_j|),
 
-positive on the side of i. With the margin M a sibling's weight falls linearly from 1, M inside of its cell, over 1/2 on
-its border to 0, M outside of its nearest plane:
+positive on the side of i. With the margin M, the weight of a sibling falls linearly: 1 at a distance M inside its cell,
+1/2 on its border, 0 at a distance M outside its nearest plane:
 
     u_i(x) = clamp(1/2 + min_j d_ij(x) / (2 M), 0, 1),    divided by the sum over the siblings.
 
-Each u_i is continuous in x, and a point farther than M from every border has the weight 1 in its own cell and 0 in the
-others. Down a tree the weights multiply, so those of a point's leaves sum to 1.
+Each u_i is continuous in x. A point farther than M from every border has the weight 1 in its own cell and 0 in the
+others. The weights of the levels of a tree multiply, so the weights of the leaves of a point sum to 1.
 
-No more than `most` leaves answer for a point: the next one's weight is taken from all of them before they are divided
-by their sum. Thus a leaf comes and goes with weight 0 and nothing jumps; only where `most` + 1 leaves have one and the
-same weight, which for 4 takes more borders in a place than cells in general position have, the nearest leaf is left.
+At most `most` leaves contribute to a point: the weight of the next leaf is subtracted from all of theirs before they
+are divided by their sum. So a leaf appears and disappears with weight 0, and nothing jumps. If `most` + 1 leaves have
+exactly the same weight, only the nearest is kept; for 4 that needs more borders in one place than cells in general
+position have.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ _CHUNK_ELEMENTS = 1 << 20  # distances held at once: 4 MiB in float32, a few tim
 
 
 class Blend(NamedTuple):
-    """The points that lie in a margin, and their leaves.
+    """The points within a margin, and their leaves.
 
     Attributes:
-        rows: int64 [m], the point of each entry, ascending; a point outside of all margins has none.
+        rows: int64 [m], the point of each entry, ascending; a point outside all margins has no entry.
         cells: int32 [m], a leaf of that point, from the heaviest to the lightest.
-        weights: floating [m], > 0; those of a point sum to 1.
+        weights: floating [m], > 0; the weights of a point sum to 1.
     """
 
     rows: Tensor
@@ -48,16 +49,16 @@ class Blend(NamedTuple):
 
 @torch.no_grad()
 def blend_cells(diagram: VoronoiDiagram, points: Tensor, margin: float, *, most: int = 4) -> Blend:
-    """The leaves that answer together for the points near borders. Not differentiable.
+    """The leaves that contribute to points near borders, and their weights. Not differentiable.
 
     Args:
         diagram: of any depth, plain or power.
-        points: floating [n, 3]; half types are compared in float32. One that is not finite is in no margin.
-        margin: M, in scene units, the same at every level; 0 blends nothing.
-        most: leaves of a point, at least 1.
+        points: floating [n, 3]; half types are compared in float32. A point that is not finite is in no margin.
+        margin: M, in scene units, the same on every level; 0 blends nothing.
+        most: largest number of leaves of a point, at least 1.
 
     Raises:
-        ValueError: shapes, a margin that is negative or not finite, fewer leaves than 1.
+        ValueError: shapes, a margin that is negative or not finite, `most` below 1.
     """
     if points.dim() != 2 or points.shape[1] != 3 or not points.is_floating_point():
         raise ValueError(f"blend_cells: points must be floating [n, 3], got {points.dtype} {list(points.shape)}")

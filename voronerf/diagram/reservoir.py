@@ -1,8 +1,8 @@
-"""Keeping the samples at which the picture is still wrong.
+"""Keeps the samples at which the picture is still wrong.
 
-The importance of a sample is `w * E(r)`: its contribution to its ray times the squared error of that ray's colour
-(Elsner et al. 2023, section 4). About 10,000 samples an epoch are kept, the same number from every batch, the heaviest
-of it, so that no batch and no time within the epoch counts more than another.
+The importance of a sample is `w * E(r)`: its contribution to its ray times the squared error of the colour of the ray
+(Elsner et al. 2023, section 4). About 10,000 samples an epoch are kept: the heaviest of every batch, the same number
+from each, so that no batch counts more than another.
 """
 
 from collections.abc import Mapping
@@ -14,14 +14,13 @@ from voronerf.ops.select_heaviest import select_heaviest
 
 
 class SampleReservoir:
-    """A ring of the heaviest samples of the last `batches` batches.
+    """The heaviest samples of the last `batches` batches.
 
-    Every batch gives its `quota = ceil(capacity / batches)` heaviest samples, so at most `batches * quota` are held, 16
-    bytes each; after `batches` batches the oldest batch is overwritten. Samples of importance 0 and those with a
-    position or an importance that is not finite are never kept, and a batch that has fewer samples than its quota gives
-    what it has.
+    Every batch gives its `quota = ceil(capacity / batches)` heaviest samples, or all it has if they are fewer. At most
+    `batches * quota` samples are held, 16 bytes each; then each new batch replaces the oldest one. Samples with an
+    importance of 0, or with a position or importance that is not finite, are not kept.
 
-    `add` reads no device value on the host, so it may stand in a training loop that runs ahead of its GPU.
+    `add` reads no device value on the host, so the host of a training loop can run ahead of its GPU.
 
     Attributes:
         capacity: number of samples asked for.
@@ -86,8 +85,8 @@ class SampleReservoir:
         self._added += 1
 
     def samples(self) -> tuple[Tensor, Tensor]:
-        """What is kept, oldest batch first: points float32 [m, 3] and importance float32 [m], all > 0; m = 0 before any
-        batch."""
+        """The kept samples, oldest batch first: points float32 [m, 3] and importance float32 [m], all > 0; m = 0 before
+        the first batch."""
         start = self._added % self.batches if self._added > self.batches else 0
         importance = self._importance.roll(-start, 0).reshape(-1)
         kept = importance > 0
@@ -97,7 +96,7 @@ class SampleReservoir:
         return int((self._importance > 0).sum())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Tensors from which `load_state_dict` restores the reservoir bit for bit."""
+        """The tensors from which `load_state_dict` restores the reservoir, bit for bit."""
         return {
             "points": self._points.clone(),
             "importance": self._importance.clone(),
@@ -105,10 +104,10 @@ class SampleReservoir:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restores a state of a reservoir of the same capacity and number of batches.
+        """Restores the state of a reservoir with the same capacity and number of batches.
 
         Raises:
-            ValueError: an entry is missing, or belongs to a reservoir of another capacity or number of batches.
+            ValueError: an entry is missing, or the capacity or number of batches differs.
         """
         missing = [name for name in ("points", "importance", "added") if name not in state]
         if missing:

@@ -1,4 +1,4 @@
-"""Splitting the cells of a diagram at the samples that are still wrong: the first split and every nested one.
+"""Splits cells of a diagram by the samples that are still wrong: the first split and every nested one.
 
 Letters: m samples, k children of one cell.
 """
@@ -18,12 +18,12 @@ CENTRES = ("balanced", "random", "uniform")
 
 @dataclass(frozen=True)
 class Split:
-    """A refined diagram and how it came about.
+    """The result of `split_diagram`.
 
     Attributes:
-        diagram: the refined diagram; the given one where no cell could be split.
+        diagram: the refined diagram; the given one if no cell could be split.
         parents: int64 [num_cells], for each cell of `diagram` the cell of the given diagram that it lies in.
-        balances: the cells of the given diagram that were split -> how their centres were balanced.
+        balances: for each cell of the given diagram that was split, how its centres were balanced.
 
     Examples:
         >>> import torch
@@ -55,8 +55,8 @@ def split_diagram(
 ) -> Split:
     """Splits cells into k each, every cell by the samples that lie in it.
 
-    A cell with fewer than `max(k, min_samples)` distinct samples, or k = 1, leaves a cell as it is. A diagram of one
-    cell is how the first split starts: its child becomes the root.
+    A cell with fewer than `max(k, min_samples)` distinct samples stays as it is, and so do all cells for k = 1. The
+    first split starts from a diagram of one cell; its child becomes the root.
 
     Args:
         diagram: a diagram of any depth.
@@ -65,23 +65,21 @@ def split_diagram(
         k: children of each cell that is split, >= 1.
         cells: "all"; "worst", the one cell with the largest accumulated importance among those that hold enough
             samples; or the numbers of the cells to split.
-        min_samples: distinct samples a cell needs to be split.
-        centres: "balanced", moved by `balance`; "random", samples drawn at random that are not moved; "uniform",
-            `uniform_centres` over the bounding box of the samples in the cell, not moved (some may lie outside of the
-            cell and stay without samples). The last two are the paper's ablations.
-        uniform_scale: how many times as large along each axis, > 0, the box of "uniform", or of init="uniform", is made
-            about its middle.
+        min_samples: number of distinct samples that a cell needs to be split.
+        centres: "balanced": moved by `balance`; "random": samples drawn at random and not moved; "uniform":
+            `uniform_centres` over the bounding box of the samples in the cell, not moved (some may lie outside the cell
+            and have no samples). The last two are ablations of the paper.
+        uniform_scale: factor > 0 on the size of the box of "uniform", or of init="uniform", about its middle.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.backends`.
-        **options: passed on to `balance` where the centres are balanced: method, steps, alpha, neighbours, normalise,
-            init.
+        **options: arguments of `balance` for "balanced": method, steps, alpha, neighbours, normalise, init.
 
     Returns:
-        The split; cells that are too small stay leaves, and `balances` says which cells were split.
+        The split. Cells that are too small stay leaves; `balances` has the cells that were split.
 
     Raises:
-        ValueError: samples that `balance` refuses, an unknown choice, a cell out of range or named twice, or more cells
-            than samples (k exceeds the number of samples in all).
+        ValueError: samples that `balance` does not accept, an unknown choice, a cell out of range or given twice, or k
+            larger than the number of samples.
         TypeError: points or importance are not floating.
 
     Examples:

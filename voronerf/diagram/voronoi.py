@@ -24,8 +24,8 @@ from torch import Tensor, nn
 
 from voronerf import backends, ops
 
-# From this many centres on a grid answers sooner than a search of all, and once this many points have been asked about,
-# making it has cost less than going on without (see ops.centre_grid).
+# A grid is faster than a search of all centres from this many centres on. Making it pays after this many points (see
+# ops.centre_grid).
 _GRID_CENTRES = 384
 _GRID_POINTS = 1 << 17
 
@@ -33,9 +33,8 @@ _GRID_POINTS = 1 << 17
 class VoronoiDiagram(nn.Module):
     """A Voronoi or power diagram of any depth, as flat tables that `ops.locate_cell` and `ops.draw_cell` read.
 
-    A diagram is never changed in place by its own methods: `refine` returns a new one. Its buffers stay float32
-    whatever dtype a surrounding module is converted to, because rounding the centres would move samples to networks
-    that never saw them.
+    No method changes a diagram in place: `refine` returns a new one. Its buffers stay float32 when a module around it
+    is converted to another dtype, because rounded centres would move samples to networks that never saw them.
 
     Attributes:
         centres: float32 [m, 3], the centres of all diagrams, diagram after diagram; diagram 0 is the root.
@@ -72,7 +71,7 @@ class VoronoiDiagram(nn.Module):
     _points_located: int = 0
 
     def __init__(self, centres: Tensor, *, weights: Tensor | None = None) -> None:
-        """Makes a flat diagram; a single centre is legal and means one cell, all of space.
+        """Makes a flat diagram. A single centre is allowed: one cell, all of space.
 
         Args:
             centres: floating [k, 3], k >= 1, finite; copied to float32.
@@ -115,14 +114,14 @@ class VoronoiDiagram(nn.Module):
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], prefix: str = "") -> "VoronoiDiagram":
-        """Makes the diagram that a `state_dict` describes, whatever its size and depth.
+        """Makes the diagram of a `state_dict`, of any size and depth.
 
         Args:
             state: a state dict of a diagram, or of a module that holds one under `prefix`.
-            prefix: what stands before "centres", e.g. "diagram.".
+            prefix: the part of the names before "centres", for example "diagram.".
 
         Raises:
-            ValueError: a table is missing or the tables are not those of a tree.
+            ValueError: a table is missing, or the tables do not form a tree.
         """
         names = ("centres", "child_offsets", "child")
         missing = [prefix + name for name in names if prefix + name not in state]
@@ -134,7 +133,7 @@ class VoronoiDiagram(nn.Module):
 
     @property
     def leaf_rows(self) -> Tensor:
-        """int64 [num_cells]: the row of `centres` that each leaf is."""
+        """int64 [num_cells]: the row of `centres` of each leaf."""
         rows = torch.nonzero(self.child < 0).squeeze(1)
         return rows[torch.argsort(self.child[rows], descending=True)]
 
@@ -144,10 +143,10 @@ class VoronoiDiagram(nn.Module):
         return self.centres[self.leaf_rows]
 
     def paths(self) -> Tensor:
-        """int64 [num_cells, depth]: the number of each leaf's ancestors among their siblings, level by level.
+        """int64 [num_cells, depth]: the path to each leaf, as the number of the child on each level.
 
-        The last number is the leaf's own; -1 stands past the end of the shallower branches of an uneven tree.
-        `paths()[:, 0]` is the cell of the root diagram that a leaf lies in, which is what a drawing colours by.
+        The last number is that of the leaf itself. Shorter branches of an uneven tree are filled up with -1.
+        `paths()[:, 0]` is the cell of the root diagram that a leaf lies in, useful as a colour in drawings.
         """
         offsets, child = self.child_offsets.tolist(), self.child.tolist()
         paths = torch.full((self.num_cells, self.depth), -1, dtype=torch.int64)
@@ -165,15 +164,15 @@ class VoronoiDiagram(nn.Module):
     def locate(self, points: Tensor, *, backend: str = "auto") -> Tensor:
         """The leaf that each point lies in.
 
-        On the CPU a flat diagram of many centres makes itself a grid of candidates once it has been asked often enough
-        (`ops.centre_grid`), which changes the time but no answer.
+        On the CPU, a flat diagram of many centres makes a grid (`ops.centre_grid`) after enough points. It makes the
+        query faster and does not change the result.
 
         Args:
             points: floating [..., 3]; half types are compared in float32, float64 points in float64.
             backend: see `voronerf.backends`.
 
         Returns:
-            int32 [...], ties to the lowest index of a level, points that are not finite to the first cell of a level.
+            int32 [...]. On each level, ties go to the lowest index, and points that are not finite to the first cell.
 
         Raises:
             ValueError: the last dimension of points is not 3.
@@ -221,23 +220,23 @@ class VoronoiDiagram(nn.Module):
         generator: torch.Generator | None = None,
         backend: str = "auto",
     ) -> Tensor:
-        """Draws the leaf of each point at random, near centres being likelier (the paper's stochastic assignment).
+        """Draws the leaf of each point at random; near centres are likelier (the paper's stochastic assignment).
 
-        The paper draws the cell "from the vector of distances" and leaves the law open. Here, at each level of the
-        tree, child i of the diagram reached so far is drawn with probability
+        The paper draws the cell "from the vector of distances" and does not give the distribution. Here, on each level
+        of the tree, child i of the current diagram is drawn with probability
 
-            p_i = exp(-d_i / temperature) / sum_j exp(-d_j / temperature),     d_i = |x - v_i|,
+            p_i = exp(-d_i / temperature) / sum_j exp(-d_j / temperature),     d_i = |x - v_i|.
 
-        so a leaf's probability is the product of these along its path, the temperature being the same at every level: a
-        length in scene units, about the width of the band along the borders in which cells mix. With power weights
-        `d_i = sqrt(|x - v_i|^2 + max_j w_j - w_i)` over the siblings j, which is the plain distance when all weights
-        are equal and does not depend on a constant added to them. The limit of temperature 0 is `locate`, which is what
-        0 gives. One number a point and level is drawn, uniform in 0 to 1 (`ops.draw_cell`).
+        The probability of a leaf is the product of these along its path. The temperature is the same on every level: a
+        length in scene units, about the width of the band along the borders in which cells mix. With power weights,
+        `d_i = sqrt(|x - v_i|^2 + max_j w_j - w_i)` over the siblings j. That is the plain distance if all weights are
+        equal, and does not depend on a constant added to them. A temperature of 0 gives `locate`. One uniform number in
+        0 to 1 is drawn for each point and level (`ops.draw_cell`).
 
         Args:
             points: floating [..., 3]; compared in float32.
             temperature: >= 0, in scene units.
-            generator: on any device, what it draws is moved to that of `points`; None for torch's global one.
+            generator: on any device; its numbers are moved to the device of `points`. None for torch's global one.
             backend: see `voronerf.backends`.
 
         Returns:
@@ -268,10 +267,10 @@ class VoronoiDiagram(nn.Module):
         return cells.reshape(points.shape[:-1])
 
     def refine(self, children: Mapping[int, "Tensor | VoronoiDiagram"]) -> tuple["VoronoiDiagram", Tensor]:
-        """A new diagram in which the named leaves are refined; the other leaves stay as they are.
+        """A new diagram in which the given leaves are refined; the other leaves stay as they are.
 
-        A child of a single cell leaves its parent a leaf. Refining a diagram of a single cell gives the child itself,
-        with no level that decides nothing.
+        If a child has a single cell, its parent stays a leaf. Refining a diagram of a single cell gives the child
+        itself, without an additional level.
 
         Args:
             children: leaf number -> centres [k, 3] of the diagram inside it, or a `VoronoiDiagram` of any depth.
@@ -280,8 +279,8 @@ class VoronoiDiagram(nn.Module):
             The refined diagram, and `parents`, int64 [new num_cells]: for each new leaf the old leaf that it lies in.
 
         Raises:
-            ValueError: a leaf out of range or named twice, or centres that `VoronoiDiagram` refuses.
-            TypeError: a leaf that is no integer, or centres that are no tensor.
+            ValueError: a leaf out of range or given twice, or centres that `VoronoiDiagram` does not accept.
+            TypeError: a leaf that is not an integer, or centres that are not a tensor.
         """
         device = self.centres.device
         grafts: dict[int, VoronoiDiagram] = {}
@@ -363,12 +362,12 @@ class VoronoiDiagram(nn.Module):
 
 
 def uniform_centres(box: Tensor, k: int) -> Tensor:
-    """k centres spread evenly over a box, as near to a regular grid as k allows (the paper's "uniform" ablation).
+    """k centres spread evenly over a box, as close to a regular grid as k allows (the paper's "uniform" ablation).
 
-    The box is cut across its longest side into 2 equal parts where k is even, into 3 where k is divisible by 3, and
-    otherwise into 2 parts in proportion to the centres on either side; each part likewise, until it holds one centre,
-    at its middle. All parts have the same volume. In a cube 8, 27, 64 ... give cubic grids, 12 gives 2 x 2 x 3, and 16
-    gives 4 x 2 x 2.
+    The box is cut across its longest side: into 2 equal parts if k is even, into 3 if k is divisible by 3, otherwise
+    into 2 parts in proportion to their numbers of centres. Each part is cut in the same way, until it holds one centre,
+    in its middle. All final parts have the same volume. In a cube, 8, 27, 64 ... give cubic grids, 12 gives 2 x 2 x 3,
+    and 16 gives 4 x 2 x 2.
 
     Args:
         box: floating [2, 3], lowest and highest corner; flat boxes are allowed.

@@ -1,6 +1,6 @@
 """LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), version 0.1 on AlexNet.
 
-The network is a few lines of plain torch; its weights are files of the user's. c channels, h x w pixels.
+The network is a few lines of plain torch. The user provides its weights as files. c channels, h x w pixels.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SHAPES = {
     **{f"lin{level}.model.1.weight": (1, o, 1, 1) for level, (_, (o, _, _), *_) in enumerate(CONVOLUTIONS)},
 }
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-#: Pixels along a side below which nothing is left for the third convolution.
+#: Smallest side in pixels; smaller images leave nothing for the third convolution.
 SMALLEST = 31
 OFF = "off"
 VARIABLE = "VORONERF_LPIPS"
@@ -95,23 +95,24 @@ class Lpips:
 def find_lpips(
     setting: Path | None, data: str = "", size: tuple[int, int] = (SMALLEST, SMALLEST)
 ) -> tuple[Lpips | None, str]:
-    """LPIPS with the weights that a user has.
+    """LPIPS with the weights found on this machine.
 
-    They are looked for in `setting`, else in what VORONERF_LPIPS names, else in the folder `lpips` of VORONERF_DATA,
-    else in the folder `lpips` beside the scene's, else in the installed `lpips` package together with the AlexNet that
-    it had torchvision download.
+    They are searched for in this order: `setting`, VORONERF_LPIPS, the folder `lpips` of VORONERF_DATA, the folder
+    `lpips` beside the folder of the scene, and the installed `lpips` package with the AlexNet that torchvision
+    downloaded for it.
 
     Args:
-        setting: a file, or a folder of files; "off" for none.
-        data: the scene's folder.
-        size: of the images, rows and columns. Where they are too small there is no LPIPS, unless `setting` asks for it.
+        setting: a file, or a folder of files; "off" for no LPIPS.
+        data: the folder of the scene.
+        size: of the images, rows and columns. LPIPS is skipped for images that are too small, unless `setting` is
+            given.
 
     Returns:
-        The metric, or None; and in one line where its weights came from, or why there are none.
+        The metric, or None; and a line that says where its weights came from, or why there are none.
 
     Raises:
-        LpipsError: the file or folder that was asked for, or the first that was found, cannot be used; or the images
-            are too small and `setting` names weights.
+        LpipsError: the given file or folder, or the first one found, cannot be used; or the images are too small and
+            `setting` names weights.
     """
     named = str(setting or os.environ.get(VARIABLE, ""))
     if named == OFF:

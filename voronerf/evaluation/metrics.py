@@ -23,9 +23,9 @@ def psnr(image: Tensor, truth: Tensor) -> Tensor:
 def ssim(image: Tensor, truth: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004), the mean over pixels and channels.
 
-    As the NeRF literature computes it (mip-NeRF's `compute_ssim`): a Gaussian window of 11 x 11 pixels with sigma 1.5,
-    only where it lies inside of the image, K1 = 0.01, K2 = 0.03, on colours; rounding is kept from making variances
-    negative. An image below 11 pixels on a side has the largest odd window that fits.
+    As in the NeRF literature (mip-NeRF's `compute_ssim`): a Gaussian window of 11 x 11 pixels with sigma 1.5, only
+    where it lies inside the image, K1 = 0.01, K2 = 0.03, on colours. Variances are clamped so that rounding does not
+    make them negative. For an image with a side below 11 pixels, the window is the largest odd one that fits.
 
     Args:
         image: [..., h, w, c] in 0..1.

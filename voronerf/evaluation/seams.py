@@ -63,8 +63,8 @@ def seam(
 
     Args:
         router: whose `blend` is changed while this runs.
-        scene: its test views are looked at.
-        picture: renders a test view through the router as it stands, without randomness.
+        scene: its test views are rendered.
+        picture: renders a test view through the router, without randomness.
         views: evenly spread test views; None for all.
         margin: in the units of the space that the cells live in; None for a hundredth of the diagonal of the scene's
             box, or of the centres'.

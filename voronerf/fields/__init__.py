@@ -1,4 +1,4 @@
-"""Networks from positions and directions to colours and densities; they know nothing of rays or images."""
+"""Networks from positions and directions to colours and densities. They do not depend on rays or images."""
 
 from voronerf.fields.density import DensityField, density_table
 from voronerf.fields.kilonerf import KiloNeRF

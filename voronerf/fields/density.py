@@ -1,4 +1,4 @@
-"""A small network for the density alone: where a ray is worth asking about. Units as in `voronerf.fields.nerf`."""
+"""A small network for the density only, which proposes where to sample a ray. Units as in `voronerf.fields.nerf`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from voronerf.layers import MLP, Layer
 
 
 def density_table(width: int, depth: int, position_octaves: int = 6, position_encoding: str = "frequency") -> MLP:
-    """The layer table of :class:`DensityField`, whose arguments these are.
+    """The layer table of a :class:`DensityField` with the same arguments.
 
     Examples:
         >>> from voronerf.fields import density_table
@@ -93,8 +93,8 @@ class DensityField(nn.Module):
 
         Args:
             positions: [n, 3] in scene units, or Gaussians [n, 6] for the integrated encoding.
-            directions: Not looked at; here because a field is called with them.
-            ray_index: Likewise.
+            directions: Ignored; accepted because renderers pass them.
+            ray_index: Ignored.
 
         Returns:
             (black [n, 3], density [n] per scene unit).

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from voronerf.fields.nerf import NeRF
 
-#: Frequencies of the position's encoding as published: the encoding fades out by itself what a Gaussian cannot resolve.
+#: Octaves of the positional encoding, as published; the encoding fades out waves that a Gaussian cannot resolve.
 OCTAVES = 16
 
 
 class MipNeRF(NeRF):
-    """The architecture of NeRF behind the integrated encoding (Barron et al. 2021, "Mip-NeRF", section 3.1).
+    """The architecture of NeRF with the integrated encoding (Barron et al. 2021, "Mip-NeRF", section 3.1).
 
-    It is called with Gaussians [n, 6], mean and diagonal variance, in the place of positions;
-    `voronerf.rendering.cones.frustum_gaussians` makes them of cones.
+    Its input is Gaussians [n, 6], mean and diagonal variance, instead of positions;
+    `voronerf.rendering.cones.frustum_gaussians` makes them from cones.
 
     Args:
         width: Channels of the hidden layers.

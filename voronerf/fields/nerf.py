@@ -30,7 +30,7 @@ def nerf_table(
     view_width: int | None = None,
     position_encoding: str = "frequency",
 ) -> MLP:
-    """The layer table of :class:`NeRF`, whose arguments these are.
+    """The layer table of a :class:`NeRF` with the same arguments.
 
     Raises:
         ValueError: For a width, depth or skip out of range.
@@ -76,26 +76,27 @@ def nerf_table(
 class NeRF(nn.Module):
     """The architecture of NeRF (Mildenhall et al. 2020, figure 7), of any width and depth.
 
-    ``depth`` ReLU layers see the encoded position, again after each layer listed in ``skips``; a linear head gives the
-    density; a linear feature layer followed by one ReLU layer of half the width, which also sees the encoded view
-    direction, gives the colour. Without view directions the colour is a linear head on the trunk.
+    The trunk is ``depth`` ReLU layers on the encoded position, which is concatenated again after each layer listed in
+    ``skips``. A linear head gives the density. A linear feature layer, followed by one ReLU layer of half the width
+    that also sees the encoded view direction, gives the colour. Without view directions, the colour is a linear head on
+    the trunk.
 
-    Density is ``density_scale * softplus(raw)`` rather than the paper's ReLU. A ReLU whose input turns negative
-    everywhere has no gradient left, which is how a NeRF on a white background collapses to an all-white image within
-    its first hundred steps; softplus always has one (mip-NeRF, section 3.1, made the same choice). The head's bias is
-    set so that the untrained density is ``INITIAL_DENSITY``. ``density_scale`` only changes the unit in which the
-    network speaks: surfaces need densities near 100 a unit, which outputs of order one reach sooner with a scale.
+    The density is ``density_scale * softplus(raw)``, where the paper has a ReLU. If the input of a ReLU becomes
+    negative everywhere, it has no gradient: a NeRF on a white background can collapse to a white image within its first
+    hundred steps. Softplus always has a gradient (mip-NeRF, section 3.1, made the same choice). The bias of the head is
+    such that the untrained density is ``INITIAL_DENSITY``. Surfaces need densities near 100 per scene unit;
+    ``density_scale`` lets network outputs of order one reach them sooner.
 
-    The field describes itself by ``layers`` (a table, see :class:`voronerf.layers.MLP`) and :meth:`linears`, in the
-    table's order; :class:`voronerf.VoronoiRouter` uses the two to evaluate all cells' copies of it in one pass.
+    ``layers`` (a table, see :class:`voronerf.layers.MLP`) and :meth:`linears`, in the order of the table, describe the
+    network. :class:`voronerf.VoronoiRouter` uses them to evaluate the copies of all cells in one pass.
 
     Args:
         width: Channels of the hidden layers, at least 2.
         depth: Hidden layers before the heads, at least 1.
-        skips: Indices of trunk layers whose output is joined with the encoded position again; None is 4, as published,
-            where the trunk has more than five layers, else none.
-        position_octaves: Frequencies of the position's encoding; 0 takes the position as it is.
-        direction_octaves: The same for the view direction.
+        skips: Indices of trunk layers whose output is concatenated with the encoded position; None is 4, as published,
+            if the trunk has more than five layers, else no layer.
+        position_octaves: Octaves of the positional encoding; 0 uses the position itself.
+        direction_octaves: Octaves of the encoding of the view direction.
         view_directions: Whether colour depends on the view direction.
         density_scale: Factor on the density, per scene unit, > 0.
         view_width: Channels of the layer that sees the view direction; None is half the width.
@@ -189,8 +190,8 @@ class NeRF(nn.Module):
             (colour [n, 3] in 0..1, density [n] >= 0 per scene unit), float32 or wider.
         """
         raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-        # Split, since its gradient is one concatenation, that of two slices two arrays of zeros and their sum. Copied,
-        # since torch's activations are vectorised for neighbouring values only: a third of the time in all.
+        # `split`, because its gradient is one concatenation, and that of two slices two padded arrays and their sum.
+        # `contiguous`, because torch vectorises activations for contiguous values only. Together a third of the time.
         colour, density = (part.contiguous() for part in raw.split([3, 1], dim=-1))
         return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
 

@@ -1,4 +1,4 @@
-"""One network that a layer table describes, on its own: what a router does for the networks of all cells."""
+"""Evaluates one network that a layer table describes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From cameras to rays, from rays to colours. Knows nothing of files."""
+"""From cameras to rays, and from rays to colours. This package does not read or write files."""
 
 from voronerf.rendering.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
 from voronerf.rendering.contraction import Contraction

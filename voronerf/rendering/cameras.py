@@ -39,7 +39,7 @@ class Rays:
     Attributes:
         origins: float32 [r, 3].
         directions: float32 [r, 3], unit length.
-        radii: float32 [r], radius at distance 1 of the cone that a ray stands for, or None.
+        radii: float32 [r], radius at distance 1 of the cone around each ray, or None.
 
     Examples:
         >>> import torch
@@ -135,8 +135,8 @@ class Cameras:
     def downscaled(self, factor: int) -> Cameras:
         """Cameras of the images averaged over blocks of `factor` x `factor` pixels.
 
-        Columns and rows that fill no whole block are dropped at the right and at the bottom, so that focal lengths and
-        the principal point are exactly divided by `factor`.
+        Incomplete blocks at the right and at the bottom are dropped, so that focal lengths and the principal point are
+        divided by exactly `factor`.
 
         Raises:
             ValueError: `factor` is below 1, or no whole block is left.
@@ -154,11 +154,11 @@ class Cameras:
 
         Args:
             image_index: integer [b], the camera of each pixel, or one camera for all.
-            x: [b] column. Integers name pixels (the ray goes through their centre), floats are positions in the image.
+            x: [b] column. Integers are pixels (the ray goes through their centre), floats are positions in the image.
             y: [b] row, likewise.
-            cones: give the rays radii: a cone's variance across its axis is that of the pixel at each distance, its
-                radius 2 / sqrt(12) of the pixel's width (Barron et al. 2021, section 3.1). A pixel off the axis is
-                farther away and so narrower; lens distortion of its size is not followed.
+            cones: give the rays radii of 2 / sqrt(12) of the width of a pixel, so that the variance of a cone across
+                its axis is that of the pixel (Barron et al. 2021, section 3.1). A pixel away from the optical axis is
+                farther away and so appears narrower. Lens distortion of the size of a pixel is ignored.
         """
         if isinstance(image_index, int):
             chosen, camera = self[[image_index]], None
@@ -189,7 +189,7 @@ class Cameras:
         return self.rays(index, x.reshape(-1), y.reshape(-1), cones=cones)
 
     def project(self, points: Tensor, index: int) -> tuple[Tensor, Tensor]:
-        """Where one camera sees points.
+        """Projects points into the image of one camera.
 
         Args:
             points: [n, 3], world.
@@ -197,7 +197,7 @@ class Cameras:
 
         Returns:
             (pixels [n, 2], depth [n]): positions (x, y) in the image, and distance along the optical axis in world
-            units. Points with depth <= 0 are behind the camera; their pixels mean nothing.
+            units. Points with depth <= 0 are behind the camera, and their pixels are meaningless.
         """
         pose = self.poses[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -214,7 +214,7 @@ def focus_point(cameras: Cameras) -> Tensor | None:
     """The point closest to all optical axes (least squares), float32 [3].
 
     Returns:
-        None where there is no such point in front of the cameras: axes that are nearly parallel, or look outwards.
+        The point, or None if it is not in front of the cameras: the axes are nearly parallel, or point outwards.
 
     Examples:
         >>> from voronerf.rendering import focus_point, orbit_cameras
@@ -235,7 +235,7 @@ def focus_point(cameras: Cameras) -> Tensor | None:
 def look_at(origins: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Poses [c, 4, 4] of cameras at `origins` [c, 3] that look at `target` [3] with `up` [3] upwards in the image.
 
-    A camera that looks along `up` itself takes another axis for it.
+    A camera that looks along `up` uses another axis instead.
     """
     back = torch.nn.functional.normalize(origins - target, dim=-1)
     along = torch.cross(up.expand_as(back), back, dim=-1)
@@ -267,7 +267,7 @@ def orbit_cameras(
         width: pixels.
         height: pixels.
         focal: pixels; the principal point is the middle of the image.
-        centre: looked at.
+        centre: the point that the cameras look at.
         start: azimuth of the first camera, degrees.
 
     Examples:

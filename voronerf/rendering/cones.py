@@ -1,4 +1,4 @@
-"""Cones in the place of rays, cut into conical frustums, as Gaussians. r rays, s frustums of a ray.
+"""Cones instead of rays, cut into conical frustums, as Gaussians. r rays, s frustums of a ray.
 
 A Gaussian is [6]: its mean and the diagonal of its covariance, in world units and their squares. Source: Barron et al.
 2021, "Mip-NeRF", section 3.1.
@@ -14,18 +14,18 @@ from voronerf.rendering.contraction import Contraction
 
 
 def frustum_moments(edges: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and variances of conical frustums, in a ray's own coordinates (equation 7 in its stable form, 8).
+    """Mean and variances of conical frustums along their ray (equation 7 in its stable form, and equation 8).
 
     Args:
         edges: [r, s + 1] ascending distances along the ray.
-        radii: [r], the cone's radius at distance 1.
+        radii: [r], radius of the cone at distance 1.
 
     Returns:
         (mean distance, variance along the ray, variance across it), each [r, s].
     """
     middle, half = (edges[:, 1:] + edges[:, :-1]) / 2, edges.diff(dim=1) / 2
     middle2, half2 = middle.square(), half.square()
-    # 0 for a frustum that is a point at distance 0 and for nothing else, whose moments are all 0.
+    # 0 only for a frustum that is a point at distance 0; its moments are all 0.
     sum2 = (3 * middle2 + half2).clamp_min(torch.finfo(edges.dtype).tiny)
     share = half2 / sum2
     mean = middle + 2 * middle * share
@@ -35,12 +35,12 @@ def frustum_moments(edges: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def frustum_gaussians(rays: Rays, edges: Tensor, contraction: Contraction | None = None) -> Tensor:
-    """The Gaussians that have the moments of a cone's frustums (equations 8 and 16).
+    """Gaussians with the moments of conical frustums (equations 8 and 16).
 
     Args:
         rays: r rays with radii.
         edges: [r, s + 1] ascending distances along the rays.
-        contraction: of the space that the Gaussians live in.
+        contraction: applied to the Gaussians.
 
     Returns:
         [r, s, 6].

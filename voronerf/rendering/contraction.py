@@ -1,7 +1,8 @@
-"""Unbounded space drawn into a ball. n points.
+"""Contraction of unbounded space into a ball. n points.
 
-Source: Barron et al. 2022, "Mip-NeRF 360", equation 10; inside of the sphere space stays as it is, what is outside is
-drawn into the shell up to twice its radius. Here the sphere has a centre and a radius of its own, in world units.
+Source: Barron et al. 2022, "Mip-NeRF 360", equation 10. Space inside a sphere stays as it is. Space outside is mapped
+into the shell between the sphere and one of twice its radius. Here the sphere has any centre and radius, in world
+units.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ class Contraction:
     """``c + R f((x - c) / R)`` with ``f(x) = x`` up to length 1 and ``(2 - 1 / |x|) x / |x|`` beyond.
 
     Attributes:
-        centre: [3], c. On the device of the points: from another it would be copied at every call.
+        centre: [3], c. It should be on the device of the points, or it is copied at every call.
         radius: R > 0.
 
     Raises:
@@ -43,14 +44,14 @@ class Contraction:
             )
 
     def points(self, points: Tensor) -> Tensor:
-        """Points [..., 3] to points [..., 3] less than 2 R from the centre."""
+        """Maps points [..., 3] to points [..., 3] less than 2 R from the centre."""
         centre = self.centre.to(points)
         offset, length = self._offset(points, centre)
         return centre + self.radius * offset * ((2 - 1 / length) / length)
 
     def gaussians(self, means: Tensor, directions: Tensor, along: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
-        """Gaussians with covariance ``S = along d d^T + across (1 - d d^T)``, carried over by the linearised map
-        (equation 9): covariance ``J S J^T``.
+        """Maps Gaussians with covariance ``S = along d d^T + across (1 - d d^T)`` by the linearised map (equation 9):
+        the new covariance is ``J S J^T``.
 
         Args:
             means: [..., 3].

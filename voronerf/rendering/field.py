@@ -1,4 +1,4 @@
-"""What can be rendered."""
+"""The form of a field that can be rendered."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class Field(Protocol):
-    """What can be rendered: colour and density of points seen along directions.
+    """A callable that returns the colour and density of points seen along directions. All renderers take one.
 
     Examples:
         >>> import torch

@@ -15,23 +15,23 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.occupancy import OccupancyGrid
 
-OPAQUE = 4e-3  # a ray that lets less than this through, a level of an 8-bit image, has ended
-WAVE = 6  # samples of a ray in a wave: fewer make more waves, more are asked for in vain behind the surface
+OPAQUE = 4e-3  # a ray ends when it lets less than this through, one level of an 8-bit image
+WAVE = 6  # samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain
 
 
 class Marched(NamedTuple):
-    """What `render_marched` returns.
+    """The result of `render_marched`.
 
     Attributes:
         colour: [r, 3], the background included.
         opacity: [r], 0..1: the sum of the weights.
-        depth: [r], expected distance, normalised by the opacity; `far` for a ray with none.
-        weights: [m], each sample's contribution.
+        depth: [r], expected distance, normalised by the opacity; `far` for a ray with opacity 0.
+        weights: [m], the contribution of each sample.
         positions: [m, 3].
-        rgb: [m, 3], each sample's colour.
+        rgb: [m, 3], the colour of each sample.
         ray_index: int32 [m], the ray of each sample.
         density: [m].
-        deltas: [m], length of each sample's stratum.
+        deltas: [m], the length of the stratum of each sample.
 
     Examples:
         >>> import torch
@@ -58,8 +58,8 @@ class Marched(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What `render_until_opaque` returns: as `Marched`, and `heaviest` [r, 3], the position of each ray's heaviest
-    sample, the point at its far end for a ray without samples."""
+    """The result of `render_until_opaque`: as `Marched`, with `heaviest` [r, 3], the position of the heaviest sample of
+    each ray, or its far end if it has no samples."""
 
     colour: Tensor
     opacity: Tensor
@@ -81,17 +81,17 @@ def render_marched(
     spacing: str = "linear",
     backend: str = "auto",
 ) -> Marched:
-    """`render_rays` without the samples that lie in empty cells; differentiable, for training.
+    """`render_rays` without the samples in empty cells of a grid; differentiable, for training.
 
     Args:
-        field: called once, on the samples that are left; they may be none.
+        field: called once, on the remaining samples, possibly none.
         rays: r rays.
         near: [r], start of the integral.
         far: [r], end.
-        grid: what is empty; outside its box is nothing.
+        grid: which space is empty; all space outside its box is.
         samples: s, strata of a ray.
         background: [3] or [r, 3]; None is black.
-        jitter: stratified random samples, the same that `render_rays` would draw, else the strata's middles.
+        jitter: random samples in the strata, the same ones as in `render_rays`, else their middles.
         generator: of the jitter.
         spacing: of the strata, "linear" or "disparity".
         backend: of the ops.
@@ -154,22 +154,22 @@ def render_until_opaque(
     heaviest: bool = True,
     backend: str = "auto",
 ) -> Seen:
-    """The same for images, without gradients: rays are walked in waves, and those that have become opaque are left.
+    """`render_marched` for images, without gradients: rays are walked in waves, and end when they are opaque.
 
-    A wave is a few samples of every ray that still sees something, so a ray costs the field little more than the
-    samples in front of its first surface.
+    A wave is a few samples of every ray that is not opaque yet. So the field evaluates little more than the samples in
+    front of the first surface of each ray.
 
     Args:
-        field: called once a wave.
+        field: called once for each wave.
         rays: r rays.
         near: [r].
         far: [r].
-        grid: what is empty.
+        grid: which space is empty.
         samples: s, strata of a ray; the samples are their middles.
         background: [3] or [r, 3]; None is black.
         spacing: of the strata.
-        heaviest: whether to look for each ray's heaviest sample, which costs a tenth of a picture; its place is the
-            ray's far end otherwise.
+        heaviest: whether to find the heaviest sample of each ray, which takes a tenth of the time of a picture.
+            Without it, `heaviest` is the far end of the ray.
         backend: of the ops.
 
     Examples:
@@ -226,7 +226,7 @@ def _keep_heaviest(
     index: Tensor,
     most: int,
 ) -> None:
-    """Depth `at` [r] and weight `top` [r] of each ray's heaviest sample so far."""
+    """Updates depth `at` [r] and weight `top` [r] of the heaviest sample of each ray so far."""
     row = torch.arange(len(index), device=index.device) - ray_offsets[index]
     place = index.long() * most + row
     table = weights.new_full((2, len(live) * most), -1.0)

@@ -1,8 +1,8 @@
-"""Which cells of a scene's box hold anything: a grid that lets rays skip the empty ones.
+"""An occupancy grid: which cells of the box of a scene are empty, so that rays can skip them.
 
-x, y, z cells of the grid along each axis, q cells asked about, r rays, s strata of a ray. Densities are per world unit.
-Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (cells that remember the largest recent
-density, decaying); learning it from the samples of a batch, and forgetting what is hidden, is this project's own.
+x, y, z cells of the grid along each axis, q cells to update, r rays, s strata of a ray. Densities are per world unit.
+Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (cells keep the largest recent density,
+which decays). Learning it from the samples of a batch, and emptying what is hidden, are additions of this project.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from voronerf.ops.update_occupancy import update_occupancy
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 
-CHUNK = 1 << 17  # points a field is asked about at a time
-HIDDEN = 1e-3  # of the light: a sample that less of it reaches is hidden
+CHUNK = 1 << 17  # points that a field evaluates at a time
+HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
 
 
 class OccupancyGrid:
     """The largest recent density of every cell of a box, and which cells count as occupied.
 
-    A new grid is occupied everywhere; cells become empty as `update` finds them so.
+    A new grid is occupied everywhere. `update` and `observe` empty cells.
 
     Attributes:
         box: float32 [2, 3], lowest and highest corner.
-        density: float32 [x, y, z], what each cell remembers.
+        density: float32 [x, y, z], the remembered density of each cell.
         occupied: bool [x, y, z], density >= threshold.
         threshold: per world unit.
 
@@ -61,12 +61,12 @@ class OccupancyGrid:
             box: [2, 3], the second corner above the first.
             resolution: cells along each axis, one number for all or three.
             threshold: density from which a cell is occupied, per world unit, > 0 and finite.
-            remembered: what a new cell remembers, in thresholds, >= 1: it has to be found empty, not to fade away by
-                the first look, and the more it remembers the more often.
+            remembered: density of a new cell, in thresholds, >= 1. The larger it is, the more often a cell has to be
+                found empty before it counts as empty.
             device: of the grid; default that of the box.
 
         Raises:
-            ValueError: a box, resolution or threshold that is none, or a new cell that would be empty.
+            ValueError: an invalid box, resolution or threshold, or `remembered` below 1.
         """
         shape = (resolution,) * 3 if isinstance(resolution, int) else tuple(resolution)
         if tuple(box.shape) != (2, 3) or not bool((box[1] > box[0]).all()) or not bool(box.isfinite().all()):
@@ -113,12 +113,13 @@ class OccupancyGrid:
         generator: torch.Generator | None = None,
         backend: str = "auto",
     ) -> None:
-        """Asks a field for the density at a random point of each cell, and keeps it or what the cell remembers.
+        """Evaluates a field at a random point of each cell, and keeps the larger of the new density and the decayed old
+        one.
 
         Args:
             field: called without gradients.
-            cells: int32 or int64 [q], flat numbers of the cells to look at; None for all.
-            decay: factor on what these cells remember, 0..1; 0 forgets it.
+            cells: int32 or int64 [q], flat numbers of the cells to update; None for all.
+            decay: factor on the old densities of these cells, 0..1; 0 forgets them.
             generator: of the points, on any device.
             backend: of the op.
 
@@ -153,18 +154,18 @@ class OccupancyGrid:
         decay: float,
         backend: str = "auto",
     ) -> None:
-        """Learns from samples that have been rendered anyway: their cells keep the densities seen, or fade.
+        """Updates cells from samples that were rendered anyway.
 
-        A sample that less than `HIDDEN` of the light reaches counts as one of density 0, so that the inside of what is
-        opaque becomes empty like the space around it, which changes no picture. A surface that few of the rays through
-        its cell see fades as well, until `update` looks at it again.
+        A sample that receives less than the share `HIDDEN` of the light counts as density 0. So the inside of an opaque
+        object becomes empty like the space around it, which changes no picture. A surface that only few of the rays
+        through its cell see fades too, until `update` evaluates it again.
 
         Args:
-            positions: float32 [m, 3] in the box; what lies outside counts for the cell at the border.
-            density: [m], found there; NaN counts as endless.
-            deltas: [m], lengths of the samples' strata.
-            weights: [m], what they contributed to their rays, as `composite` gives it.
-            decay: factor on what the cells of these samples remember, 0..1.
+            positions: float32 [m, 3] in the box; a position outside counts for the nearest cell at the border.
+            density: [m], at the positions; NaN counts as infinite.
+            deltas: [m], lengths of the strata of the samples.
+            weights: [m], contributions of the samples to their rays, from `composite`.
+            decay: factor on the old densities of the cells of these samples, 0..1.
             backend: of the op.
 
         Raises:
@@ -221,7 +222,7 @@ class OccupancyGrid:
         )
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Tensors from which `from_state` makes the same grid, bit for bit."""
+        """The tensors from which `from_state` makes the same grid, bit for bit."""
         return {
             "box": self.box.clone(),
             "density": self.density.clone(),
@@ -231,10 +232,10 @@ class OccupancyGrid:
 
     @staticmethod
     def from_state(state: Mapping[str, Tensor], *, device: torch.device | str = "cpu") -> OccupancyGrid:
-        """The grid whose `state_dict` this is.
+        """A grid from its `state_dict`.
 
         Raises:
-            ValueError: an entry is missing or has another shape than it should.
+            ValueError: an entry is missing or has a wrong shape.
         """
         missing = [name for name in ("box", "density", "occupied", "threshold") if name not in state]
         if missing:
@@ -253,7 +254,7 @@ class OccupancyGrid:
 
 
 def density_of(field: Field, points: Tensor) -> Tensor:
-    """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN counts as endless."""
+    """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN becomes infinity."""
     direction = points.new_tensor(((0.0, 0.0, 1.0),))
     _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
     return sigma.detach().float().nan_to_num(nan=float("inf"), posinf=float("inf"))

@@ -1,4 +1,4 @@
-"""Rays to colours by all passes: one, or a second where the first found something.
+"""Renders rays in one pass, or in several, where later passes sample where earlier ones found something.
 
 r rays, h x w pixels. Units as in `voronerf.rendering.volume`.
 """
@@ -30,7 +30,7 @@ from voronerf.rendering.sampling import (
 )
 from voronerf.rendering.volume import Rendered, per_ray, render_samples
 
-#: Share of the first pass in the loss where one network is asked twice (mip-NeRF, section 3.2).
+#: Share of the first pass in the loss if one network is evaluated in two passes (mip-NeRF, section 3.2).
 COARSE_SHARE = 0.1
 
 
@@ -41,8 +41,8 @@ class RenderedImage(NamedTuple):
         colour: [h, w, 3], the background included.
         opacity: [h, w].
         depth: [h, w], as in `Rendered`.
-        heaviest: [h, w, 3], position of each ray's heaviest sample: whose cell the pixel shows. Rays without samples
-            have the point at their far end (opacity 0).
+        heaviest: [h, w, 3], position of the heaviest sample of each ray; its cell is the one that the pixel shows. A
+            ray without samples (opacity 0) has its far end.
 
     Examples:
         >>> import torch
@@ -62,32 +62,32 @@ class RenderedImage(NamedTuple):
 
 
 class Renderer:
-    """How a scene's rays become colours: which fields are asked, where along a ray, and in how many passes.
+    """Renders the rays of a scene: which fields are evaluated, where along a ray, and in how many passes.
 
     - "field" alone, no fine samples: one pass over stratified samples.
-    - "field" alone with fine samples: it is asked twice (mip-NeRF, section 3.2).
-    - "coarse" and "field": the first pass is the coarse field's (NeRF, section 5.2).
-    - "proposal" and "field": before the last pass come those of a field whose colours do not count, and which learns to
-      be where the last finds something, in one or more rounds (mip-NeRF 360, section 3).
+    - "field" alone with fine samples: the field is evaluated twice (mip-NeRF, section 3.2).
+    - "coarse" and "field": the first pass uses the coarse field (NeRF, section 5.2).
+    - "proposal" and "field": a density field is evaluated first, in one or more rounds. It learns where the last pass
+      finds something; its colours are not used (mip-NeRF 360, section 3).
 
-    The second pass asks about points of both passes, or for cones and after a proposal about new intervals alone.
+    The second pass evaluates the samples of both passes; for cones and after a proposal only new intervals.
 
     Attributes:
         fields: by name.
-        occupancy: what is empty, which a single pass over points may skip; may be set at any time.
-        sharpness: exponent of a proposal's weights where intervals are drawn from them with jitter, 0..1, and 1 at
-            first: below, the next pass looks more evenly along a ray (the annealing of mip-NeRF 360, section 3).
+        occupancy: which space a single pass over points may skip; can be set at any time.
+        sharpness: exponent on the weights of a proposal when intervals are drawn from them with jitter, 0..1; 1 at
+            first. A smaller one spreads the next pass more evenly (the annealing of mip-NeRF 360, section 3).
 
     Args:
         fields: by name, as above.
-        samples: of the first pass, a ray.
-        fine_samples: of the second pass; 0 for a single pass.
-        cones: ask about Gaussians [n, 6] rather than points [n, 3]; rays need radii.
-        contraction: of the space that the fields live in.
+        samples: samples a ray in the first pass.
+        fine_samples: samples a ray in the second pass; 0 for a single pass.
+        cones: evaluate Gaussians [n, 6] instead of points [n, 3]; rays need radii.
+        contraction: of the space that the fields work in.
         spacing: of the strata, "linear" or "disparity".
-        occupancy: for a single pass over points.
-        rounds: how often a proposal is asked, each time about new intervals where it has found something.
-        distortion: factor of the last pass's `distortion_loss`; 0 is without.
+        occupancy: which space is empty, for a single pass over points.
+        rounds: how often a proposal is evaluated, each time on new intervals where it has found something.
+        distortion: factor of the `distortion_loss` of the last pass; 0 is off.
         backend: of the ops.
 
     Raises:
@@ -147,13 +147,13 @@ class Renderer:
 
     @property
     def device(self) -> torch.device:
-        """Where the field's parameters are; the CPU for one that has none."""
+        """The device of the field's parameters; the CPU for a field without parameters."""
         parameters = self.field.parameters() if isinstance(self.field, nn.Module) else iter(())
         first = next(parameters, None)
         return torch.device("cpu") if first is None else first.device
 
     def train(self, mode: bool = True) -> Renderer:
-        """Puts the fields into training mode, or for False into that of evaluation."""
+        """Puts the fields into training mode, or into evaluation mode."""
         for field in self.fields.values():
             if isinstance(field, nn.Module):
                 field.train(mode)
@@ -169,14 +169,14 @@ class Renderer:
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Rendered | Marched, ...]:
-        """What rays see, a result for each pass; the last one's colours count, the others are for :meth:`loss`.
+        """Renders rays, with one result for each pass; the last has the colours, the others are for :meth:`loss`.
 
         Args:
-            rays: r rays, with radii where the renderer works with cones.
-            near: [r] or one for all, where they begin.
-            far: [r] or one for all, where they end.
+            rays: r rays, with radii for cones.
+            near: [r] or one for all, where the rays begin.
+            far: [r] or one for all, where the rays end.
             background: [3] or [r, 3]; None is black.
-            jitter: random samples, as for training.
+            jitter: random samples, for training.
             generator: of the jitter.
         """
         near, far = per_ray(near, rays), per_ray(far, rays)
@@ -233,7 +233,7 @@ class Renderer:
     def _intervals(
         self, before: Rendered, count: int, jitter: bool, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """So many new intervals where the pass before found something, and a sample in each."""
+        """`count` new intervals where the pass before found something, and a sample in each."""
         r, weights = len(before.edges), blurred_weights(before.weights.detach())
         if jitter and "proposal" in self.fields and self.sharpness != 1.0:
             weights = weights**self.sharpness
@@ -246,13 +246,13 @@ class Renderer:
         return torch.lerp(edges[:, :-1], edges[:, 1:], inside), edges
 
     def loss(self, passes: tuple[Rendered | Marched, ...], target: Tensor) -> Tensor:
-        """What training minimises: the mean squared error of every pass's colours (NeRF, equation 6).
+        """The training loss: the mean squared error of the colours of every pass (NeRF, equation 6).
 
-        The first pass of a field that is asked twice counts a tenth (mip-NeRF, section 3.2); a proposal's passes are
-        measured by `interlevel_loss` instead, and the last pass by `distortion_loss` too where that has a factor.
+        If one field is evaluated twice, its first pass counts a tenth (mip-NeRF, section 3.2). Passes of a proposal
+        have the `interlevel_loss` instead. The last pass has the `distortion_loss` too, if its factor is not 0.
 
         Args:
-            passes: what :meth:`render` returned.
+            passes: the result of :meth:`render`.
             target: [r, 3].
         """
         *before, last = passes
@@ -284,7 +284,7 @@ class Renderer:
         heaviest: bool = True,
         chunk: int | None = None,
     ) -> RenderedImage:
-        """One camera's whole image, without gradients and without randomness; see `render_image`."""
+        """The whole image of one camera, without gradients and without randomness; see `render_image`."""
         grid = self.occupancy
         if chunk is None:
             chunk = 4096 if grid is None else 131_072

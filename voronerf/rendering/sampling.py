@@ -1,4 +1,4 @@
-"""Where along its ray a field is asked. r rays, s samples a ray; distances in world units."""
+"""Where the samples of a ray lie. r rays, s samples a ray; distances in world units."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from voronerf.ops.resample import resample
 
 SPACINGS = ("linear", "disparity")
-#: What the weights of all intervals are raised by before drawing from them (mip-NeRF, equation 18).
+#: Added to the weights of all intervals before drawing from them (mip-NeRF, equation 18).
 PADDING = 0.01
 
 
@@ -24,15 +24,14 @@ def stratified_depths(
     """One sample in each of s strata of [near, far] (Mildenhall et al. 2020, NeRF, eq. 2).
 
     Args:
-        near: [r]; positive where spacing is "disparity". That is not checked, which would make the host wait for the
-            device; a ray with near == 0 gets finite depths there, all but the far end at 0.
+        near: [r]; positive if spacing is "disparity". This is not checked, because the host would have to wait for the
+            device. A ray with near == 0 then gets finite depths, all 0 except for the far end.
         far: [r], >= near.
         samples: s, >= 1.
-        jitter: uniformly random inside each stratum, else in its middle (the middle in disparity, where that is the
-            spacing).
+        jitter: uniformly random inside each stratum, else in its middle (for "disparity", the middle in disparity).
         spacing: "linear": strata of equal length; "disparity": equal steps of 1 / distance, dense near the camera, for
             scenes with a far background.
-        generator: of the jitter, on any device: what it draws is moved to the rays'.
+        generator: of the jitter, on any device; its numbers are moved to the device of the rays.
 
     Returns:
         (depths [r, s] ascending, deltas [r, s], edges [r, s + 1]). A sample stands for its whole stratum: deltas are
@@ -107,9 +106,9 @@ def stratified_edges(
 def strata_uniforms(
     rays: int, count: int, like: Tensor, jitter: bool, generator: torch.Generator | None
 ) -> Tensor | None:
-    """Numbers [r, count] in 0..1, one in each of as many strata; None, which stands for their middles, without jitter.
+    """Random numbers [r, count] in 0..1, one in each of `count` strata; None without jitter, which means the middles.
 
-    A stratum's own draw spreads them more evenly than independent numbers, with the same distribution.
+    They are spread more evenly than independent numbers, with the same distribution.
     """
     if not jitter:
         return None
@@ -119,9 +118,10 @@ def strata_uniforms(
 
 
 def blurred_weights(weights: Tensor) -> Tensor:
-    """Weights [r, s] as drawn from: a maximum over two neighbours, blurred, and raised (mip-NeRF, equation 18).
+    """The weights [r, s] for drawing: maximum of two neighbours, blurred, plus a constant (mip-NeRF, equation 18).
 
-    The result bounds the weights from above with room at both sides, so that a second pass also looks beside a surface.
+    The result is an upper bound of the weights, with room on both sides, so a second pass also samples beside a
+    surface.
     """
     wide = torch.nn.functional.pad(weights[:, None, :], (1, 1), mode="replicate")[:, 0]
     largest = torch.maximum(wide[:, :-1], wide[:, 1:])
@@ -138,20 +138,20 @@ def union_depths(
     generator: torch.Generator | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """The samples of a first pass and further ones where it found something (NeRF, section 5.2).
+    """The samples of a first pass together with new ones where it found something (NeRF, section 5.2).
 
     Args:
         depths: [r, s], of the first pass.
         edges: [r, s + 1], of its strata.
         weights: [r, s].
-        count: f, of the further samples.
-        jitter: draw them, else the middles of strata of equal weight.
+        count: f, the number of new samples.
+        jitter: draw them at random, else take the middles of strata of equal weight.
         generator: of the jitter.
         backend: of the op.
 
     Returns:
-        (depths [r, s + f] ascending, edges [r, s + f + 1]): a sample stands for the ray
-        up to halfway to its neighbours.
+        (depths [r, s + f] ascending, edges [r, s + f + 1]). A sample stands for the part of the ray up to halfway to
+        its neighbours.
     """
     uniforms = strata_uniforms(len(depths), count, depths, jitter, generator)
     found = resample(weights, edges, count, uniforms=uniforms, backend=backend)
@@ -160,16 +160,16 @@ def union_depths(
 
 
 def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tensor) -> Tensor:
-    """What a proposal has missed (Barron et al. 2022, "Mip-NeRF 360", equation 13), the mean over rays.
+    """The loss of a proposal (Barron et al. 2022, "Mip-NeRF 360", equation 13), the mean over rays.
 
-    A histogram ``weights`` can come from one density together with the proposal only where it does not exceed the sum
-    of all of the proposal's intervals that it touches.
+    It penalises weights of the field that exceed the sum of the proposal's weights over all intervals that overlap
+    them: such weights cannot come from the same density as the proposal.
 
     Args:
-        edges: [r, s + 1], of the field's intervals; no gradient.
-        weights: [r, s]; no gradient.
-        found: [r, t + 1], edges of the proposal's intervals.
-        bounds: [r, t], the proposal's weights.
+        edges: [r, s + 1], of the intervals of the field; no gradient.
+        weights: [r, s], of the field; no gradient.
+        found: [r, t + 1], edges of the intervals of the proposal.
+        bounds: [r, t], weights of the proposal.
     """
     edges, weights = edges.detach(), weights.detach()
     total = torch.nn.functional.pad(bounds.cumsum(dim=1), (1, 0))
@@ -187,7 +187,7 @@ def normalised(edges: Tensor, near: Tensor, far: Tensor, spacing: str) -> Tensor
     Args:
         edges: [r, s].
         near: [r].
-        far: [r]; a ray that ends where it begins has fractions of 0.
+        far: [r]; if it equals near, the fractions are 0.
         spacing: "linear" or "disparity".
     """
     tiny = torch.finfo(edges.dtype).tiny
@@ -199,10 +199,10 @@ def normalised(edges: Tensor, near: Tensor, far: Tensor, spacing: str) -> Tensor
 
 
 def distortion_loss(edges: Tensor, weights: Tensor) -> Tensor:
-    """How far a ray's weights are spread (Barron et al. 2022, "Mip-NeRF 360", equation 15), the mean over rays.
+    """The spread of the weights along a ray (Barron et al. 2022, "Mip-NeRF 360", equation 15), the mean over rays.
 
     The integral of ``w(u) w(v) |u - v|`` over both: ``sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 (s_i+1 - s_i) / 3``. It
-    is small for weights in one place and for none at all, and pulls what floats in front of a surface into it.
+    is small if all weight is in one place, or if there is none. It removes floaters in front of surfaces.
 
     Args:
         edges: [r, s + 1] ascending, fractions of the way; no gradient.
@@ -210,7 +210,7 @@ def distortion_loss(edges: Tensor, weights: Tensor) -> Tensor:
     """
     edges = edges.detach()
     middles, widths = (edges[:, 1:] + edges[:, :-1]) / 2, edges.diff(dim=1)
-    # Middles ascend: of each pair the later one is the larger, and sums over the earlier ones do for all.
+    # The middles ascend: in each pair the later one is larger, so sums over the earlier ones suffice.
     mass = weights * middles
     earlier, moment = weights.cumsum(1) - weights, mass.cumsum(1) - mass
     between = 2 * (weights * (middles * earlier - moment)).sum(1)

@@ -25,12 +25,12 @@ class Rendered(NamedTuple):
     Attributes:
         colour: [r, 3], the background included.
         opacity: [r], 0..1: the sum of the weights.
-        depth: [r], expected distance, normalised by the opacity; the last edge for a ray with none.
-        weights: [r, s], each sample's contribution.
+        depth: [r], expected distance, normalised by the opacity; the last edge for a ray with opacity 0.
+        weights: [r, s], the contribution of each sample.
         positions: [r, s, 3].
-        rgb: [r, s, 3], each sample's colour.
-        depths: [r, s], distance of each sample.
-        edges: [r, s + 1], where the part of the ray that it stands for begins and ends.
+        rgb: [r, s, 3], the colour of each sample.
+        depths: [r, s], the distance of each sample.
+        edges: [r, s + 1], the ends of the parts of the ray that the samples stand for.
 
     Examples:
         >>> import torch
@@ -69,13 +69,13 @@ def render_rays(
     """Colours of rays by quadrature of the volume rendering integral (Mildenhall et al. 2020, NeRF, eq. 3).
 
     Args:
-        field: called once, on all r * s samples, a ray's samples being consecutive.
+        field: called once, on all r * s samples; the samples of a ray are consecutive.
         rays: r rays.
         near: start of the integral, [r] or one for all.
         far: end, [r] or one for all. A ray with far == near gets the background.
         samples: s, one in each of s strata.
-        background: [3] or [r, 3], seen through what is transparent; None is black.
-        jitter: stratified random samples, else the strata's middles.
+        background: [3] or [r, 3], the colour behind the scene; None is black.
+        jitter: random samples in the strata, else their middles.
         generator: of the jitter.
         spacing: of the strata, "linear" or "disparity".
         backend: of the composite op.
@@ -106,16 +106,16 @@ def render_samples(
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> Rendered:
-    """The same for samples that have been chosen.
+    """`render_rays` for given samples.
 
     Args:
-        field: called once, on all r * s samples, a ray's samples being consecutive: points [n, 3], or with cones their
-            Gaussians [n, 6].
+        field: called once, on all r * s samples; the samples of a ray are consecutive. Its input is points [n, 3], or
+            with cones Gaussians [n, 6].
         rays: r rays, with radii for cones.
         depths: [r, s].
         edges: [r, s + 1] around them.
-        cones: ask about the cones' frustums between the edges.
-        contraction: of the space that the field lives in; the positions returned lie there as well.
+        cones: evaluate the frustums of the cones between the edges.
+        contraction: of the space that the field works in; the returned positions are contracted too.
         background: [3] or [r, 3].
         backend: of the composite op.
     """
@@ -128,7 +128,7 @@ def render_samples(
     # A copy of an expanded view: repeat_interleave would gather.
     index = torch.arange(len(rays), device=depths.device, dtype=torch.int32)[:, None].expand(-1, samples).reshape(-1)
     rgb, sigma = field(inputs.reshape(-1, inputs.shape[-1]), rays.directions, index)
-    # a field under autocast answers in a half type: the sums along a ray are float32's
+    # under autocast the field returns a half type; the sums along a ray are float32
     rgb = rgb.reshape(len(rays), samples, 3).to(depths.dtype)
     sigma = sigma.reshape(len(rays), samples).to(depths.dtype)
     result = composite(sigma, rgb, depths, edges.diff(dim=-1), background=background, backend=backend)
@@ -140,7 +140,7 @@ def render_samples(
 
 
 def per_ray(distance: Tensor | float, rays: Rays) -> Tensor:
-    """A distance of each ray, from one for all or theirs."""
+    """One distance for each ray, given as one for all or as a tensor."""
     if isinstance(distance, Tensor):
         return distance.expand(len(rays))
     return torch.full_like(rays.origins[:, 0], distance)
