@@ -1,1 +1,22 @@
-"""Scores and pictures of a trained scene: PSNR, SSIM, LPIPS, panels, videos, seams, slices, curves."""
+"""Scores and pictures of a trained scene: PSNR, SSIM, LPIPS, panels, videos, seams, slices, curves.
+
+Pictures are in ``panels``, ``plots``, ``slices`` and ``video``, which import matplotlib, Pillow or ffmpeg.
+"""
+
+from voronerf.evaluation.lpips import Lpips, LpipsError, find_lpips
+from voronerf.evaluation.metrics import psnr, ssim
+from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores, score_views
+from voronerf.evaluation.seams import seam
+
+__all__ = [
+    "Lpips",
+    "LpipsError",
+    "ViewScore",
+    "evaluate",
+    "find_lpips",
+    "mean_scores",
+    "psnr",
+    "score_views",
+    "seam",
+    "ssim",
+]

@@ -50,6 +50,14 @@ class Lpips:
 
     Args:
         weights: the tensors of `SHAPES` by name.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.evaluation.lpips import SHAPES, Lpips
+        >>> lpips = Lpips({name: torch.rand(shape) for name, shape in SHAPES.items()})  # find_lpips has real ones
+        >>> image = torch.rand(40, 40, 3)
+        >>> float(lpips(image, image)), float(lpips(image, 1 - image)) > 0
+        (0.0, True)
     """
 
     def __init__(self, weights: dict[str, Tensor]) -> None:
@@ -113,6 +121,13 @@ def find_lpips(
     Raises:
         LpipsError: the given file or folder, or the first one found, cannot be used; or the images are too small and
             `setting` names weights.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from voronerf.evaluation import find_lpips
+        >>> lpips, source = find_lpips(Path("off"))
+        >>> lpips, source
+        (None, 'LPIPS is off')
     """
     named = str(setting or os.environ.get(VARIABLE, ""))
     if named == OFF:

@@ -15,6 +15,13 @@ def psnr(image: Tensor, truth: Tensor) -> Tensor:
 
     Raises:
         ValueError: the shapes differ.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.evaluation import psnr
+        >>> truth = torch.zeros(8, 8, 3)
+        >>> psnr(truth + 0.1, truth).round(decimals=4)
+        tensor(20., dtype=torch.float64)
     """
     _check_same("psnr", image, truth)
     return -10 * torch.log10((image.double() - truth.double()).square().mean())
@@ -33,6 +40,13 @@ def ssim(image: Tensor, truth: Tensor) -> Tensor:
 
     Raises:
         ValueError: the shapes differ.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.evaluation import ssim
+        >>> truth = torch.linspace(0, 1, 256).reshape(16, 16, 1)
+        >>> ssim(truth, truth), ssim(1 - truth, truth) < 0
+        (tensor(1., dtype=torch.float64), tensor(True))
     """
     _check_same("ssim", image, truth)
     height, width, channels = image.shape[-3:]

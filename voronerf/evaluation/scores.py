@@ -14,7 +14,13 @@ from voronerf.rendering.renderer import RenderedImage, Renderer
 
 @dataclass(frozen=True)
 class ViewScore:
-    """PSNR in dB, SSIM and LPIPS (None without its weights) of one view, on the scene's background (white)."""
+    """PSNR in dB, SSIM and LPIPS (None without its weights) of one view, on the scene's background (white).
+
+    Examples:
+        >>> from voronerf.evaluation import ViewScore
+        >>> ViewScore("r_0", psnr=30.0, ssim=0.95)
+        ViewScore(name='r_0', psnr=30.0, ssim=0.95, lpips=None)
+    """
 
     name: str
     psnr: float
@@ -46,7 +52,18 @@ def render_view(renderer: Renderer, scene: Scene, view: int, *, heaviest: bool =
 def evaluate(
     renderer: Renderer, scene: Scene, *, views: int | None = None, lpips: Lpips | None = None
 ) -> list[ViewScore]:
-    """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all)."""
+    """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all).
+
+    Examples:
+        >>> from voronerf import NeRF
+        >>> from voronerf.data import load_scene
+        >>> from voronerf.evaluation import evaluate
+        >>> from voronerf.rendering import Renderer
+        >>> scene = load_scene("builtin", downscale=20)
+        >>> renderer = Renderer({"field": NeRF(width=16, depth=2)}, samples=8)
+        >>> [score.name for score in evaluate(renderer, scene, views=2)]
+        ['test_000', 'test_012']
+    """
     scores = []
     for view in view_numbers(len(scene.test.names), views):
         image = render_view(renderer, scene, view, heaviest=False)
@@ -63,6 +80,12 @@ def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
 
     The latter, "psnr_of_mean_error", is what the paper's curves show; it is never above the mean of the PSNRs. "lpips"
     is None unless every view has one.
+
+    Examples:
+        >>> from voronerf.evaluation import ViewScore, mean_scores
+        >>> means = mean_scores([ViewScore("r_0", 20.0, 0.9), ViewScore("r_1", 30.0, 0.95)])
+        >>> means["psnr"], round(means["psnr_of_mean_error"], 2), means["lpips"]
+        (25.0, 22.6, None)
     """
     perceived = [s.lpips for s in scores if s.lpips is not None]
     error = sum(10 ** (-s.psnr / 10) for s in scores) / len(scores)
@@ -77,6 +100,17 @@ def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
 def score_views(
     renderer: Renderer, scene: Scene, *, views: int | None = None, lpips: Lpips | None = None
 ) -> dict[str, Any]:
-    """Scores of test views, one by one and in the mean."""
+    """Scores of test views, one by one and in the mean.
+
+    Examples:
+        >>> from voronerf import NeRF
+        >>> from voronerf.data import load_scene
+        >>> from voronerf.evaluation import score_views
+        >>> from voronerf.rendering import Renderer
+        >>> scene = load_scene("builtin", downscale=20)
+        >>> result = score_views(Renderer({"field": NeRF(width=16, depth=2)}, samples=8), scene, views=2)
+        >>> len(result["views"]), result["psnr"] > 0
+        (2, True)
+    """
     scores = evaluate(renderer, scene, views=views, lpips=lpips)
     return {**mean_scores(scores), "views": [asdict(score) for score in scores]}

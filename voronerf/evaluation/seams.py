@@ -71,6 +71,23 @@ def seam(
 
     Raises:
         ValueError: a margin that is not positive.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF, VoronoiRouter
+        >>> from voronerf.data import load_scene
+        >>> from voronerf.evaluation import seam
+        >>> from voronerf.rendering import Renderer
+        >>> scene = load_scene("builtin", downscale=20)
+        >>> field = NeRF(width=16, depth=2)
+        >>> _ = torch.nn.init.ones_(field.density.bias)  # opaque, so that borders show
+        >>> router = VoronoiRouter(field, 0.1 * torch.eye(3))  # three cells that are copies
+        >>> renderer = Renderer({"field": router}, samples=8)
+        >>> cameras = scene.test.cameras
+        >>> def picture(view):
+        ...     return renderer.image(cameras, view, near=scene.near, far=scene.far, box=scene.box)
+        >>> seam(router.eval(), scene, picture, views=1) < 1e-3
+        True
     """
     if margin is not None and not 0 < margin < float("inf"):
         raise ValueError(f"seam: margin must be positive and finite, got {margin}")
