@@ -49,11 +49,9 @@ def test_every_public_name_is_in_the_reference_once() -> None:
     assert len({id(value) for value in shown.values()}) == len(shown)
 
 
-@pytest.mark.parametrize("name", sorted(PUBLIC))
+@pytest.mark.parametrize("name", sorted(name for name, value in PUBLIC.items() if callable(value)))
 def test_example_of_a_public_name_runs(name: str) -> None:
     value = PUBLIC[name]
-    if not callable(value):
-        pytest.skip("a value")
     if inspect.isclass(value) and issubclass(value, Exception):
         assert value.__doc__
         return
