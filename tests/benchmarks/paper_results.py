@@ -1,11 +1,7 @@
-"""What the tests of benchmarks/paper*.py share: tiny settings and results without a training."""
+"""What the tests of benchmarks/paper share: tiny settings and results without a training."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
-Load = Callable[[str], Any]
 TINY = {
     "scene": ("builtin",),
     "downscale": 20,
@@ -21,18 +17,20 @@ TINY = {
 }
 
 
-def synthetic(
-    experiment: Any, settings: Any, score: Callable[[int], float], scene: str = "lego"
-) -> list[dict[str, Any]]:
+def as_options(settings) -> list[str]:
+    """Settings as the command line takes them."""
+    values = {key: value if isinstance(value, tuple) else (value,) for key, value in settings.items()}
+    return [str(part) for key, value in values.items() for part in (f"--{key.replace('_', '-')}", *value)]
+
+
+def synthetic(experiment, settings, score, scene="lego"):
     """Results of an experiment in which variant number i has a PSNR of score(i) and seams of 50 less that."""
-    variants = experiment.variants(settings, "builtin")
     found = []
-    for index, variant in enumerate(variants):
+    for index, variant in enumerate(experiment.variants(settings, "builtin")):
         for seed in range(2):
             value = score(index) + 0.01 * seed
             looks = [
-                {"look": name, "psnr": value, "seam": 50 - value, "step": 1, "seconds": 1.0}
-                for name in ("after", "end")
+                {"look": n, "psnr": value, "seam": 50 - value, "step": 1, "seconds": 1.0} for n in ("after", "end")
             ]
             curve = [{"seconds": t, "psnr": value * t / 10} for t in (5.0, 10.0)]
             row = {"variant": variant.name, "scene": scene, "seed": seed, "psnr": value, "ssim": 0.5, "lpips": None}

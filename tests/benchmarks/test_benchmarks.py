@@ -4,44 +4,49 @@ from __future__ import annotations
 
 import json
 import re
-import runpy
 import subprocess
 import sys
-from collections.abc import Callable
+import time
 from pathlib import Path
-from typing import Any
 
+import harness
 import pytest
+import table
+import throughput
 import torch
+from helpers import read_json
+from ops import (
+    alternatives,
+    case,
+    cases_foreign,
+    cases_lookup,
+    cases_marching,
+    cases_network,
+    cases_sampling,
+    networks,
+    route,
+    targets,
+)
 
 import voronerf
+from voronerf import native as _native
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 CPU = torch.device("cpu")
 OPS = {
-    "nearest_centre",
-    "locate_cell",
-    "draw_cell",
-    "cell_sort",
-    "grouped_linear",
-    "grouped_mlp",
-    "frequency_encode",
-    "integrated_encode",
-    "composite",
-    "resample",
-    "routed_mlp",
+    *("nearest_centre", "locate_cell", "draw_cell", "cell_sort", "grouped_linear", "grouped_mlp", "frequency_encode"),
+    *("integrated_encode", "composite", "resample", "routed_mlp"),
 }
 NOT_DIFFERENTIABLE = {"march_rays", "update_occupancy", "camera_rays", "balance_centres", "select_heaviest"}
 OPS |= NOT_DIFFERENTIABLE
 COLUMNS = [
-    *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "median_ms", "iqr_ms", "throughput", "unit"),
-    *("percent_of_peak", "alternatives", "speedup_over_best", "max_error"),
+    *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "threads"),
+    *("median_ms", "iqr_ms", "throughput", "unit", "percent_of_peak", "alternatives", "speedup_over_best", "max_error"),
 ]
 
 
-def test_metadata_says_what_was_measured_where() -> None:
-    harness = runpy.run_path(str(BENCHMARKS / "harness.py"))
-    metadata = json.loads(json.dumps(harness["metadata"](benchmark="balance", seeds=3)))
+def test_metadata_says_what_was_measured_where():
+    metadata = json.loads(json.dumps(harness.metadata(benchmark="balance", seeds=3)))
     assert (metadata["benchmark"], metadata["seeds"]) == ("balance", 3)
     assert (metadata["voronerf"], metadata["torch"]) == (voronerf.__version__, torch.__version__)
     assert metadata["threads"] == torch.get_num_threads() and metadata["machine"] and metadata["python"]
@@ -49,30 +54,19 @@ def test_metadata_says_what_was_measured_where() -> None:
 
 
 @pytest.mark.parametrize("name", ["Makefile", "README.md", "CONTRIBUTING.md", "docs/performance.md"])
-def test_scripts_that_are_named_are_there(name: str) -> None:
+def test_scripts_that_are_named_are_there(name):
     path = BENCHMARKS.parent / name
     for script in re.findall(r"benchmarks/\w+\.py", path.read_text()):
         assert (BENCHMARKS.parent / script).is_file(), f"{name} names {script}"
 
 
-def test_balance_runs_as_a_script(tmp_path: Path) -> None:
-    path = tmp_path / "results" / "balance.json"
-    arguments = ["--cells", "4", "--seeds", "1", "--count", "300", "--json", str(path)]
-    command = [sys.executable, str(BENCHMARKS / "balance.py"), *arguments, "--methods", "published"]
-    subprocess.run(command, check=True, capture_output=True)
-    outcome = json.loads(path.read_text())
-    assert outcome["metadata"]["benchmark"] == "balance" and outcome["metadata"]["count"] == 300
-    (row,) = outcome["results"]
-    assert row["after"] < row["before"]
-
-
 # --- timing ---------------------------------------------------------------------------------------------------------
 
 
-def test_contenders_take_turns_and_slow_ones_are_capped(load: Callable[[str], Any]) -> None:
-    harness, cost, turns = load("harness"), {"fast": 0.25, "middle": 0.5, "slow": 2.5, "slowest": 2.5}, []
+def test_contenders_take_turns_and_slow_ones_are_capped():
+    cost, turns = {"fast": 0.25, "middle": 0.5, "slow": 2.5, "slowest": 2.5}, []
 
-    def stopwatch(run: Callable[[int], Any], first: int, count: int) -> float:
+    def stopwatch(run, first, count):
         assert count == 1
         run(first)
         return cost[turns[-1][0]]
@@ -88,10 +82,10 @@ def test_contenders_take_turns_and_slow_ones_are_capped(load: Callable[[str], An
     assert numbers == sorted(set(numbers)) and 0 not in numbers, "a timed call must not see the inputs before it"
 
 
-def test_short_calls_are_timed_in_batches_behind_an_untimed_one(load: Callable[[str], Any]) -> None:
-    harness, calls = load("harness"), []
+def test_short_calls_are_timed_in_batches_behind_an_untimed_one():
+    calls = []
 
-    def stopwatch(run: Callable[[int], Any], first: int, count: int) -> float:
+    def stopwatch(run, first, count):
         for call in range(first, first + count):
             run(call)
         return 1e-3 * count
@@ -103,10 +97,8 @@ def test_short_calls_are_timed_in_batches_behind_an_untimed_one(load: Callable[[
 
 
 @pytest.mark.skipif(not Path("/proc/stat").is_file(), reason="the kernel's counters are Linux's")
-def test_other_processes_are_noticed(load: Callable[[str], Any]) -> None:
-    import time
-
-    others = load("harness").Others()
+def test_other_processes_are_noticed():
+    others = harness.Others()
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
         deadline, most = time.monotonic() + 60, 0.0
         while most <= 0.3 and time.monotonic() < deadline:
@@ -116,17 +108,15 @@ def test_other_processes_are_noticed(load: Callable[[str], Any]) -> None:
     assert most > 0.3
 
 
-def test_quartiles(load: Callable[[str], Any]) -> None:
-    timing = load("harness").Timing([0.001, 0.002, 0.003, 0.004, 0.1])
+def test_quartiles():
+    timing = harness.Timing([0.001, 0.002, 0.003, 0.004, 0.1])
     assert timing.median_ms == pytest.approx(3) and timing.iqr_ms == pytest.approx(2)
-    assert load("harness").Timing([0.5]).iqr_ms is None
+    assert harness.Timing([0.5]).iqr_ms is None
 
 
 @pytest.mark.native
-def test_instruction_set_is_forced_and_put_back(load: Callable[[str], Any]) -> None:
-    from voronerf import native as _native
-
-    harness, before = load("harness"), _native._ISA
+def test_instruction_set_is_forced_and_put_back():
+    before = _native._ISA
     with harness.instruction_set("portable"):
         assert _native._ISA == 0
     assert before == _native._ISA
@@ -137,8 +127,7 @@ def test_instruction_set_is_forced_and_put_back(load: Callable[[str], Any]) -> N
 # --- the table ------------------------------------------------------------------------------------------------------
 
 
-def test_every_operation_has_rows_in_both_modes(load: Callable[[str], Any]) -> None:
-    throughput = load("throughput")
+def test_every_operation_has_rows_in_both_modes():
     for arguments in ([], ["--quick"]):
         cases = throughput.chosen_cases(throughput.parse(arguments))
         assert {case.op for case in cases} == OPS
@@ -149,8 +138,8 @@ def test_every_operation_has_rows_in_both_modes(load: Callable[[str], Any]) -> N
     assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 
-def test_foreign_fields_have_rows_of_their_own(load: Callable[[str], Any]) -> None:
-    throughput, fields = load("throughput"), load("ops.cases_foreign").FIELDS
+def test_foreign_fields_have_rows_of_their_own():
+    fields = cases_foreign.FIELDS
     cases, quick = (throughput.chosen_cases(throughput.parse(["--foreign", *more])) for more in ([], ["--quick"]))
     assert len({case.key for case in cases}) == len(cases) and {case.op for case in cases} == {"foreign"}
     assert len(quick) == len(fields) == len({case.case.split(" n=")[0] for case in cases})
@@ -158,8 +147,8 @@ def test_foreign_fields_have_rows_of_their_own(load: Callable[[str], Any]) -> No
 
 
 @pytest.mark.parametrize("name", ["nerf-pytorch w64", "appearance", "siren laplacian", "nerfacto table", "k-planes"])
-def test_foreign_contenders_compute_what_masks_do(load: Callable[[str], Any], name: str) -> None:
-    foreign = load("ops.cases_foreign")
+def test_foreign_contenders_compute_what_masks_do(name):
+    foreign = cases_foreign
     for direction in ("forward", "forward+backward"):
         work = foreign.foreign_work(foreign.FIELDS[name], 300, 5, direction, CPU)
         contender = work.ours("reference")
@@ -168,8 +157,7 @@ def test_foreign_contenders_compute_what_masks_do(load: Callable[[str], Any], na
         assert work.error(work.alternatives["masks"]().run(0)[:1]) == 0
 
 
-def test_cost_counts_products(load: Callable[[str], Any]) -> None:
-    networks = load("ops.networks")
+def test_cost_counts_products():
     w64d4 = networks.cost(networks.NETS["w64d4"])
     hidden, head = 2 * 64 * 64 * 3, 2 * 64 * 4
     assert w64d4.forward == 2 * 63 * 64 + hidden + head
@@ -184,11 +172,10 @@ def test_cost_counts_products(load: Callable[[str], Any]) -> None:
 
 @pytest.mark.parametrize("name", ["w64d4", "nerf64", "64-64"])
 @pytest.mark.parametrize("direction", ["forward", "forward+backward"])
-def test_alternatives_compute_the_same(load: Callable[[str], Any], name: str, direction: str) -> None:
-    alternatives, networks, case = load("ops.alternatives"), load("ops.networks"), load("ops.case")
+def test_alternatives_compute_the_same(name, direction):
     features, net = networks.LAYERS.get(name) or (None, networks.NETS[name])
     for dtype in (torch.float32, torch.bfloat16):
-        tolerance = load("ops.cases_network").TOLERANCE[dtype, direction]
+        tolerance = cases_network.TOLERANCE[dtype, direction]
         batch = networks.make_batch(net, 300, 5, dtype, direction, CPU, features=features)
         error, done = networks.network_error(batch), []
         for backend in ("reference", "native"):
@@ -210,23 +197,21 @@ def test_alternatives_compute_the_same(load: Callable[[str], Any], name: str, di
 
 
 @pytest.mark.parametrize("direction", ["forward", "forward+backward"])
-def test_routes_compute_the_same(load: Callable[[str], Any], direction: str) -> None:
-    route = load("ops.route")
+def test_routes_compute_the_same(direction):
     for name in ("w64d4", "nerf64"):
         work = route.route_work(name, 300, 5, torch.float32, direction, 1e-4, False, CPU)
         contenders = {label: set_up() for label, set_up in work.alternatives.items()}
         assert any("masks" in label for label in contenders)
         contenders["ours"] = work.ours("reference")
-        contenders["separate"] = route.route_work(name, 300, 5, torch.float32, direction, 1e-4, True, CPU).ours(
-            "reference"
-        )
+        separate = route.route_work(name, 300, 5, torch.float32, direction, 1e-4, True, CPU)
+        contenders["separate"] = separate.ours("reference")
         for label, contender in contenders.items():
             assert work.error(contender.adapt(contender.run(0))) < 1e-4, f"{name}, {label}"
 
 
-def test_what_is_compared_is_right_in_every_small_case(load: Callable[[str], Any]) -> None:
-    lookup, sampling, case = load("ops.cases_lookup"), load("ops.cases_sampling"), load("ops.case")
-    marching = load("ops.cases_marching")
+def test_what_is_compared_is_right_in_every_small_case():
+    lookup, sampling = cases_lookup, cases_sampling
+    marching = cases_marching
     works = {
         "nearest_centre": lookup._nearest_work(500, 7, torch.float32, False, CPU),
         "locate_cell": lookup._locate_work(500, (4, 3), CPU),
@@ -261,15 +246,15 @@ def test_what_is_compared_is_right_in_every_small_case(load: Callable[[str], Any
             contender.run(1)
 
 
-def test_wrong_answers_are_found(load: Callable[[str], Any]) -> None:
-    lookup, networks = load("ops.cases_lookup"), load("ops.networks")
+def test_wrong_answers_are_found():
+    lookup = cases_lookup
     work = lookup._nearest_work(500, 7, torch.float32, False, CPU)
     right = work.ours("reference").run(0)
     assert work.error(right) == 0 and work.error((right + 1) % 7) == 500 and work.error(right + 7) == float("inf")
     work = lookup._sort_work(500, 7, CPU)
     order, offsets = work.ours("reference").run(0)
     assert work.error((order, offsets)) == 0 and work.error((order.flip(0), offsets)) > 0
-    marching = load("ops.cases_marching")
+    marching = cases_marching
     work = marching._march_work(1 << 13, True, CPU)
     right = work.ours("reference").run(0)
     assert work.error(right) < 1e-6 and work.error(right._replace(depths=right.depths * 1.1)) > 0.05
@@ -284,45 +269,30 @@ def test_wrong_answers_are_found(load: Callable[[str], Any]) -> None:
     assert work.error((points, kept)) == 0 and work.error((points.flip(0), kept)) == float("inf")
     batch = networks.make_batch(networks.NETS["mlp32"], 200, 3, torch.float32, "forward+backward", CPU)
     error = networks.network_error(batch)
-    out, gradients = load("ops.alternatives").ours(batch, "reference").run(0)
+    out, gradients = alternatives.ours(batch, "reference").run(0)
     assert error((out, gradients)) < 1e-5
     assert error((out, (*gradients[:-1], gradients[-1] * 1.5))) > 0.1
     assert error((out * torch.nan, None)) == float("inf")
 
 
-def test_rows_report_failures_losses_and_caps(load: Callable[[str], Any]) -> None:
-    throughput, case = load("throughput"), load("ops.case")
+def test_rows_report_failures_losses_and_caps():
 
-    def absent() -> Any:
+    def absent():
         raise case.NotApplicable("not installed")
 
-    def broken() -> Any:
+    def broken():
         raise RuntimeError("first line\nsecond")
 
-    def sleeper(seconds: float) -> Any:
-        import time
-
+    def sleeper(seconds):
         return case.Contender(lambda call: time.sleep(seconds) or torch.ones(3))
 
-    work = case.Work(
-        lambda backend: sleeper(0.006),
-        {
-            "faster": lambda: sleeper(0.001),
-            "slow": lambda: sleeper(0.4),
-            "absent": absent,
-            "broken": broken,
-            "wrong": lambda: case.Contender(lambda call: torch.zeros(3)),
-        },
-        lambda found: case.relative_error(found, torch.ones(3)),
-        1e-3,
-        1e6,
-        "",
-    )
+    others = {"faster": lambda: sleeper(0.001), "slow": lambda: sleeper(0.4), "absent": absent, "broken": broken}
+    others["wrong"] = lambda: case.Contender(lambda call: torch.zeros(3))
+    error = lambda found: case.relative_error(found, torch.ones(3))  # noqa: E731
+    work = case.Work(lambda backend: sleeper(0.006), others, error, 1e-3, 1e6, "")
     bench = throughput.Bench(CPU, quick=True, wanted=["reference"])
-    row_case = case.Case(
-        "cell_sort", "x", torch.int32, "forward", 10, 2, lambda device: work, backends=("reference", "native")
-    )
-    (row,) = bench.run(row_case)
+    given = "cell_sort", "x", torch.int32, "forward", 10, 2, lambda device: work
+    (row,) = bench.run(case.Case(*given, backends=("reference", "native")))
     assert set(COLUMNS) <= set(row) and row["backend"] == "reference"
     assert row["alternatives"]["faster"] < row["median_ms"] and row["speedup_over_best"] < 1
     assert row["alternatives"]["slow"] >= 400 and row["notes"]["slow"] == "capped"
@@ -349,23 +319,21 @@ def test_rows_report_failures_losses_and_caps(load: Callable[[str], Any]) -> Non
         (["--fast"], "unrecognized arguments: --fast"),
     ],
 )
-def test_bad_arguments_are_one_line(
-    load: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
-) -> None:
+def test_bad_arguments_are_one_line(monkeypatch, arguments, message):
     monkeypatch.chdir(BENCHMARKS.parent)
     with pytest.raises(SystemExit) as error:
-        load("throughput").main(arguments)
+        throughput.main(arguments)
     text = str(error.value)
     assert text.startswith(f"throughput: error: {message}") and "\n" not in text
 
 
-def test_throughput_runs_as_a_script_and_table_reads_its_result(tmp_path: Path, load: Callable[[str], Any]) -> None:
+def test_throughput_runs_as_a_script_and_table_reads_its_result(tmp_path):
     path = tmp_path / "results" / "throughput.json"
     script = str(BENCHMARKS / "throughput.py")
     command = [sys.executable, script, "--quick", "--filter", "^resample", "--json", str(path), "--targets"]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     assert "[1/1," in done.stderr and "not measured" in done.stdout
-    outcome = json.loads(path.read_text())
+    outcome = read_json(path)
     metadata = outcome["metadata"]
     assert metadata["benchmark"] == "throughput" and metadata["quick"] is True and metadata["device"] == "cpu"
     assert isinstance(metadata["missing"], list) and len(metadata["load"]) == 3
@@ -373,7 +341,6 @@ def test_throughput_runs_as_a_script_and_table_reads_its_result(tmp_path: Path, 
         assert list(row)[: len(COLUMNS)] == COLUMNS
         assert row["op"] == "resample" and row["unit"] == "GB/s" and row["median_ms"] > 0
         assert row["alternatives"]["torch cumsum + searchsorted"] > 0 and row["max_error"] < 1e-2
-    table = load("table")
     native = [row for row in outcome["results"] if row["backend"] == "native"]
     for row in native:
         assert f"`resample` {row['case']}" in table.markdown([row])[-1]
@@ -381,14 +348,14 @@ def test_throughput_runs_as_a_script_and_table_reads_its_result(tmp_path: Path, 
         table.load(BENCHMARKS / "results" / "time_to_quality_lego.json")
 
 
-def _row(case: str, ms: float, alternatives: dict[str, float | None], **columns: Any) -> dict[str, Any]:
+def _row(case, ms, alternatives, **columns):
     base = {"op": "grouped_mlp", "case": case, "backend": "native", "dtype": "float32", "direction": "forward"}
     numbers = {"n": 1 << 18, "median_ms": ms, "alternatives": alternatives, "percent_of_peak": 80.0}
     return {**base, **numbers, "bound": "float32", "speedup_over_best": None, **columns}
 
 
-def test_targets_read_the_rows(load: Callable[[str], Any]) -> None:
-    targets, n = load("ops.targets"), 1 << 18
+def test_targets_read_the_rows():
+    n = 1 << 18
     rows = [
         _row(f"w64d4 n={n} k=16", 20.0, {"torch loop": 60.0}, percent_of_peak=86.0),
         _row(f"nerf64 n={n} k=16", 50.0, {"torch loop": 160.0}, percent_of_peak=84.0),
@@ -413,34 +380,26 @@ def test_targets_read_the_rows(load: Callable[[str], Any]) -> None:
     assert (compared.kernel, compared.architecture) == (1.5, 12.0)
     assert "1.50 x by kernels" in targets.architecture_lines(rows)[0]
     assert len(targets.target_lines(rows)) == 1 + len(targets.TARGETS) + len(targets.ELSEWHERE)
-    assert any("| 86.0 | reached |" in line for line in load("table").target_markdown(rows))
+    assert any("| 86.0 | reached |" in line for line in table.target_markdown(rows))
 
 
-def test_targets_name_rows_that_the_benchmark_has(load: Callable[[str], Any]) -> None:
+def test_targets_name_rows_that_the_benchmark_has():
     """A target whose row is never measured could not be reached."""
-    targets, throughput = load("ops.targets"), load("throughput")
     cases = throughput.chosen_cases(throughput.parse([]))
-    rows = [
-        {
-            **_row(case.case, 1.0, {"torch loop": 1.0, "faiss flat": 1.0}),
-            "op": case.op,
-            "dtype": str(case.dtype).removeprefix("torch."),
-            "direction": case.direction,
-            "executed_percent_of_peak": 1.0,
-        }
-        for case in cases
-    ]
-    frozen = (
-        {"nearest_centre, k = 4,096, frozen centres"} if load("ops.cases_lookup").frozen_lookup() is None else set()
-    )
+    both = {"torch loop": 1.0, "faiss flat": 1.0}
+    rows = [_row(case.case, 1.0, both, op=case.op, direction=case.direction) for case in cases]
+    for row, each in zip(rows, cases):
+        row |= {"dtype": str(each.dtype).removeprefix("torch."), "executed_percent_of_peak": 1.0}
+    known = cases_lookup.frozen_lookup() is not None
+    frozen = set() if known else {"nearest_centre, k = 4,096, frozen centres"}
     assert {target.what for target, value in targets.reached(rows) if value is None} == frozen
-    for pattern in load("table").SHOWN:
+    for pattern in table.SHOWN:
         known = "frozen" not in pattern or not frozen
         assert not known or any(re.search(pattern, case.key) for case in cases), pattern
 
 
-def test_a_disturbed_limit_does_not_flatter(load: Callable[[str], Any]) -> None:
-    peaks = load("harness").Peaks(CPU)
+def test_a_disturbed_limit_does_not_flatter():
+    peaks = harness.Peaks(CPU)
     assert peaks._keep("copy", 100.0) == ("copy", 100.0)
     assert peaks._keep("copy", 95.0) == ("copy", 95.0)
     assert peaks._keep("copy", 50.0) == ("copy", 100.0)

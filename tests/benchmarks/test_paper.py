@@ -2,62 +2,65 @@
 
 from __future__ import annotations
 
-import importlib
+import contextlib
 import itertools
 import json
 import time
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from paper_results import TINY, Load, synthetic
+import turns
+from helpers import read_json
+from paper import balance, claims, figures, looks, nested, report, runs
+from paper import main as paper
+from paper.experiments import EXPERIMENTS
+from paper_results import TINY, as_options, synthetic
 from PIL import Image
 
-from voronerf.training import trainer
+from voronerf.training import networks, trainer
 from voronerf.training.config import ConfigError
 from voronerf.training.trainer import Trainer, TrainingError
 
 
 @pytest.fixture(autouse=True)
-def _steady_clock(load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+def _steady_clock(monkeypatch):
     """A step takes ten milliseconds however busy the machine is, so that every run splits and ends where it should."""
     ticks = itertools.count()
     clock = SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks), time=time.time)
-    for module in (trainer, load("paper.nested")):
+    for module in (trainer, nested):
         monkeypatch.setattr(module, "time", clock)
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(tmp_path_factory):
     """One output folder for the runs of this file, so that they are shared as `make paper` shares them."""
     return tmp_path_factory.mktemp("paper")
 
 
 @pytest.fixture
-def settings(load: Load, out: Path) -> Any:
-    return load("paper.runs").Settings(**TINY, out=out)
+def settings(out):
+    return runs.Settings(**TINY, out=out)
 
 
 # --- runs ------------------------------------------------------------------------------------------------------------
 
 
-def test_turns(load: Load) -> None:
+def test_turns():
     class Fake:
-        def __init__(self, name: str, seconds: float, step: float) -> None:
+        def __init__(self, name, seconds, step):
             self.name, self.seconds, self.step = name, seconds, step
 
-        def advance(self, until: float) -> None:
+        def advance(self, until):
             while self.seconds < until:
                 self.seconds += self.step
             log.append((self.name, round(until, 3)))
 
-    log: list[Any] = []
+    log = []
     fakes = [Fake("a", 0.0, 0.5), Fake("b", 2.0, 0.5), Fake("c", 0.0, 2.5)]
-    load("turns").take_turns(
+    turns.take_turns(
         fakes,
         budget=3.0,
         turn=1.0,
@@ -71,11 +74,11 @@ def test_turns(load: Load) -> None:
     assert log[-5:] == [("after", "a"), ("b", 3.0), ("after", "b"), ("c", 3.0), ("after", "c")]
     assert all(fake.seconds >= 3.0 for fake in fakes)
     with pytest.raises(ConfigError, match="--turn must be positive, got 0"):
-        load("turns").take_turns(fakes, budget=1, turn=0)
+        turns.take_turns(fakes, budget=1, turn=0)
 
     # resumed in the midst of a turn, after a stop that a long step had passed: it is due all the same
     log.clear()
-    load("turns").take_turns(
+    turns.take_turns(
         [Fake("a", 4.7, 0.5)],
         budget=6.0,
         turn=2.0,
@@ -86,36 +89,31 @@ def test_turns(load: Load) -> None:
 
 
 @pytest.mark.parametrize("told", [False, True])
-def test_one_that_fails_leaves_the_turns(load: Load, told: bool) -> None:
+def test_one_that_fails_leaves_the_turns(told):
     class Fake:
-        def __init__(self, limit: float) -> None:
+        def __init__(self, limit):
             self.seconds, self.limit = 0.0, limit
 
-        def advance(self, until: float) -> None:
+        def advance(self, until):
             if until > self.limit:
                 raise TrainingError("the loss is nan")
             self.seconds = until
 
     failing, other = Fake(1.0), Fake(9.0)
-    failed: list[Any] = []
-    turns = [failing, other]
+    failed = []
+    both = [failing, other]
     if told:
-        load("turns").take_turns(
-            turns, budget=3, turn=1, on_failure=lambda fake, error: failed.append((fake, str(error)))
-        )
+        turns.take_turns(both, budget=3, turn=1, on_failure=lambda fake, error: failed.append((fake, str(error))))
         assert failed == [(failing, "the loss is nan")] and other.seconds == 3
     else:
         with pytest.raises(TrainingError):
-            load("turns").take_turns(turns, budget=3, turn=1)
-    assert turns == [failing, other] and failing.seconds == 1
+            turns.take_turns(both, budget=3, turn=1)
+    assert both == [failing, other] and failing.seconds == 1
 
 
-def test_an_experiment_writes_its_files_and_is_not_run_again(
-    load: Load, settings: Any, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    paper, runs = load("paper.main"), load("paper.runs")
+def test_an_experiment_writes_its_files_and_is_not_run_again(settings, out, monkeypatch):
     outcome = paper.experiment("initialisation", settings)
-    stored = json.loads((out / "initialisation.json").read_text())
+    stored = read_json(out / "initialisation.json")
     assert stored == json.loads(json.dumps(outcome)) and stored["metadata"]["experiment"] == "initialisation"
     assert stored["metadata"]["size"] == [20, 20] and stored["metadata"]["machine"]
     assert [row["variant"] for row in stored["results"]] == ["inherited", "random parameters"]
@@ -130,41 +128,51 @@ def test_an_experiment_writes_its_files_and_is_not_run_again(
     with Image.open(out / "initialisation.png") as picture:
         assert picture.width > 400 and len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 10
 
-    def refuse(*_: Any, **__: Any) -> None:
+    def refuse(*_, **__):
         raise AssertionError("must not be trained again")
 
     monkeypatch.setattr(runs, "Trainer", refuse)
     assert paper.experiment("initialisation", settings)["results"] == outcome["results"]
     for name in ("density", "ghosting"):  # the same trainings
-        assert [row["run"] for row in paper.experiment(name, settings)["results"]] == [
-            row["run"] for row in outcome["results"]
-        ]
+        same = zip(paper.experiment(name, settings)["results"], outcome["results"], strict=True)
+        assert all(row["run"] == other["run"] for row, other in same)
         assert (out / f"{name}-pictures.png").is_file()
     for other in (replace(settings, again=True), replace(settings, budget=0.3), replace(settings, seeds=2)):
         with pytest.raises(AssertionError, match="trained again"):
             paper.experiment("initialisation", other)
 
 
-def test_an_interrupted_training_goes_on(
-    load: Load, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    runs = load("paper.runs")
-    settings = replace(settings, out=tmp_path)
-    run = runs.make_run(runs.Variant("one", {"cells": ()}), "builtin", 0, settings)
+def one(settings, seed=0, **changes):
+    """The training of one network."""
+    return runs.make_run(runs.Variant("one", {"cells": (), **changes}), "builtin", seed, settings)
+
+
+@pytest.fixture
+def interrupted(monkeypatch):
+    """Within it a training ends with its first checkpoint; the steps at which one was written."""
     save, saved = Trainer.save, []
 
-    def interrupted(self: Trainer) -> None:
+    def write(self):
         save(self)
         saved.append(self.step)
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "save", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            runs.train_missing([run], settings)
+    @contextlib.contextmanager
+    def ending():
+        with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+            patched.setattr(Trainer, "save", write)
+            yield saved
+
+    return ending
+
+
+def test_an_interrupted_training_goes_on(settings, tmp_path, interrupted, monkeypatch):
+    settings = replace(settings, out=tmp_path)
+    run = one(settings)
+    with interrupted() as saved:
+        runs.train_missing([run], settings)
     assert not (run.folder / "result.json").exists() and not runs.results([run])
-    began: list[int] = []
-    advance = Trainer.advance
+    began, advance = [], Trainer.advance
     monkeypatch.setattr(Trainer, "advance", lambda self, *args: (began.append(self.step), advance(self, *args))[1])
     runs.train_missing([run, run], settings)
     assert began[0] == saved[0] > 0
@@ -172,43 +180,28 @@ def test_an_interrupted_training_goes_on(
     assert row["seconds"] >= settings.budget and row["steps"] > saved[0]
 
 
-def test_again_leaves_no_old_result_and_goes_on(
-    load: Load, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    runs = load("paper.runs")
+def test_again_leaves_no_old_result_and_goes_on(settings, tmp_path, interrupted, monkeypatch):
     settings = replace(settings, out=tmp_path, seeds=2)
-    variant = runs.Variant("one", {"cells": (), "width": 8})
-    made = [runs.make_run(variant, "builtin", seed, settings) for seed in range(2)]
+    made = [one(settings, seed, width=8) for seed in range(2)]
     runs.train_missing(made, settings)
     assert len(runs.results(made)) == 2
-    save = Trainer.save
-
-    def interrupted(self: Trainer) -> None:
-        save(self)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "save", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            runs.train_missing(made, replace(settings, again=True))
+    with interrupted():
+        runs.train_missing(made, replace(settings, again=True))
     assert runs.results(made) == [] and not list((made[1].folder / "looks").glob("*.npz"))
-    resumed: list[bool] = []
-    start = Trainer.__init__
-    monkeypatch.setattr(
-        Trainer,
-        "__init__",
-        lambda self, config, *a, **k: (resumed.append(config.resume), start(self, config, *a, **k))[1],
-    )
+    resumed, start = [], Trainer.__init__
+
+    def begin(self, config, *args, **options):
+        resumed.append(config.resume)
+        start(self, config, *args, **options)
+
+    monkeypatch.setattr(Trainer, "__init__", begin)
     runs.train_missing(made, settings)
     assert resumed == [True, False] and len(runs.results(made)) == 2
 
 
-def test_looks_of_steps_that_are_made_again_are_not_kept(
-    load: Load, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    runs, looks = load("paper.runs"), load("paper.looks")
+def test_looks_of_steps_that_are_made_again_are_not_kept(settings, tmp_path, monkeypatch):
     settings = replace(settings, out=tmp_path)
-    made = runs.make_run(runs.Variant("one", {"cells": (), "width": 8}), "builtin", 0, settings)
+    made = one(settings, width=8)
     scene = runs.open_scene("builtin", settings)
     first = Trainer(made.config, scene)
     first.advance(0.07)
@@ -225,7 +218,7 @@ def test_looks_of_steps_that_are_made_again_are_not_kept(
     assert looks.seams(second) == {"seam": 0.25}
     monkeypatch.setattr(looks, "seam", lambda *_, **__: float("nan"))  # no border is visible
     assert looks.seams(second) == {}
-    said: list[str] = []
+    said = []
     (made.folder / "looks" / "at-25.npz").unlink()  # its time is passed for good where turns are shorter than it
     (made.folder / "looks" / "at-50.npz").write_bytes(stale)
     runs.train_group([made], scene, replace(settings, turn=0.01), said.append)
@@ -235,39 +228,36 @@ def test_looks_of_steps_that_are_made_again_are_not_kept(
     assert sum(line.startswith("LPIPS is not computed, images of 20 x 20 are below") for line in said) == 1
 
 
-def test_a_curve_is_of_the_same_views_throughout(load: Load, settings: Any, tmp_path: Path) -> None:
-    runs = load("paper.runs")
+def test_a_curve_is_of_the_same_views_throughout(settings, tmp_path):
     settings = replace(settings, out=tmp_path, final_views=3)
-    made = runs.make_run(runs.Variant("one", {"cells": (), "width": 8}), "builtin", 0, settings)
+    made = one(settings, width=8)
     runs.train_missing([made], settings)
     (row,) = runs.results([made])
     assert row["views"] == 3 and [entry["views"] for entry in row["curve"]] == [1, 1]
     assert row["psnr"] != row["curve"][-1]["psnr"] and row["curve"][-1]["seconds"] >= settings.budget
 
 
-def test_failures_of_a_training_are_told(load: Load, settings: Any, tmp_path: Path) -> None:
-    runs = load("paper.runs")
+def test_failures_of_a_training_are_told(settings, tmp_path):
     variant = runs.Variant("too many", {"cells": (5000,), "split_at_steps": (2,)})
     small = replace(settings, out=tmp_path)
     failing = runs.make_run(variant, "builtin", 0, small)
-    other = runs.make_run(runs.Variant("one", {"cells": ()}), "builtin", 0, small)
-    said: list[str] = []
+    other = one(small)
+    said = []
     runs.train_missing([other, failing], small, said.append)
     assert any("too many" in line and "failed: more cells than samples" in line for line in said)
     (row,) = runs.results([other, failing])
     assert row["variant"] == "one" and row["seconds"] >= small.budget
-    stored = json.loads((failing.folder / "result.json").read_text())
+    stored = read_json(failing.folder / "result.json")
     assert stored["psnr"] is None and stored["failed"].startswith("more cells than samples")
     assert runs.failures([failing, other, failing]) == [f"too many on builtin, seed 0: {stored['failed']}"]
     runs.train_missing([other, failing], small, said.append)
     assert said[-1].startswith("2 trainings, 2 of them made already")
 
 
-def test_runs_are_known_by_what_they_learn(load: Load, settings: Any) -> None:
-    runs = load("paper.runs")
+def test_runs_are_known_by_what_they_learn(settings):
     one = runs.Variant("one", {"cells": ()})
 
-    def folder(variant: Any = one, scene: str = "builtin", seed: int = 0, **changes: Any) -> str:
+    def folder(variant=one, scene="builtin", seed=0, **changes):
         return str(runs.make_run(variant, scene, seed, replace(settings, **changes)).folder)
 
     assert folder() == folder(runs.Variant("another name", {"cells": ()})) == folder(turn=3.0)
@@ -276,10 +266,9 @@ def test_runs_are_known_by_what_they_learn(load: Load, settings: Any) -> None:
     assert len({folder(), *others}) == 1 + len(others)
 
 
-def test_every_variant_has_the_best_of_the_same_rates(load: Load, settings: Any, tmp_path: Path) -> None:
-    runs = load("paper.runs")
+def test_every_variant_has_the_best_of_the_same_rates(settings, tmp_path):
     searched = replace(settings, rates=(1.0, 2.0), seeds=2, out=tmp_path)
-    made = load("paper.experiments").EXPERIMENTS["initialisation"].runs(searched)
+    made = EXPERIMENTS["initialisation"].runs(searched)
     assert len(made) == 2 * 2 * 2 and len({run.folder for run in made}) == 8
     usual, doubled = (next(run.config for run in made if run.rate == rate) for rate in searched.rates)
     assert usual.lr is not None and doubled.lr == 2 * usual.lr
@@ -289,17 +278,14 @@ def test_every_variant_has_the_best_of_the_same_rates(load: Load, settings: Any,
         score = scores.get((run.variant.name, run.rate), 19.0 - run.rate) + run.seed
         (run.folder / "result.json").write_text(json.dumps({"psnr": score}))
     rows = runs.results(made)
-    assert [(row["variant"], row["seed"], row["rate"], row["psnr"]) for row in rows] == [
-        ("inherited", 0, 2.0, 21.0),
-        ("inherited", 1, 2.0, 22.0),
-        ("random parameters", 0, 1.0, 18.0),
-        ("random parameters", 1, 1.0, 19.0),
-    ]
+    expected = [("inherited", seed, 2.0, 21.0 + seed) for seed in (0, 1)]
+    expected += [("random parameters", seed, 1.0, 18.0 + seed) for seed in (0, 1)]
+    assert [(row["variant"], row["seed"], row["rate"], row["psnr"]) for row in rows] == expected
     assert rows[0]["rates"] == {"1": 20.5, "2": 21.5}
-    claims = load("paper.experiments").EXPERIMENTS["initialisation"].claims
-    rows_of = load("paper.claims").Rows
 
-    def fail(rate: float) -> list[tuple[str, float]]:
+    judge = EXPERIMENTS["initialisation"].claims
+
+    def fail(rate):
         (run,) = (r for r in made if (r.variant.name, r.rate, r.seed) == ("inherited", rate, 1))
         (run.folder / "result.json").write_text(json.dumps({"failed": "the loss is nan", "psnr": None}))
         return [(row["variant"], row["rate"]) for row in runs.results(made)]
@@ -307,15 +293,14 @@ def test_every_variant_has_the_best_of_the_same_rates(load: Load, settings: Any,
     rest = [("random parameters", 1.0)] * 2
     assert fail(2.0) == [("inherited", 1.0)] * 2 + rest  # a rate at which a seed failed is none to choose
     assert runs.failures(made) == ["inherited on builtin, seed 1, rate x 2: the loss is nan"]
-    assert claims(rows_of(runs.results(made)), searched)[0].verdict == "holds for every seed"
+    assert judge(claims.Rows(runs.results(made)), searched)[0].verdict == "holds for every seed"
     assert fail(1.0) == rest
-    assert claims(rows_of(runs.results(made)), searched)[0].verdict == "not measured"
+    assert judge(claims.Rows(runs.results(made)), searched)[0].verdict == "not measured"
     with pytest.raises(ConfigError, match="--rates must be positive factors, got"):
         runs.Settings(rates=(0.0,))
 
 
-def test_sizes_and_scenes(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = load("paper.runs")
+def test_sizes_and_scenes(tmp_path, monkeypatch):
     assert [runs.factor("builtin", runs.Settings(downscale=n)) for n in (1, 4, 8, 20)] == [1, 1, 2, 5]
     assert runs.factor("lego", runs.Settings(downscale=8)) == 8
     monkeypatch.setenv("VORONERF_DATA", str(tmp_path))
@@ -329,12 +314,12 @@ def test_sizes_and_scenes(load: Load, tmp_path: Path, monkeypatch: pytest.Monkey
             runs.Settings(**wrong)
 
 
-def test_both_sides_have_the_same_settings(load: Load, settings: Any) -> None:
+def test_both_sides_have_the_same_settings(settings):
     """Variants differ in what is compared: no side has rays, samples, a rate or a schedule of its own."""
-    experiments, compared = load("paper.experiments"), {"cells", "width", "parameters", "centres", "init"}
+    compared = {"cells", "width", "parameters", "centres", "init"}
     compared |= {"assignment", "split_at", "split_at_steps", "uniform_scale"}
-    for name, experiment in experiments.EXPERIMENTS.items():
-        groups: dict[str, set[str]] = {}
+    for name, experiment in EXPERIMENTS.items():
+        groups = {}
         for variant in experiment.variants(settings, "builtin"):
             rest = {k: v for k, v in variant.changes.items() if k not in compared}
             label = variant.name.split(":")[0] if ":" in variant.name else ""
@@ -343,19 +328,19 @@ def test_both_sides_have_the_same_settings(load: Load, settings: Any) -> None:
         assert all(len(group) == 1 for group in groups.values()), name
 
 
-def test_matched_parameters(load: Load, settings: Any) -> None:
-    experiment = load("paper.experiments").EXPERIMENTS["cell-count"]
+def test_matched_parameters(settings):
+    experiment = EXPERIMENTS["cell-count"]
     variants = {v.name: v.changes for v in experiment.variants(replace(settings, large=True), "builtin")}
     assert variants["4 x 4 cells"] == {"cells": (4, 4)} and "16 x 16 cells" in variants
     assert len({v["parameters"] for v in variants.values() if "parameters" in v}) == 1
     assert variants["12 cells, matched"] == variants["12 cells"]
-    run = load("paper.runs").make_run
-    model = importlib.import_module("voronerf.training.networks")
-    scene = load("paper.runs").open_scene("builtin", settings)
+    scene = runs.open_scene("builtin", settings)
     counts = {}
     for name in ("12 cells", "12 cells, matched", "4 cells, matched", "32 cells, matched", "one network, matched"):
-        variant = load("paper.runs").Variant(name, variants[name])
-        counts[name] = model.count_parameters(model.resolve_config(run(variant, "builtin", 0, settings).config, scene))
+        variant = runs.Variant(name, variants[name])
+        counts[name] = model.count_parameters(
+            model.resolve_config(runs.make_run(variant, "builtin", 0, settings).config, scene)
+        )
     total = counts["12 cells"]
     assert counts["12 cells, matched"] == total and all(0.9 * total < count <= total for count in counts.values())
     assert variants["one network"] == {"cells": ()}
@@ -366,8 +351,7 @@ def test_matched_parameters(load: Load, settings: Any) -> None:
 # --- tables, plots, the page -----------------------------------------------------------------------------------------
 
 
-def test_bands_hold_mean_and_range(load: Load) -> None:
-    figures = load("paper.figures")
+def test_bands_hold_mean_and_range():
     figure, axes = figures.panes(1)
     line = figures.banded(axes[0], "x", [[(0, 1.0), (2, 3.0)], [(1, 4.0), (2, 5.0)]])
     x, y = line.get_data()
@@ -377,14 +361,12 @@ def test_bands_hold_mean_and_range(load: Load) -> None:
     figures.pyplot.close(figure)
 
 
-def test_a_variant_has_one_colour_in_all_panes(
-    load: Load, settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_variant_has_one_colour_in_all_panes(settings, tmp_path, monkeypatch):
     """Also where a scene has no results of the variants before it, as tables made in parts do."""
-    experiments, figures, made = load("paper.experiments"), load("paper.figures"), []
+    made = []
     monkeypatch.setattr(figures, "save", lambda figure, path: made.append(figure) or path)
     for name in ("convergence", "seams"):
-        rows = synthetic(experiments.EXPERIMENTS[name], settings, lambda i: 20.0 + i)
+        rows = synthetic(EXPERIMENTS[name], settings, lambda i: 20.0 + i)
         first = rows[0]["variant"]
         rows += [{**row, "scene": "other"} for row in rows if row["variant"] != first]
         figures.PLOTS[name](tmp_path / "x.png", rows)
@@ -396,78 +378,74 @@ def test_a_variant_has_one_colour_in_all_panes(
     figures.pyplot.close("all")
 
 
-def test_every_plot_is_drawn(load: Load, settings: Any, tmp_path: Path) -> None:
-    experiments, figures = load("paper.experiments"), load("paper.figures")
+def test_every_plot_is_drawn(settings, tmp_path):
     drawn = set()
-    for name, experiment in experiments.EXPERIMENTS.items():
+    for name, experiment in EXPERIMENTS.items():
         rows = synthetic(experiment, settings, lambda i: 20.0 + i)
         drawn |= {path.name for path in figures.draw(name, rows, tmp_path)}
-    assert drawn == {f"{name}.png" for name in figures.PLOTS if name in experiments.EXPERIMENTS}
+    assert drawn == {f"{name}.png" for name in figures.PLOTS if name in EXPERIMENTS}
     assert not figures.draw("convergence", [], tmp_path)
 
 
-def test_balance_and_a_nested_picture(load: Load, settings: Any, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    load("paper.main").experiment("initialisation", settings)  # its first variant keeps the samples
-    outcome = load("paper.balance").measure(settings, diagrams=3)
+def test_balance_and_a_nested_picture(settings, out, monkeypatch):
+    paper.experiment("initialisation", settings)  # its first variant keeps the samples
+    outcome = balance.measure(settings, diagrams=3)
     assert [row["variant"] for row in outcome["results"]] == ["kept by a training, builtin", "separate objects"]
     for row, claim in zip(outcome["results"], outcome["claims"]):
         assert len(row["after_all"]) == 3 and row["after"] == sorted(row["after_all"])[1] < row["before"]
         assert claim["published"] == "0.246 -> 0.0018" and f"{row['after']:.4f}" in claim["here"]
 
-    nested = load("paper.nested")
     small = replace(settings, budget=0.4, downscale=4 * settings.downscale)  # the picture is taken four times as large
-    outcome = load("paper.main").experiment("nested-2d", small)
+    outcome = paper.experiment("nested-2d", small)
     cells = {row["variant"]: row["cells"] for row in outcome["results"]}
     assert cells[nested.ONE] == cells[nested.MATCHED] == 1 and cells[nested.NESTED] >= 4
     (levels,) = (row["levels"] for row in outcome["results"] if row["variant"] == nested.NESTED)
     assert [level["cells"] for level in levels[:2]] == [1, 4] and len(levels) == 4
     assert (out / "nested-2d.png").is_file() and (out / "nested-2d-pictures.png").is_file()
-    again = load("paper.main").experiment("nested-2d", small)
+    again = paper.experiment("nested-2d", small)
     assert again["results"] == outcome["results"]
     for option, value in (("options", ("width=8",)), ("rates", (1.0, 2.0)), ("record", out / "record.json")):
         with pytest.raises(ConfigError, match=f"--{option} must be left out for nested-2d, a fit, got"):
-            load("paper.main").experiment("nested-2d", replace(small, **{option: value}))
+            paper.experiment("nested-2d", replace(small, **{option: value}))
 
-    def refuse(*_: Any) -> None:
+    def refuse(*_):
         raise AssertionError("fitted again")
 
     monkeypatch.setattr(nested, "nested", refuse)
-    assert load("paper.main").experiment("nested-2d", replace(small, train=False))["results"] == outcome["results"]
-    absent = load("paper.main").experiment("nested-2d", replace(small, train=False, budget=0.5))
+    assert paper.experiment("nested-2d", replace(small, train=False))["results"] == outcome["results"]
+    absent = paper.experiment("nested-2d", replace(small, train=False, budget=0.5))
     assert absent["results"] == [] and absent["metadata"]["missing"] == ["the fit of a picture"]
     assert {claim["verdict"] for claim in absent["claims"]} == {"not measured"}
-    assert load("paper.main").experiment("nested-2d", small)["results"] == outcome["results"]
+    assert paper.experiment("nested-2d", small)["results"] == outcome["results"]
     for name, value in (("WIDTH", 8), ("SPLITS", (0.5,)), ("RATE", 0.02)):
         with monkeypatch.context() as patched, pytest.raises(AssertionError, match="fitted again"):
             patched.setattr(nested, name, value)
-            load("paper.main").experiment("nested-2d", small)
+            paper.experiment("nested-2d", small)
 
 
-def test_nested_pictures_of_several_scenes(load: Load, settings: Any, tmp_path: Path) -> None:
-    nested, scenes = load("paper.nested"), ("builtin", "builtin-translucent")
+def test_nested_pictures_of_several_scenes(settings, tmp_path):
+    scenes = ("builtin", "builtin-translucent")
     size = {"budget": 0.2, "downscale": 4 * settings.downscale}
-    outcome = load("paper.main").experiment("nested-2d", replace(settings, scene=scenes, out=tmp_path, **size))
+    outcome = paper.experiment("nested-2d", replace(settings, scene=scenes, out=tmp_path, **size))
     variants = (nested.ONE, nested.MATCHED, nested.NESTED)
     assert [(row["scene"], row["variant"]) for row in outcome["results"]] == [(s, v) for s in scenes for v in variants]
     claims = [claim["claim"].split(":")[0] for claim in outcome["claims"]]
     assert claims == [f"a picture of {scene}" for scene in scenes for _ in range(2)]
     assert outcome["metadata"]["scenes"] == list(scenes)
     both = Image.open(tmp_path / "nested-2d-pictures.png").height
-    load("paper.main").experiment("nested-2d", replace(settings, out=tmp_path / "one", **size))
+    paper.experiment("nested-2d", replace(settings, out=tmp_path / "one", **size))
     assert both == 2 * Image.open(tmp_path / "one" / "nested-2d-pictures.png").height
     text = (tmp_path / "nested-2d.md").read_text()
     assert all(f"| {scene} | {nested.NESTED} |" in text for scene in scenes)
 
 
-def test_nested_fit_inherits_and_stays_in_the_plane(load: Load) -> None:
-    nested = load("paper.nested")
+def test_nested_fit_inherits_and_stays_in_the_plane():
     y, x = torch.meshgrid(torch.arange(24), torch.arange(30), indexing="ij")
     image = torch.stack(((x // 4 + y // 4) % 2, x > 15, y > 12), -1).float()
-    rates = [
-        nested.ImageFit(image, budget=1.0, width=width, splits=(), seed=0, backend="auto").rate for width in (16, 128)
-    ]
-    assert rates == [nested.RATE, nested.RATE / 2]
-    fit = nested.ImageFit(image, budget=1e9, width=8, splits=(0.0,), seed=0, backend="auto")
+    options = {"seed": 0, "backend": "auto"}
+    for width, rate in ((16, nested.RATE), (128, nested.RATE / 2)):
+        assert nested.ImageFit(image, budget=1.0, width=width, splits=(), **options).rate == rate
+    fit = nested.ImageFit(image, budget=1e9, width=8, splits=(0.0,), **options)
     for _ in range(3):
         fit._step(0.0)
     before = fit.picture()
@@ -481,13 +459,12 @@ def test_nested_fit_inherits_and_stays_in_the_plane(load: Load) -> None:
     assert nested.parameters(8, 5) == sum(p.numel() for p in nested.ImageField(8, 3, 5).parameters())
 
 
-def test_the_page_shows_what_came_out_and_keeps_notes(load: Load, settings: Any, out: Path, tmp_path: Path) -> None:
-    report = load("paper.report")
-    load("paper.main").experiment("initialisation", settings)
+def test_the_page_shows_what_came_out_and_keeps_notes(settings, out, tmp_path):
+    paper.experiment("initialisation", settings)
     page = tmp_path / "docs" / "paper.md"
     report.write_report(out, page)
     text = page.read_text()
-    stored = json.loads((out / "initialisation.json").read_text())
+    stored = read_json(out / "initialisation.json")
     assert all(claim["verdict"] in text and claim["here"] in text for claim in stored["claims"])
     summary = text.split("## Figure")[0]
     assert all(summary.count(f"| {claim['claim']} |") == 1 for claim in stored["claims"])
@@ -514,10 +491,8 @@ def test_the_page_shows_what_came_out_and_keeps_notes(load: Load, settings: Any,
         report.write_report(tmp_path / "nothing", page)
 
 
-def test_the_command_line(load: Load, settings: Any, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paper = load("paper.main")
-    values = {key: " ".join(v) if isinstance(v, tuple) else v for key, v in TINY.items()}
-    options = [part for key, v in values.items() for part in (f"--{key.replace('_', '-')}", str(v))]
+def test_the_command_line(settings, out, capsys):
+    options = as_options(TINY)
     paper.main(["figure", "density", *options, "--out", str(out)])
     assert "| builtin | inherited |" in capsys.readouterr().out and (out / "density.json").is_file()
     page = out / "page.md"

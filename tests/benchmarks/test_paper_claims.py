@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
-from paper_results import TINY, Load, synthetic
+from paper import cells, claims, experiments, runs, tables
+from paper.balance import balance_verdict
+from paper.experiments import EXPERIMENTS
+from paper_results import TINY, synthetic
 
 
 @pytest.fixture
-def settings(load: Load, tmp_path: Path) -> Any:
-    return load("paper.runs").Settings(**TINY, out=tmp_path)
+def settings(tmp_path):
+    return runs.Settings(**TINY, out=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -31,12 +32,11 @@ def settings(load: Load, tmp_path: Path) -> Any:
         ([-1.0], 2, "does not hold (one seed)"),
     ],
 )
-def test_verdicts(load: Load, gains: list[float], wanted: float, expected: str) -> None:
-    assert load("paper.claims").verdict(gains, wanted) == expected
+def test_verdicts(gains, wanted, expected):
+    assert claims.verdict(gains, wanted) == expected
 
 
-def test_gains_pair_scenes_and_seeds(load: Load) -> None:
-    claims = load("paper.claims")
+def test_gains_pair_scenes_and_seeds():
     rows = claims.Rows(
         [{"variant": v, "scene": s, "seed": n, "psnr": p}
          for v, s, n, p in (("a", "x", 0, 5.0), ("a", "x", 1, 7.0), ("b", "x", 0, 4.0), ("b", "y", 1, 1.0))]
@@ -47,40 +47,26 @@ def test_gains_pair_scenes_and_seeds(load: Load) -> None:
     assert unmeasured.values("a", metric="lpips") == [] and unmeasured.gains("a", "b") == []
 
 
-def test_a_lead_grows_or_does_not(load: Load) -> None:
-    claims = load("paper.claims")
-
-    def verdict(better: list[float], worse: list[float]) -> str:
-        rows = [
-            {
-                "variant": v,
-                "scene": "x",
-                "seed": 0,
-                "curve": [{"seconds": t, "psnr": p} for t, p in zip((5, 10), curve)],
-            }
-            for v, curve in (("a", better), ("b", worse))
-        ]
-        return str(claims.growing_claim("", "", claims.Rows(rows), "a", "b", "x").verdict)
-
-    assert verdict([20, 24], [20, 22]) == "holds (one seed)"
-    assert verdict([22, 23], [20, 22.5]) == "does not hold (one seed)"
-    assert verdict([18, 21], [20, 22]) == "does not hold: there is no lead at the end"
-    row = {"curve": [{"seconds": 2.0, "psnr": 1.0}, {"seconds": 4.0, "psnr": 3.0}]}
-    assert [claims.at_share(row, share) for share in (0.25, 0.5, 0.75, 1)] == [None, 1.0, 2.0, 3.0]
-
-    def run(variant: str, seed: int, *curve: tuple[float, float]) -> dict[str, Any]:
+def test_a_lead_grows_or_does_not():
+    def run(variant, seed, *curve):
         points = [{"seconds": t, "psnr": p} for t, p in curve]
         return {"variant": variant, "scene": "x", "seed": seed, "curve": points}
 
+    def claim(*rows):
+        return claims.growing_claim("", "", claims.Rows(rows), "a", "b", "x")
+
+    for better, worse, verdict in (
+        ([20, 24], [20, 22], "holds (one seed)"),
+        ([22, 23], [20, 22.5], "does not hold (one seed)"),
+        ([18, 21], [20, 22], "does not hold: there is no lead at the end"),
+    ):
+        assert claim(run("a", 0, *zip((5, 10), better)), run("b", 0, *zip((5, 10), worse))).verdict == verdict
+    row = {"curve": [{"seconds": 2.0, "psnr": 1.0}, {"seconds": 4.0, "psnr": 3.0}]}
+    assert [claims.at_share(row, share) for share in (0.25, 0.5, 0.75, 1)] == [None, 1.0, 2.0, 3.0]
     # seed 0 has a lead at the end alone; it is not set against the earlier lead of seed 1
-    rows = [
-        run("a", 0, (9, 30), (10, 30)),
-        run("b", 0, (10, 20)),
-        run("a", 1, (5, 23), (10, 22)),
-        run("b", 1, (5, 20), (10, 20)),
-    ]
-    claim = claims.growing_claim("", "", claims.Rows(rows), "a", "b", "x")
-    assert claim.verdict == "does not hold (one seed)" and claim.here.endswith("+2.00 at 100 %")
+    first = run("a", 0, (9, 30), (10, 30)), run("b", 0, (10, 20))
+    found = claim(*first, run("a", 1, (5, 23), (10, 22)), run("b", 1, (5, 20), (10, 20)))
+    assert found.verdict == "does not hold (one seed)" and found.here.endswith("+2.00 at 100 %")
 
 
 @pytest.mark.parametrize(
@@ -95,14 +81,13 @@ def test_a_lead_grows_or_does_not(load: Load) -> None:
         ([-0.3], "does not hold (one seed) (within 0.2 dB)"),
     ],
 )
-def test_alike(load: Load, gains: list[float], expected: str) -> None:
-    assert load("paper.claims").equal_claim("", "", gains, 0.2).verdict == expected
+def test_alike(gains, expected):
+    assert claims.equal_claim("", "", gains, 0.2).verdict == expected
 
 
-def test_claims_of_every_experiment_follow_the_figures(load: Load, settings: Any) -> None:
-    experiments, claims = load("paper.experiments"), load("paper.claims")
+def test_claims_of_every_experiment_follow_the_figures(settings):
     judged = 0
-    for name, experiment in experiments.EXPERIMENTS.items():
+    for name, experiment in EXPERIMENTS.items():
         rising = synthetic(experiment, settings, lambda i: 20 + 3 * i)
         falling = synthetic(experiment, settings, lambda i: 40 - 3 * i)
         verdicts = [[c.verdict for c in experiment.claims(claims.Rows(rows), settings)] for rows in (rising, falling)]
@@ -115,11 +100,10 @@ def test_claims_of_every_experiment_follow_the_figures(load: Load, settings: Any
     assert judged > 20
 
 
-def test_limits_set_two_scenes_against_each_other_seed_by_seed(load: Load, settings: Any) -> None:
-    experiments, claims = load("paper.experiments"), load("paper.claims")
-    experiment = experiments.EXPERIMENTS["limits"]
+def test_limits_set_two_scenes_against_each_other_seed_by_seed(settings):
+    experiment = EXPERIMENTS["limits"]
 
-    def judged(hurt: dict[str, float], helped: dict[str, float], *without: tuple[str, int]) -> dict[str, Any]:
+    def judged(hurt, helped, *without):
         rows = []
         for scene in ("builtin-translucent", "builtin"):
             scores = {experiments.NEVER: 30 - helped[scene], experiments.TOO_EARLY: 30 - hurt[scene]}
@@ -128,7 +112,8 @@ def test_limits_set_two_scenes_against_each_other_seed_by_seed(load: Load, setti
                 rows += [row] if (scene, row["seed"]) not in without else []
         return {claim.claim: claim for claim in experiment.claims(claims.Rows(rows), settings)}
 
-    found = judged({"builtin-translucent": 3.0, "builtin": 1.0}, {"builtin-translucent": 1.0, "builtin": 1.5})
+    hurt, helped = {"builtin-translucent": 3.0, "builtin": 1.0}, {"builtin-translucent": 1.0, "builtin": 1.5}
+    found = judged(hurt, helped)
     more, less = list(found)[-2:]
     assert "hurts more" in more and "help less" in less and len(found) == 4
     assert (found[more].here, found[more].verdict) == ("+3.00 dB (+2.00 to +4.00)", "holds for every seed")
@@ -136,25 +121,22 @@ def test_limits_set_two_scenes_against_each_other_seed_by_seed(load: Load, setti
     other = judged({"builtin-translucent": 1.0, "builtin": 3.0}, {"builtin-translucent": 2.0, "builtin": 1.5})
     assert other[more].verdict == other[less].verdict == "does not hold"
     # seed 1 of one scene is not set against seed 0 of the other
-    part = judged(
-        {"builtin-translucent": 3.0, "builtin": 1.0}, {"builtin-translucent": 1.0, "builtin": 1.5}, ("builtin", 0)
-    )
+    part = judged(hurt, helped, ("builtin", 0))
     assert (part[more].here, part[less].here) == ("+4.00 dB", "+1.00 dB")
     none = ("builtin", 0), ("builtin-translucent", 1)
-    apart = judged({"builtin-translucent": 3.0, "builtin": 1.0}, {"builtin-translucent": 1.0, "builtin": 1.5}, *none)
+    apart = judged(hurt, helped, *none)
     assert apart[more].verdict == apart[less].verdict == "not measured"
     published = {claim.claim.split(":")[0]: claim.published for claim in list(found.values())[:2]}
     assert published == {"builtin-translucent": "in translucent scenes", "builtin, a control": "-"}
 
 
-def test_seams_are_compared_at_the_looks_that_both_have(load: Load) -> None:
-    claims = load("paper.claims")
+def test_seams_are_compared_at_the_looks_that_both_have():
 
-    def row(variant: str, seed: int, **seams: float | None) -> dict[str, Any]:
+    def row(variant, seed, **seams):
         looks = [{"look": name} | ({} if value is None else {"seam": value}) for name, value in seams.items()]
         return {"variant": variant, "scene": "x", "seed": seed, "looks": looks}
 
-    def fewer(*rows: dict[str, Any]) -> list[float]:
+    def fewer(*rows):
         return list(claims.fewer_seams(claims.Rows(rows), "x", "a", "b", ("after", "late")))
 
     assert fewer(row("a", 0, after=0.4, late=0.2), row("b", 0, after=0.3, late=0.0)) == [pytest.approx(50)]
@@ -165,11 +147,10 @@ def test_seams_are_compared_at_the_looks_that_both_have(load: Load) -> None:
     assert fewer(row("a", 0, late=0.0), row("b", 0, late=0.0)) == []
 
 
-def test_balanced_over_random_over_uniform(load: Load, settings: Any) -> None:
-    experiments, claims = load("paper.experiments"), load("paper.claims")
-    experiment = experiments.EXPERIMENTS["split-kinds"]
+def test_balanced_over_random_over_uniform(settings):
+    experiment = EXPERIMENTS["split-kinds"]
 
-    def claim(scores: tuple[float, ...]) -> Any:
+    def claim(scores):
         rows = claims.Rows(synthetic(experiment, settings, scores.__getitem__))
         order, loose = experiment.claims(rows, settings)
         assert (loose.here.split(" (")[0], loose.verdict) == ("+3.00 dB", "holds for every seed")
@@ -182,14 +163,13 @@ def test_balanced_over_random_over_uniform(load: Load, settings: Any) -> None:
     assert "-1.00 dB" in other.here and "+3.00 dB" in other.here
 
 
-def test_early_and_late_splits_cost(load: Load, settings: Any) -> None:
-    experiments, claims = load("paper.experiments"), load("paper.claims")
-    experiment = experiments.EXPERIMENTS["early-late"]
-    usual = load("paper.cells").SPLIT_TIMES.index(load("paper.cells").TYPICAL)
+def test_early_and_late_splits_cost(settings):
+    experiment = EXPERIMENTS["early-late"]
+    usual = cells.SPLIT_TIMES.index(cells.TYPICAL)
     names = [variant.name for variant in experiment.variants(settings, "builtin")]
     assert (names[0], names[usual], names[-1]) == ("split at 5 %", "split at 20 %", "split at 60 %")
 
-    def judged(early: float, late: float) -> list[tuple[str, str]]:
+    def judged(early, late):
         scores = {0: early, usual: 30.0, len(names) - 1: late}
         rows = claims.Rows(synthetic(experiment, settings, lambda i: scores.get(i, 99.0)))
         return [(claim.here.split(" (")[0], claim.verdict) for claim in experiment.claims(rows, settings)]
@@ -200,32 +180,26 @@ def test_early_and_late_splits_cost(load: Load, settings: Any) -> None:
     assert judged(33.0, 29.0) == [("-3.00 dB", fails), ("+1.00 dB", holds)]
 
 
-def test_more_cells_at_one_width_and_at_matched_parameters(load: Load, settings: Any) -> None:
-    experiments, claims = load("paper.experiments"), load("paper.claims")
-    experiment = experiments.EXPERIMENTS["cell-count"]
+def test_more_cells_at_one_width_and_at_matched_parameters(settings):
+    experiment = EXPERIMENTS["cell-count"]
     names = [variant.name for variant in experiment.variants(settings, "builtin")]
 
-    def judged(**scores: float) -> list[Any]:
+    def judged(**scores):
         known = {name.replace("_", " ").replace("matched", ", matched"): value for name, value in scores.items()}
         assert known.keys() <= set(names)
         rows = claims.Rows(synthetic(experiment, settings, lambda i: known.get(names[i], 0.0)))
         return list(experiment.claims(rows, settings))
 
-    def cells(*scores: float) -> dict[str, float]:
-        return {f"{count}_cells": score for count, score in zip(load("paper.cells").COUNTS, scores)}
+    def of(*scores):
+        return {f"{count}_cells": score for count, score in zip(cells.COUNTS, scores)}
 
     matched = {"12_cellsmatched": 27.0, "one_networkmatched": 26.0, "32_cellsmatched": 25.0, "4_cellsmatched": 28.0}
-    most, steps, alone, least = judged(**cells(20, 21, 22, 23, 24), **matched)
-    assert [claim.verdict for claim in (most, steps, alone, least)] == [
-        "holds for every seed",
-        "holds for every seed",
-        "holds for every seed",
-        "does not hold",
-    ]
+    most, steps, alone, least = judged(**of(20, 21, 22, 23, 24), **matched)
+    assert [claim.verdict for claim in (most, steps, alone, least)] == [*["holds for every seed"] * 3, "does not hold"]
     assert [claim.here[:8] for claim in (most, alone, least)] == ["+4.00 dB", "+1.00 dB", "-3.00 dB"]
     assert "32 cells beat 4 cells" in most.claim and "12 cells beat one network" in alone.claim
     assert {most.published, steps.published, alone.published} == {"-"}
-    most, steps, *_ = judged(**cells(20, 21, 19, 23, 24), **matched)
+    most, steps, *_ = judged(**of(20, 21, 19, 23, 24), **matched)
     assert most.verdict == "holds for every seed"
     assert "12 cells over 8 cells: does not hold" in steps.verdict and "8 cells over 4 cells: holds" in steps.verdict
 
@@ -236,46 +210,39 @@ def test_more_cells_at_one_width_and_at_matched_parameters(load: Load, settings:
      (0.2, 0.3, "does not hold"), (0.001, 0.0015, "does not hold"), (0.001, 0.001, "does not hold"),
      (None, None, "not measured")],
 )  # fmt: skip
-def test_balance_verdict(load: Load, before: float, after: float, start: str) -> None:
-    assert load("paper.balance").balance_verdict(before, after).startswith(start)
+def test_balance_verdict(before, after, start):
+    assert balance_verdict(before, after).startswith(start)
 
 
-def test_published_figures_stand_beside_ours(load: Load, settings: Any) -> None:
-    experiments, tables = load("paper.experiments"), load("paper.tables")
+def test_published_figures_stand_beside_ours(settings):
     paper = replace(settings, cells=12)
-    for name, expected in (
-        (
-            "sampling",
-            ("27.355 / 0.9451 / 0.091", "31.234 / 0.9752 / 0.0417", "25.603 / 0.917 / 0.134", "27.401 / 0.945"),
-        ),
-        ("kilonerf", ("27.08 / 0.938 / 0.098", "27.765 / 0.952 / 0.078")),
-    ):
-        experiment = experiments.EXPERIMENTS[name]
+    hierarchical = "27.355 / 0.9451 / 0.091", "31.234 / 0.9752 / 0.0417", "25.603 / 0.917 / 0.134", "27.401 / 0.945"
+    kilo = "27.080 / 0.938 / 0.098", "27.765 / 0.952 / 0.078"
+    for name, expected in (("sampling", hierarchical), ("kilonerf", kilo)):
+        experiment = EXPERIMENTS[name]
         rows = synthetic(experiment, paper, lambda i: 20.0 + i)
         text = "\n".join(tables.training_table(rows, experiment.published))
         assert "published: 400 x 400, 24 h, RTX 2080 Ti" in text
-        assert all(figure.replace("27.08 /", "27.080 /") in text for figure in expected)
+        assert all(figure in text for figure in expected)
         line = next(line for line in text.splitlines() if "16 x 16" in line or "NeRF, hierarchical: 12" in line)
         assert "20.00" not in line and " to " in line and line.count("|") == text.splitlines()[0].count("|")
-        elsewhere = tables.training_table(
-            synthetic(experiment, paper, lambda i: 20.0 + i, "fern"), experiment.published
-        )
+        other = synthetic(experiment, paper, lambda i: 20.0 + i, "fern")
+        elsewhere = tables.training_table(other, experiment.published)
         assert "published" not in elsewhere[0] and not any("27.355" in line for line in elsewhere)
 
 
-def test_published_figures_are_of_their_own_cells_and_scenes(load: Load, settings: Any) -> None:
-    experiments, claims = load("paper.experiments"), load("paper.claims")
+def test_published_figures_are_of_their_own_cells_and_scenes(settings):
 
-    def published(name: str, cells: int, scene: str) -> tuple[set[str], set[str]]:
-        experiment, size = experiments.EXPERIMENTS[name], replace(settings, cells=cells)
+    def published(name, cells, scene):
+        experiment, size = EXPERIMENTS[name], replace(settings, cells=cells)
         rows = synthetic(experiment, size, lambda i: 20.0 + i, scene)
         named = {row["variant"] for row in rows if experiment.published(row["variant"], scene)}
         return named, {claim.published for claim in experiment.claims(claims.Rows(rows), size)}
 
     named, gains = published("sampling", 12, "lego")
     assert len(named) == 2 * 2 * 2 and gains == {"-", "+0.30 dB", "+0.70 dB", "+0.15 dB", "+0.58 dB"}
-    for cells in (4, 112):
-        named, gains = published("sampling", cells, "lego")
+    for count in (4, 112):
+        named, gains = published("sampling", count, "lego")
         assert named == {f"{field}, hierarchical: one network, width 256" for field in ("NeRF", "mip-NeRF")}
         assert gains == {"-"}
     assert published("sampling", 12, "ship")[1] == {"-", "+0.66 dB", "+0.78 dB"}

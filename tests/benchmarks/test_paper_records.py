@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-from paper_results import TINY, Load
+from helpers import read_json
+from paper import balance, claims, records, runs
+from paper import main as paper
+from paper.experiments import EXPERIMENTS
+from paper_results import TINY, as_options
 
 from voronerf.training.config import ConfigError
 
@@ -17,11 +20,11 @@ LATER = "uniform centres, twice the box"
 
 
 @pytest.fixture
-def settings(load: Load, tmp_path: Path) -> Any:
-    return load("paper.runs").Settings(**TINY | {"seeds": 2}, out=tmp_path / "out")
+def settings(tmp_path):
+    return runs.Settings(**TINY | {"seeds": 2}, out=tmp_path / "out")
 
 
-def finish(run: Any, psnr: float, **more: Any) -> None:
+def finish(run, psnr, **more):
     """A result as an older version wrote it, with a configuration and without machine and looks."""
     run.folder.mkdir(parents=True, exist_ok=True)
     curve = [{"seconds": t, "psnr": psnr * t / 10} for t in (5.0, 10.0)]
@@ -30,16 +33,16 @@ def finish(run: Any, psnr: float, **more: Any) -> None:
     (run.folder / "config.json").write_text(run.config.to_json())
 
 
-def elsewhere(load: Load) -> dict[str, Any]:
-    return {**load("paper.records").made_on(), "machine": "another"}
+def elsewhere():
+    return {**records.made_on(), "machine": "another"}
 
 
 @pytest.fixture
-def trained(load: Load, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def trained(monkeypatch):
     """Groups that were trained; nothing is: they have results at once."""
-    runs, groups = load("paper.runs"), []
+    groups = []
 
-    def train_group(group: Any, scene: Any, settings: Any, say: Any) -> None:
+    def train_group(group, scene, settings, say):
         groups.append([f"{run.variant.name}, {run.seed}" for run in group])
         for run in group:
             finish(run, 20.0 + run.seed + 2 * (run.variant.name == "inherited"))
@@ -48,39 +51,33 @@ def trained(load: Load, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return groups
 
 
-def test_names_of_runs_stay(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_runs_stay(tmp_path, monkeypatch):
     """Results that were kept are found by these names: a setting added to the configuration must not change them."""
-    runs, experiments = load("paper.runs"), load("paper.experiments")
     (tmp_path / "lego").mkdir()
     monkeypatch.setenv("VORONERF_DATA", str(tmp_path))
     size = {"scene": ("lego",), "evaluations": 8, "eval_views": 3, "final_views": 25}
     for budget in (480, 480.0):
-        made = experiments.EXPERIMENTS["sampling"].runs(runs.Settings(**size, budget=budget))
+        made = EXPERIMENTS["sampling"].runs(runs.Settings(**size, budget=budget))
         names = {run.variant.name: run.folder.name for run in made if run.seed == 0}
         assert names["NeRF, stratified: one network, width 256"] == "lego-0-0e0d08c58b73"
         assert names["NeRF, stratified: one network, width 64"] == "lego-0-e591eb1cb98a"
         assert names["NeRF, stratified: 12 Voronoi cells, width 64"] == "lego-0-5173d9c5022a"
-    small = runs.Settings(
-        scene=("lego",), downscale=8, budget=16, rays=512, samples=48, evaluations=6, eval_views=4, final_views=10
-    )
+    small = {"downscale": 8, "budget": 16, "rays": 512, "samples": 48}
+    small = runs.Settings(scene=("lego",), **small, evaluations=6, eval_views=4, final_views=10)
     committed = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "paper_16s.json"
     for name in ("sampling", "kilonerf", "seams", "early-late", "split-kinds", "initialisation"):
-        made = {run.folder.name for run in experiments.EXPERIMENTS[name].runs(small) if run.variant.name != LATER}
-        assert made <= load("paper.records").read_record(committed).keys(), name
+        made = {run.folder.name for run in EXPERIMENTS[name].runs(small) if run.variant.name != LATER}
+        assert made <= records.read_record(committed).keys(), name
 
 
-def test_a_table_is_made_in_parts(
-    load: Load, settings: Any, tmp_path: Path, trained: list[list[str]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    paper, record = load("paper.main"), tmp_path / "record.json"
+def test_a_table_is_made_in_parts(settings, tmp_path, trained, capsys):
+    record = tmp_path / "record.json"
     kept = replace(settings, record=record)
 
     outcome = paper.experiment("initialisation", replace(kept, train=False))
     assert trained == [] and outcome["results"] == [] and outcome["claims"][0]["verdict"] == "not measured"
-    assert outcome["metadata"]["missing"] == [
-        "inherited on builtin, seeds 0, 1",
-        "random parameters on builtin, seeds 0, 1",
-    ]
+    names = "inherited", "random parameters"
+    assert outcome["metadata"]["missing"] == [f"{name} on builtin, seeds 0, 1" for name in names]
 
     outcome = paper.experiment("initialisation", replace(kept, variants="^inher", only_seeds=(0,)))
     assert trained == [["inherited, 0"]] and len(outcome["results"]) == 1
@@ -99,7 +96,7 @@ def test_a_table_is_made_in_parts(
     # another sitting, on a machine that has the file only
     there = replace(kept, out=tmp_path / "there")
     rows = paper.experiment("initialisation", replace(there, train=False))["results"]
-    assert [row.pop("made_on") for row in rows] == [load("paper.records").made_on()] * 2
+    assert [row.pop("made_on") for row in rows] == [records.made_on()] * 2
     assert rows == outcome["results"]
     assert "2 results taken from" in capsys.readouterr().out
     finished = paper.experiment("initialisation", there)
@@ -107,88 +104,66 @@ def test_a_table_is_made_in_parts(
     assert finished["claims"][0]["verdict"] == "holds for every seed" and finished["metadata"]["missing"] == []
     assert finished["metadata"]["seeds"] == 2
     assert "Missing" not in (there.out / "initialisation.md").read_text()
-    assert len(load("paper.records").read_record(record)) == 4
+    assert len(records.read_record(record)) == 4
 
-    size = [
-        part
-        for key in ("scene", "downscale", "budget", "seeds", "cells", "rays", "samples", "evaluations")
-        for part in (f"--{key}", " ".join(TINY[key]) if key == "scene" else str(TINY[key] if key != "seeds" else 2))
-    ]
-    views = ["--eval-views", "1", "--final-views", "1"]
-    paper.main(
-        [
-            "figure",
-            "initialisation",
-            *size,
-            *views,
-            "--no-train",
-            "--record",
-            str(record),
-            "--out",
-            str(tmp_path / "third"),
-        ]
-    )
-    assert len(json.loads((tmp_path / "third" / "initialisation.json").read_text())["results"]) == 4
+    place = ["--record", str(record), "--out", str(tmp_path / "third")]
+    size = {name: value for name, value in (TINY | {"seeds": 2}).items() if name != "turn"}
+    paper.main(["figure", "initialisation", *as_options(size), "--no-train", *place])
+    assert len(read_json(tmp_path / "third" / "initialisation.json")["results"]) == 4
 
     # what is made again is not found in the file meanwhile
     with pytest.MonkeyPatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(load("paper.runs"), "train_group", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patched.setattr(runs, "train_group", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         paper.experiment("initialisation", replace(there, again=True, variants="inherited"))
     names = {row["run"] for row in finished["results"] if row["variant"] == "random parameters"}
-    assert load("paper.records").read_record(record).keys() == names
+    assert records.read_record(record).keys() == names
 
 
-def test_what_is_asked_for_now_is_checked(load: Load) -> None:
-    settings = load("paper.runs").Settings
+def test_what_is_asked_for_now_is_checked():
+    settings = runs.Settings
     with pytest.raises(ConfigError, match=r"--variants must be a regular expression, got '\(':"):
         settings(variants="(")
     with pytest.raises(ConfigError, match=r"--only-seeds must be below --seeds 2, got \(2,\)"):
         settings(seeds=2, only_seeds=(2,))
 
 
-def test_options_are_those_of_all_variants(load: Load, settings: Any) -> None:
-    experiments = load("paper.experiments").EXPERIMENTS
-    cones = experiments["split-kinds"].runs(replace(settings, options=("field=mipnerf", "sampling=hierarchical")))
+def test_options_are_those_of_all_variants(settings):
+    cones = EXPERIMENTS["split-kinds"].runs(replace(settings, options=("field=mipnerf", "sampling=hierarchical")))
     assert all((run.config.field, run.config.sampling) == ("mipnerf", "hierarchical") for run in cones)
     given = replace(settings, options=("lr_split=0.5", "split_at=[0.3]", "balance=transport"))
-    plain, made = (experiments["split-kinds"].runs(s) for s in (settings, given))
+    plain, made = (EXPERIMENTS["split-kinds"].runs(s) for s in (settings, given))
     for before, run in zip(plain, made, strict=True):
         assert (run.config.lr_split, run.config.split_at, run.config.balance) == (0.5, (0.3,), "transport")
         assert run.config.cells == before.config.cells and run.folder != before.folder
-    assert load("paper.main").experiment("split-kinds", replace(given, train=False))["metadata"]["options"] == list(
-        given.options
-    )
+    assert paper.experiment("split-kinds", replace(given, train=False))["metadata"]["options"] == list(given.options)
     assert "; lr_split=0.5; split_at=[0.3]; balance=transport; " in (settings.out / "split-kinds.md").read_text()
     names = {"early-late": "split_at", "limits": "cells, split_at", "sampling": "field", "cell-count": "cells"}
     for name, compared in names.items():
         wrong = tuple(f"{option}={'kilonerf' if option == 'field' else '[3]'}" for option in compared.split(", "))
         with pytest.raises(ConfigError, match=f"--options must not name what the experiment compares, got {compared}"):
-            experiments[name].runs(replace(settings, options=wrong))
+            EXPERIMENTS[name].runs(replace(settings, options=wrong))
+    unknown = "must name settings of `voronerf train` that have no option here, got"
     for wrong, message in (
-        ("lr", "must be NAME=VALUE, got 'lr'"),
-        ("lr=0.1", "must name settings of `voronerf train` that have no option here, got lr"),
-        ("colour=3", "must name settings of `voronerf train` that have no option here, got colour"),
+        ("lr", "--options must be NAME=VALUE, got 'lr'"),
+        ("lr=0.1", f"--options {unknown} lr"),
+        ("colour=3", f"--options {unknown} colour"),
+        ("lr_split=much", "--options must have values that their settings take, got"),
+        ("lr_split=-1", "--lr-split must be a positive factor, got -1"),
+        ("init=inherited", "--init must be inherit or random, got 'inherited'"),
     ):
-        with pytest.raises(ConfigError, match=f"--options {message}"):
-            replace(settings, options=(wrong,))
-    with pytest.raises(ConfigError, match="--options must have values that their settings take, got"):
-        experiments["split-kinds"].runs(replace(settings, options=("lr_split=much",)))
-    with pytest.raises(ConfigError, match="--lr-split must be a positive factor, got -1"):
-        experiments["split-kinds"].runs(replace(settings, options=("lr_split=-1",)))
-    with pytest.raises(ConfigError, match="--init must be inherit or random, got 'inherited'"):
-        experiments["split-kinds"].runs(replace(settings, options=("init=inherited",)))
+        with pytest.raises(ConfigError, match=message):
+            EXPERIMENTS["split-kinds"].runs(replace(settings, options=(wrong,)))
 
 
-def test_widths_that_names_tell_are_widths_trained(load: Load, settings: Any) -> None:
-    experiments = load("paper.experiments").EXPERIMENTS
+def test_widths_that_names_tell_are_widths_trained(settings):
     small = replace(settings, options=("field=kilonerf",))
-    for run in experiments["convergence"].runs(small):
+    for run in EXPERIMENTS["convergence"].runs(small):
         assert run.config.field == "kilonerf" and run.variant.name.endswith(f"width {run.config.width}")
-    assert {run.config.width for run in experiments["split-kinds"].runs(small)} == {32}
+    assert {run.config.width for run in EXPERIMENTS["split-kinds"].runs(small)} == {32}
 
 
-def test_blended_scores_are_other_results(load: Load, settings: Any) -> None:
-    experiment = load("paper.experiments").EXPERIMENTS["initialisation"]
+def test_blended_scores_are_other_results(settings):
+    experiment = EXPERIMENTS["initialisation"]
     plain, none, blended = (
         [run.folder for run in experiment.runs(replace(settings, options=options))]
         for options in ((), ("blend=0.0",), ("blend=0.1",))
@@ -196,15 +171,12 @@ def test_blended_scores_are_other_results(load: Load, settings: Any) -> None:
     assert plain == none and not set(plain) & set(blended)
 
 
-def test_a_record_holds_results_and_nothing_of_the_machine_s_folders(
-    load: Load, settings: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    paper, records = load("paper.main"), load("paper.records")
-    made = load("paper.experiments").EXPERIMENTS["initialisation"].runs(settings)
+def test_a_record_holds_results_and_nothing_of_the_machine_s_folders(settings, tmp_path, capsys):
+    made = EXPERIMENTS["initialisation"].runs(settings)
     with pytest.raises(ValueError, match="--out must hold finished trainings in runs/, got"):
         paper.export(tmp_path / "none.json", settings.out)
     finish(made[0], 20.0)
-    finish(made[2], 19.0, made_on=elsewhere(load), looks=[{"look": "end", "at": 1.0, "seam": 3.0}])
+    finish(made[2], 19.0, made_on=elsewhere(), looks=[{"look": "end", "at": 1.0, "seam": 3.0}])
     made[1].folder.mkdir(parents=True)  # not finished
     record = tmp_path / "results" / "record.json"
     paper.main(["export", str(record), "--out", str(settings.out)])
@@ -233,29 +205,28 @@ def test_a_record_holds_results_and_nothing_of_the_machine_s_folders(
             records.read_record(record)
 
 
-def test_seconds_of_different_machines_are_not_compared(load: Load, settings: Any) -> None:
-    runs, experiment = load("paper.runs"), load("paper.experiments").EXPERIMENTS["initialisation"]
-    rows_of, here = load("paper.claims").Rows, load("paper.records").made_on()
+def test_seconds_of_different_machines_are_not_compared(settings):
+    experiment = EXPERIMENTS["initialisation"]
+    rows_of, here = claims.Rows, records.made_on()
     made = experiment.runs(settings)
     for run in made:
-        where = elsewhere(load) if (run.variant.name, run.seed) == ("inherited", 1) else here
+        where = elsewhere() if (run.variant.name, run.seed) == ("inherited", 1) else here
         finish(run, 20.0, made_on=where, looks=[{"look": "end", "at": 1.0, "seam": 2.0 + run.seed, "psnr": 20.0}])
     rows = rows_of(runs.results(made))
     assert rows.paired("inherited", "random parameters") == {("builtin", 0): 0.0}
-    seams = load("paper.claims").fewer_seams(rows, "builtin", "inherited", "random parameters", ("end",))
+    seams = claims.fewer_seams(rows, "builtin", "inherited", "random parameters", ("end",))
     assert seams == [0.0]
     finish(made[1], 25.0)  # from before results said where they were made: taken as they are
     assert rows_of(runs.results(made)).gains("inherited", "random parameters") == [0.0, 5.0]
-    name = load("paper.records").machine_name
+    name = records.machine_name
     assert name({**here, "threads": 2, "machine": "x", "processor": None}) == "2 threads; x"
 
 
-def test_rates_count_when_all_were_searched(load: Load, settings: Any) -> None:
-    runs = load("paper.runs")
+def test_rates_count_when_all_were_searched(settings):
     searched = replace(settings, rates=(1.0, 2.0), only_seeds=(0,))
-    made = load("paper.experiments").EXPERIMENTS["initialisation"].runs(searched)
+    made = EXPERIMENTS["initialisation"].runs(searched)
 
-    def found() -> list[tuple[str, int, float]]:
+    def found():
         return [(row["variant"], row["seed"], row["rate"]) for row in runs.results(made)]
 
     for run in made:
@@ -272,8 +243,7 @@ def test_rates_count_when_all_were_searched(load: Load, settings: Any) -> None:
     assert "random parameters on builtin, rate x 2, seed 1" in runs.still_missing(made)
 
 
-def test_balance_says_which_samples_it_has_not(load: Load, settings: Any, tmp_path: Path) -> None:
-    balance = load("paper.balance")
+def test_balance_says_which_samples_it_has_not(settings, tmp_path):
     assert balance.without_samples(settings) == ["samples of builtin, seed 0", "samples of builtin, seed 1"]
     path = balance.samples_path(balance.runs(settings)[0])
     path.parent.mkdir(parents=True)

@@ -6,6 +6,7 @@ import pickle
 
 import pytest
 import torch
+from helpers import refuses, seeded
 
 from voronerf.diagram import VoronoiDiagram, uniform_centres
 
@@ -27,7 +28,7 @@ def slow_locate(diagram: VoronoiDiagram, point: torch.Tensor) -> int:
 
 def uneven_diagram() -> VoronoiDiagram:
     """Three levels, 4 + 3 - 1 + 5 - 1 = 10 leaves, integer coordinates so that ties are exact."""
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
 
     def centres(k: int) -> torch.Tensor:
         return torch.randint(-8, 9, (k, 3), generator=generator).float()
@@ -38,35 +39,26 @@ def uneven_diagram() -> VoronoiDiagram:
 
 
 def integer_points(n: int) -> torch.Tensor:
-    return torch.randint(-9, 10, (n, 3), generator=torch.Generator().manual_seed(5)).float()
+    return torch.randint(-9, 10, (n, 3), generator=seeded(5)).float()
 
 
 def test_flat_diagram_gives_the_nearest_centre_with_ties_to_the_first():
     diagram = VoronoiDiagram(torch.tensor([[1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]))
     cells = diagram.locate(torch.tensor([[2.0, 0, 0], [-2, 0, 0], [0, 5, 0]]))
-    assert cells.dtype == torch.int32
-    assert cells.tolist() == [0, 1, 0]
-    assert (diagram.depth, diagram.num_cells) == (1, 3)
-    assert torch.equal(diagram.leaf_centres, diagram.centres)
+    assert (cells.dtype, cells.tolist()) == (torch.int32, [0, 1, 0])
+    assert (diagram.depth, diagram.num_cells) == (1, 3) and torch.equal(diagram.leaf_centres, diagram.centres)
 
 
 def test_nested_locate_equals_a_slow_descent():
+    """With power weights on some levels too."""
     diagram, points = uneven_diagram(), integer_points(400)
     assert (diagram.depth, diagram.num_cells) == (3, 10)
-    assert diagram.locate(points).tolist() == [slow_locate(diagram, point) for point in points]
-
-
-def test_locate_with_power_weights_on_some_levels_equals_a_slow_descent():
-    generator = torch.Generator().manual_seed(1)
-    root = VoronoiDiagram(torch.randint(-8, 9, (4, 3), generator=generator).float())
-    inner = VoronoiDiagram(
-        torch.randint(-8, 9, (3, 3), generator=generator).float(), weights=torch.tensor([30.0, 0.0, -12.0])
-    )
-    diagram, _ = root.refine({1: inner})
-    points = integer_points(300)
-    assert diagram.locate(points).tolist() == [slow_locate(diagram, point) for point in points]
-    plain, _ = root.refine({1: inner.centres})
-    assert not torch.equal(diagram.locate(points), plain.locate(points))
+    root, centres = VoronoiDiagram(integer_points(4)), integer_points(7)[4:]
+    plain, _ = root.refine({1: centres})
+    weighted, _ = root.refine({1: VoronoiDiagram(centres, weights=torch.tensor([150.0, 0.0, -90.0]))})
+    for each in (diagram, plain, weighted):
+        assert each.locate(points).tolist() == [slow_locate(each, point) for point in points]
+    assert not torch.equal(weighted.locate(points), plain.locate(points))
 
 
 def test_locate_keeps_leading_shapes_and_takes_any_layout_and_dtype():
@@ -153,40 +145,33 @@ def test_refine_leaves_the_diagram_it_is_called_on_alone():
     ("centres", "weights", "error", "message"),
     [
         (torch.zeros(0, 3), None, ValueError, "at least one centre"),
-        (torch.zeros(4, 2), None, ValueError, r"shape \[k, 3\], got \[4, 2\]"),
-        (torch.zeros(3), None, ValueError, r"shape \[k, 3\], got \[3\]"),
+        (torch.zeros(4, 2), None, ValueError, "shape [k, 3], got [4, 2]"),
+        (torch.zeros(3), None, ValueError, "shape [k, 3], got [3]"),
         (torch.tensor([[0.0, float("nan"), 0.0]]), None, ValueError, "must be finite"),
         (torch.zeros(4, 3, dtype=torch.int32), None, TypeError, "floating-point"),
         ([[0.0, 0.0, 0.0]], None, TypeError, "floating-point tensor, got list"),
-        (torch.zeros(4, 3), torch.zeros(3), ValueError, r"weights must have shape \[4\], got \[3\]"),
+        (torch.zeros(4, 3), torch.zeros(3), ValueError, "weights must have shape [4], got [3]"),
         (torch.zeros(2, 3), torch.tensor([0.0, float("inf")]), ValueError, "weights must be finite"),
     ],
 )
 def test_what_is_no_diagram_is_refused(centres, weights, error, message):
-    with pytest.raises(error, match=message):
-        VoronoiDiagram(centres, weights=weights)
+    refuses(message, VoronoiDiagram, centres, weights=weights, error=error)
 
 
 def test_refine_refuses_what_is_no_leaf():
-    diagram = VoronoiDiagram(integer_points(4))
-    with pytest.raises(ValueError, match=r"leaves 0\.\.3, got 4"):
-        diagram.refine({4: integer_points(2)})
-    with pytest.raises(ValueError, match=r"got -1"):
-        diagram.refine({-1: integer_points(2)})
-    with pytest.raises(ValueError, match="each leaf once, got 1 twice"):
-        diagram.refine({1: integer_points(2), torch.tensor(1): integer_points(2)})
-    with pytest.raises(ValueError, match="at least one centre"):
-        diagram.refine({1: torch.zeros(0, 3)})
-    with pytest.raises(TypeError):
-        diagram.refine({1.5: integer_points(2)})
+    refine, two = VoronoiDiagram(integer_points(4)).refine, integer_points(2)
+    refuses("leaves 0..3, got 4", refine, {4: two})
+    refuses("got -1", refine, {-1: two})
+    refuses("each leaf once, got 1 twice", refine, {1: two, torch.tensor(1): two})
+    refuses("at least one centre", refine, {1: torch.zeros(0, 3)})
+    refuses("", refine, {1.5: two}, error=TypeError)
 
 
 def test_points_of_another_shape_or_type_are_refused():
     diagram = uneven_diagram()
-    with pytest.raises(ValueError, match=r"points must have shape \[\.\.\., 3\], got \[4, 2\]"):
-        diagram.locate(torch.zeros(4, 2))
-    with pytest.raises(TypeError, match="floating-point, got torch"):
-        diagram.sample_cell(torch.zeros(4, 3, dtype=torch.int64), temperature=1.0)
+    refuses("points must have shape [..., 3], got [4, 2]", diagram.locate, torch.zeros(4, 2))
+    wrong = torch.zeros(4, 3, dtype=torch.int64)
+    refuses("floating-point, got torch", diagram.sample_cell, wrong, temperature=1.0, error=TypeError)
 
 
 @pytest.mark.parametrize("weights", [None, torch.tensor([1.0, 2.0, 3.0])])
@@ -204,14 +189,8 @@ def test_copies_pickles_and_states_are_the_same_diagram(weights):
     file.seek(0)
     loaded = VoronoiDiagram.from_state(torch.load(file, weights_only=True))
     prefixed = VoronoiDiagram.from_state(holder.state_dict(), "diagram.")
-    for same in (
-        copy.deepcopy(diagram),
-        pickle.loads(pickle.dumps(diagram)),
-        other,
-        holder["diagram"],
-        loaded,
-        prefixed,
-    ):
+    copies = copy.deepcopy(diagram), pickle.loads(pickle.dumps(diagram))
+    for same in (*copies, other, holder["diagram"], loaded, prefixed):
         assert torch.equal(same.locate(points), expected)
         assert (same.depth, same.num_cells) == (diagram.depth, diagram.num_cells)
         assert (same.power is None) == (weights is None)
@@ -219,19 +198,17 @@ def test_copies_pickles_and_states_are_the_same_diagram(weights):
 
 def test_damaged_states_are_refused():
     state = uneven_diagram().state_dict()
-    with pytest.raises(ValueError, match="state must hold child"):
-        VoronoiDiagram.from_state({name: state[name] for name in ("centres", "child_offsets")})
-    looped = dict(state, child=torch.where(state["child"] == 1, 0, state["child"]))
-    with pytest.raises(ValueError, match="refer to each diagram once"):
-        VoronoiDiagram.from_state(looped)
-    with pytest.raises(ValueError, match="number the leaves depth-first"):
-        VoronoiDiagram.from_state(dict(state, child=torch.where(state["child"] == -1, -2, state["child"])))
-    with pytest.raises(ValueError, match="cover all 12 centres"):
-        VoronoiDiagram.from_state(dict(state, child_offsets=state["child_offsets"][:-1]))
-    with pytest.raises(ValueError, match="must be finite"):
-        VoronoiDiagram.from_state(dict(state, centres=state["centres"] / 0))
-    with pytest.raises(ValueError, match="int32"):
-        VoronoiDiagram.from_state(dict(state, child=state["child"].long()))
+    child = state["child"]
+    del state["child"]
+    refuses("state must hold child", VoronoiDiagram.from_state, state)
+    for damage, message in (
+        ({"child": torch.where(child == 1, 0, child)}, "refer to each diagram once"),
+        ({"child": torch.where(child == -1, -2, child)}, "number the leaves depth-first"),
+        ({"child_offsets": state["child_offsets"][:-1]}, "cover all 12 centres"),
+        ({"centres": state["centres"] / 0}, "must be finite"),
+        ({"child": child.long()}, "int32"),
+    ):
+        refuses(message, VoronoiDiagram.from_state, {**state, "child": child, **damage})
 
 
 def test_centres_are_not_rounded_when_a_model_changes_its_dtype():
@@ -244,59 +221,45 @@ def test_centres_are_not_rounded_when_a_model_changes_its_dtype():
         assert torch.equal(moved.power, power)
 
 
-def test_stochastic_assignment_follows_the_softmax_of_the_distances():
-    centres = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 3, 0]])
-    point, temperature, n = torch.tensor([0.2, 0.4, 0.1]), 0.7, 20_000
-    diagram = VoronoiDiagram(centres)
-    drawn = diagram.sample_cell(point.expand(n, 3), temperature=temperature, generator=torch.Generator().manual_seed(0))
-    expected = torch.softmax(-(point - centres).norm(dim=1) / temperature, 0)
-    frequencies = torch.bincount(drawn, minlength=3) / n
-    # Five standard deviations of a binomial frequency.
-    assert bool(((frequencies - expected).abs() < 5 * (expected * (1 - expected) / n).sqrt()).all())
-
-
-def test_stochastic_assignment_multiplies_along_the_path():
+def test_stochastic_assignment_is_the_softmax_of_the_distances_along_the_path():
     root = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
     inner = torch.tensor([[1.0, 1, 0], [1, -1, 0], [2, 0, 0]])
     diagram, _ = VoronoiDiagram(root).refine({1: inner})
     point, n = torch.tensor([0.6, 0.3, 0.0]), 20_000
-    drawn = diagram.sample_cell(point.expand(n, 3), temperature=0.5, generator=torch.Generator().manual_seed(1))
+    drawn = diagram.sample_cell(point.expand(n, 3), temperature=0.5, generator=seeded(1))
     level = [torch.softmax(-(point - centres).norm(dim=1) / 0.5, 0) for centres in (root, inner)]
     expected = torch.cat([level[0][:1], level[0][1] * level[1]])
     frequencies = torch.bincount(drawn, minlength=4) / n
+    # Five standard deviations of a binomial frequency.
     assert bool(((frequencies - expected).abs() < 5 * (expected * (1 - expected) / n).sqrt()).all())
 
 
 def test_stochastic_assignment_becomes_the_nearest_cell_as_the_temperature_falls():
     diagram = uneven_diagram()
-    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(2)) * 6
+    points = torch.randn(500, 3, generator=seeded(2)) * 6
     nearest = diagram.locate(points)
     assert torch.equal(diagram.sample_cell(points, temperature=0.0), nearest)
     drawn = diagram.sample_cell(points, temperature=1e-6)
     assert drawn.dtype == torch.int32
     assert int((drawn != nearest).sum()) <= 1
-    again = [diagram.sample_cell(points, temperature=9.0, generator=torch.Generator().manual_seed(4)) for _ in "ab"]
+    again = [diagram.sample_cell(points, temperature=9.0, generator=seeded(4)) for _ in "ab"]
     assert torch.equal(*again)
     assert not torch.equal(again[0], nearest)
     assert diagram.sample_cell(torch.empty(0, 2, 3), temperature=1.0).shape == (0, 2)
-    with pytest.raises(ValueError, match="temperature must be finite and at least 0, got -1"):
-        diagram.sample_cell(points, temperature=-1.0)
+    refuses("temperature must be finite and at least 0, got -1", diagram.sample_cell, points, temperature=-1.0)
 
 
 def test_stochastic_assignment_draws_on_the_generators_device():
-    drawn = (
-        uneven_diagram()
-        .to("meta")
-        .sample_cell(torch.randn(50, 3, device="meta"), temperature=1.0, generator=torch.Generator().manual_seed(2))
-    )
+    diagram, points = uneven_diagram().to("meta"), torch.randn(50, 3, device="meta")
+    drawn = diagram.sample_cell(points, temperature=1.0, generator=seeded(2))
     assert drawn.device.type == "meta" and drawn.shape == (50,)
 
 
 @pytest.mark.cuda
 def test_stochastic_assignment_on_cuda_with_a_generator_of_the_cpu():
-    diagram, points = uneven_diagram(), torch.randn(500, 3, generator=torch.Generator().manual_seed(2)) * 6
-    expected = diagram.sample_cell(points, temperature=2.0, generator=torch.Generator().manual_seed(4))
-    drawn = diagram.cuda().sample_cell(points.cuda(), temperature=2.0, generator=torch.Generator().manual_seed(4))
+    diagram, points = uneven_diagram(), torch.randn(500, 3, generator=seeded(2)) * 6
+    expected = diagram.sample_cell(points, temperature=2.0, generator=seeded(4))
+    drawn = diagram.cuda().sample_cell(points.cuda(), temperature=2.0, generator=seeded(4))
     assert drawn.is_cuda
     # Roundings of the distances may decide between two cells that are all but equally likely.
     assert int((drawn.cpu() != expected).sum()) <= 2
@@ -310,9 +273,8 @@ def test_stochastic_assignment_with_power_weights():
     diagram = VoronoiDiagram(centres, weights=weights)
     assert torch.equal(diagram.sample_cell(points, temperature=1e-6), diagram.locate(points))
     equal = VoronoiDiagram(centres, weights=torch.full((6,), 7.0))
-    generators = [torch.Generator().manual_seed(6) for _ in "ab"]
-    plain = VoronoiDiagram(centres).sample_cell(points, temperature=1.0, generator=generators[0])
-    assert torch.equal(equal.sample_cell(points, temperature=1.0, generator=generators[1]), plain)
+    plain = VoronoiDiagram(centres).sample_cell(points, temperature=1.0, generator=seeded(6))
+    assert torch.equal(equal.sample_cell(points, temperature=1.0, generator=seeded(6)), plain)
 
 
 @pytest.mark.parametrize(
@@ -335,7 +297,7 @@ def test_uniform_centres_of_any_number_lie_apart_in_the_box(k):
     assert bool(((centres > box[0]) & (centres < box[1])).all())
     assert torch.unique(centres, dim=0).shape[0] == k
     # Each part of the box has the same volume, so uniform points fall into cells of about equal size.
-    points = box[0] + torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) * (box[1] - box[0])
+    points = box[0] + torch.rand(20_000, 3, generator=seeded(0)) * (box[1] - box[0])
     counts = torch.bincount(VoronoiDiagram(centres).locate(points), minlength=k) * k / points.shape[0]
     assert float(counts.max()) < 2.2
     assert float(counts.min()) > 0.35
@@ -344,9 +306,6 @@ def test_uniform_centres_of_any_number_lie_apart_in_the_box(k):
 def test_uniform_centres_of_a_flat_box_and_of_no_box():
     flat = uniform_centres(torch.tensor([[0.0, 0, 1], [2, 2, 1]]), 4)
     assert bool((flat[:, 2] == 1).all())
-    with pytest.raises(ValueError, match="k must be at least 1, got 0"):
-        uniform_centres(torch.zeros(2, 3), 0)
-    with pytest.raises(ValueError, match=r"shape \[2, 3\], got \[3, 2\]"):
-        uniform_centres(torch.zeros(3, 2), 4)
-    with pytest.raises(ValueError, match=r"box\[0\] <= box\[1\]"):
-        uniform_centres(torch.tensor([[1.0, 0, 0], [0, 1, 1]]), 4)
+    refuses("k must be at least 1, got 0", uniform_centres, torch.zeros(2, 3), 0)
+    refuses("shape [2, 3], got [3, 2]", uniform_centres, torch.zeros(3, 2), 4)
+    refuses("box[0] <= box[1]", uniform_centres, torch.tensor([[1.0, 0, 0], [0, 1, 1]]), 4)

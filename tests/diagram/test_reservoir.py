@@ -1,13 +1,13 @@
 """The reservoir of importance samples against sorting every batch by hand."""
 
-import pytest
 import torch
+from helpers import refuses, same, seeded
 
 from voronerf.diagram.reservoir import SampleReservoir
 
 
 def batch(seed: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     return torch.randn(n, 3, generator=generator), torch.rand(n, generator=generator) + 0.1
 
 
@@ -87,7 +87,7 @@ def test_samples_are_copies():
     assert rows(*reservoir.samples()) == before
 
 
-def test_a_state_restores_the_reservoir_bit_for_bit():
+def test_a_state_restores_the_reservoir_bit_for_bit_and_no_other():
     reservoir = SampleReservoir(30, batches=4)
     for seed in range(6):
         reservoir.add(*batch(seed, 40))
@@ -96,24 +96,21 @@ def test_a_state_restores_the_reservoir_bit_for_bit():
     for seed in range(6, 9):
         for which in (reservoir, restored):
             which.add(*batch(seed, 40))
-        assert all(torch.equal(*pair) for pair in zip(reservoir.samples(), restored.samples()))
+        assert same(reservoir.samples(), restored.samples())
 
-
-def test_states_of_other_reservoirs_are_refused():
-    state = SampleReservoir(30, batches=4).state_dict()
-    with pytest.raises(ValueError, match=r"points must have shape \[5, 6, 3\] \(batches, quota\), got \[4, 8, 3\]"):
-        SampleReservoir(30, batches=5).load_state_dict(state)
-    with pytest.raises(ValueError, match="state must hold added, got points, importance"):
-        SampleReservoir(30, batches=4).load_state_dict({name: state[name] for name in ("points", "importance")})
+    state = reservoir.state_dict()
+    refuses(
+        "points must have shape [5, 6, 3] (batches, quota), got [4, 8, 3]",
+        SampleReservoir(30, batches=5).load_state_dict,
+        state,
+    )
+    del state["added"]
+    refuses("state must hold added, got points, importance", restored.load_state_dict, state)
 
 
 def test_bad_input_gets_one_clear_line():
-    with pytest.raises(ValueError, match="at least 1, got 0 and 5"):
-        SampleReservoir(0, batches=5)
-    with pytest.raises(ValueError, match="at least 1, got 5 and 0"):
-        SampleReservoir(5, batches=0)
-    reservoir = SampleReservoir(5, batches=5)
-    with pytest.raises(ValueError, match=r"got \[4, 2\] and \[4\]"):
-        reservoir.add(torch.zeros(4, 2), torch.zeros(4))
-    with pytest.raises(ValueError, match=r"got \[4, 3\] and \[3\]"):
-        reservoir.add(torch.zeros(4, 3), torch.zeros(3))
+    refuses("at least 1, got 0 and 5", SampleReservoir, 0, batches=5)
+    refuses("at least 1, got 5 and 0", SampleReservoir, 5, batches=0)
+    add = SampleReservoir(5, batches=5).add
+    refuses("got [4, 2] and [4]", add, torch.zeros(4, 2), torch.zeros(4))
+    refuses("got [4, 3] and [3]", add, torch.zeros(4, 3), torch.zeros(3))

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import refuses, seeded
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.balance import cell_weights, imbalance
@@ -12,7 +13,7 @@ ROOT = VoronoiDiagram(torch.tensor([[-2.0, 0, 0], [0, 0, 0], [2, 0, 0]]))
 
 def three_clouds(counts: tuple[int, int, int] = (600, 300, 5)) -> tuple[torch.Tensor, torch.Tensor]:
     """Samples in each of the three cells of ROOT; those of the middle one weigh 4 times as much."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded()
     points = torch.randn(sum(counts), 3, generator=generator) * 0.2
     cell = torch.repeat_interleave(torch.arange(3), torch.tensor(counts))
     importance = (0.5 + torch.rand(sum(counts), generator=generator)) * torch.tensor([1.0, 4.0, 1.0])[cell]
@@ -20,13 +21,9 @@ def three_clouds(counts: tuple[int, int, int] = (600, 300, 5)) -> tuple[torch.Te
     return (points.clamp(-0.9, 0.9) + ROOT.centres[cell])[order], importance[order]
 
 
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(1)
-
-
 def test_the_first_split_replaces_the_single_cell():
     points, importance = three_clouds()
-    split = split_diagram(VoronoiDiagram(torch.zeros(1, 3)), points, importance, 6, generator=generator())
+    split = split_diagram(VoronoiDiagram(torch.zeros(1, 3)), points, importance, 6, generator=seeded(1))
     assert (split.diagram.depth, split.diagram.num_cells) == (1, 6)
     assert split.parents.tolist() == [0] * 6
     assert torch.equal(split.diagram.centres, split.balances[0].centres)
@@ -34,7 +31,7 @@ def test_the_first_split_replaces_the_single_cell():
 
 def test_every_cell_is_balanced_by_its_own_samples_and_small_cells_stay_leaves():
     points, importance = three_clouds()
-    split = split_diagram(ROOT, points, importance, 8, generator=generator())
+    split = split_diagram(ROOT, points, importance, 8, generator=seeded(1))
     assert sorted(split.balances) == [0, 1]
     assert split.parents.tolist() == [0] * 8 + [1] * 8 + [2]
     weights = cell_weights(split.diagram.locate(points), importance, split.diagram.num_cells)
@@ -46,11 +43,11 @@ def test_every_cell_is_balanced_by_its_own_samples_and_small_cells_stay_leaves()
 
 def test_only_the_worst_cell():
     points, importance = three_clouds()
-    split = split_diagram(ROOT, points, importance, 4, cells="worst", generator=generator())
+    split = split_diagram(ROOT, points, importance, 4, cells="worst", generator=seeded(1))
     assert split.parents.tolist() == [0, 1, 1, 1, 1, 2]
     # The worst of those that hold enough samples: one sample that outweighs everything does not make a cell.
     heavy = torch.cat([points, torch.tensor([[2.0, 0, 0]])]), torch.cat([importance, torch.tensor([1e6])])
-    split = split_diagram(ROOT, *heavy, 8, cells="worst", generator=generator())
+    split = split_diagram(ROOT, *heavy, 8, cells="worst", generator=seeded(1))
     assert sorted(split.balances) == [1]
 
 
@@ -76,7 +73,7 @@ def test_samples_at_one_place_or_without_importance_do_not_count():
 
 def test_random_centres_are_samples_of_their_cell():
     points, importance = three_clouds()
-    split = split_diagram(ROOT, points, importance, 5, centres="random", generator=generator())
+    split = split_diagram(ROOT, points, importance, 5, centres="random", generator=seeded(1))
     assert torch.equal(ROOT.locate(split.diagram.leaf_centres[:-5]), split.parents[:-5].int())
     assert bool((torch.cdist(split.balances[0].centres, points).amin(1) < 1e-3).all())
     assert split.balances[0].imbalance_before == split.balances[0].imbalance_after
@@ -98,10 +95,10 @@ def test_uniform_centres_fill_the_box_of_their_cells_samples():
 
 def test_options_reach_the_balancing_and_depth_grows():
     points, importance = three_clouds()
-    split = split_diagram(ROOT, points, importance, 16, method="transport", cells=[0], generator=generator())
+    split = split_diagram(ROOT, points, importance, 16, method="transport", cells=[0], generator=seeded(1))
     assert split.diagram.power is not None
     assert split.balances[0].imbalance_after < 0.01
-    deeper = split_diagram(split.diagram, points, importance, 3, min_samples=20, steps=30, generator=generator())
+    deeper = split_diagram(split.diagram, points, importance, 3, min_samples=20, steps=30, generator=seeded(1))
     assert deeper.diagram.depth == 3
     located = deeper.diagram.locate(points).long()
     assert torch.equal(deeper.parents[located], split.diagram.locate(points).long())
@@ -110,7 +107,7 @@ def test_options_reach_the_balancing_and_depth_grows():
 
 def test_same_generator_same_split():
     points, importance = three_clouds()
-    first, second = (split_diagram(ROOT, points, importance, 8, generator=generator(), steps=20) for _ in "ab")
+    first, second = (split_diagram(ROOT, points, importance, 8, generator=seeded(1), steps=20) for _ in "ab")
     assert torch.equal(first.diagram.centres, second.diagram.centres)
 
 
@@ -119,15 +116,12 @@ def test_bad_input_gets_one_clear_line():
     for arguments, message in (
         ({"k": 0}, "k must be at least 1, got 0"),
         ({"k": 7}, "more cells than samples"),
-        ({"k": 2, "cells": [3]}, r"cells must name cells 0\.\.2, each once, got \[3\]"),
+        ({"k": 2, "cells": [3]}, "cells must name cells 0..2, each once, got [3]"),
         ({"k": 2, "cells": [1, 1]}, "each once"),
         ({"k": 2, "cells": "best"}, "got 'best'"),
         ({"k": 2, "centres": "uniform", "uniform_scale": 0.0}, "uniform_scale must be positive and finite, got 0.0"),
         ({"k": 2, "centres": "grid"}, "centres must be one of balanced, random, uniform, got 'grid'"),
     ):
-        with pytest.raises(ValueError, match=message):
-            split_diagram(ROOT, points, importance, **arguments)
-    with pytest.raises(ValueError, match="split_diagram: importance must be finite"):
-        split_diagram(ROOT, points, importance / 0 * 0, 2)
-    with pytest.raises(ValueError, match="more cells than samples"):
-        split_diagram(ROOT, torch.zeros(0, 3), torch.zeros(0), 2)
+        refuses(message, split_diagram, ROOT, points, importance, **arguments)
+    refuses("split_diagram: importance must be finite", split_diagram, ROOT, points, importance / 0 * 0, 2)
+    refuses("more cells than samples", split_diagram, ROOT, torch.zeros(0, 3), torch.zeros(0), 2)
