@@ -46,6 +46,7 @@ LATER = {
     "temperature_final": 1.0,
     "uniform_scale": 1.0,
     "blend": 0.0,
+    "field_options": [],
 }
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device", "blend"}

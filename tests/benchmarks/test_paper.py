@@ -338,8 +338,8 @@ def test_matched_parameters(settings):
     counts = {}
     for name in ("12 cells", "12 cells, matched", "4 cells, matched", "32 cells, matched", "one network, matched"):
         variant = runs.Variant(name, variants[name])
-        counts[name] = model.count_parameters(
-            model.resolve_config(runs.make_run(variant, "builtin", 0, settings).config, scene)
+        counts[name] = networks.count_parameters(
+            networks.resolve_config(runs.make_run(variant, "builtin", 0, settings).config, scene)
         )
     total = counts["12 cells"]
     assert counts["12 cells, matched"] == total and all(0.9 * total < count <= total for count in counts.values())
