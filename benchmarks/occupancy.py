@@ -30,7 +30,7 @@ from voronerf.evaluation.scores import render_view
 from voronerf.files import write_text
 from voronerf.run import open_run
 from voronerf.training.config import TrainConfig
-from voronerf.training.renderers import make_picture_grid
+from voronerf.training.occupancy import make_picture_grid
 from voronerf.training.run_directory import read_metrics, stored_config
 from voronerf.training.trainer import Trainer
 

@@ -9,7 +9,7 @@ from typing import Any
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Writes a file so that a reader, or a crash at any moment, sees the old content or the new, never a part.
+    """Writes a file atomically: a reader, or a crash at any moment, leaves the old content or the new, never a part.
 
     Raises:
         OSError: When the disk is full or the folder cannot be written; the old file is then untouched.

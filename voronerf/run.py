@@ -1,4 +1,4 @@
-"""A trained run, opened from its directory: to look at it, to score it, to go on from it."""
+"""Opens a trained run from its directory, to render it and to score it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
 from voronerf.training.networks import make_routers, restore_routers
-from voronerf.training.renderers import make_picture_grid, make_renderer
+from voronerf.training.occupancy import make_picture_grid
+from voronerf.training.renderers import make_renderer
 from voronerf.training.run_directory import checkpoint_path
 
 
@@ -136,8 +137,8 @@ def open_run(
         downscale: Factor on the images; None for that of the training.
         samples: Samples per ray, of the first pass where there are two; None for those of the training.
         fine_samples: Samples per ray of the second pass; None for those of the training.
-        occupancy: Skip empty space, found by asking the field once. A run trained with occupancy always uses its own
-            grid, since its field has learnt nothing about what is empty.
+        occupancy: Skip empty space, which the field is evaluated for once. A run trained with occupancy always uses its
+            own grid, since its field has learnt nothing about empty space.
         blend: Margin in scene units within which neighbouring cells are blended; None for that of the training.
         device: Torch device.
         backend: Backend of the operations.

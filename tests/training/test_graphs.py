@@ -14,8 +14,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import voronerf.training.trainer as trainer_module
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.graphs import WARMUP, GraphedStep, set_learning_rate
-from voronerf.training.renderers import make_picture_grid
+from voronerf.training.cuda_graph import WARMUP, GraphedStep, set_learning_rate
+from voronerf.training.occupancy import make_picture_grid
 from voronerf.training.trainer import Trainer
 
 aten = torch.ops.aten

@@ -105,14 +105,14 @@ def evaluate_run(
 
     Args:
         run: The run directory.
-        data: Scene folder, where it has moved since training.
+        data: Scene folder, if it has moved since training.
         downscale: Factor on the images; default as in training.
         views: Number of test views, evenly spread; default all.
         panels: Number of views drawn.
         samples: Samples per ray, of the first pass where there are two; default as in training.
         fine_samples: Samples per ray of the second pass; default as in training.
-        occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
-            grid.
+        occupancy: Skip empty space, which the field is evaluated for once; a run trained with --occupancy always uses
+            its own grid.
         blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
         lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
             of VORONERF_DATA or beside the scene, the installed lpips package.
@@ -173,12 +173,12 @@ def render(
         out: The video file, .mp4; default turntable.mp4 in the run directory.
         frames: Frames of one turn.
         fps: Frames per second.
-        data: Scene folder, where it has moved since training.
+        data: Scene folder, if it has moved since training.
         downscale: Factor on the images, which decides the video's size; default as in training.
         samples: Samples per ray, of the first pass where there are two; default as in training.
         fine_samples: Samples per ray of the second pass; default as in training.
-        occupancy: Skip empty space, found by asking the field once; a run trained with --occupancy always uses its own
-            grid.
+        occupancy: Skip empty space, which the field is evaluated for once; a run trained with --occupancy always uses
+            its own grid.
         blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
         device: Torch device.
         backend: Backend of the operations.

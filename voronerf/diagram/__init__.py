@@ -3,7 +3,8 @@
 from voronerf.diagram.balance import Balance, balance, imbalance
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.diagram.subdivision import Split, split_diagram
-from voronerf.diagram.voronoi import VoronoiDiagram, uniform_centres
+from voronerf.diagram.uniform import uniform_centres
+from voronerf.diagram.voronoi import VoronoiDiagram
 
 __all__ = [
     "Balance",

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from voronerf import ops
 from voronerf.diagram.transport import transport
-from voronerf.diagram.voronoi import VoronoiDiagram, uniform_centres
+from voronerf.diagram.uniform import uniform_centres
+from voronerf.diagram.voronoi import VoronoiDiagram
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ centre may then lie outside of its own cell.
 Coordinates are in scene units, in the world frame of the points that are asked about.
 """
 
-import itertools
 import operator
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -23,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import backends, ops
+from voronerf.diagram.tables import check_table, check_tree
 
 # A grid is faster than a search of all centres from this many centres on. Making it pays after this many points (see
 # ops.centre_grid).
@@ -82,12 +82,12 @@ class VoronoiDiagram(nn.Module):
             TypeError: not a floating-point tensor.
         """
         super().__init__()
-        _check_finite_table("centres", centres, (-1, 3))
+        check_table("centres", centres, (-1, 3))
         k = centres.shape[0]
         if k == 0:
             raise ValueError("VoronoiDiagram: centres must hold at least one centre, got shape [0, 3]")
         if weights is not None:
-            _check_finite_table("weights", weights, (k,))
+            check_table("weights", weights, (k,))
         device = centres.device
         self._set_tables(
             centres.detach().to(torch.float32, copy=True).contiguous(),
@@ -97,7 +97,7 @@ class VoronoiDiagram(nn.Module):
         )
 
     def _set_tables(self, centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None) -> None:
-        self.depth, self.num_cells = _check_tree(centres, child_offsets, child, power)
+        self.depth, self.num_cells = check_tree(centres, child_offsets, child, power)
         self.register_buffer("centres", centres)
         self.register_buffer("child_offsets", child_offsets)
         self.register_buffer("child", child)
@@ -359,114 +359,3 @@ class VoronoiDiagram(nn.Module):
             power = None if loaded.power is None else loaded.power.to(device)
             self._set_tables(loaded.centres.to(device), loaded.child_offsets.to(device), loaded.child.to(device), power)
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def uniform_centres(box: Tensor, k: int) -> Tensor:
-    """k centres spread evenly over a box, as close to a regular grid as k allows (the paper's "uniform" ablation).
-
-    The box is cut across its longest side: into 2 equal parts if k is even, into 3 if k is divisible by 3, otherwise
-    into 2 parts in proportion to their numbers of centres. Each part is cut in the same way, until it holds one centre,
-    in its middle. All final parts have the same volume. In a cube, 8, 27, 64 ... give cubic grids, 12 gives 2 x 2 x 3,
-    and 16 gives 4 x 2 x 2.
-
-    Args:
-        box: floating [2, 3], lowest and highest corner; flat boxes are allowed.
-        k: number of centres, >= 1.
-
-    Returns:
-        [k, 3] in the dtype and on the device of `box`.
-
-    Raises:
-        ValueError: k < 1, a wrong shape, a value that is not finite, or a highest corner below the lowest.
-
-    Examples:
-        >>> import torch
-        >>> from voronerf import uniform_centres
-        >>> box = torch.tensor([[0.0, 0, 0], [2.0, 1, 1]])
-        >>> uniform_centres(box, 2)
-        tensor([[0.5000, 0.5000, 0.5000],
-                [1.5000, 0.5000, 0.5000]])
-    """
-    if k < 1:
-        raise ValueError(f"uniform_centres: k must be at least 1, got {k}")
-    if tuple(box.shape) != (2, 3):
-        raise ValueError(f"uniform_centres: box must have shape [2, 3], got {list(box.shape)}")
-    low, high = box.tolist()
-    if not bool(torch.isfinite(box).all()) or any(a > b for a, b in zip(low, high, strict=True)):
-        raise ValueError(f"uniform_centres: box must be finite with box[0] <= box[1], got {box.tolist()}")
-
-    def place(low: list[float], high: list[float], k: int) -> list[list[float]]:
-        if k == 1:
-            return [[(a + b) / 2 for a, b in zip(low, high, strict=True)]]
-        if k % 2 == 0:
-            shares = [k // 2] * 2
-        elif k % 3 == 0:
-            shares = [k // 3] * 3
-        else:
-            shares = [k // 2, k - k // 2]
-        sides = [b - a for a, b in zip(low, high, strict=True)]
-        # Rounding must not decide between equal sides: they count as equal up to one part in a million.
-        axis = next(i for i, side in enumerate(sides) if side >= max(sides) * (1 - 1e-6))
-        centres: list[list[float]] = []
-        start, done = low[axis], 0
-        for share in shares:
-            done += share
-            end = low[axis] + sides[axis] * done / k
-            centres += place([*low[:axis], start, *low[axis + 1 :]], [*high[:axis], end, *high[axis + 1 :]], share)
-            start = end
-        return centres
-
-    return torch.tensor(place(low, high, k), dtype=box.dtype, device=box.device)
-
-
-def _check_finite_table(name: str, table: Tensor, shape: tuple[int, ...]) -> None:
-    if not isinstance(table, Tensor) or not table.is_floating_point():
-        got = table.dtype if isinstance(table, Tensor) else type(table).__name__
-        raise TypeError(f"VoronoiDiagram: {name} must be a floating-point tensor, got {got}")
-    wanted = "[k, 3]" if len(shape) == 2 else f"[{shape[0]}]"
-    matches = table.dim() == len(shape) and all(s in (-1, t) for s, t in zip(shape, table.shape, strict=True))
-    if not matches:
-        raise ValueError(f"VoronoiDiagram: {name} must have shape {wanted}, got {list(table.shape)}")
-    if not bool(torch.isfinite(table).all()):
-        raise ValueError(f"VoronoiDiagram: {name} must be finite, got NaN or infinity")
-
-
-def _check_tree(centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None) -> tuple[int, int]:
-    """Checks the tables of a tree, which may come from a damaged file; returns its depth and number of leaves."""
-
-    def refuse(rule: str) -> ValueError:
-        return ValueError(f"VoronoiDiagram: tables of a tree must {rule}")
-
-    _check_finite_table("centres", centres, (-1, 3))
-    m = centres.shape[0]
-    if power is not None:
-        _check_finite_table("power", power, (m,))
-    if any(table.dtype != torch.int32 or table.dim() != 1 for table in (child_offsets, child)):
-        raise refuse("hold child_offsets and child as int32 vectors")
-    offsets, links = child_offsets.tolist(), child.tolist()
-    if len(links) != m or len(offsets) < 2 or offsets[0] != 0 or offsets[-1] != m:
-        raise refuse(f"cover all {m} centres, got {len(links)} links and offsets {offsets[:1]}..{offsets[-1:]}")
-    if any(a >= b for a, b in itertools.pairwise(offsets)):
-        raise refuse("give every diagram at least one centre")
-
-    depth, leaf = 0, 0
-    seen = [False] * (len(offsets) - 1)
-    # Depth-first, first child first, as the leaves are numbered: rows are stacked in reverse.
-    stack = [(row, 1) for row in reversed(range(offsets[0], offsets[1]))]
-    seen[0] = True
-    while stack:
-        row, level = stack.pop()
-        depth = max(depth, level)
-        link = links[row]
-        if link < 0:
-            if link != -1 - leaf:
-                raise refuse(f"number the leaves depth-first, got {-1 - link} where {leaf} was due")
-            leaf += 1
-            continue
-        if link >= len(seen) or seen[link]:
-            raise refuse(f"refer to each diagram once, got diagram {link} of {len(seen)} again or out of range")
-        seen[link] = True
-        stack += [(inner, level + 1) for inner in reversed(range(offsets[link], offsets[link + 1]))]
-    if not all(seen):
-        raise refuse("reach every diagram from the root")
-    return depth, leaf

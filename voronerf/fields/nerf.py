@@ -100,7 +100,7 @@ class NeRF(nn.Module):
         view_directions: Whether colour depends on the view direction.
         density_scale: Factor on the density, per scene unit, > 0.
         view_width: Channels of the layer that sees the view direction; None is half the width.
-        position_encoding: "frequency", or "integrated" for Gaussians [n, 6] in the place of positions (mip-NeRF).
+        position_encoding: "frequency", or "integrated" for Gaussians [n, 6] instead of positions (mip-NeRF).
 
     Raises:
         ValueError: For a width, depth, skip or scale out of range.

@@ -36,7 +36,7 @@ class FieldType:
     Attributes:
         name: What ``--field`` calls it.
         network: The class, or the function, that makes the module.
-        inputs: What it is asked about: "points" [n, 3], or "gaussians" [n, 6].
+        inputs: "points", positions [n, 3], or "gaussians", means and variances [n, 6].
         options: Its options and their defaults in training; ``inspect.Parameter.empty`` for one that must be given.
 
     Examples:
@@ -55,7 +55,7 @@ class FieldType:
 
     @property
     def cones(self) -> bool:
-        """Whether its rays are cones, in the place of lines."""
+        """Whether its rays are cones, which are cut into Gaussians."""
         return self.inputs == "gaussians"
 
     def build(self, options: Mapping[str, Any]) -> nn.Module:

@@ -1,4 +1,4 @@
-"""Random batches of training rays with the colours seen along them.
+"""Random batches of training rays with the colours of their pixels.
 
 Letters: r rays of a batch. Colours are in 0..1, straight (not premultiplied) where there is an alpha channel.
 """
@@ -17,12 +17,12 @@ from voronerf.rendering.rays import intersect_box
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays [r], where they enter and leave the scene, and what was seen along them.
+    """Rays [r], where they enter and leave the scene, and the colours of their pixels.
 
     Attributes:
         rays: Origins and unit directions.
-        near: [r] depth at which the scene begins on each ray.
-        far: [r] depth at which it ends.
+        near: [r] depth at which each ray enters the scene.
+        far: [r] depth at which it leaves the scene.
         colour: [r, 3], straight.
         alpha: [r, 1], or None for opaque images.
     """
@@ -34,16 +34,16 @@ class Batch:
     alpha: Tensor | None
 
     def target(self, background: Tensor | None) -> Tensor:
-        """The colour to learn, over ``background`` ([3] or [r, 3]) where the images are transparent."""
+        """The colour to learn: that of the images over ``background`` ([3] or [r, 3])."""
         if self.alpha is None or background is None:
             return self.colour
         return self.colour * self.alpha + background * (1 - self.alpha)
 
 
 class RayBatches:
-    """Draws rays uniformly from the pixels of the training views whose ray meets the scene's box.
+    """Draws rays uniformly from those pixels of the training views whose ray meets the box of the scene.
 
-    A ray that misses the box shows the background whatever the network says; drawing it would teach nothing.
+    A ray that misses the box shows the background whatever the networks are, so there is nothing to learn from it.
 
     Args:
         scene: The scene; its training views are used.

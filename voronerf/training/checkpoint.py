@@ -1,7 +1,7 @@
 """Checkpoints: one safetensors file, written atomically, read without pickle.
 
-The tensors are the router's (diagram included), the optimiser's per-parameter state, the sample reservoir's and the
-random generators'. What is not a tensor (configuration, counters, stages) is JSON in the file's metadata.
+The tensors are those of the routers with their diagrams, of the optimiser, of the sample reservoir and of the random
+generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ FORMAT = "voronerf-checkpoint-1"
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be read or does not belong here; the message names the file."""
+    """A checkpoint that cannot be read, or that belongs to another configuration; the message names the file."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a file holds: tensors by name and everything else as plain JSON values."""
+    """The contents of a checkpoint: tensors by name, and everything else as JSON values."""
 
     tensors: dict[str, Tensor]
     values: dict[str, Any]

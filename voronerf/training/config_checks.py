@@ -1,4 +1,4 @@
-"""What the settings of a training run must be, and how a setting that cannot be used is refused."""
+"""Checks of the settings of a training run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def check_field(config: TrainConfig) -> None:
 
 
 def parse_option(text: str) -> tuple[str, Any]:
-    """``name=value`` as a name and a Python value; what is no literal is a string."""
+    """Splits ``name=value`` into a name and a Python value; a value that is no Python literal is a string."""
     name, _, value = text.partition("=")
     try:
         return name, ast.literal_eval(value)

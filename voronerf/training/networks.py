@@ -17,7 +17,7 @@ from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
 from voronerf.training.config import ConfigError, TrainConfig
 
-#: Channels, layers and frequencies of the proposal's density network: small, and asked about coarse intervals alone.
+#: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
 
 
@@ -36,7 +36,7 @@ def octaves_for(scene: Scene) -> int:
 
 
 def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
-    """The configuration with what depends on the scene filled in: octaves, and with ``parameters`` width and rate.
+    """Fills in the settings that depend on the scene: octaves, and with ``parameters`` the width and learning rate.
 
     Raises:
         ConfigError: When the smallest networks have more parameters than asked for.
@@ -51,11 +51,10 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
 
 
 def network_names(config: TrainConfig) -> tuple[str, ...]:
-    """The networks of a cell, as :class:`voronerf.rendering.Renderer` names them; "field" is the one whose colours
-    count."""
+    """The names of a cell's networks for :class:`voronerf.rendering.Renderer`; "field" gives the colours."""
     if config.sampling == "proposal":
         return ("field", "proposal")
-    # mip-NeRF asks one network twice.
+    # With cones one network is evaluated twice, as in mip-NeRF.
     return ("field", "coarse") if config.sampling == "hierarchical" and not config.field_type.cones else ("field",)
 
 
@@ -99,7 +98,7 @@ def solve_width(config: TrainConfig, total: int) -> int:
 
 
 def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, VoronoiRouter]:
-    """A router of one cell around each of the configured networks: the coarse stage. Depends on the seed alone."""
+    """A router of one cell around each network, for the coarse stage; the seed alone decides its parameters."""
     with torch.random.fork_rng():  # of GPUs as well: manual_seed reaches them
         torch.manual_seed(config.seed)
         networks = {name: make_network(config, name) for name in network_names(config)}
@@ -117,26 +116,27 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
 
 
 def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) -> torch.optim.Adam:
-    """Adam with a shorter memory of squared gradients than its default (0.99 for 0.999).
+    """Adam with a decay of 0.99 for the squared gradients, where the default is 0.999.
 
-    After a split each cell meets fewer samples and other gradients than its parent; moments inherited from the parent
-    would otherwise set its step sizes for a thousand steps. Worth 0.7 dB after 800 steps of Lego at 100 x 100.
+    After a split each cell sees fewer samples and other gradients than its parent. With the default, the moments of the
+    parent would set its step sizes for a thousand steps. The change is worth 0.7 dB after 800 steps of Lego at
+    100 x 100.
     """
     assert config.lr is not None
     parameters = [parameter for router in routers.values() for parameter in router.parameters()]
     options: dict[str, Any] = {"lr": config.lr}
-    if config.cuda_graph:  # which reads the learning rate from a tensor, and counts steps in one
+    if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=parameters[0].device), "capturable": True}
     return torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True, **options)
 
 
 def router_states(routers: Mapping[str, VoronoiRouter]) -> dict[str, dict[str, Any]]:
-    """The routers' states, under the names that a checkpoint has for them."""
+    """The states of the routers, by their names in a checkpoint."""
     return {_group(name): router.state_dict() for name, router in routers.items()}
 
 
 def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint) -> None:
-    """Fills routers with a checkpoint's cells, whatever the number of them.
+    """Loads the cells of a checkpoint into routers; their number may differ.
 
     Raises:
         CheckpointError: When the checkpoint's parameters are of another architecture.

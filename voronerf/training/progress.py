@@ -1,4 +1,4 @@
-"""What a training run says of itself: its stages, its progress, and why it stopped."""
+"""The messages of a training run: its stages, its progress, and the error that stops it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 
 class TrainingError(RuntimeError):
-    """Training cannot go on; the message says why and what is left on disk."""
+    """Training cannot continue; the message gives the reason and what is left on disk."""
 
 
 @dataclass(frozen=True)
 class Stage:
     """A period of training on one diagram.
 
-    ``balance_before`` and ``balance_after`` are std(W / max W) over the new cells of one parent, the median over the
-    parents that were split; None for the coarse stage.
+    ``balance_before`` and ``balance_after`` are std(W / max W) over the new cells of a parent, and of these the median
+    over the parents that were split; None for the coarse stage.
     """
 
     cells: int
@@ -27,7 +27,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Progress:
-    """What a display shows of a running training; one is passed to the caller's callback after every step."""
+    """The state of a training after a step, for a display; see ``Trainer``'s ``on_step``."""
 
     step: int
     seconds: float

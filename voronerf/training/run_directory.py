@@ -1,4 +1,4 @@
-"""Run directories: choosing one, keeping it to oneself, and the files in it."""
+"""Run directories: the choice of one, a lock on it, and the files in it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
 
 
 def _made(folder: Path) -> bool:
-    """Whether a folder was made now, rather than being there already, if only since another run began."""
+    """Makes a folder; False if it exists, which may be since another run began."""
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
@@ -51,7 +51,7 @@ def _made(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Keeps a run directory from being written by two processes, where the file system has locks.
+    """Locks a run directory, so that two processes cannot write it; without effect on file systems without locks.
 
     Raises:
         ConfigError: When another process holds it.
@@ -75,13 +75,13 @@ def held(folder: Path) -> Iterator[None]:
         finally:
             with contextlib.suppress(OSError):
                 if made:
-                    folder.rmdir()  # where nothing was written
+                    folder.rmdir()  # fails if something was written, and is then not needed
     finally:
         os.close(number)
 
 
 def stored_config(run: Path) -> TrainConfig | None:
-    """The settings of the run in a directory, to be continued there; None when there is none.
+    """The settings of the run in a directory, for its continuation; None if it holds no run.
 
     Raises:
         ConfigError: When the file is of another version.
@@ -98,7 +98,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 
 def write_curve(run: Path) -> Path | None:
-    """Plots PSNR over training seconds into ``plots/psnr.png``; None when nothing was evaluated."""
+    """Plots PSNR over training time into ``plots/psnr.png``; returns None if nothing was evaluated."""
     metrics = read_metrics(run)
     if not metrics:
         return None

@@ -1,4 +1,4 @@
-"""When cells are split and into how many: the plan of a run, known before it starts."""
+"""The planned splits of a run: when, which cells, and into how many."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 SplitKind = Literal["all", "worst"]
 TimeUnit = Literal["fraction", "seconds", "steps"]
 
-#: The first split, and the last one where there are several, as fractions of a run.
+#: Default times as fractions of a run: of a single split, and of the first and last of several.
 ONLY, FIRST, LAST = 0.2, 0.15, 0.5
 
 
@@ -18,10 +18,10 @@ class PlannedSplit:
     """One split.
 
     Attributes:
-        at: when, in the unit of the plan.
-        children: of every cell that is split.
-        cells: every cell, or only the one with the largest accumulated error.
-        most: cells that there may be afterwards, or None for no limit.
+        at: time, in the unit of the plan.
+        children: number of new cells for each cell that is split.
+        cells: "all" cells are split, or only the "worst", which has the largest accumulated error.
+        most: largest number of cells after the split, or None for no limit.
     """
 
     at: float
@@ -43,11 +43,11 @@ def plan_splits(
     """The splits of a run, in order.
 
     Args:
-        cells: children of a split, per level.
-        times: when: one for each level; with ``max_cells`` the first and the last split.
-        kind: what is split below the first level.
-        max_cells: with kind "worst": after the first split the worst cell is split into ``cells[-1]`` again and again
-            until there are that many cells, the last time into fewer where that fits; evenly spaced in time.
+        cells: children of a split, for each level.
+        times: one for each level; with ``max_cells`` those of the first and the last split.
+        kind: which cells are split below the first level.
+        max_cells: with kind "worst": after the first split, the worst cell is split into ``cells[-1]`` at evenly spaced
+            times until there are this many cells; the last split may have fewer children.
     """
     if max_cells is None:
         return tuple(
@@ -64,7 +64,7 @@ def plan_splits(
 
 
 def final_cells(plan: Sequence[PlannedSplit]) -> int:
-    """Cells at the end of a plan in which every cell holds enough samples to be split."""
+    """Cells after all splits of a plan, if every cell holds enough samples to be split."""
     cells = 1
     for split in plan:
         cells = cells * split.children if split.cells == "all" else cells + split.children - 1

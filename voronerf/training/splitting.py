@@ -1,4 +1,4 @@
-"""A split of the training: the kept samples, the diagram they balance, and what is written of them."""
+"""A split during training: the new diagram from the kept samples, and the file of these samples."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def split_by_samples(
     importance: Tensor,
     generator: torch.Generator,
 ) -> Split | None:
-    """The planned split of a diagram into cells of k children, by points [m, 3] and their importance [m].
+    """Makes a planned split of a diagram, k children a cell, from points [m, 3] and their importance [m].
 
     Returns:
-        None where there are fewer than k samples in all.
+        The split; None if there are fewer than k samples in all.
     """
     if points.shape[0] < k:
         return None
@@ -48,12 +48,12 @@ def split_by_samples(
 
 
 def median(values: list[float]) -> float | None:
-    """The median, the lower of two; None of nothing."""
+    """The median, of an even number the lower middle value; None for an empty list."""
     return float(torch.tensor(values).median()) if values else None
 
 
 def save_samples(path: Path, points: Tensor, importance: Tensor) -> None:
-    """Writes the samples that a split was made from, for a later look (and ``benchmarks/balance.py``)."""
+    """Writes the samples that a split was made from, which ``benchmarks/balance.py`` can read."""
     buffer = io.BytesIO()
     np.savez(buffer, points=points.cpu().numpy(), importance=importance.cpu().numpy())
     write_bytes(path, buffer.getvalue())

@@ -22,37 +22,29 @@ from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
 from voronerf.files import read_json_lines, write_text
 from voronerf.rendering.marching import Marched
-from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.volume import Rendered
 from voronerf.router import VoronoiRouter
 from voronerf.training.batches import RayBatches
-from voronerf.training.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    load_checkpoint,
-    load_optimizer_tensors,
-    optimizer_tensors,
-    save_checkpoint,
-)
-from voronerf.training.config import TrainConfig, differences
-from voronerf.training.graphs import GraphedStep, set_learning_rate
-from voronerf.training.networks import make_optimizer, make_routers, resolve_config, restore_routers, router_states
+from voronerf.training.checkpoint import save_checkpoint
+from voronerf.training.config import TrainConfig
+from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
+from voronerf.training.networks import make_optimizer, make_routers, resolve_config
+from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
-from voronerf.training.renderers import OCCUPANCY_DECAY, make_grid, make_renderer
+from voronerf.training.renderers import make_renderer
+from voronerf.training.resume import resume_training, training_state
 from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.splitting import median, save_samples, split_by_samples
 
-#: Steps between looks at random cells, which bring back those that were thought empty, and the share looked at.
-OCCUPANCY_EVERY, OCCUPANCY_SHARE = 16, 1 / 32
-#: Steps on a device other than the CPU after which the host reads the loss, and with that waits for the device.
+#: Steps between evaluations of random cells of the occupancy grid.
+OCCUPANCY_EVERY = 16
+#: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
 READ_EVERY = 50
-#: What the networks' products are rounded to, by the configuration's precision; float32 is left alone.
+#: The dtype of autocast for each precision but float32.
 HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 #: Steps between tries to split the worst cell.
 SPLIT_EVERY = 5
-
-
-#: What summary.json repeats of the last evaluation.
+#: Entries of the last evaluation that summary.json repeats.
 FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views")
 
 
@@ -87,7 +79,7 @@ class Trainer:
         self.on_step = on_step
         self.on_event = on_event
         self.device = torch.device(config.device)
-        # Every op of a step is looked up now: a backend that cannot train should say so before anything is written.
+        # Look up every op of a step now: a backend that cannot train should say so before anything is written.
         marching = ("march_rays", "update_occupancy") if config.occupancy else ()
         drawing = () if config.sampling == "stratified" else ("resample",)
         assigning = ("draw_cell",) if config.assignment == "stochastic" else ()
@@ -96,7 +88,7 @@ class Trainer:
             backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
         backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
         self.generator = torch.Generator().manual_seed(config.seed)
-        # What a step draws, it draws where it is used: the host need not wait, and a graph can draw anew.
+        # Random numbers are drawn on the device that uses them: the host need not wait, and a graph can draw them.
         self.draws = self.generator
         if self.device.type == "cuda":
             self.draws = torch.Generator(self.device).manual_seed(config.seed)
@@ -120,7 +112,7 @@ class Trainer:
         self.stopped = False
         self.loss = math.nan
         if config.resume:
-            self._load()
+            self._resume()
         self.saved_at = self.seconds
         self._compute = self._make_step()
         write_text(self.out / "config.json", config.to_json())
@@ -192,8 +184,8 @@ class Trainer:
     def advance(self, until: float = math.inf) -> None:
         """Trains until ``until`` training seconds or the end of the budget, whichever comes first.
 
-        :meth:`run` is this, once, and the final evaluation; calling it in turns lets several trainers share a machine
-        so that its noise falls on all of them alike.
+        :meth:`run` calls it once, and evaluates. Calls in turns let several trainers share a machine, so that its noise
+        affects all of them alike.
 
         Raises:
             As :meth:`run`.
@@ -237,7 +229,7 @@ class Trainer:
             raise TrainingError(f"{self.out}: the loss is {self.loss} at step {self.step}, try a smaller --lr; {kept}")
 
     def _make_step(self) -> Callable[[], tuple[Tensor, Tensor | None, Tensor | None]]:
-        """The work of a step: as it is, or from now on captured in a graph."""
+        """The function of a step: the plain one, or a new CUDA graph of it."""
         return GraphedStep(self._forward_backward, [self.draws]) if self.config.cuda_graph else self._forward_backward
 
     def train_step(self) -> Tensor:
@@ -247,7 +239,8 @@ class Trainer:
             router.temperature = self.temperature()
         self.renderer.sharpness = self.sharpness()
         if self.occupancy is not None and self.step % OCCUPANCY_EVERY == 0:
-            self._look(self.occupancy)
+            self.router.eval()
+            revisit_cells(self.occupancy, self.renderer.field, self.generator, backend=self.config.backend)
         self.renderer.train()
         loss, positions, importance = self._compute()
         if positions is not None and importance is not None:
@@ -255,7 +248,7 @@ class Trainer:
         return loss
 
     def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """Loss, and until the last split the samples' positions [n, 3] and importance [n]; parameters are updated."""
+        """Updates the parameters; returns the loss, and until the last split positions [n, 3] and importance [n]."""
         config = self.config
         batch = self.batches.draw(config.rays, self.draws)
         background = self.background
@@ -268,11 +261,12 @@ class Trainer:
                 batch.rays, batch.near, batch.far, background=background, jitter=True, generator=self.draws
             )
         if isinstance(passes[0], Marched):
-            self._observe(passes[0])
+            assert self.occupancy is not None
+            observe_samples(self.occupancy, passes[0], backend=config.backend)
         target = batch.target(background)
         loss = self.renderer.loss(passes, target)
         self.optimizer.zero_grad(set_to_none=True)
-        # All on the device: the fused optimiser itself leaves out a step whose gradients have overflowed.
+        # Nothing is read on the host: the fused optimiser skips a step whose gradients have overflowed by itself.
         self.scaler.scale(loss).backward()
         self.scaler.step(self.optimizer)
         self.scaler.update()
@@ -280,35 +274,17 @@ class Trainer:
             return loss.detach(), None, None
         # Importance of a sample: its weight in the image times its ray's error (section 3.1 of the paper).
         rendered = passes[-1]
-        wrong = (rendered.colour.detach() - target).square().sum(-1)
-        wrong = wrong[:, None] if isinstance(rendered, Rendered) else wrong[rendered.ray_index]
-        importance = rendered.weights.detach() * wrong
+        error = (rendered.colour.detach() - target).square().sum(-1)
+        error = error[:, None] if isinstance(rendered, Rendered) else error[rendered.ray_index]
+        importance = rendered.weights.detach() * error
         return loss.detach(), rendered.positions.detach().reshape(-1, 3), importance.reshape(-1)
-
-    def _observe(self, marched: Marched) -> None:
-        """Lets the grid learn from the samples of a step."""
-        assert self.occupancy is not None
-        found = (marched.positions, marched.density, marched.deltas, marched.weights)
-        self.occupancy.observe(
-            *(tensor.detach() for tensor in found), decay=OCCUPANCY_DECAY, backend=self.config.backend
-        )
-
-    def _look(self, grid: OccupancyGrid) -> None:
-        """Looks at random cells, so that one that was wrongly thought empty comes back."""
-        every = grid.occupied.numel()
-        count = max(1, int(every * OCCUPANCY_SHARE))
-        cells = torch.randint(every, (count,), generator=self.generator, device=self.generator.device)
-        self.router.eval()
-        grid.update(
-            self.renderer.field, cells.to(self.device), decay=1.0, generator=self.generator, backend=self.config.backend
-        )
 
     def split_is_due(self) -> bool:
         """Whether :meth:`advance` splits before the next step."""
         if self.level >= len(self.plan):
             return False
         planned = self.plan[self.level]
-        # A split of the worst cell waits for samples where no cell holds enough, and is tried again.
+        # While no cell holds enough samples, a split of the worst cell is tried again.
         return self._now() >= planned.at - 1e-9 and (planned.most is None or self.step % SPLIT_EVERY == 0)
 
     def split(self) -> None:
@@ -328,7 +304,7 @@ class Trainer:
         split = split_by_samples(config, planned, self.router.diagram, k, points, importance, self.generator)
         balances = [] if split is None else list(split.balances.values())
         if planned.most is not None and not balances:
-            return  # samples go on being kept
+            return  # the reservoir goes on collecting samples
         save_samples(self.out / "samples" / f"level-{level + 1}.npz", points, importance)
         for name, router in self.routers.items():
             if split is not None and balances and (name != "proposal" or config.split_proposal):
@@ -339,7 +315,7 @@ class Trainer:
         after = median([balance.imbalance_after for balance in balances])
         self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
-        self._compute = self._make_step()  # parameters are others now
+        self._compute = self._make_step()  # a graph would update the parameters from before the split
         when = f"at {self.seconds:.0f} s, step {self.step}"
         if balances:
             self._say(f"{self.router.num_cells} cells {when}, std(W / max W) {before:.3f} -> {after:.4f}")
@@ -350,7 +326,7 @@ class Trainer:
     # --- evaluation and files --------------------------------------------------------------------------------------
 
     def _due(self) -> int:
-        """Evaluations that should have been made by now."""
+        """Number of evaluations that are due by now."""
         return int(self.fraction * self.config.evaluations + 1e-9)
 
     def _evaluate(self, views: int | None, lpips: Lpips | None = None) -> list[ViewScore]:
@@ -390,52 +366,12 @@ class Trainer:
 
     def save(self) -> None:
         """Writes ``checkpoints/last.safetensors``."""
-        tensors: dict[str, Tensor] = {}
-        parts = {
-            **router_states(self.routers),
-            "optimizer": optimizer_tensors(self.optimizer),
-            "reservoir": self.reservoir.state_dict(),
-            "generator": {"state": self.generator.get_state(), "draws": self.draws.get_state()},
-        }
-        if self.occupancy is not None:
-            parts["occupancy"] = self.occupancy.state_dict()
-        if self.scaler.is_enabled():
-            parts["scaler"] = self.scaler.state_dict()
-        for prefix, group in parts.items():
-            tensors |= {f"{prefix}.{name}": torch.as_tensor(value) for name, value in group.items()}
-        values = {
-            "config": json.loads(self.config.to_json()),
-            "step": self.step,
-            "seconds": self.seconds,
-            "stages": [asdict(stage) for stage in self.stages],
-        }
-        save_checkpoint(checkpoint_path(self.out), Checkpoint(tensors, values))
+        save_checkpoint(checkpoint_path(self.out), training_state(self))
         self.saved_at = self.seconds
 
-    def _load(self) -> None:
-        path = checkpoint_path(self.out)
-        checkpoint = load_checkpoint(path)
-        stored = TrainConfig.from_json(json.dumps(checkpoint.values["config"]), str(path))
-        different = differences(stored, self.config)
-        if different:
-            raise CheckpointError(f"{path}: a checkpoint of another configuration: {'; '.join(different)}")
-        restore_routers(self.routers, checkpoint)
-        self.optimizer = make_optimizer(self.routers, self.config)
-        load_optimizer_tensors(self.optimizer, checkpoint.group("optimizer"))
-        self.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
-        self.reservoir.load_state_dict(checkpoint.group("reservoir"))
-        occupancy = checkpoint.group("occupancy")
-        if occupancy:
-            self.occupancy = OccupancyGrid.from_state(occupancy, device=self.device)
-            self.renderer.occupancy = self.occupancy
-        generators = checkpoint.group("generator")
-        self.generator.set_state(generators["state"])
-        drawn = generators.get("draws", generators["state"])
-        if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
-            self.draws.set_state(drawn)  # else the run began on another kind of device
-        self.step = checkpoint.values["step"]
-        self.seconds = checkpoint.values["seconds"]
-        self.stages = [Stage(**stage) for stage in checkpoint.values["stages"]]
+    def _resume(self) -> None:
+        """Goes on from the last checkpoint."""
+        resume_training(self, checkpoint_path(self.out))
         self.evaluated = self._due()
         # Evaluations made after the checkpoint will be made again.
         self.metrics = [m for m in read_json_lines(self.out / "metrics.jsonl") if m["step"] <= self.step]

@@ -1,9 +1,9 @@
 """A training step that is captured in a CUDA graph and replayed.
 
-A step of small networks is some hundred launches, which take the host longer than the device. A captured step is one.
-It reads its inputs where they were when it was captured: parameters and moments that are updated in place, a learning
-rate in a tensor, and random numbers that are drawn on the device by generators the graph knows of. What changes tensors
-for others, as a split does, ends a graph; the next one is captured from the steps after it.
+A step of small networks launches some hundred kernels, which takes the host longer than the device. A captured step is
+one launch. It reads its inputs from the memory where they were at the capture: parameters and moments that are updated
+in place, a learning rate in a tensor, and random numbers from generators that are registered with the graph. A split
+replaces parameters by new tensors. It ends the graph, and the steps after it are captured anew.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-#: Steps before the capture: libraries choose algorithms and allocate what they keep, the optimiser makes its moments.
+#: Steps before the capture, in which libraries choose algorithms and allocate memory, and the optimiser its moments.
 WARMUP = 3
 
 
 class GraphedStep:
-    """Runs a step: as it is for the first ``WARMUP`` times, on a stream of its own, then as a graph.
+    """Runs a step: the first ``WARMUP`` times directly, on a separate stream, afterwards as a graph.
 
     Args:
-        step: A whole training step, the same work each time, that reads nothing on the host; returns tensors.
-        generators: CUDA generators that it draws from.
+        step: A whole training step that does the same work each time and never waits for the device; returns tensors.
+        generators: The CUDA generators that it draws from.
     """
 
     def __init__(self, step: Callable[[], Any], generators: Sequence[torch.Generator]) -> None:
@@ -34,8 +34,8 @@ class GraphedStep:
         self.results: Any = None
 
     def __call__(self) -> Any:
-        """One step. A replay's results are the same tensors each time, with new contents."""
-        # Streams and captures are those of the current device, which need not be the trainer's.
+        """Runs one step. Every replay returns the same tensors with new contents."""
+        # Streams and captures belong to the current device, which may be another one than the trainer's.
         with torch.cuda.device(self.generators[0].device):
             return self._run()
 
@@ -59,7 +59,7 @@ class GraphedStep:
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    """The learning rate of all groups, in place where it is a tensor that a graph reads."""
+    """Sets the learning rate of all groups; a tensor, which a graph reads, is changed in place."""
     for group in optimizer.param_groups:
         if isinstance(group["lr"], Tensor):
             group["lr"].fill_(rate)

@@ -1,0 +1,80 @@
+"""The occupancy grid of a run: made, taught by the samples of training, or made for pictures of a trained field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import nn
+
+from voronerf.data import Scene
+from voronerf.rendering.field import Field
+from voronerf.rendering.marching import Marched
+from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.training.config import ConfigError, TrainConfig
+
+#: A cell is empty if a sample in it would take less of the light than this, were the cell that dense throughout: for
+#: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
+#: through empty space lies between the two, and would keep a third of the samples.
+LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
+#: The factor on what a cell remembers for each sample of a batch in it, and how many such samples in a row empty a new
+#: cell: about thirty steps, until which the field has said nothing about most cells.
+OCCUPANCY_DECAY, OCCUPANCY_PATIENCE = 0.8, 8
+#: The share of all cells that are evaluated at random from time to time.
+OCCUPANCY_SHARE = 1 / 32
+#: Of a grid made for pictures alone: cells along each axis, and points evaluated in each.
+PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
+
+
+def make_grid(
+    config: TrainConfig,
+    scene: Scene,
+    device: torch.device | str,
+    resolution: int | None = None,
+    least_opacity: float = TRAINING_OPACITY,
+) -> OccupancyGrid:
+    """A grid over the scene's box that is occupied everywhere.
+
+    A cell is empty below the density with which an average stratum, the box's diagonal divided by the samples of a ray,
+    takes `least_opacity` of the light.
+
+    Raises:
+        ConfigError: When the scene has no box.
+    """
+    if scene.box is None:
+        raise ConfigError(f"--occupancy needs a scene with a box around everything, {scene.name} has none")
+    diagonal = float((scene.box[1] - scene.box[0]).norm())
+    threshold = -math.log1p(-least_opacity) * int(config.samples or 0) / diagonal
+    size = resolution or config.occupancy_resolution
+    remembered = OCCUPANCY_DECAY**-OCCUPANCY_PATIENCE
+    return OccupancyGrid(scene.box, size, threshold=threshold, remembered=remembered, device=device)
+
+
+def make_picture_grid(config: TrainConfig, scene: Scene, field: Field, *, backend: str = "auto") -> OccupancyGrid:
+    """The occupancy grid of a field that was trained without one, made by asking the field in every cell.
+
+    Raises:
+        ConfigError: When the scene has no box, or the run's sampling has no use for a grid.
+    """
+    replace(config, occupancy=True, cuda_graph=False)  # checks that the run can use one
+    device = next(field.parameters()).device if isinstance(field, nn.Module) else "cpu"
+    grid = make_grid(config, scene, device, PICTURE_RESOLUTION, LEAST_OPACITY)
+    generator = torch.Generator().manual_seed(0)
+    for points in range(PICTURE_POINTS):
+        grid.update(field, decay=float(points > 0), generator=generator, backend=backend)
+    return grid
+
+
+def observe_samples(grid: OccupancyGrid, marched: Marched, *, backend: str) -> None:
+    """Teaches a grid what the samples of a training step found."""
+    found = (marched.positions, marched.density, marched.deltas, marched.weights)
+    grid.observe(*(tensor.detach() for tensor in found), decay=OCCUPANCY_DECAY, backend=backend)
+
+
+def revisit_cells(grid: OccupancyGrid, field: Field, generator: torch.Generator, *, backend: str) -> None:
+    """Evaluates the field in random cells, so that a cell that was wrongly found empty is found occupied again."""
+    every = grid.occupied.numel()
+    count = max(1, int(every * OCCUPANCY_SHARE))
+    cells = torch.randint(every, (count,), generator=generator, device=generator.device)
+    grid.update(field, cells.to(grid.occupied.device), decay=1.0, generator=generator, backend=backend)
