@@ -1,4 +1,4 @@
-"""The one table of tolerances: how far a result may be from the same computed in float64.
+"""How far a result may be from the same computed in float64; the table itself is in `voronerf/tolerances.py`.
 
 The error of a result is its largest absolute difference from the float64 result, divided by the largest magnitude
 there. It may be twice that of plain PyTorch in the same dtype, plus a floor: the rounding of the result itself, and for
@@ -10,13 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-FLOOR = {
-    torch.float64: 1e-14,
-    torch.float32: 2e-6,
-    torch.float16: 2.0**-11,
-    torch.bfloat16: 2.0**-8,
-}
-"""bfloat16 has half of a unit in the last place, 2^-9, for the result and the same for one intermediate."""
+from voronerf.tolerances import FLOOR
 
 
 def error(result: Tensor, exact: Tensor) -> float:

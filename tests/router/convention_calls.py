@@ -250,7 +250,7 @@ CALLS = [
     ),
     Case("scripted", Scripted, one(), first, one_pass=False),
     Case("operations", Operations, one(), first),
-    Case("checkpointed", Checkpointed, one(), first),
+    Case("checkpointed", Checkpointed, one(), first, one_pass=False),
     Case("named tuple", Named, one(), first, lead=RAYS),
     Case(
         "containers",

@@ -116,10 +116,11 @@ def test_how_often_the_module_runs(case: Case, centres: Tensor, monkeypatch: pyt
     assert 0 not in counter.rows
     if case.one_pass:
         assert len(counter.rows) <= 1, f"ran {len(counter.rows)} times for {K} cells"
-        assert not [str(w.message) for w in said if "VoronoiRouter" in str(w.message)]
+        assert not [str(w.message) for w in said if "cell by cell" in str(w.message)]
     elif len(counter.rows) > 1:
-        counts = nearest(case, centres, args, kwargs).unique(return_counts=True)[1]
-        assert sorted(counter.rows) == sorted(counts.tolist())
+        counts = nearest(case, centres, args, kwargs).unique(return_counts=True)[1].tolist()
+        # Where another batch may do without the loop, that is looked at on a few samples.
+        assert sorted(counter.rows[-len(counts) :]) == sorted(counts)
 
 
 @every_case

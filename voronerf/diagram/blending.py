@@ -186,3 +186,50 @@ def _heaviest(rows: Tensor, cells: Tensor, weights: Tensor, most: int) -> tuple[
     left = torch.where(total[number] > 0, left / total[number], (rank == 0).to(left.dtype))
     kept = left > 0
     return rows[kept], cells[kept], left[kept]
+
+
+class Mixture:
+    """What is to be evaluated beside each sample in its own cell, and how much of it goes into the result.
+
+    Attributes:
+        rows: int64 [m], the sample of each entry; m is never 1.
+        cells: int32 [m], the cell to evaluate it in.
+        weights: floating [m].
+        kept: floating [n], the share of a sample's own cell; 1 outside of all margins.
+    """
+
+    def __init__(self, rows: Tensor, cells: Tensor, weights: Tensor, kept: Tensor) -> None:
+        self.rows, self.cells, self.weights, self.kept = rows, cells, weights, kept
+
+    @classmethod
+    def of(cls, diagram: VoronoiDiagram, positions: Tensor, margin: float, backend: str) -> Mixture | None:
+        """The mixture at positions [..., 3]; None where no sample lies in a margin."""
+        positions = positions.detach().reshape(-1, 3)
+        blend = blend_cells(diagram, positions, margin)
+        if blend.rows.numel() == 0:
+            return None
+        own = blend.cells == diagram.locate(positions[blend.rows], backend=backend)
+        kept = torch.ones(positions.shape[0], dtype=blend.weights.dtype, device=positions.device)
+        kept[blend.rows] = 0
+        kept[blend.rows[own]] = blend.weights[own]
+        rows, cells, weights = (part[~own] for part in blend)
+        if rows.numel() == 0:
+            return None
+        if rows.shape[0] == 1:  # one row leaves open what is a row: the second counts for nothing
+            rows, cells, weights = rows.repeat(2), cells.repeat(2), torch.cat([weights, torch.zeros_like(weights)])
+        return cls(rows, cells, weights, kept)
+
+    def mix(self, own: Tensor, others: Tensor) -> Tensor:
+        """Weighted means; what is not floating stays that of a sample's own cell.
+
+        Args:
+            own: [n, ...] in whatever leading dimensions, the results in the samples' own cells.
+            others: [m, ...], those of the entries.
+        """
+        if not own.is_floating_point():
+            return own
+        dtype = torch.promote_types(torch.promote_types(own.dtype, torch.float32), self.kept.dtype)
+        n, m = self.kept.shape[0], self.rows.shape[0]
+        total = own.reshape(n, -1).to(dtype) * self.kept[:, None]
+        total = total.index_add(0, self.rows, others.reshape(m, -1).to(dtype) * self.weights[:, None].to(dtype))
+        return total.to(own.dtype).reshape(own.shape)

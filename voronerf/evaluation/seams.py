@@ -23,9 +23,9 @@ import torch
 from torch import Tensor
 
 from voronerf.data import Scene
+from voronerf.diagram.blending import Mixture
 from voronerf.evaluation.scores import view_numbers
 from voronerf.router import VoronoiRouter
-from voronerf.router.blended import Mixture
 
 #: The margin as a part of the diagonal of the scene's box: 0.04 of a Blender scene, a pixel and a half at 100 x 100.
 MARGIN = 0.01

@@ -1,4 +1,4 @@
-"""Samples sorted by cell: the order, its inverse, and what a pass over the sorted rows needs to know.
+"""Samples sorted by cell: the order, its inverse, and what running a module on the sorted rows needs to know.
 
 n samples, k cells. A sorted tensor may have m entries a sample: its first dimension is then n * m, sample after sample.
 """
@@ -6,6 +6,7 @@ n samples, k cells. A sorted tensor may have m entries a sample: its first dimen
 from __future__ import annotations
 
 import itertools
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -13,43 +14,6 @@ import torch
 from torch import Tensor
 
 from voronerf import ops
-
-
-class PerCell(torch.Tensor):
-    """k tensors, one for each cell, that look like one of them: what a routed module finds in the place of a parameter.
-
-    It has the shape of a single cell's tensor and no storage: the operations that it takes part in are carried out by
-    :class:`voronerf.router.rows.RowMode`, on ``stacked``, and any other use fails.
-
-    Attributes:
-        stacked: [k, ...], one entry for each cell.
-    """
-
-    stacked: Tensor
-    # Shape and dtype are answered by the wrapper itself.
-    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
-
-    @staticmethod
-    def __new__(cls, stacked: Tensor, is_parameter: bool = False) -> PerCell:
-        """Wraps [k, ...]; ``is_parameter`` makes it an instance of ``nn.Parameter``."""
-        wrapper: PerCell = torch.Tensor._make_wrapper_subclass(
-            cls,
-            stacked.shape[1:],
-            dtype=stacked.dtype,
-            device=stacked.device,
-            requires_grad=stacked.requires_grad and stacked.is_floating_point(),
-        )
-        wrapper.stacked = stacked
-        wrapper._is_param = is_parameter
-        return wrapper
-
-    @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        """Refuses what did not pass through the mode."""
-        raise TypeError(
-            f"VoronoiRouter: {func} met the parameters of all cells outside of a routed call; call the router, or take "
-            "one cell's module with cell(i)"
-        )
 
 
 class Grouping:
@@ -166,9 +130,8 @@ class Grouping:
         """[n, ...] sorted by cell -> the original order."""
         return x if self.order is None else permute(x, self.inverse, self.order)
 
-    def expand(self, parameter: PerCell, m: int = 1) -> Tensor:
-        """[n * m, ...]: each row with its cell's tensor."""
-        stacked = parameter.stacked
+    def expand(self, stacked: Tensor, m: int = 1) -> Tensor:
+        """[k, ...] -> [n * m, ...]: the entry of each row's cell."""
         # Copies under all settings: a product in TF32 would round them.
         rounds = stacked.is_cuda and torch.backends.cuda.matmul.fp32_precision == "tf32"
         if not stacked.is_floating_point() or stacked[0].numel() == 0 or rounds:
@@ -258,3 +221,53 @@ def permute(x: Tensor, index: Tensor | None, inverse: Tensor | None) -> Tensor:
         return permuted
     assert index is not None
     return x.index_select(0, index)
+
+
+class Assignments:
+    """The last assignment, for other methods that are called with the same positions."""
+
+    def __init__(self) -> None:
+        self._key: tuple[Any, ...] = ()
+        self._source: weakref.ref[Tensor] | None = None
+        self._version = 0
+        self._positions: Tensor | None = None
+        self._methods: set[str] = set()
+        self._grouping: Grouping | None = None
+
+    def find(self, method: str, source: Tensor | None, positions: Tensor, key: tuple[Any, ...]) -> Grouping | None:
+        """The assignment made for the same positions, or None. One that was drawn serves each method once.
+
+        Args:
+            method: that is called.
+            source: the tensor that holds the positions, or None where they have been computed.
+            positions: [..., 3].
+            key: what else the assignment depends on.
+        """
+        if self._grouping is None or key != self._key or positions.numel() == 0:
+            return None
+        if source is not None:
+            known = self._source is not None and self._source() is source and source._version == self._version
+        else:
+            known = (
+                self._positions is not None
+                and self._positions.shape == positions.shape
+                and self._positions.device == positions.device
+                and torch.equal(self._positions, positions)
+            )
+        drawn = key[2]
+        if not known or (drawn and method in self._methods):
+            return None
+        self._methods.add(method)
+        return self._grouping
+
+    def keep(
+        self, method: str, source: Tensor | None, positions: Tensor, key: tuple[Any, ...], grouping: Grouping
+    ) -> None:
+        """Remembers an assignment."""
+        if source is not None and source.is_inference():  # has no version that would tell of changes
+            self._grouping = None
+            return
+        self._key, self._methods, self._grouping = key, {method}, grouping
+        self._source = None if source is None else weakref.ref(source)
+        self._version = 0 if source is None else source._version
+        self._positions = positions.detach().clone() if source is None else None

@@ -1,20 +1,29 @@
-"""The loop over cells: a module without a grouped form on the contiguous rows of each cell."""
+"""The loop over cells: the definition of a routed call. Each cell's module runs on the contiguous rows of its cell."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.arguments import map_result, narrow, tensors_of
-from voronerf.router.checkpointing import rerun_in
-from voronerf.router.functions import RANDOM
 from voronerf.router.grouping import Grouping
-from voronerf.router.parameters import in_place_of_parameters, owned_parameters
+from voronerf.router.layout import Call, Layout, map_tree, rebuild, tensors_of
+from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
+from voronerf.tolerances import agree
+
+_DRAWS = """
+    rand_like randn_like randint_like bernoulli normal_ uniform_ bernoulli_ exponential_ random_ cauchy_ log_normal_
+    geometric_ dropout dropout_ alpha_dropout feature_alpha_dropout rrelu rand randn randint randperm normal multinomial
+"""
+RANDOM = frozenset(
+    getattr(place, name) for place in (torch, torch.Tensor, F) for name in _DRAWS.split() if hasattr(place, name)
+)
+"""What draws random numbers."""
 
 
 class NoRandomness(TorchFunctionMode):
@@ -29,99 +38,161 @@ class NoRandomness(TorchFunctionMode):
         return func(*args, **kwargs).zero_()
 
 
+@dataclass
+class Given:
+    """Arguments as a module sees them, with rows sorted by cell.
+
+    Attributes:
+        args: Positional.
+        kwargs: Keyword.
+        rows: The tensors among them that have rows.
+    """
+
+    args: Sequence[Any]
+    kwargs: dict[str, Any]
+    rows: list[Tensor]
+
+    def part(self, first: int, last: int, axis: int) -> Given:
+        """Rows ``first`` to ``last`` alone."""
+        rows = {id(tensor) for tensor in self.rows}
+        found: list[Tensor] = []
+
+        def cut(name: str, value: Any, nested: bool) -> Any:
+            if not isinstance(value, Tensor):
+                if not any(id(tensor) in rows for tensor in tensors_of(value)):
+                    return value
+                value = value[(slice(None),) * axis + (slice(first, last),)]
+                found.extend(tensors_of(value))
+                return value
+            if id(value) not in rows:
+                return value
+            found.append(value.narrow(axis, first, last - first))
+            return found[-1]
+
+        args, kwargs = map_tree((tuple(self.args), self.kwargs), cut, batches=True)
+        return Given(args, kwargs, found)
+
+
+@dataclass
+class Results:
+    """What a method returned for rows.
+
+    Attributes:
+        value: Of any structure.
+        tensors: Its tensors, [n * m, ...] where they have rows.
+        rows: Which of them have rows.
+        flattened: Which of them are [n, ...] though the module saw [1, n, ...].
+    """
+
+    value: Any
+    tensors: list[Tensor]
+    rows: list[bool]
+    flattened: list[bool]
+
+
 def run_cells(
-    module: nn.Module,
-    call: Callable[..., Any],
-    args: Sequence[Any],
-    kwargs: dict[str, Any],
-    grouping: Grouping,
-    rows: Callable[[Tensor], bool],
-    check: bool,
-) -> tuple[Any, bool]:
+    module: nn.Module, call: Call, layout: Layout, given: Given, grouping: Grouping, *, again: bool = False
+) -> Results:
     """A module's results for sorted rows, one call for each cell that has any.
 
     Args:
-        module: with stacked parameters.
-        call: its method.
-        args: as the module sees them, sorted.
-        kwargs: likewise.
-        grouping: of the rows.
-        rows: whether a tensor among the arguments has rows.
-        check: whether to find out first if the module mixes samples.
-
-    Returns:
-        The results, with tensors [rows of all cells, ...], and whether the check could be made.
+        module: With stacked parameters.
+        call: Of a method of it.
+        layout: Of its arguments.
+        given: The arguments, sorted.
+        grouping: Of the rows.
+        again: Whether the module's code runs again in the backward pass (``torch.utils.checkpoint``): every cell has a
+            copy of the module then, which keeps the cell's parameters.
 
     Raises:
-        TypeError: when the module mixes samples.
-        ValueError: for a result without a row for each sample.
+        ValueError: For a result without a row for each sample, or other results in some cells.
     """
-    parameters = {id(p): p for _, _, p in owned_parameters(module)}
-    pieces = {key: parameter.unbind(0) for key, parameter in parameters.items()}
-
-    def on_cell(cell: int, first: int, last: int) -> Any:
-        part = narrow((tuple(args), kwargs), rows, first, last)
-        own = {key: values[cell] for key, values in pieces.items()}
-
-        @contextlib.contextmanager
-        def again() -> Iterator[Callable[[Tensor], Any]]:
-            with in_place_of_parameters(module, own):
-                yield lambda _: None
-
-        with in_place_of_parameters(module, own), rerun_in(again, lambda _: False):
-            return call(*part[0], **part[1])
-
     occupied = grouping.occupied()
-    checked = False
-    if check:
-        cell, first, last = max(occupied, key=lambda bounds: bounds[2] - bounds[1])
-        if last - first >= 2:
-            with NoRandomness():  # with gradients, which the module may take inside
-                _check_rows(module, on_cell, cell, first, last)
-            checked = True
-    results = [on_cell(*bounds) for bounds in occupied]
-    counts = [last - first for _, first, last in occupied]
-    return _join(results, counts), checked
+    parameters = {id(p): p for _, _, p in cell_parameters(module)}
+    pieces = {key: parameter.unbind(0) for key, parameter in parameters.items()}
+    results = []
+    for cell, first, last in occupied:
+        own: dict[int, Any] = {key: values[cell] for key, values in pieces.items()}
+        part = given if len(occupied) == 1 else given.part(first, last, layout.axis)
+        if again:
+            kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
+            results.append(call.function(clone_module(module, kept | own))(*part.args, **part.kwargs))
+            continue
+        with in_place_of_parameters(module, own):
+            results.append(call.function(module)(*part.args, **part.kwargs))
+    return _join(results, [last - first for _, first, last in occupied], module, layout)
 
 
-def _check_rows(module: nn.Module, on_cell: Callable[[int, int, int], Any], cell: int, first: int, last: int) -> None:
+def _join(results: list[Any], counts: list[int], module: nn.Module, layout: Layout) -> Results:
+    """The results of cells as one."""
+    parts = [tensors_of(result) for result in results]
+    if any(len(part) != len(parts[0]) for part in parts):
+        raise ValueError("VoronoiRouter: module must return as many tensors for every cell, got different numbers")
+    same = {id(buffer) for buffer in module.buffers()}
+    joined = Results(results[0], [], [], [])
+    for pieces in zip(*parts, strict=True):
+        constant = id(pieces[0]) in same
+        rows = [layout.rows_of(piece) for piece in pieces]
+        m = rows[0].shape[0] // counts[0] if rows[0].dim() else 0
+        if not constant and (m == 0 or any(r.dim() == 0 or r.shape[0] != m * n for r, n in zip(rows, counts))):
+            raise ValueError(
+                "VoronoiRouter: results must have a row for each sample, got "
+                f"{list(pieces[0].shape)} for {counts[0]} samples"
+            )
+        joined.tensors.append(pieces[0] if constant else rows[0] if len(rows) == 1 else torch.cat(rows))
+        joined.rows.append(not constant)
+        joined.flattened.append(layout.axis > 0 and pieces[0].shape == rows[0].shape)
+    return joined
+
+
+def check_rows(module: nn.Module, call: Call, layout: Layout, given: Given, grouping: Grouping, again: bool) -> None:
+    """Finds out whether a module gives other results for samples when other samples are left out.
+
+    Raises:
+        TypeError: When it does.
+    """
+    cell, first, last = max(grouping.occupied(), key=lambda bounds: bounds[2] - bounds[1])
     middle = (first + last) // 2
-    whole = [a for a in tensors_of(on_cell(cell, first, last)) if a.dim() and a.shape[0] == last - first]
-    pairs = [(a[: middle - first], b) for a, b in zip(whole, tensors_of(on_cell(cell, first, middle)))]
-    pairs += [(a[middle - first :], b) for a, b in zip(whole, tensors_of(on_cell(cell, middle, last)))]
-    for a, b in pairs:
-        if a.shape != b.shape or not same(a, b):
+    outcomes = []
+    for a, b in ((first, last), (first, middle), (middle, last)):
+        part = given.part(a, b, layout.axis)
+        cells = torch.full((b - a,), cell, dtype=torch.int32, device=grouping.device)
+        alone = Grouping(cells, b - a, grouping.k, grouping.device, grouping.backend)
+        outcomes.append(run_cells(module, call, layout, part, alone, again=again))
+    whole, *halves = outcomes
+    for i, tensor in enumerate(whole.tensors):
+        if whole.rows[i] and not agree(torch.cat([half.tensors[i] for half in halves]), tensor):
             raise TypeError(
                 f"VoronoiRouter: module must treat samples one by one, but {type(module).__name__} gives other results "
                 "for a sample when other samples are left out: it mixes samples (attention or statistics over a batch)"
             )
 
 
-def same(a: Tensor, b: Tensor) -> bool:
-    """Whether two tensors are equal up to what the order of sums may change."""
-    a, b = a.detach(), b.detach()
-    if not a.is_floating_point():
-        return torch.equal(a, b)
-    return torch.allclose(a.double(), b.double(), rtol=1e-2, atol=1e-2 * _scale(a), equal_nan=True)
+def restored(results: Results, layout: Layout, grouping: Grouping | None, flat: Sequence[bool]) -> Any:
+    """Results in the caller's order, with the leading dimensions of the call.
+
+    Args:
+        results: Sorted by cell; in the original order where ``grouping`` is None.
+        layout: Of the call.
+        grouping: Of the samples.
+        flat: Which of the tensors the module itself flattens to [rays * samples, ...].
+    """
+    tensors = []
+    for i, tensor in enumerate(results.tensors):
+        if results.rows[i]:
+            tensor = _unsorted(tensor, layout, grouping)
+            tensor = layout.restore(tensor, results.flattened[i] or (i < len(flat) and flat[i]))
+        tensors.append(tensor)
+    return rebuild(results.value, tensors)
 
 
-def _scale(values: Tensor) -> float:
-    finite = values[values.isfinite()]
-    return float(finite.abs().max()) if finite.numel() else 0.0
-
-
-def _join(results: Sequence[Any], counts: Sequence[int]) -> Any:
-    """The results of cells as one."""
-    parts = [tensors_of(result) for result in results]
-    if any(len(part) != len(parts[0]) for part in parts):
-        raise ValueError("VoronoiRouter: module must return as many tensors for every cell, got different numbers")
-    joined = iter([_join_tensors(pieces, counts) for pieces in zip(*parts, strict=True)])
-    return map_result(results[0], lambda _: next(joined))
-
-
-def _join_tensors(pieces: Sequence[Tensor], counts: Sequence[int]) -> Tensor:
-    if all(piece.dim() > 0 and piece.shape[0] == count for piece, count in zip(pieces, counts, strict=True)):
-        return torch.cat(list(pieces))
-    raise ValueError(
-        f"VoronoiRouter: results must have a row for each sample, got {list(pieces[0].shape)} for {counts[0]} samples"
-    )
+def _unsorted(rows: Tensor, layout: Layout, grouping: Grouping | None) -> Tensor:
+    if grouping is None:
+        return rows
+    m = rows.shape[0] // grouping.n
+    if m > 1:
+        rows = rows.reshape(grouping.n, m, *rows.shape[1:])
+    rows = grouping.unsort(rows)
+    if not layout.n:
+        rows = rows[:0]
+    return rows.flatten(0, 1) if m > 1 else rows

@@ -7,19 +7,24 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import fnmatch
 import itertools
 import warnings
-from collections.abc import Iterator, Sequence
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.parameter import UninitializedParameter
 from torch.nn.utils import parametrizations
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from voronerf.router.grouping import PerCell
+from voronerf.router.layout import map_tree, tensors_of
 
 _OP = "VoronoiRouter"
+_SHARED, _ALIASES = "_voronerf_shared", "_voronerf_aliases"  # names that parts of a routed module carry
+_OWN = frozenset(vars(nn.Module())) | {_SHARED, _ALIASES}
 _ELEMENTWISE_OPTIMIZERS = (
     torch.optim.Adam,
     torch.optim.AdamW,
@@ -46,6 +51,16 @@ def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Paramet
     ]
 
 
+def cell_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parameter]]:
+    """Those of :func:`owned_parameters` that are stacked, [k, ...]; not those that all cells share."""
+    return [owned for owned in owned_parameters(module) if not is_shared(owned[0], owned[1])]
+
+
+def is_shared(owner: nn.Module, name: str) -> bool:
+    """Whether a parameter is one for all cells."""
+    return name in vars(owner).get(_SHARED, ())
+
+
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
     """A deep copy, also of a module that keeps results of its last call (which torch refuses to copy)."""
     memo = {} if memo is None else memo
@@ -67,14 +82,15 @@ def check_module(module: nn.Module) -> None:
         raise TypeError(f"{_OP}: module must be an nn.Module, got {type(module).__name__}")
     if isinstance(module, torch.jit.ScriptModule):
         raise TypeError(f"{_OP}: module must be an ordinary nn.Module, got the script {type(module).__name__}")
+    registered = {id(parameter) for parameter in module.parameters()}
     for name, part in module.named_modules():
-        reason = _refusal(part)
+        reason = _refusal(part, registered)
         if reason:
             where = f"`{name}`, a {type(part).__name__}," if name else f"a {type(part).__name__}"
             raise TypeError(f"{_OP}: module must treat samples one by one, but {where} {reason}")
 
 
-def _refusal(part: nn.Module) -> str:
+def _refusal(part: nn.Module, registered: set[int]) -> str:
     if isinstance(part, nn.modules.batchnorm._BatchNorm):
         return "mixes the samples of a batch (use LayerNorm or GroupNorm)"
     if isinstance(part, nn.modules.instancenorm._InstanceNorm) and part.track_running_stats:
@@ -86,67 +102,117 @@ def _refusal(part: nn.Module) -> str:
         return "keeps a state for each weight (spectral norm) that cells cannot share"
     if any(isinstance(parameter, UninitializedParameter) for parameter in part._parameters.values()):
         return "has no sizes yet (run it once, so that lazy layers get their parameters)"
-    for name, value in vars(part).items():
-        if name not in ("_parameters", "_modules") and isinstance(value, (list, tuple, dict)):
-            items = value.values() if isinstance(value, dict) else value
-            if any(isinstance(item, nn.Parameter) for item in items):
-                return f"keeps parameters in the plain {type(value).__name__} `{name}` (use nn.ParameterList)"
+    for name, value in _containers(part):
+        if any(isinstance(item, nn.Parameter) and id(item) not in registered for item in tensors_of(value)):
+            return f"keeps parameters in the plain {type(value).__name__} `{name}` (use nn.ParameterList)"
     return ""
 
 
-def stack_parameters(module: nn.Module, k: int) -> None:
-    """Gives every parameter of a module k equal entries, in place."""
+def _containers(part: nn.Module) -> list[tuple[str, Any]]:
+    """The plain lists, tuples and dicts among a module's attributes."""
+    return [
+        (name, value)
+        for name, value in vars(part).items()
+        if isinstance(value, (list, tuple, dict)) and not name.endswith("_hooks") and name not in _OWN
+    ]
+
+
+def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
+    """Gives every parameter of a module k equal entries, in place.
+
+    Args:
+        module: Changed in place.
+        k: Cells.
+        share: Patterns of names, as ``fnmatch`` has them; such parameters stay as they are, one for all cells.
+
+    Raises:
+        ValueError: For a pattern that no parameter has.
+    """
+    names = [name for name, _ in module.named_parameters(remove_duplicate=False)]
+    for pattern in share:
+        if not fnmatch.filter(names, pattern):
+            raise ValueError(
+                f"{_OP}: share must name parameters of {type(module).__name__}, such as {', '.join(names[:3])}, got "
+                f"{pattern!r}"
+            )
+    shared = {
+        id(parameter)
+        for name, parameter in module.named_parameters(remove_duplicate=False)
+        if any(fnmatch.fnmatchcase(name, pattern) for pattern in share)
+    }
     stacked: dict[int, nn.Parameter] = {}
     for owner, name, parameter in owned_parameters(module):
+        if id(parameter) in shared:
+            vars(owner)[_SHARED] = (*vars(owner).get(_SHARED, ()), name)
+            continue
         if id(parameter) not in stacked:
             values = parameter.detach().expand(k, *parameter.shape).clone()
             stacked[id(parameter)] = nn.Parameter(values, requires_grad=parameter.requires_grad)
         owner.register_parameter(name, stacked[id(parameter)])
+    for part in module.modules():
+        aliases = [name for name, value in _containers(part) if any(id(t) in stacked for t in tensors_of(value))]
+        if aliases:
+            vars(part)[_ALIASES] = tuple(aliases)
+            _point_aliases(part, stacked)
+
+
+def _point_aliases(part: nn.Module, values: Mapping[int, Tensor]) -> dict[str, Any]:
+    """Puts other tensors into plain lists and the like that hold parameters; returns the lists as they were."""
+    before = {name: vars(part)[name] for name in vars(part).get(_ALIASES, ())}
+    for name, value in before.items():
+        vars(part)[name] = map_tree(value, lambda _, tensor, nested: values.get(id(tensor), tensor))
+    return before
 
 
 def take_cell(module: nn.Module, index: int) -> nn.Module:
     """A plain copy of one cell's module."""
-    plain: nn.Module = clone_module(module)
-    single: dict[int, nn.Parameter] = {}
-    for owner, name, parameter in owned_parameters(plain):
-        if id(parameter) not in single:
-            single[id(parameter)] = nn.Parameter(
-                parameter.detach()[index].clone(), requires_grad=parameter.requires_grad
-            )
-        owner.register_parameter(name, single[id(parameter)])
+    single = {
+        id(parameter): nn.Parameter(parameter.detach()[index].clone(), requires_grad=parameter.requires_grad)
+        for _, _, parameter in cell_parameters(module)
+    }
+    plain = clone_module(module, single)
+    for part in plain.modules():
+        for name in (_SHARED, _ALIASES):
+            vars(part).pop(name, None)
     return plain
 
 
 @torch.no_grad()
-def fill_cell(stacked: nn.Module, index: int, module: nn.Module, op: str) -> None:
+def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None:
     """Puts a plain module's parameters into one cell.
 
     Raises:
         ValueError: names, shapes or buffers that are not those of the routed module.
     """
-    ours, theirs = dict(stacked.named_parameters()), dict(module.named_parameters())
+    ours, theirs = dict(routed.named_parameters()), dict(module.named_parameters())
     if ours.keys() != theirs.keys():
         odd = sorted(ours.keys() ^ theirs.keys())
         raise ValueError(f"{op}: module must have the parameters of the routed one, got a difference in {odd[0]!r}")
+    stacked = {id(parameter) for _, _, parameter in cell_parameters(routed)}
     for name, parameter in theirs.items():
-        if parameter.shape != ours[name].shape[1:]:
-            raise ValueError(
-                f"{op}: module's {name} must have shape {list(ours[name].shape[1:])}, got {list(parameter.shape)}"
-            )
+        own = id(ours[name]) in stacked
+        shape = ours[name].shape[1:] if own else ours[name].shape
+        if parameter.shape != shape:
+            raise ValueError(f"{op}: module's {name} must have shape {list(shape)}, got {list(parameter.shape)}")
+        if not own and not torch.equal(parameter.to(ours[name]), ours[name]):
+            raise ValueError(f"{op}: module's {name} must be that of the routed one, since cells share it")
     buffers = dict(module.named_buffers())
-    for name, buffer in stacked.named_buffers():
+    for name, buffer in routed.named_buffers():
         if name not in buffers or not torch.equal(buffers[name].to(buffer.device), buffer):
             raise ValueError(f"{op}: module's buffer {name} must be that of the routed one, since cells share buffers")
     for name, parameter in theirs.items():
-        ours[name][index] = parameter.to(ours[name])
+        if id(ours[name]) in stacked:
+            ours[name][index] = parameter.to(ours[name])
 
 
 @contextlib.contextmanager
-def in_place_of_parameters(module: nn.Module, values: dict[int, Tensor]) -> Iterator[None]:
+def in_place_of_parameters(module: nn.Module, values: Mapping[int, Tensor]) -> Iterator[None]:
     """Lets a module find other tensors where its parameters are; ``values`` by the id of the parameter."""
-    owned = owned_parameters(module)
+    owned = cell_parameters(module)
+    parts = list(module.modules())
     # Hooks such as that of torch.nn.utils.weight_norm leave tensors made of parameters behind.
-    attributes = [(owner, dict(vars(owner))) for owner in module.modules() if owner._forward_pre_hooks]
+    attributes = [(part, dict(vars(part))) for part in parts if part._forward_pre_hooks]
+    aliases = [(part, _point_aliases(part, values)) for part in parts if _ALIASES in vars(part)]
     for owner, name, parameter in owned:
         owner._parameters[name] = values[id(parameter)]  # type: ignore[assignment]
     try:
@@ -154,89 +220,121 @@ def in_place_of_parameters(module: nn.Module, values: dict[int, Tensor]) -> Iter
     finally:
         for owner, name, parameter in owned:
             owner._parameters[name] = parameter
+        for part, before in aliases:
+            vars(part).update(before)
         for owner, before in attributes:
             for name, value in list(vars(owner).items()):
                 if isinstance(value, Tensor) and value is not before.get(name):
                     vars(owner)[name] = before.get(name)
 
 
-def as_per_cell(module: nn.Module) -> dict[int, Tensor]:
-    """A :class:`PerCell` for every parameter, by its id."""
-    return {
-        id(parameter): PerCell(parameter, is_parameter=True)
-        for parameter in {id(p): p for _, _, p in owned_parameters(module)}.values()
-    }
-
-
-def inherit_parameters(
-    module: nn.Module, parents: Tensor, fresh: Sequence[Tensor] | None, new: Tensor
-) -> dict[Tensor, nn.Parameter]:
-    """Replaces parameters of k cells by those of their children; returns old -> new.
+@torch.no_grad()
+def inherit_parameters(module: nn.Module, parents: Tensor, fresh: Sequence[Tensor] | None, new: Tensor) -> None:
+    """Replaces the values of k cells by those of their children; the parameter objects stay.
 
     Args:
-        module: with stacked parameters, changed in place.
+        module: With stacked parameters, changed in place.
         parents: int64 [children], the cell that each child comes from.
-        fresh: for each of ``owned_parameters`` values [children, ...] for the cells that ``new`` names, or None.
+        fresh: For each of ``owned_parameters`` values [children, ...] for the cells that ``new`` names, or None.
         new: bool [children].
     """
-    replaced: dict[Tensor, nn.Parameter] = {}
-    for index, (owner, name, parameter) in enumerate(owned_parameters(module)):
-        if parameter not in replaced:
+    stacked = {id(parameter) for _, _, parameter in cell_parameters(module)}
+    done: set[int] = set()
+    for index, (_, _, parameter) in enumerate(owned_parameters(module)):
+        if id(parameter) in done or id(parameter) not in stacked:
+            continue
+        done.add(id(parameter))
+        with torch.inference_mode(False):
             values = parameter.detach()[parents.to(parameter.device)]
             if fresh is not None:
                 values[new.to(values.device)] = fresh[index][new].to(values)
-            replaced[parameter] = nn.Parameter(values, requires_grad=parameter.requires_grad)
-        owner.register_parameter(name, replaced[parameter])
-    return replaced
+            parameter.data, parameter.grad = values, None
 
 
-def check_optimizer(optimizer: torch.optim.Optimizer, module: nn.Module) -> None:
+def check_optimizer(optimizer: torch.optim.Optimizer, module: nn.Module, method: str = "subdivide") -> None:
     """Raises ValueError for an optimiser that holds none of a module's parameters."""
     ours = {id(parameter) for parameter in module.parameters()}
     if ours and not any(id(parameter) in ours for group in optimizer.param_groups for parameter in group["params"]):
-        raise ValueError(f"{_OP}.subdivide: optimizer must hold the router's parameters, got one of others")
+        raise ValueError(f"{_OP}.{method}: optimizer must hold the router's parameters, got one of others")
 
 
 def move_state(
-    optimizer: torch.optim.Optimizer, replaced: dict[Tensor, nn.Parameter], parents: Tensor, fresh: Tensor | None
-) -> str:
-    """Puts the new parameters in the place of the old in an optimiser, their state copied from the parent cell.
+    optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
+) -> None:
+    """Gives every cell the state that an optimiser has for its parent; other optimisers begin anew, which is said.
 
-    The state of the cells that the mask ``fresh`` names is zero instead.
-
-    Returns:
-        Empty, or the name of an optimiser whose state could not be carried over, and begins anew.
+    Args:
+        optimizer: Of a module whose parameters are those of the new cells already.
+        module: With stacked parameters.
+        parents: int64 [new cells].
+        k: Cells before.
+        fresh: bool [new cells], whose state is zero instead, or None.
     """
-    for group in optimizer.param_groups:
-        # The list stays the same object: LBFGS, for one, has taken it elsewhere.
-        group["params"][:] = [replaced.get(parameter, parameter) for parameter in group["params"]]
-    known = isinstance(optimizer, _ELEMENTWISE_OPTIMIZERS)
-    lost = ""
-    for old, new in replaced.items():
-        state = optimizer.state.pop(old, None)
-        if not state:
-            continue
-        if not known:
-            lost = type(optimizer).__name__
-            continue
+    known, lost = isinstance(optimizer, _ELEMENTWISE_OPTIMIZERS), False
+    for parameter in {id(p): p for _, _, p in cell_parameters(module)}.values():
+        old, state = (k, *parameter.shape[1:]), optimizer.state.get(parameter, {})
+        lost = lost or (bool(state) and not known)
         for key, value in state.items():
-            moved = copy.deepcopy(value)
-            if isinstance(value, Tensor) and value.shape == old.shape:
-                moved = value[parents.to(value.device)]
+            if isinstance(value, Tensor) and value.shape == old and known:
+                state[key] = value[parents.to(value.device)]
                 if fresh is not None:
-                    moved[fresh.to(value.device)] = 0
-            optimizer.state[new][key] = moved
+                    state[key][fresh.to(value.device)] = 0
     if not known:
         # Some keep what is not a parameter's own, such as the last flattened gradient; nothing of it fits any more.
         optimizer.state.clear()
         if isinstance(optimizer, torch.optim.LBFGS):
             optimizer._numel_cache = None  # the number of entries of all parameters together
-    return lost
+    if lost:
+        name = type(optimizer).__name__
+        warnings.warn(
+            f"{_OP}.subdivide: the state of {name} cannot be inherited by cells and begins anew", stacklevel=4
+        )
 
 
-def warn_fresh_state(name: str) -> None:
-    """Says that an optimiser begins anew."""
-    warnings.warn(f"{_OP}.subdivide: the state of {name} cannot be inherited by cells and begins anew", stacklevel=3)
+def drop_state(optimizer: torch.optim.Optimizer) -> None:
+    """Lets an optimiser begin anew where its state has the shapes of other cells than the parameters have."""
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            if _is_stale(optimizer, parameter):
+                optimizer.state.pop(parameter)
+                if isinstance(optimizer, torch.optim.Adagrad):  # which makes its state when it is made
+                    total = torch.full_like(parameter, group["initial_accumulator_value"])
+                    optimizer.state[parameter].update(step=torch.tensor(0.0), sum=total)
+    if isinstance(optimizer, torch.optim.LBFGS):
+        optimizer.state.clear()
+        optimizer._numel_cache = None
+
+
+def _is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
+    state = optimizer.state.get(parameter, {})
+    return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())
+
+
+def watch_optimizers(module: nn.Module, line: str) -> Any:
+    """Raises at the next step of an optimiser that holds state of other cells than a module's parameters have.
+
+    Args:
+        module: Whose parameters have got other cells.
+        line: What to write, so that the optimiser follows.
+
+    Returns:
+        A handle whose ``remove()`` ends the watch.
+    """
+    watched = {id(parameter): weakref.ref(parameter) for _, _, parameter in cell_parameters(module)}
+
+    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched] if watched else []
+        if any(watched[id(parameter)]() is parameter and _is_stale(optimizer, parameter) for parameter in held):
+            raise ValueError(
+                f"{_OP}: optimizer, a {type(optimizer).__name__}, holds the state of other cells than the router has; "
+                f"write {line}, or make the optimizer afterwards"
+            )
+        if held:
+            watched.clear()  # torch does not let a hook remove itself
+
+    handle = register_optimizer_step_pre_hook(check)
+    weakref.finalize(module, handle.remove)
+    return handle
 
 
 def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | None) -> list[Tensor]:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import copy
 import functools
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, cast
 
 import torch
@@ -17,11 +16,10 @@ from torch import Tensor, nn
 from voronerf.backends import BACKENDS
 from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
+from voronerf.diagram.blending import Mixture
 from voronerf.diagram.subdivision import split_diagram
-from voronerf.router.arguments import accepted_names
-from voronerf.router.blended import Mixture, mix_call
-from voronerf.router.calls import Call, run_grouped
-from voronerf.router.grouping import Grouping
+from voronerf.router.evaluate import Choices, evaluate, mixed
+from voronerf.router.grouping import Assignments, Grouping
 from voronerf.router.layered import (
     LayeredField,
     coords_by_rule,
@@ -30,26 +28,25 @@ from voronerf.router.layered import (
     evaluate_table,
     told_by_table,
 )
-from voronerf.router.memory import Memory
+from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.parameters import (
     check_module,
     check_optimizer,
     clone_module,
     draw_parameters,
+    drop_state,
     fill_cell,
     inherit_parameters,
     move_state,
     stack_parameters,
     take_cell,
-    warn_fresh_state,
+    watch_optimizers,
 )
 
 Assignment = Literal["nearest", "stochastic"]
 
 # Centres of a flat diagram beyond which it may look cells up by a grid of its own.
 _MANY = 256
-# A routed call puts stand-ins in the place of parameters; calls from several threads take turns.
-_ONE_AT_A_TIME = threading.RLock()
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
 
@@ -115,6 +112,9 @@ class VoronoiRouter(nn.Module):
         per_ray: Sequence[str | int] | None = None,
         shared: Sequence[str | int] = (),
         methods: Sequence[str] = (),
+        share: Sequence[str] = (),
+        fuse: bool = False,
+        layout: Literal["rays", "flat"] = "rays",
         assignment: Assignment = "nearest",
         temperature: float = 0.05,
         backend: str = "auto",
@@ -129,11 +129,13 @@ class VoronoiRouter(nn.Module):
             raise ValueError(f"VoronoiRouter: temperature must be positive, got {temperature}")
         if not 0 <= blend < float("inf"):
             raise ValueError(f"VoronoiRouter: blend must be finite and at least 0, got {blend}")
+        if layout not in ("rays", "flat"):
+            raise ValueError(f"VoronoiRouter: layout must be 'rays' or 'flat', got {layout!r}")
         if backend not in ("auto", *BACKENDS):
             raise ValueError(f"VoronoiRouter: backend must be auto, {', '.join(BACKENDS)}, got {backend!r}")
         if not (coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords)):
             raise ValueError(f"VoronoiRouter: coords must be 'first3', a slice or a function, got {coords!r}")
-        for name, value in (("per_ray", per_ray), ("shared", shared), ("methods", methods)):
+        for name, value in (("per_ray", per_ray), ("shared", shared), ("methods", methods), ("share", share)):
             if isinstance(value, (str, int)):
                 raise TypeError(f"VoronoiRouter: {name} must be a list, got {value!r}")
         for name in methods:
@@ -165,11 +167,14 @@ class VoronoiRouter(nn.Module):
         self._own_coords = frozenset(
             name for name in ("forward", *methods) if "coords" in (accepted_names([getattr(module, name)]) or ())
         )
-        self._memory = Memory()
+        self.share, self.fuse, self.layout = tuple(share), fuse, layout
+        self._choices, self._assignments = Choices(), Assignments()
+        self._argument_names: dict[tuple[str, int], list[str]] = {}
+        self._watch: Any = None  # of optimisers that hold the state of other cells
 
         self.module: nn.Module = clone_module(module)
-        stack_parameters(self.module, self.diagram.num_cells)
-        self._told = self._layered and told_by_table(self.module)
+        stack_parameters(self.module, self.diagram.num_cells, self.share)
+        self._told = self._layered and told_by_table(self.module) and not self.share
 
     @classmethod
     def from_modules(
@@ -236,7 +241,7 @@ class VoronoiRouter(nn.Module):
             TypeError: When the module turns out to mix samples.
         """
         if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
-            self._told = told_by_table(self.module)
+            self._told = told_by_table(self.module) and not self.share
         if self._told:
             coords = coords_by_rule(self.coords, args, kwargs) if coords is None else coords
             if self._blends:
@@ -247,11 +252,35 @@ class VoronoiRouter(nn.Module):
             args, kwargs = each_direction(args, kwargs)
         return self._call_method("forward", *args, coords=coords, **kwargs)
 
+    def explain(self) -> str:
+        """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
+
+        Example:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.randn(4, 3), coords="first3")
+            >>> router.explain()
+            'forward: not called yet'
+        """
+        if self._told:
+            return "forward: fused, by the layer table of the field"
+        return self._choices.explain(("forward", *self.methods))
+
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
-        if name in self.__dict__.get("methods", ()):
+        methods = self.__dict__.get("methods", ())
+        if name in methods:
             return functools.partial(self._call_method, name)
-        return super().__getattr__(name)
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            module = self.__dict__.get("_modules", {}).get("module")
+            if not callable(getattr(module, name, None)):
+                raise
+            raise AttributeError(
+                f"VoronoiRouter: {name} of {type(module).__name__} is not routed; pass "
+                f"methods={[*methods, name]!r} to the router"
+            ) from None
 
     def _call_method(self, name: str, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         if name in self._own_coords and coords is not None:
@@ -261,24 +290,36 @@ class VoronoiRouter(nn.Module):
     @not_compiled
     def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """One call of a method of the module. ``torch.compile`` leaves it as it is and goes on behind it."""
-        with _ONE_AT_A_TIME:
-            return self._routed(method, args, kwargs, coords)
-
-    def _routed(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
-        call = Call(method, self.module, args, kwargs, self._memory)
+        names = self._argument_names.get((method, len(args)))
+        if names is None:
+            names = argument_names(getattr(self.module, method), len(args))
+            self._argument_names[method, len(args)] = names
+        call = Call(method, [*names, *kwargs], args, kwargs)
         rule = coords if coords is not None else self.coords
         if rule is None and self._layered:
             rule = "first3"
-        layout, positions, source = call.locate(rule, self.per_ray, self.shared)
-        grouping = self._memory.assignments.find(method, source, positions, self._assignment_key())
-        if grouping is None:
-            grouping = self._group(positions, layout.n)
-            self._memory.assignments.keep(method, source, positions, self._assignment_key(), grouping)
-        result = run_grouped(self.module, call, layout, grouping, self._memory)
-        mixture = self._mixture(positions) if self._blends else None
-        if mixture is None:
-            return result
-        return mix_call(result, self.module, call, layout, mixture, self.num_cells, self.backend, self._memory)
+        positions, source = find_positions(rule, args, kwargs)
+
+        def named(item: str | int) -> str:
+            return item if isinstance(item, str) else names[item] if item < len(names) else str(item)
+
+        layout = Layout(
+            tuple(positions.shape[:-1]),
+            None if self.per_ray is None else frozenset(map(named, self.per_ray)),
+            frozenset(map(named, self.shared)),
+            self.layout == "flat",
+        )
+        with self._choices.lock:  # what stands in for the module's parameters does so for one call at a time
+            key = self._assignment_key()
+            grouping = self._assignments.find(method, source, positions, key)
+            if grouping is None:
+                grouping = self._group(positions, layout.n)
+                self._assignments.keep(method, source, positions, key, grouping)
+            result, choice = evaluate(self.module, call, layout, grouping, self._choices, fuse=self.fuse)
+            mixture = self._mixture(positions) if self._blends else None
+            if mixture is None:
+                return result
+            return mixed(result, self.module, call, layout, mixture, grouping, self._choices, choice)
 
     @property
     def _blends(self) -> bool:
@@ -291,14 +332,13 @@ class VoronoiRouter(nn.Module):
         flat, k = positions.detach().reshape(-1, 3), self.num_cells
         cells: Tensor | Callable[[], Tensor] | None = None
         tables: dict[str, Any] | None = None
-        if k > 1 and n < 2:
-            # The module runs on two rows, since sizes of 0 and 1 leave open what is a row.
-            cells = self.assign(flat).expand(2).clone() if n else torch.zeros(2, dtype=torch.int32, device=flat.device)
-        elif k > 1:
+        if not n:  # the module runs on placeholders, since it may not take an empty batch
+            return Grouping(torch.zeros(2, dtype=torch.int32, device=flat.device), 2, k, flat.device, self.backend)
+        if k > 1:
             where = self._where(flat, flat)
             cells = where.get("cells", functools.partial(self.assign, flat))
             tables = None if "cells" in where else where
-        return Grouping(cells, max(n, 2), k, positions.device, self.backend, tables)
+        return Grouping(cells, n, k, positions.device, self.backend, tables)
 
     def _assignment_key(self) -> tuple[Any, ...]:
         drawn, centres = self.assignment == "stochastic" and self.training, self.diagram.centres
@@ -427,32 +467,71 @@ class VoronoiRouter(nn.Module):
         fresh = None if inherit else draw_parameters(self.cell(0), diagram.num_cells, self.generator)
         if optimizer is not None:
             check_optimizer(optimizer, self.module)
-        replaced = inherit_parameters(self.module, parents, fresh, new)
-        if optimizer is not None:
-            lost = move_state(optimizer, replaced, parents, None if inherit else new)
-            if lost:
-                warn_fresh_state(lost)
+        before = self.num_cells
+        inherit_parameters(self.module, parents, fresh, new)
         self.diagram = copy.deepcopy(diagram).to(self.diagram.centres.device)
-        self._memory.forget()
+        self._assignments = Assignments()
+        if optimizer is not None:
+            move_state(optimizer, self.module, parents, before, None if inherit else new)
+        else:
+            self._watch_optimizers("router.subdivide(..., optimizer=optimizer)")
         return parents
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Takes over the stored diagram first, so that parameters of any number of cells fit.
+    def _watch_optimizers(self, line: str) -> None:
+        if self._watch is not None:
+            self._watch.remove()
+        self._watch = watch_optimizers(self.module, line)
 
-        Where the number of cells changes, the parameter objects are new: make the optimiser afterwards.
+    def load_state_dict(
+        self,
+        state_dict: Mapping[str, Any],
+        strict: bool = True,
+        assign: bool = False,
+        *,
+        optimizer: torch.optim.Optimizer | None = None,
+    ) -> Any:
+        """Loads a state of any number of cells; the parameter objects stay, so an optimiser goes on with them.
+
+        Args:
+            state_dict: What ``state_dict()`` of a router around the same module gave.
+            strict: As of ``nn.Module``.
+            assign: As of ``nn.Module``; parameters are new objects then.
+            optimizer: The optimiser that holds this router's parameters. Where the number of cells changes, its state
+                begins anew, if its own ``load_state_dict`` does not follow. Without it an optimiser that has state of
+                the cells before raises at its next step.
+
+        Returns:
+            Missing and unexpected keys.
+
+        Raises:
+            ValueError: When the optimiser holds none of the router's parameters.
         """
-        self._memory.forget()
+        if optimizer is not None:
+            check_optimizer(optimizer, self.module, "load_state_dict")
+        result = super().load_state_dict(state_dict, strict, assign)
+        if optimizer is not None:
+            drop_state(optimizer)
+        return result
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Takes over the stored diagram first, so that parameters of any number of cells fit."""
+        self._assignments = Assignments()
         if f"{prefix}diagram.centres" in state_dict:
             diagram = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram.")
             if diagram.num_cells == self.num_cells:
                 self.diagram = diagram.to(self.diagram.centres.device)
             else:
                 self.subdivide(diagram, torch.zeros(diagram.num_cells, dtype=torch.int64))
+                self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
-        self._memory.forget()
+        self._choices.forget()
+        self._assignments = Assignments()
         return super()._apply(fn, recurse)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_watch": None, "_assignments": Assignments()}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
         for part in self.modules():
@@ -461,7 +540,7 @@ class VoronoiRouter(nn.Module):
                     memo[id(value)] = value.detach().clone()
         copied = type(self).__new__(type(self))
         memo[id(self)] = copied
-        copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in vars(self).items()})
+        copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
         return copied
 
     def extra_repr(self) -> str:

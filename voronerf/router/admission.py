@@ -1,0 +1,308 @@
+"""Finding the fastest way to run a kind of call that gives what the loop over cells gives.
+
+The ways run once on a few samples of the batch, in a copy of the module whose cells have parameters of their own, and
+their results and gradients are compared with the loop's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.backends import BackendUnavailable
+from voronerf.router.fused import Program, trace
+from voronerf.router.grouped import Ungroupable, run_part
+from voronerf.router.grouping import Entries, Grouping
+from voronerf.router.layout import RAY, SHARED, Call, Layout, map_tree, tensors_of
+from voronerf.router.loop import Given, NoRandomness, Results, check_rows, run_cells
+from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
+from voronerf.router.tracing import Unfusable
+from voronerf.tolerances import agree, agree_gradients
+
+_OP = "VoronoiRouter"
+_TRIED, _CELLS = 41, 3  # samples of a comparison, unlike any number of features, and their cells
+_PIECE = 4 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
+
+
+@dataclass
+class Choice:
+    """How calls of a kind are carried out.
+
+    Attributes:
+        way: "fused", "grouped" or "cell by cell".
+        why: What stands in the way of a faster one; empty where nothing does.
+        flat: For the tensors of a result, whether the module itself flattens them to [rays * samples, ...].
+        piece: Rows that a grouped module runs on at once on a CPU.
+        again: Whether the module's code runs again in the backward pass.
+        open: Whether another batch may be carried out in a faster way.
+        fusable: Whether ``fuse=True`` would serve.
+        program: The fused network.
+    """
+
+    way: str
+    why: str = ""
+    flat: tuple[bool, ...] = ()
+    piece: int = 1 << 16
+    again: bool = False
+    open: bool = False
+    fusable: bool = False
+    program: Program | None = None
+
+
+def admitted(trial: Trial, fuse: bool) -> Choice:
+    """The fastest way that gives what the loop gives."""
+    name = f"{type(trial.original).__name__}.{trial.call.method}"
+    again = False
+    try:
+        try:
+            expected = trial.outcome(trial.by_cells)
+        except Exception:  # perhaps its code runs again in the backward pass
+            again = trial.again = True
+            expected = trial.outcome(trial.by_cells)
+    except Exception as error:
+        return Choice("cell by cell", f"its forward fails on a few samples ({type(error).__name__}: {error})")
+    if fuse:
+        program, why = None, ""
+        try:
+            program = trial.traced()
+            if not trial.same(trial.outcome(trial.fused(program)), expected):
+                why = "the traced network gives other results than its forward"
+        except Unfusable as error:
+            why = str(error)
+        except Exception as error:
+            why = f"the traced network fails for other samples ({type(error).__name__}: {error})"
+        if why:
+            trial.check_rows()
+            raise ValueError(f"{_OP}: fuse=True needs a network that a layer table describes, but in {name} {why}")
+        return Choice("fused", program=program)
+    why, open_ = "", False
+    try:
+        if trial.same(trial.outcome(trial.grouped), expected):
+            piece = min(max(_PIECE * _TRIED // trial.widest, 1 << 10), 1 << 16)
+            return Choice("grouped", piece=piece, again=again, fusable=trial.is_fusable(expected))
+        why = "its forward on the samples of all cells gives other results than on those of one cell"
+    except BackendUnavailable:
+        raise
+    except Ungroupable as error:
+        why, open_ = str(error), error.of_batch
+    except Exception as error:
+        why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
+    trial.check_rows()
+    return Choice("cell by cell", why, again=again, open=open_)
+
+
+class Trial:
+    """A copy of a module and a few samples of a call, in cells of their own whose parameters differ.
+
+    Neither the module nor the arguments nor their gradients are touched.
+    """
+
+    def __init__(self, module: nn.Module, call: Call, layout: Layout, grouping: Grouping) -> None:
+        self.original, self.layout, self.again = module, layout, False
+        device = grouping.device
+        picked = torch.arange(_TRIED, device=device) * layout.n // _TRIED
+        cells = (torch.arange(_TRIED, device=device) * 7 % 5 // 2).int()
+        self.entries = Entries(picked, cells, _CELLS, grouping.backend)
+        self.widest = 0
+        generator = torch.Generator().manual_seed(0)
+        memo: dict[int, Any] = {}
+        for _, _, parameter in cell_parameters(module):
+            if id(parameter) not in memo:
+                memo[id(parameter)] = _made_different(parameter, generator)
+        self.module = clone_module(module, memo)
+        self._leaves: list[Tensor] = []
+        args, kwargs = map_tree((call.args, call.kwargs), self._leaf)
+        self.call = replace(call, args=args, kwargs=kwargs)
+
+    def _leaf(self, name: str, tensor: Tensor, nested: bool) -> Tensor:
+        """An argument with a gradient of its own, where it takes one."""
+        leaf = tensor.detach()
+        if tensor.requires_grad and torch.is_grad_enabled():
+            self._leaves.append(leaf.requires_grad_())
+        return leaf
+
+    def given(self) -> Given:
+        """The arguments, fresh for each run."""
+        return Given(*self.call.arranged(self.layout, self.entries))
+
+    def outcome(self, run: Callable[[Given], Results]) -> tuple[Results, list[Tensor]]:
+        """Results, and gradients of a weighted sum of them."""
+        with NoRandomness():
+            results = run(self.given())
+        generator, total = torch.Generator().manual_seed(7), []
+        for tensor in results.tensors:
+            if tensor.requires_grad and tensor.is_floating_point():
+                weights = torch.randn(tensor.shape, generator=generator).to(tensor)
+                total.append((tensor * weights).sum().float())
+        leaves = [t for t in (*self.module.parameters(), *self._leaves) if t.requires_grad]
+        gradients: list[Tensor] = []
+        if total and torch.is_grad_enabled():
+            torch.stack(total).sum().backward()
+            gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in leaves]
+            for leaf in leaves:
+                leaf.grad = None
+        return results, gradients
+
+    def same(self, found: tuple[Results, list[Tensor]], expected: tuple[Results, list[Tensor]]) -> bool:
+        """Whether two ways gave the same."""
+        (a, ours), (b, theirs) = found, expected
+        if (a.rows, a.flattened, len(ours)) != (b.rows, b.flattened, len(theirs)):
+            return False
+        pairs = zip(a.tensors, b.tensors, strict=True)
+        return all(agree(x, y) for x, y in pairs) and agree_gradients(ours, theirs)
+
+    def by_cells(self, given: Given) -> Results:
+        """The loop."""
+        return run_cells(self.module, self.call, self.layout, given, self.entries, again=self.again)
+
+    def grouped(self, given: Given) -> Results:
+        """All cells at once."""
+        results, run = run_part(self.module, self.call, self.layout, given, self.entries)
+        self.widest = max(run.widest, *[t.numel() * t.element_size() for t in given.rows], 1)
+        return results
+
+    def fused(self, program: Program) -> Callable[[Given], Results]:
+        """As one operation, with the parameters of the copy."""
+        here = program.with_parameters_of(self.original, self.module)
+        return lambda given: here.run(given.rows, self.layout, self.entries)
+
+    def is_groupable(self) -> bool:
+        """Whether the module runs for all cells at once on this batch, right or wrong."""
+        try:
+            with torch.no_grad(), NoRandomness():
+                self.grouped(self.given())
+        except Exception:
+            return False
+        return True
+
+    def traced(self) -> Program:
+        """The network as a layer table."""
+        with NoRandomness():
+            return trace(self.original, self.module, self.call, self.given, self.layout)
+
+    def is_fusable(self, expected: tuple[Results, list[Tensor]]) -> bool:
+        """Whether ``fuse=True`` would serve."""
+        try:
+            return self.same(self.outcome(self.fused(self.traced())), expected)
+        except Exception:
+            return False
+
+    def check_rows(self) -> None:
+        """Raises TypeError where the module mixes samples."""
+        with NoRandomness():
+            check_rows(self.module, self.call, self.layout, self.given(), self.entries, self.again)
+
+
+@torch.no_grad()
+def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Parameter:
+    """Entries for the cells of a trial, [3, ...], each some way off the router's own."""
+    cells = torch.arange(_CELLS, device=parameter.device) % parameter.shape[0]
+    with torch.inference_mode(False):
+        values = parameter.detach()[cells].clone()
+        if values.is_floating_point() and values.numel():
+            size = float(values.float().square().mean().sqrt()) or 0.1
+            noise = torch.randn(values.shape, generator=generator)
+            values += (0.2 * size * noise).to(values)
+        return nn.Parameter(values, requires_grad=parameter.requires_grad)
+
+
+# Rays -----------------------------------------------------------------------------------------------------------------
+
+
+def flattened(module: nn.Module, call: Call, layout: Layout) -> tuple[bool, ...]:
+    """For each tensor that a call with rays returns, whether the module itself makes [rays * samples, ...] of it.
+
+    The module runs on a few samples of two rays, as rays and as it would see them.
+
+    Raises:
+        TypeError: When the samples of a ray meet in the module.
+        ValueError: When the module gives other results for [n, 1, f] than for [rays, samples, f].
+    """
+    *outer, rays, along = layout.lead
+    for samples in (6, along):  # a module may be made for a number of samples
+        lead = (*[1] * len(outer), min(rays, 2), min(along, samples))
+        try:
+            whole = _on_rays(module, call, layout, lead)
+            alone = _as_samples(module, call, layout, lead)
+            changed = _on_rays(module, call, layout, lead, change=True)
+        except Exception:
+            continue
+        mixed = any(
+            a.shape[: len(lead)] == lead and not agree(b[..., 0, :], a[..., 0, :])
+            for a, b in zip(whole, changed, strict=True)
+            if a.dim() > len(lead)
+        )
+        same = len(whole) == len(alone) and all(
+            a.numel() == b.numel() and a.dtype == b.dtype and agree(b.flatten(), a.flatten())
+            for a, b in zip(whole, alone)
+        )
+        name = type(module).__name__
+        if mixed:
+            raise TypeError(
+                f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when "
+                "others along its ray change: it mixes the samples of a ray"
+            )
+        if not same:
+            raise ValueError(
+                f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but {name} does not; "
+                "layout='flat' calls it with [n, f], for modules that squeeze or flatten their arguments"
+            )
+        n = lead[-1] * lead[-2]
+        return tuple(tuple(a.shape[: len(lead)]) != lead and a.shape[:1] == (n,) for a in whole)
+    return ()
+
+
+def _picked(layout: Layout, lead: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Numbers of rays, and of their samples."""
+    rays = torch.arange(lead[-2])
+    return rays, (rays[:, None] * layout.lead[-1] + torch.arange(lead[-1])).flatten()
+
+
+def _as_samples(module: nn.Module, call: Call, layout: Layout, lead: tuple[int, ...]) -> list[Tensor]:
+    _, samples = _picked(layout, lead)
+    device = tensors_of((call.args, call.kwargs))[0].device
+    cells = torch.zeros(samples.shape[0], dtype=torch.int32, device=device)
+    args, kwargs, _ = call.arranged(layout, Entries(samples.to(device), cells, 1, "auto"))
+    return _run_first(module, call, args, kwargs)
+
+
+def _on_rays(
+    module: nn.Module, call: Call, layout: Layout, lead: tuple[int, ...], change: bool = False
+) -> list[Tensor]:
+    """The module's own results for [rays, samples, f]; ``change`` alters all but the first sample of each ray."""
+    rays, samples = _picked(layout, lead)
+
+    def pick(name: str, value: Any, nested: bool) -> Any:
+        if not isinstance(value, Tensor):
+            shape = tuple(value.shape)
+            if shape not in (layout.lead, layout.lead[:-1]):
+                return value
+            ray = shape != layout.lead
+            picked = value.flatten()[rays if ray else samples]
+            return picked.reshape(lead[:-1] if ray else lead)
+        kind = layout.kind(name, value, nested)
+        if kind == SHARED:
+            return value
+        flat = layout.flatten(value.detach(), kind)[(rays if kind == RAY else samples).to(value.device)]
+        if kind == RAY:
+            return flat.reshape(*lead[:-1], *flat.shape[1:])
+        flat = flat.reshape(*lead, *flat.shape[1:])
+        if change and flat.is_floating_point():
+            first = flat.narrow(len(lead) - 1, 0, 1)
+            rest = flat.narrow(len(lead) - 1, 1, lead[-1] - 1) * 0.7 + 0.01
+            flat = torch.cat([first, rest], len(lead) - 1)
+        return flat
+
+    values = (*call.args, *call.kwargs.values())
+    picked = [map_tree(v, pick, name, batches=True) for name, v in zip(call.names, values, strict=True)]
+    return _run_first(module, call, picked[: len(call.args)], dict(zip(call.kwargs, picked[len(call.args) :])))
+
+
+def _run_first(module: nn.Module, call: Call, args: list[Any], kwargs: dict[str, Any]) -> list[Tensor]:
+    first = {id(parameter): parameter.detach()[0] for _, _, parameter in cell_parameters(module)}
+    with torch.no_grad(), NoRandomness(), in_place_of_parameters(module, first):
+        return tensors_of(call.function(module)(*args, **kwargs))

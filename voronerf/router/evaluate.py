@@ -1,0 +1,243 @@
+"""How a routed call is carried out: chosen once for a kind of call, and admitted by one comparison with the loop.
+
+The loop over cells (:mod:`voronerf.router.loop`) is the definition of the result. The faster ways are the module's own
+``forward`` once for the rows of all cells (:mod:`voronerf.router.grouped`) and, where the user said ``fuse=True``, one
+fused operation (:mod:`voronerf.router.fused`). Before a kind of call takes one of them, both run on a few samples of
+the batch, in cells whose parameters are made different, and have to give the same results and gradients.
+"""
+
+from __future__ import annotations
+
+import inspect
+import threading
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.backends import BackendUnavailable
+from voronerf.diagram.blending import Mixture
+from voronerf.router import rules  # noqa: F401  registers the rules
+from voronerf.router.admission import Choice, Trial, admitted, flattened
+from voronerf.router.grouped import Ungroupable, is_inside, run_grouped
+from voronerf.router.grouping import Entries, Grouping
+from voronerf.router.layout import Call, Layout, rebuild, tensors_of
+from voronerf.router.loop import Given, Results, restored, run_cells
+
+_OP = "VoronoiRouter"
+_FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs
+_GAIN = "about 1.4 times as fast at width 64 and 65,536 samples"
+_KINDS, _VALUES = 256, 16  # kinds of calls that are remembered; numbers and words of an argument that tell kinds apart
+
+
+class Choices:
+    """What a router has found out about its module. Copies of a router begin anew.
+
+    Attributes:
+        lock: Held during a call: stand-ins are in the place of the module's parameters.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.forget()
+
+    def forget(self) -> None:
+        """Begins anew, after a change of dtype, device or parameters' names."""
+        self._kinds: dict[Any, Choice] = {}
+        self._values: dict[Any, set[Any]] = {}
+        self._said: set[str] = set()
+        self._latest: dict[str, dict[str, str]] = {}
+
+    def kind(self, module: nn.Module, call: Call, layout: Layout, device: torch.device) -> Any:
+        """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
+
+        Numbers and words count by what they are while an argument has had few of them.
+        """
+        autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
+        modes = (call.method, module.training, torch.is_grad_enabled(), autocast, layout.one_ray, tuple(call.kwargs))
+        d = len(layout.lead)
+        values = (*call.args, *call.kwargs.values())
+        alike = (*modes, d, *[_description(value, d, False) for value in values])
+        if not any(type(value) in (int, str) for value in values):
+            return alike
+        kind = (*modes, d, *[_description(value, d, True) for value in values])
+        known = self._values.setdefault(alike, set())
+        if len(known) < _VALUES:
+            known.add(kind)
+        return kind if kind in known else alike
+
+    def find(self, kind: Any) -> Choice | None:
+        """What is known of a kind of call."""
+        return self._kinds.get(kind)
+
+    def keep(self, kind: Any, choice: Choice) -> None:
+        """Remembers a choice."""
+        if len(self._kinds) >= _KINDS:
+            self._kinds, self._values = {}, {}
+        self._kinds[kind] = choice
+
+    def note(self, call: Call, choice: Choice) -> None:
+        """For :meth:`explain`: how a method was carried out."""
+        self._latest.setdefault(call.method, {})[choice.way] = choice.why
+
+    def explain(self, methods: tuple[str, ...]) -> str:
+        """How each method has been carried out so far, and why."""
+        lines = []
+        for method in methods:
+            ways = self._latest.get(method, {"not called yet": ""})
+            lines += [f"{method}: {way}{f': {why}' if why else ''}" for way, why in ways.items()]
+        return "\n".join(lines)
+
+    def say_once(self, topic: str, message: str) -> None:
+        """Warns, the first time that a topic comes up, at the line that called the router."""
+        if topic in self._said:
+            return
+        self._said.add(topic)
+        level, frame = 1, inspect.currentframe()
+        while frame is not None and is_inside(frame.f_code.co_filename):
+            level, frame = level + 1, frame.f_back
+        warnings.warn(f"{_OP}: {message}", stacklevel=level)
+
+    def __deepcopy__(self, memo: Any) -> Choices:
+        return Choices()
+
+    def __reduce__(self) -> tuple[type[Choices], tuple[()]]:
+        return Choices, ()
+
+
+def _description(value: Any, d: int, by_value: bool) -> Any:
+    if isinstance(value, Tensor):
+        ones = tuple(size == 1 for size in value.shape[:d])
+        return tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad, ones
+    if value is None or isinstance(value, bool) or (by_value and isinstance(value, (int, str))):
+        return value
+    return type(value)
+
+
+# Carrying out ---------------------------------------------------------------------------------------------------------
+
+
+def evaluate(
+    module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, *, fuse: bool
+) -> tuple[Any, Choice]:
+    """Runs a method of a module for the samples of all cells.
+
+    Args:
+        module: With stacked parameters.
+        call: Of a method of it.
+        layout: Of the arguments.
+        grouping: Of the samples; of two placeholders where there are none.
+        choices: Of the router.
+        fuse: Whether the user says that the module's ``forward`` is fixed.
+
+    Returns:
+        What the module returns, and how that was found.
+    """
+    choice = _choose(module, call, layout, grouping, choices, fuse)
+    if choice.way == "fused":
+        assert choice.program is not None
+        given = Given(*call.arranged(layout, None))
+        results = choice.program.run(given.rows, layout, grouping)
+        choices.note(call, choice)
+        return restored(results, layout, None, choice.flat), choice
+    results, choice = _evaluate_sorted(module, call, layout, grouping, choices, choice)
+    return restored(results, layout, grouping, choice.flat), choice
+
+
+def mixed(
+    own: Any,
+    module: nn.Module,
+    call: Call,
+    layout: Layout,
+    mixture: Mixture,
+    grouping: Grouping,
+    choices: Choices,
+    choice: Choice,
+) -> Any:
+    """The blended results of a call.
+
+    Args:
+        own: What the call returned for all samples in their own cells.
+        module: With stacked parameters.
+        call: Of a method of it.
+        layout: Of its arguments.
+        mixture: Of its samples.
+        grouping: Of its samples.
+        choices: Of the router.
+        choice: How the call was carried out.
+    """
+    entries = Entries(mixture.rows, mixture.cells, grouping.k, grouping.backend)
+    if choice.way == "fused":
+        assert choice.program is not None
+        given = Given(*call.arranged(layout, entries))
+        results = choice.program.run(given.rows, layout, entries)
+    else:
+        results, _ = _evaluate_sorted(module, call, layout, entries, choices, choice)
+    tensors = tensors_of(own)
+    for i, tensor in enumerate(results.tensors):
+        if results.rows[i]:
+            tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(entries.n, -1)))
+    return rebuild(own, tensors)
+
+
+def _evaluate_sorted(
+    module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, choice: Choice
+) -> tuple[Results, Choice]:
+    failure: Exception | None = None
+    if choice.way == "grouped" and grouping.k > 1:
+        try:
+            results = run_grouped(module, call, layout, grouping, choice.piece)
+            choices.note(call, choice)
+            return results, choice
+        except BackendUnavailable:
+            raise
+        except Ungroupable as error:
+            choice = replace(choice, way="cell by cell", why=f"for some batches, since {error}")
+        except Exception as error:
+            if isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error):
+                raise
+            failure = error
+            choice = replace(choice, way="cell by cell", why=f"for some batches, since its forward fails ({error})")
+    try:
+        given = Given(*call.arranged(layout, grouping))
+        results = run_cells(module, call, layout, given, grouping, again=choice.again)
+    except Exception as error:
+        if hasattr(error, "add_note") and len(layout.lead) > 1 and not layout.flat:
+            error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
+        if failure is not None:
+            raise error from failure
+        raise
+    choices.note(call, choice)
+    if grouping.k > 1 and choice.why and layout.n >= _FEWEST:
+        name = f"{type(module).__name__}.{call.method}"
+        choices.say_once(f"cells {call.method}", f"{name} runs cell by cell: {choice.why}")
+    return results, choice
+
+
+def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
+    kind = choices.kind(module, call, layout, grouping.device)
+    choice = choices.find(kind)
+    if choice is not None and not choice.open:
+        return choice
+    if layout.n < _FEWEST:
+        return Choice("cell by cell", f"for fewer than {_FEWEST} samples") if choice is None else choice
+    devices = [grouping.device] if grouping.device.type == "cuda" else []
+    with torch.random.fork_rng(devices):
+        flat: tuple[bool, ...] = () if choice is None else choice.flat
+        if choice is None and len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat and not layout.one_ray:
+            flat = flattened(module, call, layout)
+        trial = Trial(module, call, layout, grouping)
+        if choice is not None and not trial.is_groupable():
+            return choice
+        found = replace(admitted(trial, fuse), flat=flat)
+    choices.keep(kind, found)
+    if found.fusable:
+        name = f"{type(module).__name__}.{call.method}"
+        choices.say_once(
+            f"fuse {call.method}",
+            f"{name} runs grouped; its network is a layer table, and VoronoiRouter(..., fuse=True) runs it as one "
+            f"operation, {_GAIN}, if its forward does the same in every call",
+        )
+    return found

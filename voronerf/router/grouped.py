@@ -1,0 +1,369 @@
+"""Running a module's own ``forward`` once for the samples of all cells.
+
+The rows are sorted by cell and :class:`PerCell` tensors stand in the place of the module's parameters.
+:class:`GroupedRun` sees every PyTorch function on the way. A function that meets a parameter is served by a rule
+(:func:`register`); a function of parameters alone runs for all cells at once; any other runs as it is. Which tensors
+depend on the samples is noted on the way, so that a rule knows rows from constants, and a value of samples that is read
+on the host is found. Where a step has no rule, :class:`Ungroupable` says which, and the call is a loop over cells.
+
+Letters: n samples, k cells; a tensor of rows is [n * m, ...], the m entries of a sample next to each other.
+"""
+
+from __future__ import annotations
+
+import inspect
+import linecache
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
+
+from voronerf.router.grouping import Grouping
+from voronerf.router.layout import Call, Layout, map_tree, tensors_of
+from voronerf.router.loop import Given, Results
+from voronerf.router.parameters import cell_parameters, in_place_of_parameters
+
+_MARK = "_voronerf_rows"
+_TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
+
+Rule = Callable[..., Any]
+_RULES: dict[Any, Rule] = {}
+
+
+def _find(names: str, *places: Any) -> frozenset[Any]:
+    found = (getattr(place, name, None) for place in places for name in names.split())
+    return frozenset(function for function in found if function is not None)
+
+
+_VALUES = {"T", "H", "mT", "mH", "data", "grad", "real", "imag", "_base"}
+METADATA = frozenset(
+    getattr(torch.Tensor, name).__get__
+    for name in dir(torch.Tensor)
+    if type(getattr(torch.Tensor, name)).__name__ in ("getset_descriptor", "property") and name not in _VALUES
+) | _find(
+    """
+    size dim ndimension numel nelement stride is_contiguous is_floating_point is_complex element_size get_device
+    storage_offset is_signed is_same_size is_inference data_ptr __len__ __hash__ __repr__ __dir__ __reduce_ex__
+    is_tensor is_storage register_hook retain_grad requires_grad is_pinned
+    """,
+    torch,
+    torch.Tensor,
+)
+"""What reads no value: shapes, dtypes, devices."""
+CREATE = _find("zeros ones full empty rand randn randint", torch)
+"""New tensors of given sizes; with n of them in front they are rows."""
+_WRITES = ("requires_grad_", "register_hook", "retain_grad", "backward", "__set__", "__setitem__")
+
+
+class Ungroupable(Exception):
+    """A module cannot be run on the samples of all cells at once; the message says where.
+
+    Attributes:
+        of_batch: Whether it may be otherwise for other samples.
+    """
+
+    def __init__(self, reason: str, of_batch: bool = False) -> None:
+        super().__init__(reason)
+        self.of_batch = of_batch
+
+
+class PerCell(torch.Tensor):
+    """k tensors, one for each cell, that look like one of them: what a routed module finds in place of a parameter.
+
+    It has the shape of a single cell's tensor and no storage.
+
+    Attributes:
+        stacked: [k, ...], one entry for each cell.
+    """
+
+    stacked: Tensor
+    # Shape and dtype are answered by the wrapper itself.
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    @staticmethod
+    def __new__(cls, stacked: Tensor, is_parameter: bool = False) -> PerCell:
+        """Wraps [k, ...]; ``is_parameter`` makes it an instance of ``nn.Parameter``."""
+        wrapper: PerCell = torch.Tensor._make_wrapper_subclass(
+            cls,
+            stacked.shape[1:],
+            dtype=stacked.dtype,
+            device=stacked.device,
+            requires_grad=stacked.requires_grad and stacked.is_floating_point(),
+        )
+        wrapper.stacked = stacked
+        wrapper._is_param = is_parameter
+        return wrapper
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
+        """Refuses what did not pass through the mode."""
+        raise TypeError(
+            f"VoronoiRouter: {func} met the parameters of all cells outside of a routed call; call the router, or take "
+            "one cell's module with cell(i)"
+        )
+
+
+def register(function: Any, rule: Rule) -> None:
+    """Says how a function that meets parameters runs for all cells at once.
+
+    Without a rule, a call of a module that uses the function is a loop over cells.
+
+    Args:
+        function: What PyTorch's function modes see, such as ``torch.nn.functional.linear``, an operator of
+            ``torch.ops``, or a function of your own that calls ``torch.overrides.handle_torch_function``.
+        rule: ``rule(run, *args, **kwargs)`` with the :class:`GroupedRun` and the function's own arguments: tensors of
+            rows are sorted by cell, and a parameter is a :class:`PerCell`, whose ``stacked`` is [k, ...]. It returns
+            rows, or ``NotImplemented`` for arguments that it does not serve.
+
+    Example:
+        >>> import torch, voronerf.router
+        >>> def blend(run, rows, parameter, share):          # torch.lerp(rows, parameter, share)
+        ...     return torch.lerp(rows, run.rows_of(parameter), share)
+        >>> voronerf.router.register(torch.lerp, blend)
+    """
+    _RULES[function] = rule
+
+
+def name_of(function: Any) -> str:
+    """A function's name for messages."""
+    resolved = torch.overrides.resolve_name(function)
+    return resolved or getattr(function, "__qualname__", None) or str(function)
+
+
+def is_inside(file: str) -> bool:
+    """Whether a file is one of PyTorch or the router."""
+    return file.startswith((_TORCH, _HERE))
+
+
+def user_line() -> str:
+    """Where the routed module is just now: file, line and code; empty where no code of its own is on the stack."""
+    frame, inside = inspect.currentframe(), False
+    while frame is not None:
+        file = frame.f_code.co_filename
+        ours = file.startswith(_HERE)
+        if ours and inside:
+            break  # the router that called the module
+        inside = inside or not ours
+        if inside and not ours and not file.startswith(_TORCH):
+            code = linecache.getline(file, frame.f_lineno).strip()
+            return f" ({os.path.basename(file)}:{frame.f_lineno}{f': {code}' if code else ''})"
+        frame = frame.f_back
+    return ""
+
+
+class GroupedRun(TorchFunctionMode):
+    """Active while a module runs on the sorted rows of all cells; what a rule is given.
+
+    Args:
+        grouping: Of the samples.
+        axis: The dimension of the rows in what the module sees; 0 but for a call of one ray.
+
+    Attributes:
+        n: Samples.
+        failed: Why the results are not valid, also where the module caught the error; None where they are.
+        widest: Bytes of the largest tensor of rows that was made.
+    """
+
+    def __init__(self, grouping: Grouping, axis: int = 0) -> None:
+        super().__init__()
+        self.grouping, self.n, self.axis = grouping, grouping.n, axis
+        self.failed: Ungroupable | None = None
+        self.widest = 0
+        self._token = object()
+
+    # For rules --------------------------------------------------------------------------------------------------------
+
+    def is_rows(self, value: Any) -> bool:
+        """Whether a value is a tensor that depends on the samples."""
+        return isinstance(value, Tensor) and getattr(value, _MARK, (None,))[0] is self._token
+
+    def entries(self, rows: Tensor) -> int:
+        """m of a tensor of rows [n * m, ...]."""
+        if rows.dim() == 0 or not rows.shape[0] or rows.shape[0] % self.n:
+            shape = list(rows.shape)
+            reason = f"parameters meet a tensor of shape {shape}, which has no row for each of {self.n} samples"
+            raise self.fail(reason, of_batch=True)
+        return rows.shape[0] // self.n
+
+    def rows_of(self, parameter: PerCell, m: int = 1) -> Tensor:
+        """[n * m, ...]: for each row the parameter of its cell."""
+        return self.grouping.expand(parameter.stacked, m)
+
+    # Marks ------------------------------------------------------------------------------------------------------------
+
+    def mark(self, tensor: Tensor, tag: str = "") -> Tensor:
+        """Notes that a tensor depends on the samples; ``tag`` is "any" or "all" for such a reduction of them."""
+        setattr(tensor, _MARK, (self._token, tag))
+        return tensor
+
+    def fail(self, reason: str, of_batch: bool = False) -> Ungroupable:
+        """The error to raise where the run cannot go on."""
+        self.failed = self.failed or Ungroupable(reason + user_line(), of_batch)
+        return self.failed
+
+    # Functions --------------------------------------------------------------------------------------------------------
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Runs one PyTorch function of the module."""
+        kwargs = kwargs or {}
+        if func in METADATA:
+            return func(*args, **kwargs)
+        operands = tensors_of((args, kwargs))
+        marked = [tensor for tensor in operands if self.is_rows(tensor)]
+        if any(type(tensor) is PerCell for tensor in operands):
+            return self._with_parameters(func, args, kwargs, operands, marked)
+        result = func(*args, **kwargs)
+        found = tensors_of(result)
+        if not marked:
+            if func in CREATE:
+                for tensor in found:
+                    if tensor.dim() > self.axis and tensor.shape[self.axis] == self.n:
+                        self.mark(tensor)
+            return result
+        name = getattr(func, "__name__", "")
+        if name == "__setitem__" or (name.endswith("_") and not name.startswith("__")):
+            self.mark(operands[0])
+        if isinstance(kwargs.get("out"), Tensor):
+            self.mark(kwargs["out"])
+        tag = name if name in ("any", "all") else ""
+        for tensor in found:
+            self.mark(tensor, tag)
+            self.widest = max(self.widest, tensor.numel() * tensor.element_size())
+        if not found:
+            self._check_read(func, result, marked[0])
+        return result
+
+    def _check_read(self, func: Any, result: Any, source: Tensor) -> None:
+        """Refuses values of samples on the host, which a loop over cells would read for each cell alone."""
+        if result is None or isinstance(result, (str, torch.dtype, torch.device, torch.Size)):
+            return
+        # If no sample of all has a property, then no sample of any cell has it; if all have, all of each cell have.
+        if isinstance(result, bool) and getattr(source, _MARK)[1] == ("all" if result else "any"):
+            return
+        raise self.fail(f"{name_of(func)} reads values of the samples", of_batch=True)
+
+    def _with_parameters(self, func: Any, args: Any, kwargs: Any, operands: list[Tensor], marked: list[Tensor]) -> Any:
+        for tensor in operands:
+            unseen = type(tensor) is not PerCell and not hasattr(tensor, _MARK) and tensor.dim() > self.axis
+            if unseen and tensor.shape[self.axis] == self.n and not isinstance(tensor, torch.nn.Parameter):
+                raise self.fail(f"{name_of(func)} takes rows that no PyTorch function was seen to make")
+        rule = _RULES.get(func)
+        result: Any = NotImplemented if rule is None else self._by_rule(rule, args, kwargs, marked)
+        if result is NotImplemented:
+            if marked:
+                raise self.fail(f"{name_of(func)} meets parameters and has no rule for all cells at once")
+            return for_all_cells(self, func, args, kwargs)
+        for tensor in tensors_of(result):
+            if type(tensor) is not PerCell:
+                self.mark(tensor)
+                self.widest = max(self.widest, tensor.numel() * tensor.element_size())
+        return result
+
+    def _by_rule(self, rule: Rule, args: Any, kwargs: Any, marked: list[Tensor]) -> Any:
+        """Calls a rule; the rows of a call of one ray, [1, n, ...], are [n, ...] for it."""
+        axis = self.axis
+        if not axis or not marked or any(t.dim() <= axis or t.shape[axis] % self.n for t in marked):
+            return rule(self, *args, **kwargs)
+
+        def squeezed(name: str, value: Tensor, nested: bool) -> Tensor:
+            return self.mark(value.reshape(value.shape[axis:])) if self.is_rows(value) else value
+
+        args, kwargs = map_tree((args, kwargs), squeezed)
+        result = rule(self, *args, **kwargs)
+        return map_tree(result, lambda name, value, nested: value.reshape(*[1] * axis, *value.shape))
+
+
+def for_all_cells(run: GroupedRun | None, func: Any, args: Any, kwargs: Any) -> Any:
+    """A function of parameters and constants alone, for all cells at once; results are :class:`PerCell`."""
+    stacks = [leaf.stacked for leaf in tensors_of((args, kwargs)) if isinstance(leaf, PerCell)]
+
+    def fail(reason: str) -> Exception:
+        return Ungroupable(reason) if run is None else run.fail(reason)
+
+    if func is torch.autograd.grad:
+        raise fail("it differentiates with respect to parameters")
+    if getattr(func, "__name__", "") in _WRITES:
+        raise fail(f"it calls {name_of(func)} on a parameter")
+    if func is torch.Tensor.data.__get__:  # type: ignore[attr-defined]
+        return PerCell(stacks[0].detach())
+    function = _weight_norm if func is torch._weight_norm else func
+
+    def on_one(*single: Tensor) -> Any:
+        following = iter(single)
+        given = map_tree((args, kwargs), lambda n, value, _: next(following) if isinstance(value, PerCell) else value)
+        return function(*given[0], **given[1])
+
+    try:
+        result = torch.vmap(on_one, randomness="different")(*stacks)
+    except Exception:
+        try:
+            singles = [on_one(*single) for single in zip(*[stack.unbind(0) for stack in stacks], strict=True)]
+        except Exception as error:
+            raise fail(f"{name_of(func)} of parameters fails: {error}") from error
+        result = _stack(func, singles, fail)
+    return map_tree(result, lambda name, value, nested: PerCell(value))
+
+
+def _weight_norm(v: Tensor, g: Tensor, dim: int = 0) -> Tensor:
+    """``torch._weight_norm`` of functions that can be mapped over cells."""
+    others = [d for d in range(v.dim()) if d != dim]
+    return v * (g / torch.linalg.vector_norm(v, dim=others, keepdim=True))
+
+
+def _stack(func: Any, singles: Sequence[Any], fail: Callable[[str], Exception]) -> Any:
+    first = singles[0]
+    if isinstance(first, Tensor) and all(single.shape == first.shape for single in singles):
+        return torch.stack(list(singles))
+    if isinstance(first, (list, tuple)):
+        return tuple(_stack(func, parts, fail) for parts in zip(*singles, strict=True))
+    if not isinstance(first, Tensor) and all(single == first for single in singles):
+        return first
+    raise fail(f"{name_of(func)} reads values of parameters, which differ between cells")
+
+
+def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, piece: int) -> Results:
+    """A module's results for the samples of all cells, in one run, or on a CPU in pieces of so many rows.
+
+    Raises:
+        Ungroupable: Where that is not possible.
+    """
+    parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
+    found = [run_part(module, call, layout, Given(*call.arranged(layout, part)), part)[0] for part in parts]
+    first = found[0]
+    if len(found) == 1:
+        return first
+    tensors = [
+        torch.cat([results.tensors[i] for results in found]) if first.rows[i] else tensor
+        for i, tensor in enumerate(first.tensors)
+    ]
+    return replace(first, tensors=tensors)
+
+
+def run_part(module: nn.Module, call: Call, layout: Layout, given: Given, part: Grouping) -> tuple[Results, GroupedRun]:
+    """The results for some rows, and the run that gave them."""
+    run = GroupedRun(part, layout.axis)
+    for tensor in given.rows:
+        run.mark(tensor)
+    stand_ins = {id(p): PerCell(p, is_parameter=True) for _, _, p in cell_parameters(module)}
+    with in_place_of_parameters(module, stand_ins), run:
+        value = call.function(module)(*given.args, **given.kwargs)
+    if run.failed is not None:
+        raise run.failed
+    results = Results(value, [], [], [])
+    buffers = {id(buffer) for buffer in module.buffers()}
+    for tensor in tensors_of(value):
+        if isinstance(tensor, PerCell):
+            raise Ungroupable("a result is made of parameters alone")
+        marked, rows = run.is_rows(tensor), layout.rows_of(tensor)
+        if marked and (rows.dim() == 0 or not rows.shape[0] or rows.shape[0] % part.n):
+            raise Ungroupable(f"a result of shape {list(tensor.shape)} has no row for each of {part.n} samples", True)
+        if not marked and rows.shape[:1] == (part.n,) and id(tensor) not in buffers:
+            raise Ungroupable("a result has rows that no PyTorch function was seen to make")
+        results.tensors.append(rows if marked else tensor)
+        results.rows.append(marked)
+        results.flattened.append(layout.axis > 0 and rows.shape == tensor.shape)
+    return results, run

@@ -1,0 +1,430 @@
+"""How a call's arguments relate to its samples, and how they are brought into another order and back.
+
+Letters: n samples in leading dimensions ``lead``, for example (rays, samples of a ray); f features.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import inspect
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.router.grouping import Grouping
+
+_OP = "VoronoiRouter"
+SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
+_DEEPEST = 6  # objects within objects that are searched for tensors
+_PLAIN = (int, float, str, bytes, type(None), torch.Size, torch.dtype, torch.device, slice, type, nn.Module)
+
+Change = Callable[[str, Any, bool], Any]
+
+
+# Nested values --------------------------------------------------------------------------------------------------------
+
+
+def map_tree(
+    value: Any, change: Change, name: str = "", *, batches: bool = False, nested: bool = False, depth: int = 0
+) -> Any:
+    """The same structure with every tensor changed: lists, tuples, named tuples, dicts, dataclasses, other objects.
+
+    Args:
+        value: Of any structure.
+        change: Called with a tensor's name ("x", "samples.origins", "views.0"), the tensor, and whether it is inside an
+            object; returns what goes in its place.
+        name: Of the value.
+        batches: Whether ``change`` also gets objects that have ``shape``, ``flatten()``, ``reshape(shape)`` and
+            indexing of their own, as nerfstudio's ``TensorDataclass``, instead of their tensors.
+        nested: Whether the value is inside an object.
+        depth: Containers around the value; what lies deeper than six is left alone.
+
+    Returns:
+        The structure; where nothing in it changed, the same object.
+    """
+    if isinstance(value, Tensor) or (batches and is_batch(value)):
+        return change(name, value, nested)
+    items = None if depth > _DEEPEST else _items(value)
+    if not items:
+        return value
+    nested = nested or not isinstance(value, (dict, list, tuple))
+    new = {
+        key: map_tree(item, change, f"{name}.{key}", batches=batches, nested=nested, depth=depth + 1)
+        for key, item in items.items()
+    }
+    if all(new[key] is item for key, item in items.items()):
+        return value
+    return _rebuilt(value, items, new)
+
+
+def _items(value: Any) -> dict[Any, Any] | None:
+    """What a container holds, by key, index or attribute; None for what is no container."""
+    if isinstance(value, _PLAIN):
+        return None
+    if isinstance(value, dict):
+        return value
+    if isinstance(value, (list, tuple)):
+        return dict(enumerate(value))
+    if callable(value):
+        return None
+    if hasattr(value, "__dict__"):
+        return dict(vars(value))
+    if dataclasses.is_dataclass(value):
+        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    return None
+
+
+def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
+    if isinstance(value, (list, tuple)):
+        parts = list(new.values())
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    if type(value) is dict:
+        return new
+    changed = {key: item for key, item in new.items() if item is not items[key]}
+    if isinstance(value, dict):
+        try:
+            rebuilt = copy.copy(value)
+        except Exception:  # one that takes attributes for items, before Python 3.11
+            rebuilt = type(value).__new__(type(value))
+            rebuilt.update(value)
+        rebuilt.update(changed)
+        return rebuilt
+    if hasattr(value, "__post_init__"):  # it may derive other attributes, such as a shape
+        given = {f.name for f in dataclasses.fields(value) if f.init}
+        value = dataclasses.replace(value, **{key: changed.pop(key) for key in given & changed.keys()})
+    rebuilt = copy.copy(value)
+    for key, item in changed.items():
+        object.__setattr__(rebuilt, key, item)
+    return rebuilt
+
+
+def tensors_of(value: Any) -> list[Tensor]:
+    """All tensors of a nested value, in the order of :func:`map_tree`."""
+    found: list[Tensor] = []
+    _collect(value, found, 0)
+    return found
+
+
+def _collect(value: Any, found: list[Tensor], depth: int) -> None:
+    if isinstance(value, Tensor):
+        found.append(value)
+    elif depth <= _DEEPEST and (items := _items(value)):
+        for item in items.values():
+            _collect(item, found, depth + 1)
+
+
+def rebuild(value: Any, tensors: Iterable[Any]) -> Any:
+    """A nested value with other tensors in the order of :func:`tensors_of`."""
+    following = iter(tensors)
+    return map_tree(value, lambda name, tensor, nested: next(following))
+
+
+def is_batch(value: Any) -> bool:
+    """Whether an object has ``shape``, ``flatten()``, ``reshape(shape)`` and indexing of its own."""
+    if isinstance(value, (Tensor, dict, list, tuple, *_PLAIN)) or not isinstance(
+        getattr(value, "shape", None), (tuple, torch.Size)
+    ):
+        return False
+    return all(callable(getattr(value, name, None)) for name in ("flatten", "reshape", "__getitem__"))
+
+
+# Layouts --------------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """How the tensors of a call are laid out, and what the module sees of them.
+
+    A module of layout "flat" sees [n, f] for every argument with rows. One of layout "rays" sees [n, 1, f] for
+    [rays, samples, f] and [n, f] for what is per ray: n rays of one sample. A call of one ray, [1, samples, f], stays
+    one ray: the module sees [1, n, f], and what is per ray is passed on.
+
+    Attributes:
+        lead: Leading dimensions of a tensor with an entry for each sample.
+        per_ray: Names of the arguments with an entry for each ray, or None to tell by shapes.
+        shared: Names of the arguments that are the same for all samples.
+        flat: Whether the module sees [n, f].
+    """
+
+    lead: tuple[int, ...]
+    per_ray: frozenset[str] | None
+    shared: frozenset[str]
+    flat: bool = False
+
+    @property
+    def n(self) -> int:
+        """Samples."""
+        return math.prod(self.lead)
+
+    @property
+    def one_ray(self) -> bool:
+        """Whether the module sees [1, n, f]."""
+        return not self.flat and len(self.lead) > 1 and self.lead[-1] > 1 and math.prod(self.lead[:-1]) == 1
+
+    @property
+    def axis(self) -> int:
+        """The dimension of the rows in what the module sees."""
+        return len(self.lead) - 1 if self.one_ray else 0
+
+    def kind(self, name: str, tensor: Tensor, nested: bool) -> str:
+        """What a tensor has an entry for: each sample, each ray, or neither.
+
+        Args:
+            name: Of the argument; of an attribute of it, "argument.attribute".
+            tensor: The argument.
+            nested: Inside an object, where what fits nothing is left alone.
+
+        Raises:
+            ValueError: For a tensor that fits nothing, or two readings.
+        """
+        shape, lead, d = tuple(tensor.shape), self.lead, len(self.lead)
+        if not shape or _named(name, self.shared):
+            return SHARED
+        by_sample = shape[:d] == lead
+        by_ray = d >= 2 and shape[: d - 1] == lead[:-1] and len(shape) in (d - 1, d)
+        if self.per_ray is not None and _named(name, self.per_ray):
+            if d < 2 or shape[: d - 1] != lead[:-1]:
+                raise ValueError(
+                    f"{_OP}: {name} is per ray and must have shape [{_sizes(lead[:-1], 'rays')}, ...] beside samples "
+                    f"of [{_sizes(lead)}, ...], got {list(shape)}"
+                )
+            return RAY
+        if self.per_ray is None and by_ray and self.n and lead[-1] > 1 and (by_sample or lead[-1] == lead[-2]):
+            other = f"each of {lead[-1]} samples" if by_sample else "a sample's place along every ray"
+            raise ValueError(
+                f"{_OP}: per_ray must say what {name} is, since [{_sizes(shape)}] beside samples of "
+                f"[{_sizes(lead)}, ...] may stand for rays or for {other}; pass per_ray=[{name!r}], or per_ray=[] if "
+                "it is not per ray"
+            )
+        if by_sample:
+            return SAMPLE
+        if by_ray and self.per_ray is None:
+            return RAY
+        if tensor.numel() == 1 or all(size == 1 for size in shape[:d]):
+            return SHARED
+        if len(shape) >= d and all(size in (1, whole) for size, whole in zip(shape, lead)):
+            return BROADCAST
+        if nested:
+            return SHARED
+        ray = f", per ray [{_sizes(lead[:-1])}, ...]" if d >= 2 else ""
+        raise ValueError(
+            f"{_OP}: {name} must be per sample [{_sizes(lead)}, ...]{ray}, or named in shared=, got {list(shape)}"
+        )
+
+    def flatten(self, tensor: Tensor, kind: str) -> Tensor:
+        """[n, ...] of a tensor per sample, [rays, ...] of one per ray."""
+        d = len(self.lead)
+        if kind == RAY:
+            return tensor.reshape(math.prod(self.lead[:-1]), *tensor.shape[d - 1 :])
+        if kind == BROADCAST:
+            tensor = tensor.expand(*self.lead, *tensor.shape[d:])
+        return tensor.reshape(self.n, *tensor.shape[d:])
+
+    def shown(self, rows: Tensor, kind: str) -> Tensor:
+        """Rows [n, ...] as the module sees them."""
+        if self.flat or len(self.lead) == 1:
+            return rows
+        ones = [1] * (len(self.lead) - (2 if kind == RAY else 1))
+        if self.one_ray:
+            return rows.reshape(*ones, *rows.shape)
+        return rows.reshape(rows.shape[0], *ones, *rows.shape[1:]) if ones else rows
+
+    def rows_of(self, result: Tensor) -> Tensor:
+        """A result of the module as rows [n * m, ...]."""
+        axis = self.axis
+        kept = axis and result.dim() > axis and all(size == 1 for size in result.shape[:axis])
+        return result.reshape(result.shape[axis:]) if kept else result
+
+    def restore(self, rows: Tensor, flattened: bool) -> Tensor:
+        """Rows of a result in the original order, with the leading dimensions of the call.
+
+        Args:
+            rows: [n * m, ...], from [n, 1, ...] with its dimension of one.
+            flattened: Whether the module itself makes [rays * samples, ...] of what it gets.
+        """
+        n, rest = self.n, rows.shape[1:]
+        if len(self.lead) == 1 or flattened or (n and rows.shape[0] != n):
+            return rows
+        ones = 0 if self.flat or self.one_ray else len(self.lead) - 1
+        dropped = next((i for i, size in enumerate(rest[:ones]) if size != 1), min(ones, len(rest)))
+        return rows.reshape(*self.lead, *rest[dropped:])
+
+
+def _named(name: str, names: Iterable[str]) -> bool:
+    return any(name == known or name.startswith(f"{known}.") for known in names)
+
+
+def _sizes(shape: Sequence[int], empty: str = "") -> str:
+    return ", ".join(str(size) for size in shape) or empty
+
+
+# Calls ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Call:
+    """A method of the module with the arguments of one call.
+
+    Attributes:
+        method: Its name.
+        names: Of the arguments, positional ones first.
+        args: As they came.
+        kwargs: As they came.
+    """
+
+    method: str
+    names: list[str]
+    args: tuple[Any, ...]
+    kwargs: dict[str, Any]
+
+    def function(self, module: nn.Module) -> Callable[..., Any]:
+        """The bound method; ``forward`` by way of the module, whose hooks run then."""
+        return module.__call__ if self.method == "forward" else getattr(module, self.method)
+
+    def arranged(self, layout: Layout, grouping: Grouping | None) -> tuple[list[Any], dict[str, Any], list[Tensor]]:
+        """The arguments as the module sees them, in the order of a grouping.
+
+        Args:
+            layout: Of the arguments.
+            grouping: Of the samples; None keeps the original order.
+
+        Returns:
+            Positional arguments, keyword arguments, and the tensors among them that have rows.
+        """
+        order = _Order(layout, grouping)
+        values = [
+            map_tree(value, order.change, name, batches=True)
+            for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
+        ]
+        return values[: len(self.args)], dict(zip(self.kwargs, values[len(self.args) :])), order.found
+
+
+class _Order:
+    """Brings tensors and batch-like objects into the order of a grouping."""
+
+    def __init__(self, layout: Layout, grouping: Grouping | None) -> None:
+        self.layout, self.grouping = layout, grouping
+        self.n = layout.n if grouping is None else grouping.n
+        self.found: list[Tensor] = []
+        self._rays: Tensor | None = None
+
+    def change(self, name: str, value: Any, nested: bool) -> Any:
+        if not isinstance(value, Tensor):
+            return self._batch(name, value)
+        kind = self.layout.kind(name, value, nested)
+        if kind == SHARED or (kind == RAY and self.layout.one_ray):
+            return value
+        rows = self.layout.shown(self._rows(self.layout.flatten(value, kind), kind == RAY), kind)
+        self.found.append(rows)
+        return rows
+
+    def _rows(self, flat: Tensor, ray: bool) -> Tensor:
+        if not self.layout.n:  # a module that is never called without rows gives its sizes on placeholders
+            empty = flat.new_full((self.n, *flat.shape[1:]), 0.5 if flat.is_floating_point() else 0)
+            return torch.cat([flat[:0], empty])  # joined, so that results depend on the argument as ever
+        if ray:
+            return flat.index_select(0, self._ray_of_rows(flat.device))
+        rows = flat if self.grouping is None else self.grouping.sort(flat)
+        return rows.view_as(rows) if rows is flat else rows  # an object of its own, to be told apart
+
+    def _ray_of_rows(self, device: torch.device) -> Tensor:
+        if self._rays is None:
+            grouping = self.grouping or Grouping(None, self.n, 1, device, "auto")
+            self._rays = grouping.rays(self.layout.lead[-1])
+        return self._rays
+
+    def _batch(self, name: str, value: Any) -> Any:
+        """An object that can be flattened, indexed and reshaped as a whole."""
+        layout, shape = self.layout, tuple(value.shape)
+        if shape not in (layout.lead, layout.lead[:-1]) or not shape or (layout.one_ray and shape != layout.lead):
+            return value
+        if not layout.n:
+            items = _items(value) or {}
+            new = {key: map_tree(item, self.change, f"{name}.{key}", nested=True) for key, item in items.items()}
+            return _rebuilt(value, items, new)
+        flat, device = value.flatten(), next((t.device for t in tensors_of(value)), torch.device("cpu"))
+        if shape != layout.lead:
+            flat = flat[self._ray_of_rows(device).long()]
+        elif self.grouping is not None:
+            flat = flat[self.grouping.sort(torch.arange(layout.n, device=device))]
+        ones = () if layout.flat else (1,) * (len(shape) - 1)
+        rows = flat.reshape((*ones, self.n) if layout.one_ray else (self.n, *ones)) if ones else flat
+        axis = layout.axis
+        self.found += [t for t in tensors_of(rows) if t.dim() > axis and t.shape[axis] == self.n]
+        return rows
+
+
+def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> tuple[Tensor, Tensor | None]:
+    """The positions of a call's samples.
+
+    Args:
+        rule: Positions [..., 3], "first3", a slice of the features of the first tensor, or a function.
+        args: Of the call.
+        kwargs: Of the call.
+
+    Returns:
+        Positions [..., 3], and the tensor whose identity stands for them, or None.
+
+    Raises:
+        ValueError: Where no rule is given, or it does not fit the arguments.
+        TypeError: For positions that are no tensor.
+    """
+    if rule is None:
+        raise ValueError(
+            f"{_OP}: coords must say where the positions are, since a module's arguments do not: pass "
+            "coords='first3', a slice of the features or a function of the arguments to the router, or "
+            "coords=positions [..., 3] to this call"
+        )
+    source: Tensor | None
+    if isinstance(rule, Tensor):
+        positions, source, what = rule, rule, "coords"
+    elif callable(rule):
+        positions, source, what = rule(*args, **kwargs), None, "what coords returns"
+    else:
+        source = next((v for v in (*args, *kwargs.values()) if isinstance(v, Tensor)), None)
+        if source is None:
+            got = ", ".join(type(value).__name__ for value in (*args, *kwargs.values())) or "nothing"
+            raise ValueError(
+                f"{_OP}: coords={rule!r} must find a tensor among the arguments, got {got}; pass a function"
+            )
+        if source.dim() == 0:
+            raise ValueError(f"{_OP}: coords={rule!r} must find features in the first tensor, got a number")
+        positions = source[..., :3] if rule == "first3" else source[..., rule]
+        what = f"what coords={rule!r} takes from the first tensor, {list(source.shape)},"
+    if not isinstance(positions, Tensor):
+        raise TypeError(f"{_OP}: {what} must be a tensor, got {type(positions).__name__}")
+    if positions.dim() == 0 or positions.shape[-1] != 3 or not positions.is_floating_point():
+        raise ValueError(
+            f"{_OP}: {what} must have shape [..., 3] and a floating-point dtype, got {list(positions.shape)} of "
+            f"{positions.dtype}"
+        )
+    return positions, source
+
+
+def argument_names(function: Callable[..., Any], count: int) -> list[str]:
+    """Names of the first positional arguments of a function; their numbers where it does not name them."""
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    names = [parameter.name for parameter in _signature(function) or () if parameter.kind in kinds]
+    return [names[i] if i < len(names) else str(i) for i in range(count)]
+
+
+def accepted_names(functions: Sequence[Callable[..., Any]]) -> list[str] | None:
+    """The names of the arguments that any of some functions take; None where one takes any name."""
+    names: dict[str, None] = {}
+    for function in functions:
+        parameters = _signature(function)
+        if parameters is None or any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
+            return None
+        names |= dict.fromkeys(parameter.name for parameter in parameters)
+    return list(names)
+
+
+def _signature(function: Callable[..., Any]) -> list[inspect.Parameter] | None:
+    try:
+        return list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return None
