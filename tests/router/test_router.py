@@ -137,6 +137,24 @@ def test_subdivide_inherits_parameters_and_moments(field: NeRF, generator: torch
         torch.testing.assert_close(now, then)
 
 
+def test_results_from_before_a_split_that_are_still_held_do_not_disturb(
+    field: NeRF, generator: torch.Generator
+) -> None:
+    """Parameters stay the same objects, of another shape; a graph that was built before remembers the old one."""
+    router, _ = trained(field, generator)
+    positions, directions = samples(200, generator)
+    held = router(positions, directions)
+    diagram, parents = router.diagram.refine({0: torch.randn(4, 3, generator=generator)})
+    router.subdivide(diagram, parents)
+    fresh = copy.deepcopy(router)
+    for routed in (router, fresh):
+        rgb, sigma = routed(positions, directions)
+        (rgb.square().sum() + sigma.sum()).backward()
+    for a, b in zip(router.parameters(), fresh.parameters(), strict=True):
+        assert a.grad.shape == a.shape and torch.equal(a.grad, b.grad)
+    assert held[0].requires_grad
+
+
 def test_children_part_ways_after_the_split(field: NeRF, generator: torch.Generator) -> None:
     router, optimizer = trained(field, generator)
     diagram, parents = router.diagram.refine({0: torch.randn(4, 3, generator=generator)})

@@ -119,11 +119,25 @@ def register(function: Any, rule: Rule) -> None:
             rows are sorted by cell, and a parameter is a :class:`PerCell`, whose ``stacked`` is [k, ...]. It returns
             rows, or ``NotImplemented`` for arguments that it does not serve.
 
-    Example:
-        >>> import torch, voronerf.router
-        >>> def blend(run, rows, parameter, share):          # torch.lerp(rows, parameter, share)
-        ...     return torch.lerp(rows, run.rows_of(parameter), share)
-        >>> voronerf.router.register(torch.lerp, blend)
+    Examples:
+        >>> import torch
+        >>> from voronerf import VoronoiRouter
+        >>> from voronerf.router import register
+        >>> def shift(rows, offset):  # a function of yours that PyTorch's function modes see
+        ...     if torch.overrides.has_torch_function((rows, offset)):
+        ...         return torch.overrides.handle_torch_function(shift, (rows, offset), rows, offset)
+        ...     return rows + offset.exp()
+        >>> def shift_in_cells(run, rows, offset):
+        ...     return rows + run.rows_of(offset).exp()
+        >>> register(shift, shift_in_cells)
+        >>> class Field(torch.nn.Linear):
+        ...     def forward(self, x):
+        ...         return shift(x @ self.weight.T, self.bias)
+        >>> router = VoronoiRouter(Field(3, 2), torch.randn(4, 3), coords="first3")
+        >>> router(torch.randn(64, 3)).shape
+        torch.Size([64, 2])
+        >>> print(router.explain())
+        forward: grouped
     """
     _RULES[function] = rule
 

@@ -248,6 +248,11 @@ def inherit_parameters(module: nn.Module, parents: Tensor, fresh: Sequence[Tenso
             values = parameter.detach()[parents.to(parameter.device)]
             if fresh is not None:
                 values[new.to(values.device)] = fresh[index][new].to(values)
+            # A graph of an earlier call that is still held remembers the old shape of the parameter, and would have the
+            # gradients of the new cells summed to it. With another dtype in between torch forgets it.
+            if values.is_floating_point():
+                other = torch.float32 if values.dtype == torch.float64 else torch.float64
+                parameter.data = values.new_empty(0, dtype=other)
             parameter.data, parameter.grad = values, None
 
 

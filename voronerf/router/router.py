@@ -255,7 +255,7 @@ class VoronoiRouter(nn.Module):
     def explain(self) -> str:
         """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
 
-        Example:
+        Examples:
             >>> import torch
             >>> from voronerf import VoronoiRouter
             >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.randn(4, 3), coords="first3")
