@@ -1,19 +1,15 @@
 """What tests of every room share: refusals, seeded generators, equal tensors, scripts, files of JSON."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
 
 import pytest
 import torch
 
 
-def refuses(message: str, call: Callable[..., Any], *args: Any, error: type[Exception] = ValueError, **options: Any):
+def refuses(message, call, *args, error=ValueError, **options):
     """Fails unless the call raises an error of one line that contains ``message``, which is no pattern."""
     with pytest.raises(error) as caught:
         call(*args, **options)
@@ -21,18 +17,18 @@ def refuses(message: str, call: Callable[..., Any], *args: Any, error: type[Exce
     assert message in text and "\n" not in text, text
 
 
-def seeded(seed: int = 0) -> torch.Generator:
+def seeded(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def same(first: Any, second: Any) -> bool:
+def same(first, second):
     """Whether two sequences of tensors, or two dictionaries of them, are equal bit for bit."""
     if isinstance(first, Mapping):
         return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
     return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def python(*args: Any, **options: Any) -> str:
+def python(*args, **options):
     """The output of a Python process, which must succeed."""
     command = [sys.executable, *map(str, args)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, **options)
@@ -40,5 +36,5 @@ def python(*args: Any, **options: Any) -> str:
     return done.stdout
 
 
-def read_json(path: Path) -> Any:
+def read_json(path):
     return json.loads(path.read_text())

@@ -1,15 +1,12 @@
 """The build scripts: commands of build.ninja, from compilers of more than one word, and the check of the CUDA files."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import runpy
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,7 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture
-def build(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def build(monkeypatch):
     """The functions of setup.py, which is run without its last call."""
     if not (ROOT / "setup.py").is_file():
         pytest.skip("setup.py is not there: the tests are not in the source tree")
@@ -28,7 +25,7 @@ def build(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return runpy.run_path(str(ROOT / "setup.py"), run_name="voronerf_setup")
 
 
-def commands(build: dict[str, Any], cuda: Any) -> dict[str, str]:
+def commands(build, cuda):
     """Command of every rule."""
     lines = build["ninja_file"](Path("_C.so"), cuda).splitlines()
     rules = [line.removeprefix("rule ") for line in lines if line.startswith("rule ")]
@@ -36,14 +33,14 @@ def commands(build: dict[str, Any], cuda: Any) -> dict[str, str]:
     return dict(zip(rules, texts, strict=True))
 
 
-def test_a_launcher_before_the_compiler(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_launcher_before_the_compiler(build, monkeypatch):
     monkeypatch.setenv("CXX", "ccache g++")
     rules = commands(build, build["Cuda"]("built without CUDA"))
     assert rules["cxx"].startswith("ccache g++ -std=c++17 ")
     assert rules["link"].startswith("ccache g++ -")
 
 
-def test_nvcc_gets_one_program_and_the_arguments(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nvcc_gets_one_program_and_the_arguments(build, monkeypatch):
     cuda = build["Cuda"]("built with CUDA", Path("/cuda/bin/nvcc"), ("80",))
     monkeypatch.setenv("CXX", "/usr/bin/ccache 'the compilers/g++' -m64")
     rules = commands(build, cuda)
@@ -55,15 +52,13 @@ def test_nvcc_gets_one_program_and_the_arguments(build: dict[str, Any], monkeypa
 
 
 @pytest.mark.parametrize("given", ["", "-Ofast -march=native", "-ffast-math -ffp-contract=fast"])
-def test_arithmetic_is_exact_whatever_flags_are_given(
-    build: dict[str, Any], monkeypatch: pytest.MonkeyPatch, given: str
-) -> None:
+def test_arithmetic_is_exact_whatever_flags_are_given(build, monkeypatch, given):
     monkeypatch.setenv("CXXFLAGS", given)
     command = commands(build, build["Cuda"]("built without CUDA"))["cxx"]
     assert f"{given} -fno-fast-math -ffp-contract=off $flags " in command
 
 
-def test_every_module_lies_in_a_package() -> None:
+def test_every_module_lies_in_a_package():
     """Folders without ``__init__.py`` work in a checkout and are left out of wheels."""
     setuptools = pytest.importorskip("setuptools")
     modules = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "voronerf").rglob("*.py")}
@@ -71,7 +66,7 @@ def test_every_module_lies_in_a_package() -> None:
     assert modules == {name.replace(".", "/") for name in packages} and "voronerf/training" in modules
 
 
-def test_clang_on_linux_is_refused_before_it_builds(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clang_on_linux_is_refused_before_it_builds(build, monkeypatch):
     """It would link, and then ask torch's OpenMP for what GCC's has not."""
     answer = SimpleNamespace(stdout="Ubuntu clang version 18.1.3\nTarget: x86_64")
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
@@ -82,9 +77,7 @@ def test_clang_on_linux_is_refused_before_it_builds(build: dict[str, Any], monke
     assert "clang version 18.1.3" in build["build_info"](build["Cuda"]("none"))
 
 
-def test_nvcc_is_found_where_cuda_home_has_none(
-    build: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_nvcc_is_found_where_cuda_home_has_none(build, monkeypatch, tmp_path):
     for name in ("home/bin", "path"):
         (tmp_path / name).mkdir(parents=True)
     nvcc = tmp_path / "path" / "nvcc"
@@ -100,7 +93,7 @@ def test_nvcc_is_found_where_cuda_home_has_none(
     assert build["find_cuda"]().nvcc == own
 
 
-def test_one_word_and_none(build: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_word_and_none(build, monkeypatch):
     monkeypatch.setenv("CXX", "ccache")
     assert build["host_compiler"]() == ["-ccbin", "ccache"]
     for empty in ("", " "):
@@ -118,7 +111,7 @@ ptxas info    : Used 8 registers, used 0 barriers
 """
 
 
-def cuda_check() -> ModuleType:
+def cuda_check():
     path = ROOT / ".ci" / "cuda_check.py"
     if not path.is_file():
         pytest.skip(".ci/cuda_check.py is not there: the tests are not in the source tree")
@@ -138,13 +131,13 @@ def cuda_check() -> ModuleType:
     ],
 )
 def test_cuda_check_fails_where_nothing_was_checked(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    reported: list[str],
-    status: int,
-    outcome: str,
-) -> None:
+    monkeypatch,
+    capsys,
+    tmp_path,
+    reported,
+    status,
+    outcome,
+):
     check = cuda_check()
     # An nvcc that compiles nothing and reports what it is told to.
     (tmp_path / "report").write_text("".join(REPORT.format(arch) for arch in reported))
@@ -157,9 +150,7 @@ def test_cuda_check_fails_where_nothing_was_checked(
     assert capsys.readouterr().out.rstrip().endswith(outcome)
 
 
-def test_cuda_check_leaves_the_toolkits_own_kernels_alone(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_cuda_check_leaves_the_toolkits_own_kernels_alone(monkeypatch, capsys, tmp_path):
     check = cuda_check()
     theirs = REPORT.replace("_Z6kernelv", "_ZN3cub18CUB_300001_SM_8000EmptyKernelIvEEvv").replace(
         "0 bytes spill", "8 bytes spill"
@@ -175,9 +166,7 @@ def test_cuda_check_leaves_the_toolkits_own_kernels_alone(
     assert "cub" not in said and "kernels and 1 of the toolkit's compiled for sm_80" in said
 
 
-def test_cuda_check_takes_no_serialized_products(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_cuda_check_takes_no_serialized_products(monkeypatch, capsys, tmp_path):
     """ptxas's word for it, which -Werror does not reach."""
     check = cuda_check()
     told = (
@@ -196,7 +185,7 @@ def test_cuda_check_takes_no_serialized_products(
     assert "(C7510)" in said and "failed: ptxas serializes wgmma in " in said
 
 
-def test_cuda_check_compares_with_the_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cuda_check_compares_with_the_table(monkeypatch, tmp_path):
     check = cuda_check()
     row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")

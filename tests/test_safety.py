@@ -1,15 +1,11 @@
 """Kernels under what programs do to them: several Python threads, forked children, thread counts, odd numbers."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
 
 import voronerf as v
 
@@ -18,12 +14,12 @@ pytestmark = pytest.mark.native
 BAD = (torch.nan, torch.inf, -torch.inf)
 
 
-def network(points: Tensor, weight: Tensor) -> Tensor:
+def network(points, weight):
     offsets = torch.tensor([0, len(points) // 2, len(points)], dtype=torch.int32)
     return v.grouped_linear(points, offsets, weight)
 
 
-def calls(seed: int) -> list[Callable[[], tuple[Tensor, ...]]]:
+def calls(seed):
     generator = torch.Generator().manual_seed(seed)
     points = torch.rand(5000, 3, generator=generator)
     centres = torch.rand(400, 3, generator=generator)
@@ -34,7 +30,7 @@ def calls(seed: int) -> list[Callable[[], tuple[Tensor, ...]]]:
     rgb = torch.rand(100, 50, 3, generator=generator)
     edges = torch.rand(100, 51, generator=generator).sort(dim=1).values
 
-    def gradient() -> tuple[Tensor, ...]:
+    def gradient():
         own = weight.clone().requires_grad_()
         return torch.autograd.grad(network(points, own).square().sum(), own)
 
@@ -51,12 +47,12 @@ def calls(seed: int) -> list[Callable[[], tuple[Tensor, ...]]]:
     ]
 
 
-def test_calls_from_several_python_threads_at_once() -> None:
+def test_calls_from_several_python_threads_at_once():
     everything = [calls(seed) for seed in range(4)]
     expected = [[call() for call in own] for own in everything]
-    wrong: list[object] = []
+    wrong = []
 
-    def work(which: int) -> None:
+    def work(which):
         try:
             torch.set_num_threads(1 + which % 2)
             for _ in range(5):
@@ -77,7 +73,7 @@ def test_calls_from_several_python_threads_at_once() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
-def test_a_forked_child_runs_on_one_thread() -> None:
+def test_a_forked_child_runs_on_one_thread():
     """After the parent has used a team; with more than one thread the child would wait for it, as torch's own do."""
     code = """
 import os, torch, voronerf
@@ -97,7 +93,7 @@ raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
     assert result.returncode == 0, result.stderr
 
 
-def test_set_num_threads_is_honoured() -> None:
+def test_set_num_threads_is_honoured():
     """A team of the asked size and no larger: threads of the process before and after."""
     code = """
 import os, torch, voronerf
@@ -117,13 +113,13 @@ assert len(os.listdir("/proc/self/task")) == before + 2
     assert result.returncode == 0, result.stderr
 
 
-def agree(native: Tensor, reference: Tensor) -> None:
+def agree(native, reference):
     """NaN where the reference has NaN, the same infinities, close elsewhere."""
     torch.testing.assert_close(native, reference, equal_nan=True, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_odd_numbers_propagate_as_in_the_reference(bad: float) -> None:
+def test_odd_numbers_propagate_as_in_the_reference(bad):
     points = torch.rand(70, 3)
     points[::9, 1] = bad
     centres, weight = torch.rand(5, 3), torch.rand(5, 6, 3) - 0.5
@@ -148,7 +144,7 @@ def test_odd_numbers_propagate_as_in_the_reference(bad: float) -> None:
     ("where", "bad"),
     [(where, bad) for where in ("sigma", "rgb", "depths") for bad in BAD[: 2 if where == "sigma" else 3]],
 )
-def test_odd_numbers_along_rays(where: str, bad: float) -> None:
+def test_odd_numbers_along_rays(where, bad):
     values = {"sigma": torch.rand(8, 20), "rgb": torch.rand(8, 20, 3), "depths": torch.rand(8, 20)}
     values[where][3, 7] = bad
     deltas = torch.rand(8, 20)

@@ -1,7 +1,5 @@
 """What the tests of benchmarks/paper share: tiny settings and results without a training."""
 
-from __future__ import annotations
-
 TINY = {
     "scene": ("builtin",),
     "downscale": 20,
@@ -17,7 +15,7 @@ TINY = {
 }
 
 
-def as_options(settings) -> list[str]:
+def as_options(settings):
     """Settings as the command line takes them."""
     values = {key: value if isinstance(value, tuple) else (value,) for key, value in settings.items()}
     return [str(part) for key, value in values.items() for part in (f"--{key.replace('_', '-')}", *value)]

@@ -1,7 +1,5 @@
 """What the scripts under benchmarks/ share, and that the throughput table compares like with like."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

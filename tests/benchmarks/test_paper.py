@@ -1,7 +1,5 @@
 """benchmarks/paper.py: files, tables and plots of tiny runs."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What benchmarks/paper.py concludes: verdicts that follow the figures, and published figures beside their own rows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """benchmarks/paper.py in parts: what is trained now, what a file of results keeps, what a table says is missing."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scripts of benchmarks/ from end to end: occupancy.py on a run that is there, balance.py, step_profile.py."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,7 @@ from voronerf.training.trainer import Trainer
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
-def outcome(script: str, folder: Path, options: str) -> tuple[dict, list | dict, str]:
+def outcome(script, folder, options):
     """Metadata, results and what was printed."""
     path = folder / "results" / "outcome.json"
     said = python(BENCHMARKS / f"{script}.py", *options.split(), "--json", path)

@@ -1,7 +1,5 @@
 """The command line as a user meets it: commands, files, and one line for everything that can go wrong."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os
@@ -26,13 +24,13 @@ TINY = [
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "tiny"
     assert main(["train", "--data", "builtin", "--out", str(out), *TINY]) == 0
     return out
 
 
-def error_of(capsys: pytest.CaptureFixture[str], *args: str) -> str:
+def error_of(capsys, *args):
     """The single line that a failing command prints; its exit status must not be 0."""
     assert main(list(args)) != 0
     text = capsys.readouterr().err
@@ -40,7 +38,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *args: str) -> str:
     return text
 
 
-def test_train_writes_the_run_directory(run: Path) -> None:
+def test_train_writes_the_run_directory(run):
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
     assert {"config.json", "metrics.jsonl", "summary.json", "checkpoints/last.safetensors", "plots/psnr.png"} <= names
     panels = list((run / "images").glob("*.png"))
@@ -51,7 +49,7 @@ def test_train_writes_the_run_directory(run: Path) -> None:
     assert {"psnr", "ssim", "seconds", "steps", "rays_per_second", "parameters", "stages"} <= summary.keys()
 
 
-def test_eval_scores_every_view(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_scores_every_view(run, capsys):
     assert main(["eval", str(run), "--views", "3", "--panels", "2"]) == 0
     result = json.loads((run / "eval.json").read_text())
     assert len(result["views"]) == 3
@@ -64,7 +62,7 @@ def test_eval_scores_every_view(run: Path, capsys: pytest.CaptureFixture[str]) -
     assert "nowhere: there is no such file or folder" in error_of(capsys, "eval", str(run), "--lpips", "nowhere")
 
 
-def test_render_makes_a_video(run: Path, tmp_path: Path) -> None:
+def test_render_makes_a_video(run, tmp_path):
     path = tmp_path / "turn.mp4"
     assert main(["render", str(run), "--frames", "3", "--samples", "4", "--out", str(path)]) == 0
     frames = imageio_ffmpeg.read_frames(str(path))
@@ -72,14 +70,14 @@ def test_render_makes_a_video(run: Path, tmp_path: Path) -> None:
     assert len(list(frames)) == 3
 
 
-def test_pictures_through_an_occupancy_grid(run: Path, tmp_path: Path) -> None:
+def test_pictures_through_an_occupancy_grid(run, tmp_path):
     assert main(["eval", str(run), "--views", "1", "--panels", "0", "--occupancy"]) == 0
     path = tmp_path / "turn.mp4"
     assert main(["render", str(run), "--frames", "2", "--out", str(path), "--occupancy"]) == 0
     assert path.stat().st_size > 0
 
 
-def test_pictures_of_blended_cells(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_pictures_of_blended_cells(run, capsys, tmp_path):
     found = []
     for blend in ("0", "0.3"):
         assert main(["eval", str(run), "--views", "1", "--panels", "1", "--blend", blend]) == 0
@@ -92,7 +90,7 @@ def test_pictures_of_blended_cells(run: Path, capsys: pytest.CaptureFixture[str]
     assert "--blend must be a distance of 0 or more, got -1.0" in error_of(capsys, "eval", str(run), "--blend", "-1")
 
 
-def test_info_names_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_names_every_backend(capsys):
     assert main(["info"]) == 0
     output = capsys.readouterr().out
     for word in ("torch", "reference", "native", "warp", "nearest_centre", "grouped_mlp", "resample"):
@@ -100,7 +98,7 @@ def test_info_names_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.warp
-def test_preload_compiles_into_the_cache_of_ones_choice(tmp_path: Path) -> None:
+def test_preload_compiles_into_the_cache_of_ones_choice(tmp_path):
     # In a process of its own, since Warp reads the place once; one file of kernels, since all take a while.
     code = (
         "import pkgutil, sys; every = pkgutil.iter_modules; "
@@ -114,12 +112,12 @@ def test_preload_compiles_into_the_cache_of_ones_choice(tmp_path: Path) -> None:
     assert any("update_occupancy" in str(path) for path in (tmp_path / "cache").rglob("*"))
 
 
-def test_preload_for_a_device_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_preload_for_a_device_that_is_not_there_is_one_line(capsys):
     error = error_of(capsys, "preload", "--device", "cuda:99")
     assert "--device must name a device that is present, got 'cuda:99'" in error
 
 
-def test_resume_needs_no_setting_again(run: Path, tmp_path: Path) -> None:
+def test_resume_needs_no_setting_again(run, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     assert main(["train", "--resume", "--out", str(copy), "--steps", "20"]) == 0
@@ -135,18 +133,14 @@ def test_resume_needs_no_setting_again(run: Path, tmp_path: Path) -> None:
     assert json.loads((copy / "summary.json").read_text())["steps"] == 24
 
 
-def test_folders_with_brackets_and_spaces_are_told_as_they_are(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folders_with_brackets_and_spaces_are_told_as_they_are(run, tmp_path, capsys):
     copy = tmp_path / "toys[old] :dog: 2"
     shutil.copytree(run, copy)
     assert main(["eval", str(copy), "--views", "1", "--panels", "0"]) == 0
     assert f"wrote {copy / 'eval.json'}" in capsys.readouterr().out
 
 
-def test_demo_compares_two_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demo_compares_two_runs(tmp_path, capsys, monkeypatch):
     # A step takes ten milliseconds however busy the machine is.
     ticks = itertools.count()
     monkeypatch.setattr("voronerf.training.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks)))
@@ -166,7 +160,7 @@ def test_demo_compares_two_runs(
     assert not (tmp_path / "x").exists()
 
 
-def test_help_has_units(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_has_units(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["train", "--help"])
     assert stop.value.code == 0
@@ -178,7 +172,7 @@ def test_help_has_units(capsys: pytest.CaptureFixture[str]) -> None:
     assert "seconds" in output
 
 
-def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(run, tmp_path, capsys):
     out = str(tmp_path / "out")
     assert "there is no such folder" in error_of(capsys, "train", "--data", str(tmp_path / "none"), "--out", out)
     assert "is no scene" in error_of(capsys, "train", "--data", str(tmp_path), "--out", out)
@@ -197,7 +191,7 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, capsys: pytest.Capture
     assert not Path(out).exists()
 
 
-def test_a_failed_run_leaves_its_folder_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_run_leaves_its_folder_usable(tmp_path, capsys):
     out = ["--out", str(tmp_path / "out")]
     many = ["400" if word == "3" else word for word in TINY]
     few = ["--reservoir", "400", "--reservoir-batches", "10"]
@@ -207,17 +201,15 @@ def test_a_failed_run_leaves_its_folder_usable(tmp_path: Path, capsys: pytest.Ca
     assert (tmp_path / "out" / "metrics.jsonl").read_text().count("\n") == 2
 
 
-def test_another_configuration_is_one_line(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_configuration_is_one_line(run, capsys):
     args = ["train", "--data", "builtin", "--out", str(run), "--resume", *TINY, "--lr", "0.1"]
     assert "a checkpoint of another configuration: --lr " in error_of(capsys, *args)
 
 
-def test_a_full_disk_is_one_line(
-    run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_is_one_line(run, monkeypatch, tmp_path, capsys):
     whole, calls = os.fsync, []
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         calls.append(descriptor)
         if len(calls) > 3:
             raise OSError(28, "No space left on device")
@@ -232,7 +224,7 @@ def test_a_full_disk_is_one_line(
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGINT") or sys.platform == "win32", reason="needs POSIX signals")
-def test_ctrl_c_leaves_a_usable_checkpoint(tmp_path: Path) -> None:
+def test_ctrl_c_leaves_a_usable_checkpoint(tmp_path):
     out = tmp_path / "run"
     endless = ["100000" if word == "16" else word for word in TINY]
     command = [sys.executable, "-m", "voronerf.cli.main", "train", "--data", "builtin", "--out", str(out), *endless]

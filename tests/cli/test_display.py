@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 from rich.console import Console
@@ -8,7 +6,7 @@ from voronerf.cli.display import TrainingDisplay
 from voronerf.training.progress import Progress
 
 
-def test_the_loss_is_that_of_the_steps_whose_loss_was_read() -> None:
+def test_the_loss_is_that_of_the_steps_whose_loss_was_read():
     """On a GPU the first losses are not known, and a resumed run begins at a later step."""
     display = TrainingDisplay(Console(quiet=True), "run")
     for step, loss in ((51, math.nan), (52, math.nan), (53, 0.4), (54, 0.2)):

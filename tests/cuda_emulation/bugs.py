@@ -3,16 +3,13 @@
 The last line printed is "right", "wrong" or the error.
 """
 
-from __future__ import annotations
-
 import sys
-from types import ModuleType
 
 import numpy as np
 from emulation_build import load
 
 
-def rounded(values: np.ndarray, bfloat16: bool) -> tuple[np.ndarray, np.ndarray]:
+def rounded(values, bfloat16):
     """Values of 16 bits: the bits, and what they stand for."""
     if bfloat16:
         wide = values.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF0000)
@@ -21,7 +18,7 @@ def rounded(values: np.ndarray, bfloat16: bool) -> tuple[np.ndarray, np.ndarray]
     return halves.view(np.uint16), halves.astype(np.float64)
 
 
-def pack(bits: np.ndarray, leading: int, stride: int, step_bytes: int, size: int) -> np.ndarray:
+def pack(bits, leading, stride, step_bytes, size):
     """b [n, k] in core matrices, written element by element from what the PTX manual says of the two offsets."""
     packed = np.full(size // 2, 0x7FC0, np.uint16)
     for n, k in np.ndindex(bits.shape):
@@ -31,9 +28,7 @@ def pack(bits: np.ndarray, leading: int, stride: int, step_bytes: int, size: int
     return packed
 
 
-def group_error(
-    module: ModuleType, *, tiles: int, bfloat16: bool, steps=3, groups=1, threads=0, order="k", bug=0, seed=0
-) -> float:
+def group_error(module, *, tiles, bfloat16, steps=3, groups=1, threads=0, order="k", bug=0, seed=0):
     """The largest error against float64 of a product of groups of four warps, of what it adds up.
 
     ``order``: whether core matrices lie side by side along k or along n.
@@ -55,7 +50,7 @@ def group_error(
     return float(np.nan_to_num(np.abs(out - (before + left @ right.T)) / added, nan=np.inf).max())
 
 
-def planted(module: ModuleType, bug: int, seed: int) -> float:
+def planted(module, bug, seed):
     """The largest error of three times the sum of a block, in each of its threads."""
     blocks, threads = 2, 64
     values = ((7 * np.arange(blocks * threads)) % 13).astype(np.float32)
@@ -66,7 +61,7 @@ def planted(module: ModuleType, bug: int, seed: int) -> float:
     return float(np.nan_to_num(np.abs(out - sums.repeat(threads)), nan=np.inf).max())
 
 
-def main(path: str, bug: str, seed: str) -> None:
+def main(path, bug, seed):
     """One bug, in a module that may be under a sanitizer."""
     module = load(path)
     try:

@@ -4,8 +4,6 @@ The .cu files of csrc/ are compiled by g++ with emulation.h in place of CUDA; ni
 module for each sanitizer, which are told nothing of the scheduler (emulation.cpp): it is what they must look through.
 """
 
-from __future__ import annotations
-
 import fcntl
 import importlib.util
 import platform
@@ -14,7 +12,6 @@ import subprocess
 import sys
 import sysconfig
 from pathlib import Path
-from types import ModuleType
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 HERE = Path(__file__).resolve().parent
@@ -35,7 +32,7 @@ REPLACED = {"radix_sort.cu"}
 """What consists of the CUDA toolkit's headers: a file of the same name in this folder stands in."""
 
 
-def build(sanitizer: str = "none") -> Path:
+def build(sanitizer="none"):
     """The module, built where it was not up to date."""
     out = ROOT / "build" / "cuda-emulation" / f"{platform.machine()}-{sys.implementation.cache_tag}"
     (out / sanitizer).mkdir(parents=True, exist_ok=True)
@@ -44,7 +41,7 @@ def build(sanitizer: str = "none") -> Path:
         return _build(out, sanitizer)
 
 
-def _build(out: Path, sanitizer: str) -> Path:
+def _build(out, sanitizer):
     import pybind11
 
     module = out / sanitizer / f"voronerf_emulation{sysconfig.get_config_var('EXT_SUFFIX')}"
@@ -78,7 +75,7 @@ def _build(out: Path, sanitizer: str) -> Path:
     return module
 
 
-def load(path: str | Path) -> ModuleType:
+def load(path):
     """The module at a path, without torch, which takes a sanitizer minutes."""
     spec = importlib.util.spec_from_file_location("voronerf_emulation", path)
     assert spec is not None and spec.loader is not None

@@ -1,9 +1,5 @@
 """What the launches of a network would be on a CUDA device: the emulated module's plans of layer tables."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import torch
 from emulated import module
 from emulated_networks import KIB
@@ -20,20 +16,20 @@ SHARED = {75: 64 * KIB, 80: 163 * KIB, 86: 99 * KIB, 90: 227 * KIB, 120: 99 * KI
 SIZES = ((0, 1), (1, 1), (1000, 7), (4_000_000, 4096))
 
 
-def nerf(width: int, depth: int) -> MLP:
+def nerf(width, depth):
     """The architecture of the original, in any size."""
     trunk = tuple(Layer((index - 1,) if index else (POSITIONS,), width, "relu") for index in range(depth))
     heads = (Layer((depth - 1,), 1), Layer((depth - 1,), width), Layer((depth + 1, DIRECTIONS), width // 2, "relu"))
     return MLP((*trunk, *heads, Layer((depth + 2,), 3)), (depth + 3, depth), 10, 4)
 
 
-def plain(width: int, depth: int) -> MLP:
+def plain(width, depth):
     """ReLU layers and a head of four outputs."""
     hidden = [Layer((index - 1,) if index else (POSITIONS,), width, "relu") for index in range(depth)]
     return MLP((*hidden, Layer((depth - 1,), 4)), (depth,), position_octaves=10)
 
 
-def numbers(layers: MLP, d: int | None = None) -> list[int]:
+def numbers(layers, d=None):
     """A table as the compiled module takes it."""
     d = d or (6 if layers.integrated else 3)
     seen = torch.zeros(1, 3) if layers.uses_directions else None
@@ -42,29 +38,25 @@ def numbers(layers: MLP, d: int | None = None) -> list[int]:
     return native_mlp._numbers(given.table, given.positions, given.weights, given.directions)
 
 
-def plan(
-    layers: MLP, n: int = MANY, k: int = 16, *, precision="bfloat16", backward=True, d: int | None = None, asked="auto"
-) -> dict[str, Any]:
+def plan(layers, n=MANY, k=16, *, precision="bfloat16", backward=True, d=None, asked="auto"):
     """What the launches would be on the emulated device."""
     operands = PRECISIONS.index(precision)
     return module().grouped_mlp_plan(numbers(layers, d), operands, n, k, backward, WAYS.index(asked))
 
 
-def way(layers: MLP, precision: str, *, backward: bool = False, **options: Any) -> str:
+def way(layers, precision, *, backward=False, **options):
     """The way through the network on the emulated device."""
     return WAYS[plan(layers, precision=precision, backward=backward, **options)["way"]]
 
 
-def chain(
-    layers: MLP, *, d=None, precision="bfloat16", n=MANY, k=16, groups=False, compiled=True, **device: int
-) -> dict[str, Any]:
+def chain(layers, *, d=None, precision="bfloat16", n=MANY, k=16, groups=False, compiled=True, **device):
     """The chained plan, or the rule that the table breaks, on an H200 unless another device is given."""
     known = {"capability": 90, "shared_bytes": 227 * KIB, "multiprocessors": 132} | device
     operands = PRECISIONS.index(precision)
     return module().chain_plan(numbers(layers, d), operands, n, k, *known.values(), groups, compiled)
 
 
-def assert_covers(found: dict[str, Any], n: int, k: int) -> None:
+def assert_covers(found, n, k):
     """There are at least as many tasks as the worst offsets make."""
     rows, tasks = found["task_rows"], found["tasks"]
     assert tasks >= sum(-(-part // rows) for part in (n // k,) * (k - 1) + (n - n // k * (k - 1),))

@@ -7,11 +7,7 @@ Without torch, which takes a sanitizer minutes. Results are test_ops.py's matter
 that every element of an output is written.
 """
 
-from __future__ import annotations
-
 import sys
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 from emulation_build import load
@@ -21,28 +17,28 @@ GPU = (0, 0)
 RANDOM = np.random.default_rng(0)
 
 
-def at(array: np.ndarray | None) -> int:
+def at(array):
     return 0 if array is None else array.ctypes.data
 
 
-def floats(*shape: int, dtype: Any = np.float32) -> np.ndarray:
+def floats(*shape, dtype=np.float32):
     return RANDOM.random(shape).astype(dtype)
 
 
-def integers(*values: int) -> np.ndarray:
+def integers(*values):
     return np.array(values, np.int32)
 
 
-def unwritten(*shape: int, dtype: Any = np.float32) -> np.ndarray:
+def unwritten(*shape, dtype=np.float32):
     return np.full(shape, np.nan if dtype is not np.int32 else -7777, dtype)
 
 
-def written(*arrays: np.ndarray) -> None:
+def written(*arrays):
     for array in arrays:
         assert not (np.isnan(array) if array.dtype != np.int32 else array == -7777).any()
 
 
-def nearest_centre(module: ModuleType) -> None:
+def nearest_centre(module):
     for dtype, name in ((np.float32, "float32"), (np.float64, "float64")):
         points, centres, weights, cells = floats(300, 3, dtype=dtype), floats(530, 3, dtype=dtype), None, None
         for weights in (None, floats(530, dtype=dtype)):
@@ -52,7 +48,7 @@ def nearest_centre(module: ModuleType) -> None:
             written(cells)
 
 
-def locate_cell(module: ModuleType) -> None:
+def locate_cell(module):
     points, centres, leaves = floats(300, 3), floats(5, 3), unwritten(300, dtype=np.int32)
     child_offsets, child = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
     addresses = at(points), at(centres), 0, at(child_offsets), at(child), at(leaves)
@@ -60,7 +56,7 @@ def locate_cell(module: ModuleType) -> None:
     written(leaves)
 
 
-def draw_cell(module: ModuleType) -> None:
+def draw_cell(module):
     points, centres, uniforms = floats(300, 3), floats(5, 3), floats(300, 2)
     child_offsets, child = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
     for weights in (None, floats(5)):
@@ -70,7 +66,7 @@ def draw_cell(module: ModuleType) -> None:
         written(leaves)
 
 
-def cell_sort(module: ModuleType) -> None:
+def cell_sort(module):
     # By counting and by radix. Keys of 4 bytes would need 65,535 cells, each a thread: too many for a sanitizer.
     for n, k, way in ((3000, 5, 0), (9000, 2, 1), (600, 3, 2), (300, 1100, 0)):
         cells = RANDOM.integers(-1, k + 1, n).astype(np.int32)
@@ -81,7 +77,7 @@ def cell_sort(module: ModuleType) -> None:
         written(offsets)
 
 
-def composite(module: ModuleType) -> None:
+def composite(module):
     m, r = 180, 5
     ray_offsets = integers(2, 2, 3, 73, 140, 177)
     for c, background in ((3, floats(3)), (5, floats(r, 5)), (1, None)):
@@ -98,7 +94,7 @@ def composite(module: ModuleType) -> None:
         written(*outgoing, *([] if background is None else [workspace]))
 
 
-def encode(module: ModuleType) -> None:
+def encode(module):
     x, gradient = floats(90, 3), floats(90, 27)
     for variances, include in ((None, True), (None, False), (floats(90, 3), False)):
         width = 3 * (8 + include)
@@ -110,7 +106,7 @@ def encode(module: ModuleType) -> None:
         written(out, grad_x, *([] if second is None else [second]))
 
 
-def resample(module: ModuleType) -> None:
+def resample(module):
     r, s, count = 6, 45, 70
     for uniforms in (None, floats(r, count)):
         weights, edges = floats(r, s), np.cumsum(floats(r, s + 1), axis=1)
@@ -126,7 +122,7 @@ TABLE = [3, 3, 2, -1, 0, 0, 0, 3, 2, 20, 4, 1, -1, 70, 2, 2, 0, -1, 18, 3, 2, 1,
 SHAPES = [(20, 15), (70, 35), (18, 73)]
 
 
-def grouped_mlp(module: ModuleType) -> None:
+def grouped_mlp(module):
     counts = [37, 0, 20, 3]
     n, k, r = 64, len(counts), 5
     offsets = np.cumsum([2, *counts]).astype(np.int32)
@@ -143,7 +139,7 @@ def grouped_mlp(module: ModuleType) -> None:
     ):
         module.device(90, 120, shared * 1024)
 
-        def workspace(backward: bool, precision: int = precision, way: int = way) -> np.ndarray:
+        def workspace(backward, precision=precision, way=way):
             size = module.grouped_mlp_workspace_cuda(TABLE, precision, n, k, backward, True, 0, way)
             assert isinstance(size, int), size
             return np.full(size, 255, np.uint8)
@@ -157,7 +153,7 @@ def grouped_mlp(module: ModuleType) -> None:
         written(out, *grad_weights, *grad_biases, grad_positions, grad_directions)
 
 
-def hostile(module: ModuleType) -> None:
+def hostile(module):
     least, most = -(2**31), 2**31 - 1
     cells = RANDOM.choice([least, -1, 0, 4, 5, 6, 65_536, most], 700).astype(np.int32)
     for k, way in ((1, 1), (5, 1), (5, 2), (1100, 0)):
@@ -212,11 +208,11 @@ def hostile(module: ModuleType) -> None:
             module.grouped_mlp_backward_cuda(*given[:4], *addresses, *GPU, backward)
 
 
-KEPT: list[Any] = []
+KEPT = []
 """What addresses have been taken of."""
 
 
-def network(n: int, k: int, offsets: np.ndarray) -> tuple[tuple[Any, ...], list[np.ndarray]]:
+def network(n, k, offsets):
     """Arguments up to the gradients of biases; output, its gradient, and those of positions and directions."""
     positions, directions, index = floats(n, 3), floats(5, 3), RANDOM.integers(0, 5, n).astype(np.int32)
     weights, biases = [floats(k, o, i) for o, i in SHAPES], [floats(k, o) for o, _ in SHAPES]
@@ -228,7 +224,7 @@ def network(n: int, k: int, offsets: np.ndarray) -> tuple[tuple[Any, ...], list[
     return (TABLE, arguments, *lists), [unwritten(n, 38), floats(n, 38), unwritten(n, 3), unwritten(n, 3)]
 
 
-def main(path: str, kind: str = "usual") -> None:
+def main(path, kind="usual"):
     module = load(path)
     usual = (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, resample, grouped_mlp)
     for run in (hostile,) if kind == "hostile" else usual:

@@ -1,7 +1,5 @@
 """How cell_sort runs on CUDA, as a pure function of the sizes."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest
@@ -14,7 +12,7 @@ CELLS = (1, 2, 254, 255, 510, 511, 1022, 1023, 4096, 65_534, 65_535, 1 << 20, MO
 
 
 @pytest.mark.parametrize("k", CELLS)
-def test_few_cells_are_counted_and_many_sorted_by_radix(k: int) -> None:
+def test_few_cells_are_counted_and_many_sorted_by_radix(k):
     for n in ROWS:
         assert module().cell_sort_plan(n, k, AUTOMATIC, 0)["radix"] == (k > 1022)
         assert module().cell_sort_plan(n, k, RADIX, 0)["radix"]
@@ -24,14 +22,14 @@ def test_few_cells_are_counted_and_many_sorted_by_radix(k: int) -> None:
 
 
 @pytest.mark.parametrize("k", CELLS)
-def test_keys_have_exactly_the_bits_of_the_buckets(k: int) -> None:
+def test_keys_have_exactly_the_bits_of_the_buckets(k):
     plan = module().cell_sort_plan(100, k, RADIX, 0)
     assert plan["bits"] == (k + 1).bit_length(), "the largest bucket is k + 1"
     assert plan["key_bytes"] == (2 if plan["bits"] <= 16 else 4)
 
 
 @pytest.mark.parametrize(("way", "k"), [(AUTOMATIC, k) for k in CELLS] + [(RADIX, k) for k in CELLS])
-def test_parts_of_the_workspace_lie_side_by_side(way: int, k: int) -> None:
+def test_parts_of_the_workspace_lie_side_by_side(way, k):
     for n, temporary in itertools.product(ROWS, (0, 12_345)):
         plan = module().cell_sort_plan(n, k, way, temporary)
         if plan["radix"]:

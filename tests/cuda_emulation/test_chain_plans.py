@@ -1,7 +1,5 @@
 """The chained network's layouts and its plan: which networks take it, and where its weights and values are."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import random
@@ -20,7 +18,7 @@ HELD, STORED, IN_POSITIONS, IN_DIRECTIONS = range(4)
 
 @pytest.mark.parametrize("pairs", [1, 2, 4])
 @pytest.mark.parametrize("steps", [1, 2, 3, 8, 20])
-def test_every_weight_has_one_place(pairs: int, steps: int) -> None:
+def test_every_weight_has_one_place(pairs, steps):
     own = module()
     places = {}
     for output, column in itertools.product(range(16 * pairs), range(16 * steps)):
@@ -35,7 +33,7 @@ def test_every_weight_has_one_place(pairs: int, steps: int) -> None:
         assert (output // 8 % 2, column // 8 % 2) == divmod(matrix % 4, 2)
 
 
-def test_every_feature_of_an_encoding_has_one_column() -> None:
+def test_every_feature_of_an_encoding_has_one_column():
     for octaves, features, integrated in itertools.product(range(-1, 17), (1, 2, 3, 4, 7), (False, True)):
         if integrated and octaves < 1:
             continue
@@ -57,7 +55,7 @@ def test_every_feature_of_an_encoding_has_one_column() -> None:
                     assert column % 16 < 8 and found[column + 8] == feature + 2 * features
 
 
-def test_turns_of_large_angles() -> None:
+def test_turns_of_large_angles():
     """Every exponent of a float32, with 1 / 2 pi to 400 bits."""
     # Machin: pi / 4 = 4 arctan(1 / 5) - arctan(1 / 239).
     one = 1 << 480
@@ -79,9 +77,9 @@ def test_turns_of_large_angles() -> None:
     assert all(math.isnan(module().turns_of_large(x)) for x in (math.inf, -math.inf, math.nan))
 
 
-def random_table(seed: int) -> MLP:
+def random_table(seed):
     draw = random.Random(seed)
-    layers: list[Layer] = []
+    layers = []
     for index in range(draw.randint(1, 12)):
         choices = [POSITIONS, DIRECTIONS, *range(index), *([index - 1] * 3 if index else [])]
         sources = tuple(draw.choice(choices) for _ in range(draw.randint(1, 4)))
@@ -91,7 +89,7 @@ def random_table(seed: int) -> MLP:
 
 
 @pytest.mark.parametrize("shared", [227, 99, 64])
-def test_every_source_is_where_the_plan_says(shared: int) -> None:
+def test_every_source_is_where_the_plan_says(shared):
     """The plan walked through as the kernel does, with what lies in registers and in every place of shared memory."""
     planned = 0
     for seed in range(150):
@@ -103,7 +101,7 @@ def test_every_source_is_where_the_plan_says(shared: int) -> None:
         assert plan["shared_bytes"] == plan["weights"] + plan["warps"] * plan["region"] <= shared * KIB
         held, places, packed, pieces = None, {}, 0, 0
 
-        def write(region: int, value: object, bytes_: int, places: dict = places, plan: dict = plan) -> None:
+        def write(region, value, bytes_, places=places, plan=plan):
             assert region % 16 == 0 and 0 <= region <= plan["region"] - bytes_
             for at in [at for at, (_, size) in places.items() if at < region + bytes_ and region < at + size]:
                 del places[at]
@@ -142,7 +140,7 @@ def test_every_source_is_where_the_plan_says(shared: int) -> None:
 
 
 @pytest.mark.parametrize("capability", SHARED)
-def test_workspaces_cover_any_offsets(capability: int) -> None:
+def test_workspaces_cover_any_offsets(capability):
     for n, k in SIZES:
         plan = chain(SKIPS, precision="float16", n=n, k=k, capability=capability, shared_bytes=SHARED[capability])
         assert plan["task_rows"] % (32 * plan["warps"]) == 0
@@ -150,7 +148,7 @@ def test_workspaces_cover_any_offsets(capability: int) -> None:
         assert plan["workspace"] >= k * plan["packed_bytes"] + 4 * (k + 1)
 
 
-def test_which_way_a_network_goes() -> None:
+def test_which_way_a_network_goes():
     """Chained are those of the benchmarks, in 16 bits; what does not fit goes in tiles, and what is wide by layers."""
     with emulated():
         for layers in (plain(64, 4), plain(32, 3), NeRF(width=64).layers, nerf(128, 8)):
@@ -168,7 +166,7 @@ def test_which_way_a_network_goes() -> None:
         assert way(plain(64, 4), "bfloat16") == "layers"
 
 
-def test_what_stays_where() -> None:
+def test_what_stays_where():
     """The published network at width 64: weights resident, its skip's encoding kept, no value ever stored."""
     plan = chain(NeRF(width=64).layers)
     assert plan["width"] == 64 and plan["resident"] and plan["warps"] == 12 and plan["region"] == 4 * 2 * 512
@@ -185,7 +183,7 @@ def test_what_stays_where() -> None:
     assert chain(plain(130, 4)) == "a layer must have at most 128 features"
 
 
-def test_plans_of_four_warps_have_whole_groups() -> None:
+def test_plans_of_four_warps_have_whole_groups():
     for layers in (plain(64, 4), plain(32, 3), NeRF(width=64).layers, nerf(128, 8), SKIPS):
         for shared in (227, 99, 64):
             alone, together = (chain(layers, shared_bytes=shared * KIB, groups=groups) for groups in (False, True))
@@ -199,7 +197,7 @@ def test_plans_of_four_warps_have_whole_groups() -> None:
                 assert {**alone, "groups": True} == together
 
 
-def test_four_warps_multiply_only_on_hopper_and_for_those_who_ask() -> None:
+def test_four_warps_multiply_only_on_hopper_and_for_those_who_ask():
     rule = "wgmma must be asked for with compute capability 9.0 and kernels compiled for sm_90a"
     assert not chain(plain(64, 4))["groups"]
     for capability in (75, 80, 89, 100, 103, 120):

@@ -1,9 +1,6 @@
 """Whole training steps on the emulated device: every CUDA kernel of a step, in the trainer's own order and types."""
 
-from __future__ import annotations
-
 import contextlib
-from pathlib import Path
 
 import pytest
 from emulated import emulated
@@ -15,7 +12,7 @@ from voronerf.training.trainer import Trainer
 STEPS = 16
 
 
-def losses(out: Path, precision: str, *, on_device: bool) -> tuple[list[float], Trainer]:
+def losses(out, precision, *, on_device):
     """Of the steps of a run that splits in the middle."""
     config = TrainConfig(
         out=out, steps=STEPS, cells=(4,), split_at=(0.5,), width=16, depth=2, rays=32, samples=8, lr=0.005,
@@ -33,7 +30,7 @@ def losses(out: Path, precision: str, *, on_device: bool) -> tuple[list[float], 
 
 @pytest.mark.native
 @pytest.mark.parametrize(("precision", "allowed"), [("fp32", 1e-3), ("bf16", 0.05), ("fp16", 0.02)])
-def test_steps_are_those_of_the_cpu(tmp_path: Path, precision: str, allowed: float) -> None:
+def test_steps_are_those_of_the_cpu(tmp_path, precision, allowed):
     expected, _ = losses(tmp_path / "cpu", "fp32", on_device=False)
     found, trainer = losses(tmp_path / "emulated", precision, on_device=True)
     assert trainer.router.num_cells == 4

@@ -1,7 +1,5 @@
 """What the emulation finds: every planted bug, by results, by its own checks, or by a sanitizer."""
 
-from __future__ import annotations
-
 import os
 import random
 import subprocess
@@ -59,7 +57,7 @@ BUGS = [
 """Bug of planted.cu (p) or of group_product.cu, sanitizer, and what must come out."""
 
 
-def run(command: list[str], sanitizer: str = "none") -> subprocess.CompletedProcess[str]:
+def run(command, sanitizer="none"):
     environment = {**os.environ, "PYTHONMALLOC": "malloc"}
     if sanitizer != "none":
         name = {"address": "libasan.so", "thread": "libtsan.so"}[sanitizer]
@@ -72,7 +70,7 @@ def run(command: list[str], sanitizer: str = "none") -> subprocess.CompletedProc
     return subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-def script(name: str, sanitizer: str, *arguments: str) -> str:
+def script(name, sanitizer, *arguments):
     """What a script of this folder says of the module under a sanitizer."""
     built = run([str(HERE / "emulation_build.py"), sanitizer])
     assert built.returncode == 0, built.stdout
@@ -80,7 +78,7 @@ def script(name: str, sanitizer: str, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize(("bug", "sanitizer", "expected"), BUGS)
-def test_finds(bug: str, sanitizer: str, expected: str) -> None:
+def test_finds(bug, sanitizer, expected):
     found = script("bugs.py", sanitizer, bug, "1")
     if expected in ("data race", "heap-buffer-overflow"):
         assert expected in found
@@ -89,13 +87,13 @@ def test_finds(bug: str, sanitizer: str, expected: str) -> None:
 
 
 @pytest.mark.parametrize("given", [["address"], ["thread"], ["address", "hostile"]], ids=" ".join)
-def test_kernels_touch_nothing_outside_and_race_with_nobody(given: list[str]) -> None:
+def test_kernels_touch_nothing_outside_and_race_with_nobody(given):
     """On sound arguments, and on hostile ones whatever the offsets say."""
     found = script("sanitize.py", *given)
     assert found.splitlines() == ["clean"], found
 
 
-def test_operations_pass_their_tests_on_the_emulated_device() -> None:
+def test_operations_pass_their_tests_on_the_emulated_device():
     """The tests of the operations themselves; ``make emulate-cuda`` takes more seeds."""
     command = ["-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--emulate-cuda", "1", "-W", "ignore"]
     files = [str(HERE.parent / "ops" / f"test_{op}.py") for op in OPERATIONS]
@@ -103,7 +101,7 @@ def test_operations_pass_their_tests_on_the_emulated_device() -> None:
     assert found.returncode == 0 and " passed" in found.stdout, found.stdout
 
 
-def test_descriptors_have_their_fields() -> None:
+def test_descriptors_have_their_fields():
     """By the table "Matrix Descriptor Format" of the PTX manual: bits 0-13, 16-29 and 32-45, in units of 16 bytes."""
     draw = random.Random(0)
     for _ in range(200):
@@ -117,7 +115,7 @@ def test_descriptors_have_their_fields() -> None:
 
 @pytest.mark.parametrize("bfloat16", [False, True])
 @pytest.mark.parametrize("tiles", [1, 2, 4, 8])
-def test_products_of_groups_of_four_warps(tiles: int, bfloat16: bool) -> None:
+def test_products_of_groups_of_four_warps(tiles, bfloat16):
     for seed, (steps, groups, order) in enumerate([(1, 1, "k"), (3, 2, "k"), (8, 1, "n")]):
         options = {"tiles": tiles, "bfloat16": bfloat16, "steps": steps, "groups": groups, "order": order}
         assert group_error(module(), seed=seed, **options) < 1e-6

@@ -4,13 +4,10 @@ Every activation, fused and layer by layer. What a value exceeds is cut off (65,
 infinite, for a GradScaler to see; the other samples and cells are as exact as ever.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from emulated import emulated
 from emulated_networks import KIB
-from torch import Tensor
 
 import voronerf
 from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
@@ -20,12 +17,12 @@ WAYS = pytest.mark.parametrize("shared", [227, 1], ids=["fused", "by-layers"])
 ROWS, CELLS = 40, 2
 
 
-def network(activation: str) -> MLP:
+def network(activation):
     """A layer of large values, one that reads them, and outputs of both."""
     return MLP((Layer((POSITIONS,), 16, activation), Layer((0,), 16, activation), Layer((1,), 3)), (2, 0))
 
 
-def given(layers: MLP, size: float) -> list[Tensor]:
+def given(layers, size):
     """Positions, weights and biases, numbers of float16. An eighth of the rows has a first layer of this size, positive
     in half of the columns; the other rows have one of 1."""
     torch.manual_seed(1)
@@ -39,7 +36,7 @@ def given(layers: MLP, size: float) -> list[Tensor]:
     return [positions, *(parameter.half().float() for parameter in parameters)]
 
 
-def outcome(layers: MLP, parts: list[Tensor], dtype: torch.dtype, backend: str, scale: float = 1.0) -> list[Tensor]:
+def outcome(layers, parts, dtype, backend, scale=1.0):
     """Output, gradients of positions, weights and biases, for a gradient of ``scale``; as in training, parameters are
     in float32, and float16 is autocast's."""
     leaves = [part.to(dtype).requires_grad_() for part in parts]
@@ -50,7 +47,7 @@ def outcome(layers: MLP, parts: list[Tensor], dtype: torch.dtype, backend: str, 
     return [out, *torch.autograd.grad(out, leaves, torch.full_like(out, scale))]
 
 
-def run(layers: MLP, parts: list[Tensor], shared: int, scale: float = 1.0) -> list[Tensor]:
+def run(layers, parts, shared, scale=1.0):
     with emulated(shared_bytes=shared * KIB):
         return outcome(layers, parts, torch.float32, "native", scale)
 
@@ -58,7 +55,7 @@ def run(layers: MLP, parts: list[Tensor], shared: int, scale: float = 1.0) -> li
 @WAYS
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("size", [0.5 * LARGEST, LARGEST - 32, 65519.0, 65520.0, 2 * LARGEST, 1e6, 1e30])
-def test_values_up_to_the_limit_are_exact_and_those_beyond_cut_off(activation: str, size: float, shared: int) -> None:
+def test_values_up_to_the_limit_are_exact_and_those_beyond_cut_off(activation, size, shared):
     """From 65,520 on they would round to infinity. Nothing is a NaN, and what is not large is as it should be."""
     layers = network(activation)
     parts = given(layers, size)
@@ -75,7 +72,7 @@ def test_values_up_to_the_limit_are_exact_and_those_beyond_cut_off(activation: s
 
 @WAYS
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_gradients_of_a_scaled_loss(activation: str, shared: int) -> None:
+def test_gradients_of_a_scaled_loss(activation, shared):
     """They are the same for a power of 2, up to where float16 ends; beyond, not finite, for a GradScaler to see."""
     layers = network(activation)
     parts = given(layers, 1.0)

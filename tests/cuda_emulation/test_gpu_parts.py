@@ -1,7 +1,5 @@
 """The programs of ``make gpu-check`` on the CPU, so that their first run on a GPU does not end in a slip of theirs."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import itertools

@@ -1,7 +1,5 @@
 """The index maps of the CUDA kernels (csrc/common/index_maps.h), all of them: every element once, none out of range."""
 
-from __future__ import annotations
-
 import bisect
 import itertools
 
@@ -12,7 +10,7 @@ THREADS, ROWS, COLUMNS = 128, 64, 128
 """Of a block of the products, and its tile."""
 
 
-def test_a_lanes_sums_are_those_of_the_tile() -> None:
+def test_a_lanes_sums_are_those_of_the_tile():
     """A tile [16][8] of mma.sync, and pairs of neighbours, which the kernels write at once."""
     place = module().accumulator_place
     found = [place(lane, i) for lane in range(32) for i in range(4)]
@@ -23,14 +21,14 @@ def test_a_lanes_sums_are_those_of_the_tile() -> None:
             assert place(lane, i + 1) == (row, column + 1) and column % 2 == 0
 
 
-def test_the_sums_of_a_block_are_its_tile() -> None:
+def test_the_sums_of_a_block_are_its_tile():
     place = module().product_place
     found = [place(*at) for at in itertools.product(range(THREADS), range(2), range(8), range(4))]
     assert sorted(found) == list(itertools.product(range(ROWS), range(COLUMNS)))
 
 
 @pytest.mark.parametrize("columns", range(8, COLUMNS + 64, 8))
-def test_a_block_with_fewer_columns_has_just_those(columns: int) -> None:
+def test_a_block_with_fewer_columns_has_just_those(columns):
     emulated = module()
     found = set()
     for thread in range(THREADS):
@@ -45,7 +43,7 @@ def test_a_block_with_fewer_columns_has_just_those(columns: int) -> None:
     # By rows: chunks of 64 bytes; by depth: 32 or 16 rows of 64 or 128 elements of 2 or 4 bytes.
     [(64, 4), (128, 4), (32, 8), (32, 16), (16, 16), (16, 32)],
 )
-def test_threads_copy_every_word_of_a_tile(rows: int, words: int) -> None:
+def test_threads_copy_every_word_of_a_tile(rows, words):
     turns = rows * words // THREADS
     found = [module().fetched_word(t, i, THREADS, words) for t in range(THREADS) for i in range(turns)]
     assert sorted(found) == list(itertools.product(range(rows), range(words)))
@@ -53,7 +51,7 @@ def test_threads_copy_every_word_of_a_tile(rows: int, words: int) -> None:
 
 @pytest.mark.parametrize("inputs", [16, 112, 128, 144, 256, 272])
 @pytest.mark.parametrize("outputs", [16, 48, 64, 80, 128, 336])
-def test_blocks_cover_the_weight_gradients_of_all_cells(outputs: int, inputs: int) -> None:
+def test_blocks_cover_the_weight_gradients_of_all_cells(outputs, inputs):
     emulated, cells = module(), 3
     tiles = emulated.gradient_tiles(outputs, inputs, ROWS, COLUMNS)
     found = [emulated.gradient_tile(block, outputs, inputs, ROWS, COLUMNS) for block in range(tiles * cells)]
@@ -63,9 +61,9 @@ def test_blocks_cover_the_weight_gradients_of_all_cells(outputs: int, inputs: in
 
 @pytest.mark.parametrize("step", [16, 32])
 @pytest.mark.parametrize("parts", [1, 2, 3, 7, 64])
-def test_parts_of_a_cells_rows_are_all_of_them(parts: int, step: int) -> None:
+def test_parts_of_a_cells_rows_are_all_of_them(parts, step):
     for begin, rows in itertools.product((0, 5, 1000), (0, 1, 15, 16, 17, 33, 100, 448, 449, 4097)):
-        found: list[int] = []
+        found = []
         for part in range(parts):
             first, last = module().part_of_rows(begin, begin + rows, part, parts, step)
             if first < last:
@@ -74,7 +72,7 @@ def test_parts_of_a_cells_rows_are_all_of_them(parts: int, step: int) -> None:
         assert found == list(range(begin, begin + rows))
 
 
-def test_a_tile_is_of_the_cell_that_counts_it() -> None:
+def test_a_tile_is_of_the_cell_that_counts_it():
     """Every way in which up to four cells have up to three tiles each."""
     for cells in range(1, 5):
         for tiles in itertools.product(range(4), repeat=cells):
@@ -84,14 +82,14 @@ def test_a_tile_is_of_the_cell_that_counts_it() -> None:
             assert found == owners
 
 
-def test_the_first_row_of_a_cell() -> None:
+def test_the_first_row_of_a_cell():
     for n in range(6):
         for keys in itertools.combinations_with_replacement(range(5), n):
             for value in range(-1, 6):
                 assert module().first_above(list(keys), value) == bisect.bisect_right(keys, value)
 
 
-def test_columns_of_sources_and_packed_ones_are_each_others_inverse() -> None:
+def test_columns_of_sources_and_packed_ones_are_each_others_inverse():
     emulated = module()
     for widths in itertools.chain.from_iterable(
         itertools.product((1, 3, 15, 16, 17, 63), repeat=count) for count in (1, 2, 3)
@@ -110,7 +108,7 @@ def test_columns_of_sources_and_packed_ones_are_each_others_inverse() -> None:
         ]
 
 
-def test_buckets_keep_cells_that_are_none_apart() -> None:
+def test_buckets_keep_cells_that_are_none_apart():
     low, high = -(2**31), 2**31 - 1
     for k in (1, 2, 5, 1022, 65_535, high - 1, high):
         for cell in {low, -2, -1, 0, 1, k // 2, k - 1, min(k, high), min(k + 1, high), high}:

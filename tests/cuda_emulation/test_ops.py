@@ -3,8 +3,6 @@
 Sizes are small: a block of 256 threads is 256 fibers. The tests of the operations themselves run in test_emulation.py.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from emulated import emulated
@@ -22,12 +20,12 @@ def gpu(request):
         yield
 
 
-def both(op, *args, **options) -> tuple[torch.Tensor, torch.Tensor]:
+def both(op, *args, **options):
     return tuple(op(*args, backend=backend, **options) for backend in ("native", "reference"))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_look_ups(dtype: torch.dtype) -> None:
+def test_look_ups(dtype):
     for n, k in ((0, 3), (1, 1), (300, 17), (270, 700)):
         # Integers: many ties, which go to the lowest index.
         points, centres = (torch.randint(-3, 4, (count, 3)).to(dtype) for count in (n, k))
@@ -43,8 +41,8 @@ def test_look_ups(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_draw_cell(weighted: bool) -> None:
-    def of(k: int) -> VoronoiDiagram:
+def test_draw_cell(weighted):
+    def of(k):
         return VoronoiDiagram(torch.rand(k, 3), weights=torch.rand(k) / 4 if weighted else None)
 
     diagram, _ = of(4).refine({1: of(3), 3: of(3)})
@@ -56,7 +54,7 @@ def test_draw_cell(weighted: bool) -> None:
     assert int((found != expected).sum()) <= 1 and found[7] == 0
 
 
-def test_draw_cell_stays_inside_unsound_tables() -> None:
+def test_draw_cell_stays_inside_unsound_tables():
     points, centres = torch.rand(50, 3), torch.rand(3, 3)
     for offsets, child, depth in (
         ([0, 3], [5, 1_000_000_000, 9], 3),  # no such diagram
@@ -73,7 +71,7 @@ def test_draw_cell_stays_inside_unsound_tables() -> None:
 SIZES = [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600), (2100, 1022), (2100, 1023), (300, 65_534), (300, 65_535)]
 
 
-def sorted_by(way: str, cells: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+def sorted_by(way, cells, k):
     """Into memory that is poisoned."""
     order, offsets = torch.full_like(cells, -7), torch.full((k + 1,), -7, dtype=torch.int32)
     _native.sort_cells(cells, order, offsets, "cell_sort", way)
@@ -82,7 +80,7 @@ def sorted_by(way: str, cells: torch.Tensor, k: int) -> tuple[torch.Tensor, torc
 
 @pytest.mark.parametrize("way", _native.SORTS)
 @pytest.mark.parametrize(("n", "k"), SIZES)
-def test_cell_sort(n: int, k: int, way: str) -> None:
+def test_cell_sort(n, k, way):
     if way == "counting" and k > 1022:
         with pytest.raises(RuntimeError, match="cell_sort: too many cells to be counted in shared memory"):
             sorted_by(way, torch.zeros(n, dtype=torch.int32), k)
@@ -95,7 +93,7 @@ def test_cell_sort(n: int, k: int, way: str) -> None:
 
 @pytest.mark.parametrize("k", [3, 1022, 1023, 65_534, 65_535])
 @pytest.mark.parametrize("way", ["automatic", "radix"])
-def test_cell_sort_keeps_cells_that_are_none_at_the_ends(way: str, k: int) -> None:
+def test_cell_sort_keeps_cells_that_are_none_at_the_ends(way, k):
     low, high = -(2**31), 2**31 - 1
     cells = torch.tensor([2, -1, 0, k, 1, low, high, k - 1, 65_536, -65_536, 1], dtype=torch.int32)
     order, offsets = sorted_by(way, cells, k)

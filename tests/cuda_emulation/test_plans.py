@@ -1,7 +1,5 @@
 """How grouped_mlp runs on the GPUs there are, as a pure function: every launch can be made, and fits its workspace."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest
@@ -39,7 +37,7 @@ MORE = [*SIZES, (1, 4096), (4_000_000, 16), (4_000_000, 256), (2**31 - 1, 16)]
 
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("gpu", GPUS)
-def test_every_launch_can_be_made(gpu: str, network: str) -> None:
+def test_every_launch_can_be_made(gpu, network):
     table, device = numbers(NETWORKS[network]), GPUS[gpu]
     for (n, k), precision, backward in itertools.product(MORE, range(4), (False, True)):
         plan = module().plan_for(table, precision, n, k, backward, device)
@@ -64,7 +62,7 @@ def test_every_launch_can_be_made(gpu: str, network: str) -> None:
 
 
 @pytest.mark.parametrize("gpu", GPUS)
-def test_workspaces_are_moderate(gpu: str) -> None:
+def test_workspaces_are_moderate(gpu):
     """Of 4 M rows: what is kept between layers does not grow with the batch, nor do partial gradients beyond 1 GiB."""
     device = GPUS[gpu]
     for network, k, backward in itertools.product(("w64d4", "mlp32", "nerf64", "nerf256"), (16, 256), (False, True)):
@@ -74,7 +72,7 @@ def test_workspaces_are_moderate(gpu: str) -> None:
 
 @pytest.mark.parametrize("gpu", GPUS)
 @pytest.mark.parametrize("network", ["w64d4", "mlp32", "nerf64"])
-def test_networks_of_the_benchmarks_are_fused(network: str, gpu: str) -> None:
+def test_networks_of_the_benchmarks_are_fused(network, gpu):
     """Forward, and chained, wherever tensor cores multiply them; backward where a block can hold a tile's values."""
     table, device = numbers(NETWORKS[network]), GPUS[gpu]
     precision = PRECISIONS.index("bfloat16" if device[0] >= 80 else "float16")
@@ -84,7 +82,7 @@ def test_networks_of_the_benchmarks_are_fused(network: str, gpu: str) -> None:
 
 
 @pytest.mark.parametrize("capability", SHARED)
-def test_workspaces_of_tiles_cover_any_offsets(capability: int) -> None:
+def test_workspaces_of_tiles_cover_any_offsets(capability):
     with emulated(capability=capability, shared_bytes=SHARED[capability]):
         for (n, k), backward, precision in itertools.product(SIZES, (False, True), PRECISIONS):
             found = plan(BRANCHED, n, k, precision=precision, backward=backward)
@@ -94,7 +92,7 @@ def test_workspaces_of_tiles_cover_any_offsets(capability: int) -> None:
 
 
 @pytest.mark.parametrize(("capability", "compiled"), [(90, 120), (75, 120), (90, 75), (80, 80)])
-def test_what_is_multiplied_is_what_the_kernels_were_compiled_for(capability: int, compiled: int) -> None:
+def test_what_is_multiplied_is_what_the_kernels_were_compiled_for(capability, compiled):
     """A newer device runs code for an older one, which does not have the newer one's instructions."""
     modern = min(capability, compiled) >= 80
     expected = {"float32": 0, "bfloat16": 1 if modern else 0, "float16": 2, "tf32": 3 if modern else 0}
@@ -106,7 +104,7 @@ def test_what_is_multiplied_is_what_the_kernels_were_compiled_for(capability: in
             check(BRANCHED, [30, 5], 3, "bfloat16")
 
 
-def test_splits_fill_the_device_within_their_memory() -> None:
+def test_splits_fill_the_device_within_their_memory():
     """A slab of sorted rows has few of the cells, whatever their number."""
     loaded, most = module(), 512 << 20
     loaded.multiprocessors(132)
@@ -124,7 +122,7 @@ def test_splits_fill_the_device_within_their_memory() -> None:
 
 
 @pytest.mark.parametrize("shared", [64, 99, 227])
-def test_memory_of_layers_is_bounded(shared: int) -> None:
+def test_memory_of_layers_is_bounded(shared):
     """Values of a slab keep within their share whatever the batch, and tiles cover any offsets."""
     with emulated(shared_bytes=shared * KIB):
         for width, (n, k) in itertools.product((64, 300, 4096), SIZES):

@@ -1,22 +1,15 @@
 """Scenes written to folders, as Blender's and as captures."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from voronerf.data import Scene
-from voronerf.rendering.cameras import Cameras
-
 Contents = dict[str, Any]
 
 
-def write_blender(folder: Path, scene: Scene, angle: float) -> None:
+def write_blender(folder, scene, angle):
     """Writes a scene the way Blender's are stored."""
     for name, split in (("train", scene.train), ("test", scene.test)):
         (folder / name).mkdir(parents=True)
@@ -27,7 +20,7 @@ def write_blender(folder: Path, scene: Scene, angle: float) -> None:
         (folder / f"transforms_{name}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
 
 
-def write_capture(folder: Path, cameras: Cameras, **entries: Any) -> None:
+def write_capture(folder, cameras, **entries):
     """A capture whose image i is of grey i; its frames are listed from the last to the first."""
     folder.mkdir(exist_ok=True)
     frames = []
@@ -38,7 +31,7 @@ def write_capture(folder: Path, cameras: Cameras, **entries: Any) -> None:
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 20.0, **entries, "frames": frames[::-1]}))
 
 
-def rewrite(folder: Path, change: Callable[[Contents], object], name: str = "transforms", **options: Any) -> Contents:
+def rewrite(folder, change, name="transforms", **options):
     """Changes the contents of a file of transforms; returns them."""
     path = folder / f"{name}.json"
     contents = json.loads(path.read_text())

@@ -1,12 +1,8 @@
 """Every broken scene is one clear line that names the file."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +16,7 @@ POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1]]
 NOISE = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
 
 
-def write_noise(folder: Path, count: int = 3, **entries: Any) -> None:
+def write_noise(folder, count=3, **entries):
     """A capture of noise images from one place."""
     folder.mkdir(exist_ok=True)
     for index in range(count):
@@ -29,19 +25,19 @@ def write_noise(folder: Path, count: int = 3, **entries: Any) -> None:
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 9.0, **entries, "frames": frames}))
 
 
-def fails(folder: Path | str, *parts: str, downscale: int = 1) -> None:
+def fails(folder, *parts, downscale=1):
     for part in parts:
         refuses(part, load_scene, folder, downscale=downscale, error=SceneError)
 
 
-def test_folder(tmp_path: Path) -> None:
+def test_folder(tmp_path):
     fails(tmp_path / "nowhere", "nowhere: there is no such folder")
     fails(tmp_path, "is no scene", "transforms_train.json", "transforms.json")
     (tmp_path / "file").write_text("")
     fails(tmp_path / "file", "file: is no folder")
 
 
-def test_downscale(tmp_path: Path) -> None:
+def test_downscale(tmp_path):
     for downscale in (0, -2):
         fails("builtin", f"downscale must be >= 1, got {downscale}", downscale=downscale)
     fails("builtin", "leaves no pixel of 100 x 100", downscale=101)
@@ -64,12 +60,12 @@ def test_downscale(tmp_path: Path) -> None:
         ('{"frames": [{"file_path": "x.png"}]}', "frame 0 (x.png): transform_matrix"),
     ],
 )
-def test_json(tmp_path: Path, text: str | bytes, reason: str) -> None:
+def test_json(tmp_path, text, reason):
     (tmp_path / "transforms.json").write_bytes(text if isinstance(text, bytes) else text.encode())
     fails(tmp_path, "transforms.json", reason)
 
 
-def edited(row: int, column: int, value: Any) -> list[list[Any]]:
+def edited(row, column, value):
     matrix = [list(line) for line in POSE]
     matrix[row][column] = value
     return matrix
@@ -93,20 +89,20 @@ def edited(row: int, column: int, value: Any) -> list[list[Any]]:
     ],
     ids=range(14),
 )
-def test_pose(tmp_path: Path, matrix: Any, reason: str) -> None:
+def test_pose(tmp_path, matrix, reason):
     write_noise(tmp_path)
     rewrite(tmp_path, lambda contents: contents["frames"][1].update(transform_matrix=matrix))
     fails(tmp_path, "transforms.json: frame 1 (1.png)", reason)
 
 
-def test_what_is_sound_loads(tmp_path: Path) -> None:
+def test_what_is_sound_loads(tmp_path):
     write_noise(tmp_path)
     assert len(load_scene(tmp_path).train) == 2
     rewrite(tmp_path, lambda contents: contents["frames"][1].update(transform_matrix=POSE[:3]))
     load_scene(tmp_path)
 
 
-def test_images(tmp_path: Path) -> None:
+def test_images(tmp_path):
     write_noise(tmp_path)
     path, whole = tmp_path / "2.png", (tmp_path / "2.png").read_bytes()
     for broken, reason in (
@@ -149,20 +145,20 @@ def test_images(tmp_path: Path) -> None:
         ({"cy": 1e39}, "cy must be a finite number, got 1e+39"),
     ],
 )
-def test_intrinsics_and_lens(tmp_path: Path, entries: dict[str, Any], reason: str) -> None:
+def test_intrinsics_and_lens(tmp_path, entries, reason):
     write_noise(tmp_path, **entries)
     fails(tmp_path, reason)
 
 
 @pytest.mark.skipif(not hasattr(sys, "get_int_max_str_digits"), reason="this Python reads integers of any length")
-def test_more_digits_than_python_reads(tmp_path: Path) -> None:
+def test_more_digits_than_python_reads(tmp_path):
     write_noise(tmp_path, k1=0)
     path = tmp_path / "transforms.json"
     path.write_text(path.read_text().replace('"k1": 0', '"k1": 1' + "0" * sys.get_int_max_str_digits()))
     fails(tmp_path, "transforms.json: is no JSON")
 
 
-def test_blender(tmp_path: Path) -> None:
+def test_blender(tmp_path):
     write_noise(tmp_path)
     contents = json.loads((tmp_path / "transforms.json").read_text())
     (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")

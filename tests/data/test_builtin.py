@@ -1,7 +1,5 @@
 """The built-in scene against its own formulas, and the box that is carved from its masks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,22 +8,21 @@ from helpers import refuses
 from voronerf.data import builtin_scene, load_scene
 from voronerf.data.builtin.opaque import bounds, cast
 from voronerf.data.builtin.opaque_solids import SOLIDS
-from voronerf.data.builtin.solids import Box, Cylinder, Solid, Sphere, Torus, rotation
+from voronerf.data.builtin.solids import Box, Cylinder, Sphere, Torus, rotation
 from voronerf.data.carving import carve_box
-from voronerf.data.scene import Scene
 from voronerf.rendering.cameras import Cameras
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     return builtin_scene(40)
 
 
-def white(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def white(points, normals):
     return np.ones_like(points)
 
 
-def inside(solid: Solid, points: np.ndarray) -> np.ndarray:
+def inside(solid, points):
     """Whether points are in a solid, from its definition."""
     local = points - np.array(solid.centre)
     if solid.turn is not None:
@@ -51,7 +48,7 @@ def inside(solid: Solid, points: np.ndarray) -> np.ndarray:
     ],
     ids=lambda solid: type(solid).__name__,
 )
-def test_hits_against_marching(solid: Solid) -> None:
+def test_hits_against_marching(solid):
     generator = np.random.default_rng(0)
     origins = generator.normal(size=(150, 3))
     origins = (2 * origins / np.linalg.norm(origins, axis=-1, keepdims=True)).astype(np.float32)
@@ -79,7 +76,7 @@ def test_hits_against_marching(solid: Solid) -> None:
     assert (points >= box[0] - 1e-3).all() and (points <= box[1] + 1e-3).all()
 
 
-def test_every_solid_is_seen_and_in_the_box() -> None:
+def test_every_solid_is_seen_and_in_the_box():
     box = bounds()
     for solid in SOLIDS:
         own = solid.bounds()
@@ -90,7 +87,7 @@ def test_every_solid_is_seen_and_in_the_box() -> None:
         assert np.isfinite(depth).all()
 
 
-def test_pixels_are_the_average_of_their_rays(scene: Scene) -> None:
+def test_pixels_are_the_average_of_their_rays(scene):
     """A pixel against rays cast by the cameras themselves, 3 x 3 of them."""
     cameras = scene.test.cameras
     offsets = (torch.arange(3) + 0.5) / 3
@@ -103,7 +100,7 @@ def test_pixels_are_the_average_of_their_rays(scene: Scene) -> None:
         assert np.abs(found.numpy() - expected).max() < 2.5 / 255
 
 
-def test_shape_and_determinism(scene: Scene) -> None:
+def test_shape_and_determinism(scene):
     assert scene.train.images.shape == (100, 40, 40, 4) and scene.test.images.shape == (25, 40, 40, 4)
     assert (scene.near, scene.far, scene.background) == (2, 6, "white")
     again = builtin_scene(40, train_views=100, test_views=1)
@@ -119,7 +116,7 @@ def test_shape_and_determinism(scene: Scene) -> None:
     assert float(nearest.min()) > 0.02  # no test view is a training view
 
 
-def test_views_differ_by_highlights() -> None:
+def test_views_differ_by_highlights():
     """The same point of a glossy solid has another colour from elsewhere."""
     point = np.array([[0.62, 0.30, -0.10 + 0.359]], dtype=np.float32)
     colours = []
@@ -130,14 +127,14 @@ def test_views_differ_by_highlights() -> None:
     assert np.abs(colours[0] - colours[1]).max() > 0.02
 
 
-def test_sizes() -> None:
+def test_sizes():
     assert load_scene("builtin", downscale=50).train.images.shape == (100, 2, 2, 4)
     assert builtin_scene(1, train_views=1, test_views=1).train.images.shape == (1, 1, 1, 4)
     refuses("size must be >= 1, got 0", builtin_scene, 0)
     refuses("at least one view", builtin_scene, 4, train_views=0)
 
 
-def test_carved_box_holds_the_scene_and_is_tight(scene: Scene) -> None:
+def test_carved_box_holds_the_scene_and_is_tight(scene):
     """One wrong mask does not cut it."""
     masks = scene.train.images[..., 3]
     wrong = masks.clone()
@@ -152,7 +149,7 @@ def test_carved_box_holds_the_scene_and_is_tight(scene: Scene) -> None:
     assert (scene.box[0] - box[0])[:2].max() < 0.12 * sides and (scene.box[0] - box[0])[2] < 0.5 * sides
 
 
-def test_no_box_without_silhouettes(scene: Scene) -> None:
+def test_no_box_without_silhouettes(scene):
     cameras, alpha = scene.train.cameras, scene.train.images[..., 3]
     assert carve_box(cameras, torch.zeros_like(alpha), 2.0, 6.0) is None
     assert carve_box(cameras, torch.full_like(alpha, 255), 2.0, 6.0) is None

@@ -1,9 +1,5 @@
 """Decoding and downscaling, against slow averages."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -11,7 +7,7 @@ from PIL import Image
 from voronerf.data.images import area_average, read_image, read_images
 
 
-def test_area_average_is_that_of_the_composited_image() -> None:
+def test_area_average_is_that_of_the_composited_image():
     generator = np.random.default_rng(0)
     image = generator.integers(0, 256, (13, 10, 4), dtype=np.uint8)
     image[:6, :, 3] = generator.choice((0, 255), (6, 10))
@@ -28,14 +24,14 @@ def test_area_average_is_that_of_the_composited_image() -> None:
                 assert np.abs(found[y, x] - block).max() <= 1.01 / 255
 
 
-def test_area_average_does_not_bleed_hidden_colours() -> None:
+def test_area_average_does_not_bleed_hidden_colours():
     image = np.zeros((2, 2, 4), dtype=np.uint8)
     image[0, 0] = (200, 100, 50, 255)
     image[1, 1] = (0, 255, 0, 0)  # transparent green
     assert area_average(image, 2)[0, 0].tolist() == [200, 100, 50, 64]
 
 
-def test_opaque_average_and_identity() -> None:
+def test_opaque_average_and_identity():
     image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
     assert area_average(image, 1) is image
     assert np.array_equal(area_average(image, 4)[0, 0], np.rint(image.reshape(16, 3).mean(axis=0)))
@@ -43,7 +39,7 @@ def test_opaque_average_and_identity() -> None:
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 6, 8, 12, 16])
 @pytest.mark.parametrize("size", [(48, 64), (53, 67)])
-def test_jpeg_reduction_is_the_area_average(tmp_path: Path, factor: int, size: tuple[int, int]) -> None:
+def test_jpeg_reduction_is_the_area_average(tmp_path, factor, size):
     height, width = size
     y, x = np.mgrid[:height, :width]
     smooth = np.stack((127 + 100 * np.sin(x / 9), 127 + 100 * np.cos(y / 7), x + y), axis=-1).astype(np.uint8)
@@ -57,7 +53,7 @@ def test_jpeg_reduction_is_the_area_average(tmp_path: Path, factor: int, size: t
 
 
 @pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3), ("1", 3)])
-def test_modes(tmp_path: Path, mode: str, channels: int) -> None:
+def test_modes(tmp_path, mode, channels):
     path = tmp_path / "a.png"
     Image.new("RGB", (5, 4), (255, 255, 255)).convert(mode).save(path)
     pixels, _ = read_image(path, 1)
@@ -65,7 +61,7 @@ def test_modes(tmp_path: Path, mode: str, channels: int) -> None:
     assert (pixels == 255).all()
 
 
-def test_one_image_with_alpha_gives_all_alpha(tmp_path: Path) -> None:
+def test_one_image_with_alpha_gives_all_alpha(tmp_path):
     paths = [tmp_path / "a.png", tmp_path / "b.png"]
     Image.new("RGB", (3, 2), (1, 2, 3)).save(paths[0])
     Image.new("RGBA", (3, 2), (4, 5, 6, 7)).save(paths[1])

@@ -1,7 +1,5 @@
 """The rich built-in scene: its rays are cast by the op, whose tables must mean the same solids as NumPy's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,7 @@ from voronerf.data.builtin.rich import SOLIDS, caster
 from voronerf.data.builtin.solids import Box, Cylinder, Sphere, Torus, first_hits, normalised
 
 
-def rays(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def rays(count, seed=0):
     random = np.random.default_rng(seed)
     origins = normalised(random.normal(size=(count, 3)).astype(np.float32)) * np.float32(4)
     targets = random.uniform(-0.7, 0.7, size=(count, 3)).astype(np.float32)
@@ -22,7 +20,7 @@ def rays(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("solids", [FEW, SOLIDS], ids=["builtin", "rich"])
 @pytest.mark.parametrize("name", ["reference", pytest.param("warp", marks=pytest.mark.warp)])
-def test_backends_see_what_numpy_sees(name: str, solids: tuple) -> None:
+def test_backends_see_what_numpy_sees(name, solids):
     origins, directions = rays(4000)
     depth, which = first_hits(solids, origins, directions)
     found, number = caster(solids, name)(origins, directions)
@@ -41,14 +39,14 @@ def test_backends_see_what_numpy_sees(name: str, solids: tuple) -> None:
     assert caster(solids, name)(origins[:0], LIGHT)[0].shape == (0,) == first_hits(solids, origins[:0], LIGHT)[0].shape
 
 
-def test_every_kind_is_there_often_and_stands_on_the_plinth() -> None:
+def test_every_kind_is_there_often_and_stands_on_the_plinth():
     for kind, least in ((Box, 190), (Sphere, 100), (Cylinder, 35), (Torus, 30)):
         assert sum(isinstance(solid, kind) for solid in SOLIDS) >= least
     lows = [float(solid.bounds()[0, 2]) for solid in SOLIDS[1:]]
     assert min(lows) >= -0.4605, "nothing sinks into the plinth's top at -0.46"
 
 
-def test_the_scene_is_of_the_usual_form() -> None:
+def test_the_scene_is_of_the_usual_form():
     scene = rich_scene(24, train_views=2, test_views=1)
     assert scene.name == "builtin-rich" and scene.train.images.shape == (2, 24, 24, 4) and len(scene.test) == 1
     alpha = scene.test.images[0, ..., 3].float() / 255
@@ -64,14 +62,14 @@ def test_the_scene_is_of_the_usual_form() -> None:
         rich_scene(8, backend="native")
 
 
-def test_it_is_named_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_named_on_the_command_line(monkeypatch):
     import voronerf.data as data
 
     monkeypatch.setitem(data.BUILTIN, "builtin-rich", lambda size: size)
     assert load_scene("builtin-rich", downscale=4) == 25
 
 
-def test_shadows_are_cast_by_the_same_solids() -> None:
+def test_shadows_are_cast_by_the_same_solids():
     """A patch of floor behind a wall, seen from the lamp's side and from above: dark only where the wall stands."""
     floor = Box((0, 0, -0.1), lambda p, n: np.ones_like(p), gloss=0.0, half=(2.0, 2.0, 0.1))
     wall = Box((0, 0, 0.5), lambda p, n: np.ones_like(p), gloss=0.0, half=(0.3, 0.02, 0.5))

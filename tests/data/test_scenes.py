@@ -1,19 +1,15 @@
 """Loading good scenes: cameras fit their images, normalisation, splits."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from PIL import Image
 from scene_files import rewrite, write_blender, write_capture
-from torch import Tensor
 
 from voronerf.data import builtin_scene, load_scene
 from voronerf.data.capture import normalise_poses
@@ -23,14 +19,14 @@ from voronerf.rendering.volume import render_rays
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 
 
-def needs(name: str) -> Path:
+def needs(name):
     folder = DATA / name
     if not folder.is_dir():
         pytest.skip(f"{folder} is not there; set VORONERF_DATA to a folder that holds {name}")
     return folder
 
 
-def test_blender_round_trip(tmp_path: Path) -> None:
+def test_blender_round_trip(tmp_path):
     original = builtin_scene(24, train_views=6, test_views=2)
     write_blender(tmp_path / "toys", original, 0.6911112)
     scene = load_scene(tmp_path / "toys")
@@ -48,7 +44,7 @@ def test_blender_round_trip(tmp_path: Path) -> None:
     torch.testing.assert_close(half.train.truth(0, white), averaged, atol=1.01 / 255, rtol=0)
 
 
-def test_blender_without_alpha_has_no_box(tmp_path: Path) -> None:
+def test_blender_without_alpha_has_no_box(tmp_path):
     original = builtin_scene(12, train_views=5, test_views=1)
     write_blender(tmp_path, original, 0.69)
     for path in tmp_path.glob("*/*.png"):
@@ -58,7 +54,7 @@ def test_blender_without_alpha_has_no_box(tmp_path: Path) -> None:
     assert torch.equal(scene.train.truth(0, torch.ones(3)), scene.train.images[0] / 255)
 
 
-def test_a_capture_that_others_split(tmp_path: Path) -> None:
+def test_a_capture_that_others_split(tmp_path):
     """As torch-ngp's scripts write it: Blender's files, but with a principal point and distortion."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=4)
@@ -81,12 +77,12 @@ def test_a_capture_that_others_split(tmp_path: Path) -> None:
         assert b.cameras.distortion is not None and float(b.cameras.distortion[0, 0]) == pytest.approx(0.02)
 
 
-def test_files_from_elsewhere(tmp_path: Path) -> None:
+def test_files_from_elsewhere(tmp_path):
     """Names with the separators of Windows, a byte order mark, stems that come twice, suffixes in capitals."""
     original = builtin_scene(16, train_views=4, test_views=1)
     write_blender(tmp_path, original, 0.6911112)
 
-    def move(contents: dict[str, Any]) -> None:
+    def move(contents):
         for index, frame in enumerate(contents["frames"]):
             folder = tmp_path / f"cam{index % 2}"
             folder.mkdir(exist_ok=True)
@@ -100,13 +96,13 @@ def test_files_from_elsewhere(tmp_path: Path) -> None:
     assert load_scene(tmp_path).train.names == ("cam0_0", "cam1_0", "cam0_1", "cam1_1")
 
 
-def test_val_stands_in_for_test(tmp_path: Path) -> None:
+def test_val_stands_in_for_test(tmp_path):
     write_blender(tmp_path, builtin_scene(8, train_views=4, test_views=3), 0.69)
     (tmp_path / "transforms_test.json").rename(tmp_path / "transforms_val.json")
     assert len(load_scene(tmp_path).test) == 3
 
 
-def test_truth_composites() -> None:
+def test_truth_composites():
     split = builtin_scene(10, train_views=1, test_views=1).test
     colour, alpha = split.images[0, ..., :3] / 255, split.images[0, ..., 3:] / 255
     found = split.truth(0, torch.tensor((0.0, 0.5, 1.0)))[..., 1:2]
@@ -114,7 +110,7 @@ def test_truth_composites() -> None:
     torch.testing.assert_close(split.truth(0, None), colour * alpha)
 
 
-def test_capture(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_capture(tmp_path, caplog):
     orbit = orbit_cameras(20, radius=7, elevation=15, width=12, height=10, focal=20, centre=(5, -2, 3))
     write_capture(tmp_path / "room", orbit, cx=5.5, cy=6.5, k1=0.02, p2=-0.001)
     for index in (3, 4):
@@ -148,7 +144,7 @@ def test_capture(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
 
 
 @pytest.mark.parametrize("rig", ["outward", "parallel", "one place"])
-def test_rays_of_a_capture_without_a_common_focus_are_finite(tmp_path: Path, rig: str) -> None:
+def test_rays_of_a_capture_without_a_common_focus_are_finite(tmp_path, rig):
     """Among them one whose camera stands at the origin, from which near is measured."""
     poses = orbit_cameras(9, radius=2, elevation=0, width=4, height=4, focal=4).poses
     if rig == "outward":
@@ -164,7 +160,7 @@ def test_rays_of_a_capture_without_a_common_focus_are_finite(tmp_path: Path, rig
     origins = torch.cat([split.cameras.origins for split in (scene.train, scene.test)])
     assert float(origins.norm(dim=-1).min()) < 1e-6
 
-    def field(positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def field(positions, directions, ray_index):
         assert positions.isfinite().all()
         return torch.full_like(positions, 0.5), torch.ones(len(positions))
 
@@ -176,7 +172,7 @@ def test_rays_of_a_capture_without_a_common_focus_are_finite(tmp_path: Path, rig
         assert (rendered.depth > scene.near).all() and (rendered.depth < scene.far).all()
 
 
-def test_names_of_a_capture_are_all_different(tmp_path: Path) -> None:
+def test_names_of_a_capture_are_all_different(tmp_path):
     write_capture(tmp_path, orbit_cameras(8, radius=2, elevation=5, width=4, height=4, focal=4))
     path = tmp_path / "transforms.json"
     contents = json.loads(path.read_text())
@@ -189,7 +185,7 @@ def test_names_of_a_capture_are_all_different(tmp_path: Path) -> None:
         frame["file_path"] = name
     path.write_text(json.dumps(contents))
 
-    def names() -> list[str]:
+    def names():
         scene = load_scene(tmp_path)
         return sorted(scene.train.names + scene.test.names)
 
@@ -204,10 +200,10 @@ def test_names_of_a_capture_are_all_different(tmp_path: Path) -> None:
     assert names() == list("abcdefgh")
 
 
-def test_capture_intrinsics_per_frame_and_from_angles(tmp_path: Path) -> None:
+def test_capture_intrinsics_per_frame_and_from_angles(tmp_path):
     write_capture(tmp_path, orbit_cameras(3, radius=2, elevation=5, width=12, height=10, focal=4))
 
-    def change(contents: dict[str, Any]) -> None:
+    def change(contents):
         del contents["fl_x"]
         contents["camera_angle_x"] = 2 * math.atan(0.5)
         contents["frames"][0] |= {"fl_x": 30.0, "fl_y": 31.0, "cx": 1.0, "k1": 0.05}  # the last by name
@@ -219,7 +215,7 @@ def test_capture_intrinsics_per_frame_and_from_angles(tmp_path: Path) -> None:
     assert train.cameras.distortion[:, 0].tolist() == pytest.approx([0, 0.05])
 
 
-def test_capture_with_alpha_is_an_object_on_white(tmp_path: Path) -> None:
+def test_capture_with_alpha_is_an_object_on_white(tmp_path):
     original = builtin_scene(20, train_views=12, test_views=1)
     write_capture(tmp_path, original.train.cameras, camera_angle_x=0.6911112, fl_x=None)
     for index, image in enumerate(original.train.images):
@@ -229,7 +225,7 @@ def test_capture_with_alpha_is_an_object_on_white(tmp_path: Path) -> None:
     assert scene.box is not None and float(scene.box.abs().max()) < 1
 
 
-def test_normalise_poses() -> None:
+def test_normalise_poses():
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2)))[0].double()
     turn *= torch.linalg.det(turn)
     poses = orbit_cameras(9, radius=6, elevation=30, width=1, height=1, focal=1, centre=(1, 2, 3)).poses.double()
@@ -245,7 +241,7 @@ def test_normalise_poses() -> None:
     torch.testing.assert_close(rotation.mT @ rotation, torch.eye(3).double().expand(9, 3, 3), atol=1e-5, rtol=0)
 
 
-def test_normalise_degenerate_poses() -> None:
+def test_normalise_degenerate_poses():
     one_place = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     assert normalise_poses(one_place).isfinite().all()
     row = one_place.clone()
@@ -254,7 +250,7 @@ def test_normalise_degenerate_poses() -> None:
 
 
 @pytest.mark.data
-def test_lego() -> None:
+def test_lego():
     scene = load_scene(needs("lego"), downscale=4)
     assert scene.train.images.shape == (100, 100, 100, 4) and scene.test.images.shape == (200, 100, 100, 4)
     assert scene.box is not None
@@ -262,7 +258,7 @@ def test_lego() -> None:
 
 
 @pytest.mark.data
-def test_fox(caplog: pytest.LogCaptureFixture) -> None:
+def test_fox(caplog):
     with caplog.at_level(logging.WARNING):
         scene = load_scene(needs("fox"), downscale=8)
     assert "17 of 67 listed images are missing" in caplog.text

@@ -1,22 +1,19 @@
 """The built-in translucent scene against marching, and what makes it translucent."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
 from voronerf.data import load_scene, translucent_scene
 from voronerf.data.builtin.translucent import MEDIA, Medium, bounds, integrate, layered_block, striped_shell
-from voronerf.data.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     return translucent_scene(25)
 
 
-def marched(origin: np.ndarray, direction: np.ndarray, media: tuple[Medium, ...], steps: int = 60_000) -> np.ndarray:
+def marched(origin, direction, media, steps=60_000):
     """Premultiplied colour and opacity along one ray by many small steps, from the definition of the media."""
     edges = np.linspace(0, 7, steps + 1)
     points = origin + ((edges[1:] + edges[:-1]) / 2)[:, None] * direction
@@ -33,7 +30,7 @@ def marched(origin: np.ndarray, direction: np.ndarray, media: tuple[Medium, ...]
     return np.append(colour, 1 - np.exp(-passed.sum()))
 
 
-def rays(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def rays(count, seed=0):
     generator = np.random.default_rng(seed)
     origins = generator.normal(size=(count, 3))
     origins = 4 * origins / np.linalg.norm(origins, axis=-1, keepdims=True)
@@ -42,7 +39,7 @@ def rays(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return origins.astype(np.float32), directions.astype(np.float32)
 
 
-def test_rays_against_marching() -> None:
+def test_rays_against_marching():
     seen = []
     for origin, direction in zip(*rays(20)):
         found = integrate(origin[None], direction[None])[0]
@@ -55,7 +52,7 @@ def test_rays_against_marching() -> None:
     assert integrate(origin[None], np.zeros((0, 3), np.float32)).shape == (0, 4)
 
 
-def test_a_ball_and_a_shell_by_hand() -> None:
+def test_a_ball_and_a_shell_by_hand():
     origin, ahead = np.array([[-4.0, 0, 0]], np.float32), np.array([[1.0, 0, 0]], np.float32)
     ball = (Medium((0, 0, 0), (0.5, 1, 1), 2.0, (1.0, 0.5, 0.0)),)
     opacity = 1 - np.exp(-2.0)
@@ -70,7 +67,7 @@ def test_a_ball_and_a_shell_by_hand() -> None:
     assert not integrate(beside, ahead, block).any()
 
 
-def test_everything_lies_in_the_box_and_no_density_is_negative() -> None:
+def test_everything_lies_in_the_box_and_no_density_is_negative():
     box = bounds()
     points = np.random.default_rng(0).uniform(box[0] - 0.2, box[1] + 0.2, size=(200_000, 3))
     density = sum(medium.density * medium.contains(points) for medium in MEDIA)
@@ -79,7 +76,7 @@ def test_everything_lies_in_the_box_and_no_density_is_negative() -> None:
     assert not density[outside].any() and density[~outside].mean() > 0.1
 
 
-def test_most_of_what_is_seen_is_translucent(scene: Scene) -> None:
+def test_most_of_what_is_seen_is_translucent(scene):
     alpha = scene.train.images[..., 3]
     inside = alpha > 5
     assert 0.2 < float(inside.float().mean()) < 0.7
@@ -89,7 +86,7 @@ def test_most_of_what_is_seen_is_translucent(scene: Scene) -> None:
     assert float((solid[solid > 5] < 245).float().mean()) < 0.3
 
 
-def test_shape_and_name(scene: Scene) -> None:
+def test_shape_and_name(scene):
     assert scene.train.images.shape == (100, 25, 25, 4) and scene.test.images.shape == (25, 25, 25, 4)
     assert (scene.name, scene.near, scene.far, scene.background) == ("builtin-translucent", 2, 6, "white")
     loaded = load_scene("builtin-translucent", downscale=4)

@@ -1,7 +1,5 @@
 """Blended cells: the weights against a slow search, their limits, and that nothing jumps."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -9,13 +7,13 @@ import torch
 from helpers import refuses, same, seeded
 
 from voronerf import VoronoiDiagram
-from voronerf.diagram.blending import Blend, blend_cells
+from voronerf.diagram.blending import blend_cells
 
 
-def diagram_of(kind: str) -> VoronoiDiagram:
+def diagram_of(kind):
     generator = seeded()
 
-    def of(k: int, power: float | None = None) -> VoronoiDiagram:
+    def of(k, power=None):
         centres = torch.rand(k, 3, generator=generator) * 2 - 1
         return VoronoiDiagram(centres, weights=None if power is None else power * torch.rand(k, generator=generator))
 
@@ -30,15 +28,15 @@ def diagram_of(kind: str) -> VoronoiDiagram:
 KINDS = ("flat", "power", "same", "nested")
 
 
-def slow_leaves(diagram: VoronoiDiagram, x: torch.Tensor, margin: float) -> dict[int, float]:
+def slow_leaves(diagram, x, margin):
     """Weights of all leaves of one point, by the definition."""
     offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
     power = [0.0] * len(child) if diagram.power is None else diagram.power.tolist()
     centres = diagram.centres.double().tolist()
     point = x.double().tolist()
-    found: dict[int, float] = {}
+    found = {}
 
-    def inside(i: int, rows: range) -> float:
+    def inside(i, rows):
         """How far the point is on the side of centre i, from the plane that is nearest."""
         least = math.inf
         for j in rows:
@@ -50,7 +48,7 @@ def slow_leaves(diagram: VoronoiDiagram, x: torch.Tensor, margin: float) -> dict
                 least = -math.inf
         return least
 
-    def descend(node: int, weight: float) -> None:
+    def descend(node, weight):
         rows = range(offsets[node], offsets[node + 1])
         shares = {i: min(max(0.5 + inside(i, rows) / (2 * margin), 0.0), 1.0) for i in rows}
         for i in rows:
@@ -64,7 +62,7 @@ def slow_leaves(diagram: VoronoiDiagram, x: torch.Tensor, margin: float) -> dict
     return found
 
 
-def weights_of(blend: Blend, diagram: VoronoiDiagram, points: torch.Tensor) -> torch.Tensor:
+def weights_of(blend, diagram, points):
     """[n, cells], the leaf that holds a point where it is in no margin."""
     table = torch.zeros(points.shape[0], diagram.num_cells, dtype=points.dtype)
     table[torch.arange(points.shape[0]), diagram.locate(points).long()] = 1
@@ -74,7 +72,7 @@ def weights_of(blend: Blend, diagram: VoronoiDiagram, points: torch.Tensor) -> t
 
 @pytest.mark.parametrize("margin", [0.02, 0.3])
 @pytest.mark.parametrize("kind", KINDS)
-def test_against_the_definition(kind: str, margin: float) -> None:
+def test_against_the_definition(kind, margin):
     diagram = diagram_of(kind)
     points = torch.rand(300, 3, dtype=torch.float64) * 2.4 - 1.2
     found = weights_of(blend_cells(diagram, points, margin, most=diagram.num_cells), diagram, points)
@@ -86,7 +84,7 @@ def test_against_the_definition(kind: str, margin: float) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_entries_are_sorted_few_and_sum_to_one(kind: str) -> None:
+def test_entries_are_sorted_few_and_sum_to_one(kind):
     diagram, points = diagram_of(kind), torch.rand(5000, 3) * 2.4 - 1.2
     blend = blend_cells(diagram, points, 0.25, most=3)
     assert blend.rows.numel() > 1000 and (blend.rows.diff() >= 0).all() and (blend.weights > 0).all()
@@ -104,7 +102,7 @@ def test_entries_are_sorted_few_and_sum_to_one(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_points_beyond_the_margin_have_no_entry(kind: str) -> None:
+def test_points_beyond_the_margin_have_no_entry(kind):
     diagram, margin = diagram_of(kind), 0.05
     points = torch.rand(400, 3, dtype=torch.float64) * 2.4 - 1.2
     inside = torch.zeros(400, dtype=torch.bool)
@@ -119,7 +117,7 @@ def test_points_beyond_the_margin_have_no_entry(kind: str) -> None:
 
 @pytest.mark.parametrize("most", [2, 4])
 @pytest.mark.parametrize("kind", KINDS)
-def test_nothing_jumps_across_borders(kind: str, most: int) -> None:
+def test_nothing_jumps_across_borders(kind, most):
     diagram, margin = diagram_of(kind), 0.1
     start = torch.rand(40, 1, 3, dtype=torch.float64) * 2.4 - 1.2
     end = torch.rand(40, 1, 3, dtype=torch.float64) * 2.4 - 1.2
@@ -136,7 +134,7 @@ def test_nothing_jumps_across_borders(kind: str, most: int) -> None:
     assert float(jump.median()) < bound and int((jump > 10 * bound).sum()) <= (3 if most == 2 else 0)
 
 
-def test_nothing_to_blend() -> None:
+def test_nothing_to_blend():
     points = torch.rand(50, 3)
     for diagram, margin in ((diagram_of("flat"), 0.0), (diagram_of("one"), 1.0)):
         assert blend_cells(diagram, points, margin).rows.numel() == 0
@@ -147,20 +145,20 @@ def test_nothing_to_blend() -> None:
     assert torch.equal(halves.cells, blend_cells(diagram_of("flat"), points.half().float(), 0.1).cells)
 
 
-def test_one_leaf_is_the_nearest() -> None:
+def test_one_leaf_is_the_nearest():
     diagram, points = diagram_of("flat"), torch.rand(500, 3) * 2 - 1
     blend = blend_cells(diagram, points, 0.2, most=1)
     assert torch.equal(blend.cells, diagram.locate(points[blend.rows])) and (blend.weights == 1).all()
 
 
-def test_large_batches_go_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_batches_go_in_pieces(monkeypatch):
     diagram, points = diagram_of("nested"), torch.rand(1000, 3) * 2 - 1
     whole = blend_cells(diagram, points, 0.2)
     monkeypatch.setattr("voronerf.diagram.blending._CHUNK_ELEMENTS", 500)
     assert same(whole, blend_cells(diagram, points, 0.2))
 
 
-def test_bad_arguments() -> None:
+def test_bad_arguments():
     diagram = diagram_of("flat")
     refuses("points must be floating [n, 3], got torch.float32 [2, 2]", blend_cells, diagram, torch.zeros(2, 2), 0.1)
     for margin in (-0.1, math.inf, math.nan):

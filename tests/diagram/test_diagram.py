@@ -11,7 +11,7 @@ from helpers import refuses, seeded
 from voronerf.diagram import VoronoiDiagram, uniform_centres
 
 
-def slow_locate(diagram: VoronoiDiagram, point: torch.Tensor) -> int:
+def slow_locate(diagram, point):
     """Descends the tables of a diagram with Python numbers; ties to the first centre."""
     offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
     centres = diagram.centres.double().tolist()
@@ -26,11 +26,11 @@ def slow_locate(diagram: VoronoiDiagram, point: torch.Tensor) -> int:
         node = child[row]
 
 
-def uneven_diagram() -> VoronoiDiagram:
+def uneven_diagram():
     """Three levels, 4 + 3 - 1 + 5 - 1 = 10 leaves, integer coordinates so that ties are exact."""
     generator = seeded(3)
 
-    def centres(k: int) -> torch.Tensor:
+    def centres(k):
         return torch.randint(-8, 9, (k, 3), generator=generator).float()
 
     first, _ = VoronoiDiagram(centres(4)).refine({2: centres(3)})
@@ -38,7 +38,7 @@ def uneven_diagram() -> VoronoiDiagram:
     return second
 
 
-def integer_points(n: int) -> torch.Tensor:
+def integer_points(n):
     return torch.randint(-9, 10, (n, 3), generator=seeded(5)).float()
 
 

@@ -6,16 +6,16 @@ from helpers import refuses, same, seeded
 from voronerf.diagram.reservoir import SampleReservoir
 
 
-def batch(seed: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
+def batch(seed, n):
     generator = seeded(seed)
     return torch.randn(n, 3, generator=generator), torch.rand(n, generator=generator) + 0.1
 
 
-def rows(points: torch.Tensor, importance: torch.Tensor) -> set[tuple[float, ...]]:
+def rows(points, importance):
     return {tuple(row) for row in torch.cat([points, importance[:, None]], 1).tolist()}
 
 
-def heaviest(seed: int, n: int, count: int) -> set[tuple[float, ...]]:
+def heaviest(seed, n, count):
     points, importance = batch(seed, n)
     kept = sorted(range(n), key=lambda i: -float(importance[i]))[:count]
     return rows(points[kept], importance[kept])

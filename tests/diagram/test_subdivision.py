@@ -11,7 +11,7 @@ from voronerf.diagram.subdivision import split_diagram
 ROOT = VoronoiDiagram(torch.tensor([[-2.0, 0, 0], [0, 0, 0], [2, 0, 0]]))
 
 
-def three_clouds(counts: tuple[int, int, int] = (600, 300, 5)) -> tuple[torch.Tensor, torch.Tensor]:
+def three_clouds(counts=(600, 300, 5)):
     """Samples in each of the three cells of ROOT; those of the middle one weigh 4 times as much."""
     generator = seeded()
     points = torch.randn(sum(counts), 3, generator=generator) * 0.2

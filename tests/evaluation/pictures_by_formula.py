@@ -6,8 +6,6 @@ torchmetrics agrees: PSNR to 2e-6 dB (it divides in float32), SSIM to 1e-15 wher
 is left out of its map (its own mean takes the border in: 0.9032 for 100 x 100), LPIPS to the last bit of float32.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +29,7 @@ FIGURES = (
 )
 
 
-def pictures_by_formula(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def pictures_by_formula(height, width):
     """(image, truth), float32 [h, w, 3] in 0..1: waves and squares in a disc, on white."""
     y, x, c = np.meshgrid(np.arange(height), np.arange(width), np.arange(3), indexing="ij")
     truth = 0.5 + 0.3 * np.sin(0.31 * x + 0.7 * c) * np.cos(0.23 * y) + 0.2 * (((x // 9 + y // 7) % 2) - 0.5)

@@ -1,7 +1,5 @@
 """LPIPS: against patches and sums in float64, against the lpips package's figures, and everything about its weights."""
 
-from __future__ import annotations
-
 import importlib.machinery
 import math
 import os
@@ -21,7 +19,7 @@ Weights = dict[str, torch.Tensor]
 
 
 @pytest.fixture(autouse=True)
-def nothing_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def nothing_installed(monkeypatch):
     """A user who has no weights anywhere."""
     monkeypatch.delenv("VORONERF_LPIPS", raising=False)
     monkeypatch.delenv("VORONERF_DATA", raising=False)
@@ -29,7 +27,7 @@ def nothing_installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def weights() -> Weights:
+def weights():
     generator = torch.Generator().manual_seed(1)
     drawn = {}
     for name, shape in SHAPES.items():
@@ -39,7 +37,7 @@ def weights() -> Weights:
     return drawn
 
 
-def patches(x: np.ndarray, size: int, stride: int, padding: int) -> np.ndarray:
+def patches(x, size, stride, padding):
     """[c, h, w] -> [rows, columns, c, size, size], each filter's view of it copied out."""
     x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
     rows, columns = ((extent - size) // stride + 1 for extent in x.shape[1:])
@@ -51,7 +49,7 @@ def patches(x: np.ndarray, size: int, stride: int, padding: int) -> np.ndarray:
     )
 
 
-def slow_lpips(image: np.ndarray, truth: np.ndarray, weights: Weights) -> float:
+def slow_lpips(image, truth, weights):
     """Equation 1 of the paper, pixel by pixel."""
     maps = [np.moveaxis(2 * p.astype(np.float64) - 1, -1, 0) for p in (image, truth)]
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
@@ -77,7 +75,7 @@ def slow_lpips(image: np.ndarray, truth: np.ndarray, weights: Weights) -> float:
 
 
 @pytest.mark.parametrize(("height", "width"), [(31, 31), (31, 52), (44, 35)])
-def test_against_patches_and_sums(height: int, width: int, weights: Weights) -> None:
+def test_against_patches_and_sums(height, width, weights):
     image, truth = pictures_by_formula(height, width)
     found = Lpips(weights)(torch.from_numpy(image), torch.from_numpy(truth))
     assert float(found) == pytest.approx(slow_lpips(image, truth, weights), rel=1e-5)
@@ -86,7 +84,7 @@ def test_against_patches_and_sums(height: int, width: int, weights: Weights) -> 
 
 @pytest.mark.data
 @pytest.mark.parametrize("figures", FIGURES, ids=lambda figures: f"{figures.height}x{figures.width}")
-def test_against_the_lpips_package(figures) -> None:
+def test_against_the_lpips_package(figures):
     if not (DATA / "lpips").is_dir():
         pytest.skip(f"{DATA / 'lpips'} is not there; set VORONERF_DATA to a folder that holds lpips")
     found, source = find_lpips(DATA / "lpips")
@@ -95,7 +93,7 @@ def test_against_the_lpips_package(figures) -> None:
     assert float(found(image, truth)) == pytest.approx(figures.lpips, rel=2e-5)
 
 
-def test_shapes_and_small_images(weights: Weights) -> None:
+def test_shapes_and_small_images(weights):
     score = Lpips(weights)
     with pytest.raises(ValueError, match=r"same shape \[h, w, 3\], got \[40, 40, 3\] and \[40, 41, 3\]"):
         score(torch.zeros(40, 40, 3), torch.zeros(40, 41, 3))
@@ -103,7 +101,7 @@ def test_shapes_and_small_images(weights: Weights) -> None:
         score(torch.zeros(30, 40, 3), torch.zeros(30, 40, 3))
 
 
-def test_where_weights_are_looked_for(tmp_path: Path, weights: Weights, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_weights_are_looked_for(tmp_path, weights, monkeypatch):
     scenes = tmp_path / "scenes"
     (scenes / "lego").mkdir(parents=True)
     found, line = find_lpips(None, str(scenes / "lego"))
@@ -134,7 +132,7 @@ def test_where_weights_are_looked_for(tmp_path: Path, weights: Weights, monkeypa
         find_lpips(file, size=(16, 40))
 
 
-def test_the_installed_package(tmp_path: Path, weights: Weights, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_installed_package(tmp_path, weights, monkeypatch):
     package, hub = tmp_path / "lpips", tmp_path / "hub"
     spec = importlib.machinery.ModuleSpec("lpips", None, is_package=True)
     spec.submodule_search_locations = [str(package)]
@@ -153,7 +151,7 @@ def test_the_installed_package(tmp_path: Path, weights: Weights, monkeypatch: py
     assert all(torch.equal(found.weights[name], weights[name]) for name in SHAPES)
 
 
-def test_names_of_the_whole_network_and_several_files(tmp_path: Path, weights: Weights) -> None:
+def test_names_of_the_whole_network_and_several_files(tmp_path, weights):
     slices = {0: 1, 3: 2, 6: 3, 8: 4, 10: 5}
     whole = {
         f"net.slice{slices[int(name.split('.')[1])]}.{name[9:]}" if name.startswith("features") else name: tensor
@@ -170,8 +168,8 @@ def test_names_of_the_whole_network_and_several_files(tmp_path: Path, weights: W
     assert found is not None and torch.equal(found.weights["lin0.model.1.weight"], weights["lin0.model.1.weight"])
 
 
-def test_bad_files(tmp_path: Path, weights: Weights) -> None:
-    def error(name: str) -> str:
+def test_bad_files(tmp_path, weights):
+    def error(name):
         with pytest.raises(LpipsError) as caught:
             find_lpips(tmp_path / name)
         assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
@@ -193,6 +191,6 @@ def test_bad_files(tmp_path: Path, weights: Weights) -> None:
     assert "holds no file of weights" in error("empty")
 
 
-def test_the_table_is_alexnets() -> None:
+def test_the_table_is_alexnets():
     assert sum(math.prod(shape) for shape in SHAPES.values()) == 2_469_696 + 1_152
     assert [o for _, (o, _, _), *_ in CONVOLUTIONS] == [64, 192, 384, 256, 256]

@@ -1,7 +1,5 @@
 """PSNR and SSIM against slow loops written from their definitions, scipy, and figures of other programs."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -14,13 +12,13 @@ from voronerf.evaluation.metrics import psnr, ssim
 from voronerf.evaluation.scores import ViewScore, mean_scores
 
 
-def pictures(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+def pictures(height, width):
     generator = torch.Generator().manual_seed(height)
     truth = torch.rand(height, width, 3, generator=generator) * torch.linspace(0, 1, width)[None, :, None]
     return (truth + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1), truth
 
 
-def slow_ssim(image: torch.Tensor, truth: torch.Tensor, size: int = 11) -> float:
+def slow_ssim(image, truth, size=11):
     weights = [
         [math.exp(-((y - size // 2) ** 2 + (x - size // 2) ** 2) / (2 * 1.5**2)) for x in range(size)]
         for y in range(size)
@@ -49,18 +47,18 @@ def slow_ssim(image: torch.Tensor, truth: torch.Tensor, size: int = 11) -> float
 
 
 @pytest.mark.parametrize(("height", "width"), [(11, 11), (14, 19)])
-def test_ssim_against_slow_loop(height: int, width: int) -> None:
+def test_ssim_against_slow_loop(height, width):
     image, truth = pictures(height, width)
     assert float(ssim(image, truth)) == pytest.approx(slow_ssim(image, truth), abs=1e-6)
 
 
-def test_ssim_of_small_images_uses_a_smaller_window() -> None:
+def test_ssim_of_small_images_uses_a_smaller_window():
     image, truth = pictures(8, 8)
     assert float(ssim(image, truth)) == pytest.approx(slow_ssim(image, truth, 7), abs=1e-6)
     assert float(ssim(image[:1, :1], truth[:1, :1])) <= 1
 
 
-def test_ssim_limits() -> None:
+def test_ssim_limits():
     image, truth = pictures(20, 20)
     assert float(ssim(truth, truth)) == pytest.approx(1, abs=1e-12)
     assert float(ssim(torch.zeros(12, 12, 3), torch.ones(12, 12, 3))) < 1e-3
@@ -68,7 +66,7 @@ def test_ssim_limits() -> None:
     assert float(stacked) == pytest.approx((float(ssim(image, truth)) + 1) / 2)
 
 
-def test_psnr_against_slow_loop() -> None:
+def test_psnr_against_slow_loop():
     image, truth = pictures(6, 7)
     squares = [(a - b) ** 2 for a, b in zip(image.flatten().tolist(), truth.flatten().tolist())]
     assert float(psnr(image, truth)) == pytest.approx(-10 * math.log10(sum(squares) / len(squares)))
@@ -77,14 +75,14 @@ def test_psnr_against_slow_loop() -> None:
 
 
 @pytest.mark.parametrize("score", [psnr, ssim])
-def test_shapes(score) -> None:
+def test_shapes(score):
     with pytest.raises(ValueError, match=r"same shape \[..., h, w, c\] with pixels, got \[2, 2, 3\] and \[2, 3, 3\]"):
         score(torch.zeros(2, 2, 3), torch.zeros(2, 3, 3))
     with pytest.raises(ValueError, match="same shape"):
         score(torch.zeros(0, 2, 3), torch.zeros(0, 2, 3))
 
 
-def scipy_ssim(image: np.ndarray, truth: np.ndarray) -> float:
+def scipy_ssim(image, truth):
     """The same by scipy's filter, which cuts a Gaussian of 1.5 off at 5 pixels too."""
     scores = []
     for a, b in zip(np.moveaxis(image.astype(np.float64), -1, 0), np.moveaxis(truth.astype(np.float64), -1, 0)):
@@ -98,7 +96,7 @@ def scipy_ssim(image: np.ndarray, truth: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("figures", FIGURES, ids=lambda figures: f"{figures.height}x{figures.width}")
-def test_against_other_programs(figures) -> None:
+def test_against_other_programs(figures):
     image, truth = pictures_by_formula(figures.height, figures.width)
     found = [float(score(torch.from_numpy(image), torch.from_numpy(truth))) for score in (psnr, ssim)]
     assert found[0] == pytest.approx(figures.psnr, abs=1e-9)
@@ -106,7 +104,7 @@ def test_against_other_programs(figures) -> None:
     assert found[1] == pytest.approx(scipy_ssim(image, truth), abs=1e-9)
 
 
-def test_means_and_the_psnr_of_the_mean_error() -> None:
+def test_means_and_the_psnr_of_the_mean_error():
     scores = [ViewScore("a", 20.0, 0.5, 0.1), ViewScore("b", 30.0, 0.7, 0.3)]
     means = mean_scores(scores)
     assert means["psnr"] == pytest.approx(25) and means["ssim"] == pytest.approx(0.6)
@@ -116,6 +114,6 @@ def test_means_and_the_psnr_of_the_mean_error() -> None:
     assert mean_scores([ViewScore("perfect", math.inf, 1.0)])["psnr_of_mean_error"] == math.inf
 
 
-def test_scores_that_are_no_numbers_are_not_perfect() -> None:
+def test_scores_that_are_no_numbers_are_not_perfect():
     scores = [ViewScore("a", 20.0, 0.5, None), ViewScore("b", math.nan, math.nan, None)]
     assert math.isnan(mean_scores(scores)["psnr_of_mean_error"])

@@ -1,9 +1,6 @@
 """Panels, sheets and videos."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +13,20 @@ from voronerf.evaluation.video import check_video, write_video
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 16, 256, 5000])
-def test_palette_is_distinct_and_stable(count: int) -> None:
+def test_palette_is_distinct_and_stable(count):
     colours = panels.palette(count)
     assert colours.shape == (count, 3) and colours.dtype == torch.uint8
     assert len({tuple(colour) for colour in colours.tolist()}) == count
     assert torch.equal(colours[:2], panels.palette(2)[:count])
 
 
-def test_the_first_colours_are_far_apart() -> None:
+def test_the_first_colours_are_far_apart():
     colours = panels.palette(16).float()
     distance = torch.cdist(colours, colours) + 1000 * torch.eye(16)
     assert float(distance.min()) > 30
 
 
-def test_cells_and_opacity() -> None:
+def test_cells_and_opacity():
     cells = torch.tensor([[0, 3], [1, 3]], dtype=torch.int32)
     opacity = torch.tensor([[1.0, 1.0], [0.5, 0.0]])
     picture = panels.picture_of_cells(cells, opacity)
@@ -42,7 +39,7 @@ def test_cells_and_opacity() -> None:
     assert (shaded[0, 0] <= (colours[0] * 0.41).round()).all()
 
 
-def test_depth_and_error() -> None:
+def test_depth_and_error():
     depth = torch.linspace(2, 4, 50).reshape(5, 10)
     picture = panels.picture_of_depth(depth, torch.ones(5, 10))
     assert float(picture[0, 0].float().sum()) > float(picture[-1, -1].float().sum())  # near is bright
@@ -55,7 +52,7 @@ def test_depth_and_error() -> None:
     assert int(panels.picture_of_error(torch.ones(2, 2, 3), torch.ones(2, 2, 3)).max()) < 10
 
 
-def test_panel_file(tmp_path: Path) -> None:
+def test_panel_file(tmp_path):
     colour = torch.rand(7, 9, 3)
     path = tmp_path / "new" / "panel.png"
     cells = torch.zeros(7, 9, dtype=torch.int32)
@@ -71,10 +68,10 @@ def test_panel_file(tmp_path: Path) -> None:
         panels.contact_sheet({"a": truth, "b": truth[1:]})
 
 
-def test_depths_of_more_pixels_than_torch_takes_quantiles_of(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depths_of_more_pixels_than_torch_takes_quantiles_of(monkeypatch):
     quantile, most = torch.Tensor.quantile, 2**20
 
-    def limited(values: torch.Tensor, q: float) -> torch.Tensor:
+    def limited(values, q):
         assert values.numel() <= most, "quantile() input tensor is too large"
         return quantile(values, q)
 
@@ -83,7 +80,7 @@ def test_depths_of_more_pixels_than_torch_takes_quantiles_of(monkeypatch: pytest
     assert panels.picture_of_depth(depth, torch.ones_like(depth)).shape == (1100, 1000, 3)
 
 
-def test_a_video_that_ffmpeg_did_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_video_that_ffmpeg_did_not_finish(tmp_path, monkeypatch):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     frames = (torch.rand(3, 16, 16, 3) * 255).to(torch.uint8)
     path = tmp_path / "turn.mp4"
@@ -91,7 +88,7 @@ def test_a_video_that_ffmpeg_did_not_finish(tmp_path: Path, monkeypatch: pytest.
     before = path.read_bytes()
     write_frames = imageio_ffmpeg.write_frames
 
-    def broken(name: str, *args: object, **kwargs: object) -> Iterator[object]:
+    def broken(name, *args, **kwargs):
         writer = write_frames(name, *args, **kwargs)
         yield writer.send(None)
         try:
@@ -107,7 +104,7 @@ def test_a_video_that_ffmpeg_did_not_finish(tmp_path: Path, monkeypatch: pytest.
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
-def test_what_no_video_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_no_video_can_be_written_to(tmp_path, monkeypatch):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     with pytest.raises(ValueError, match=r"turn: a video must end in \.mp4, \.m4v"):
         check_video(tmp_path / "turn")
@@ -115,7 +112,7 @@ def test_what_no_video_can_be_written_to(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(OSError, match="file"):
         check_video(tmp_path / "file" / "turn.mp4")
 
-    def missing() -> str:
+    def missing():
         raise RuntimeError("No ffmpeg exe could be found")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
@@ -124,7 +121,7 @@ def test_what_no_video_can_be_written_to(tmp_path: Path, monkeypatch: pytest.Mon
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 
-def test_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_video(tmp_path, monkeypatch):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     frames = (torch.rand(5, 17, 21, 3) * 255).to(torch.uint8)
     path = tmp_path / "deep" / "turn.mp4"

@@ -1,16 +1,14 @@
 """The seam measure on a ball whose cells are painted differently, and slices through a known density."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from voronerf import VoronoiRouter
-from voronerf.data import Scene, builtin_scene
+from voronerf.data import builtin_scene
 from voronerf.evaluation.scores import render_view
 from voronerf.evaluation.seams import seam
 from voronerf.evaluation.slices import picture_of_density, slice_density, slice_points
@@ -24,22 +22,22 @@ RADIUS, THICK = 0.6, 800.0
 class Ball(nn.Module):
     """An opaque ball with a gradient on it, in a colour of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.paint = nn.Parameter(torch.full((3,), 0.3))
         self.thickness = nn.Parameter(torch.tensor(THICK))
 
-    def forward(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, positions, directions, ray_index):
         inside = (positions.norm(dim=-1) < RADIUS).to(positions.dtype)
         return self.paint + 0.2 * positions, inside * self.thickness
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     return builtin_scene(40)
 
 
-def painted(*paints: tuple[float, float, float], centres: Tensor | None = None) -> VoronoiRouter:
+def painted(*paints, centres=None):
     places = torch.tensor([[-0.4, 0.0, 0.0], [0.4, 0.0, 0.0]]) if centres is None else centres
     router = VoronoiRouter(Ball(), places, coords=lambda positions, *_: positions, shared=["directions"])
     with torch.no_grad():
@@ -47,15 +45,15 @@ def painted(*paints: tuple[float, float, float], centres: Tensor | None = None) 
     return router.eval()
 
 
-def measure(router: VoronoiRouter, scene: Scene, **options: float) -> float:
+def measure(router, scene, **options):
     return seam(router, scene, partial(render_view_of, router, scene), views=4, **options)
 
 
-def render_view_of(router: VoronoiRouter, scene: Scene, view: int):
+def render_view_of(router, scene, view):
     return render_view(Renderer({"field": router}, samples=128, backend="reference"), scene, view)
 
 
-def test_a_known_jump(scene: Scene) -> None:
+def test_a_known_jump(scene):
     for step in (0.05, 0.2):
         router = painted((0.0, 0.0, 0.0), (step, 0.0, -2 * step))
         assert measure(router, scene) == pytest.approx(step, rel=0.02)
@@ -63,24 +61,24 @@ def test_a_known_jump(scene: Scene) -> None:
         assert router.blend == 0
 
 
-def test_no_seam(scene: Scene) -> None:
+def test_no_seam(scene):
     assert measure(painted(), scene) == pytest.approx(0, abs=1e-6)
     assert measure(painted((0.3, 0.3, 0.3), centres=torch.zeros(1, 3)), scene) == 0
     far = torch.tensor([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]])
     assert math.isnan(measure(painted((0.0,) * 3, (0.4,) * 3, centres=far), scene))  # no border is visible
 
 
-def test_more_borders_weigh_by_what_is_seen(scene: Scene) -> None:
+def test_more_borders_weigh_by_what_is_seen(scene):
     centres = torch.tensor([[-0.5, -0.1, 0.0], [0.0, 0.0, 0.0], [0.5, 0.1, 0.0]])
     found = measure(painted((0.0,) * 3, (0.1,) * 3, (0.4,) * 3, centres=centres), scene)
     assert 0.1 < found < 0.3
 
 
-def test_what_was_set_stays_set(scene: Scene) -> None:
+def test_what_was_set_stays_set(scene):
     router = painted((0.0,) * 3, (0.1,) * 3)
     router.blend = 0.07
 
-    def broken(view: int):
+    def broken(view):
         raise RuntimeError("out of memory")
 
     with pytest.raises(RuntimeError):
@@ -91,7 +89,7 @@ def test_what_was_set_stays_set(scene: Scene) -> None:
             measure(router, scene, margin=margin)
 
 
-def test_a_slice(scene: Scene) -> None:
+def test_a_slice(scene):
     router = painted((0.0,) * 3, (0.1,) * 3)
     with torch.no_grad():
         router.module.thickness.copy_(torch.tensor([20.0, 60.0]))
@@ -113,7 +111,7 @@ def test_a_slice(scene: Scene) -> None:
         slice_points(scene, size=0)
 
 
-def test_the_picture_of_a_slice() -> None:
+def test_the_picture_of_a_slice():
     density = torch.tensor([[0.0, 1.0, 10.0], [100.0, 1e6, math.nan]])
     picture = picture_of_density(density)
     light = picture.float().sum(-1).flatten().tolist()
@@ -124,7 +122,7 @@ def test_the_picture_of_a_slice() -> None:
 
 
 @pytest.mark.parametrize("cones", [False, True])
-def test_a_slice_through_a_layer_table(scene: Scene, cones: bool) -> None:
+def test_a_slice_through_a_layer_table(scene, cones):
     field = MipNeRF(width=8, depth=2, position_octaves=2) if cones else NeRF(width=8, depth=2, position_octaves=2)
     router = VoronoiRouter(field, torch.randn(4, 3), blend=0.1)
     density = slice_density(router, slice_points(scene, size=8), cones=cones)
@@ -132,7 +130,7 @@ def test_a_slice_through_a_layer_table(scene: Scene, cones: bool) -> None:
 
 
 @pytest.mark.parametrize("cones", [False, True])
-def test_a_slice_through_contracted_space(scene: Scene, cones: bool) -> None:
+def test_a_slice_through_contracted_space(scene, cones):
     field = MipNeRF(width=8, depth=2, position_octaves=2) if cones else NeRF(width=8, depth=2, position_octaves=2)
     router, points = VoronoiRouter(field, torch.randn(4, 3)), slice_points(scene, size=8)
     within = Contraction(torch.zeros(3), 10.0)

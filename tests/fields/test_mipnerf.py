@@ -1,11 +1,8 @@
 """mip-NeRF and the density field: their encodings and heads, and their cells chosen by the mean of a Gaussian."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import DensityField, MipNeRF
@@ -14,17 +11,17 @@ from voronerf.ops import integrated_encode
 from voronerf.router import VoronoiRouter
 
 
-def gaussians(n: int, seed: int = 0) -> Tensor:
+def gaussians(n, seed=0):
     generator = torch.Generator().manual_seed(seed)
     means = 2 * torch.rand(n, 3, generator=generator) - 1
     return torch.cat((means, 0.02 * torch.rand(n, 3, generator=generator)), dim=1)
 
 
-def directions(n: int) -> Tensor:
+def directions(n):
     return F.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(9)), dim=1)
 
 
-def test_mipnerf_layer_by_layer() -> None:
+def test_mipnerf_layer_by_layer():
     field = MipNeRF(width=16, depth=3, position_octaves=5, view_directions=False).double()
     x = gaussians(40).double()
     h = integrated_encode(x[:, :3], x[:, 3:], 5)
@@ -35,7 +32,7 @@ def test_mipnerf_layer_by_layer() -> None:
     torch.testing.assert_close(density, 10 * F.softplus(field.density(h)[:, 0]))
 
 
-def test_wide_gaussians_hide_what_is_finer() -> None:
+def test_wide_gaussians_hide_what_is_finer():
     """Octaves that a Gaussian cannot resolve have no part in the result."""
     field = MipNeRF(width=16, depth=2, view_directions=False)
     x = gaussians(30)
@@ -48,7 +45,7 @@ def test_wide_gaussians_hide_what_is_finer() -> None:
     assert not torch.allclose(field(x)[1], before)
 
 
-def test_density_field() -> None:
+def test_density_field():
     field = DensityField(width=8, depth=2, position_octaves=3)
     assert [tuple(layer.weight.shape) for layer in field.linears()] == [(8, 21), (8, 8), (1, 8)]
     raw = torch.tensor([[-50.0], [0.0], [3.0]])
@@ -66,7 +63,7 @@ def test_density_field() -> None:
 
 @pytest.mark.parametrize("kind", ["mipnerf", "density"])
 @pytest.mark.parametrize("assignment", ["nearest", "stochastic", "many", "nested"])
-def test_cells_by_the_mean_of_a_gaussian(kind: str, assignment: str) -> None:
+def test_cells_by_the_mean_of_a_gaussian(kind, assignment):
     torch.manual_seed(0)
     if kind == "mipnerf":
         field: torch.nn.Module = MipNeRF(width=8, depth=2, position_octaves=4)
@@ -99,7 +96,7 @@ def test_cells_by_the_mean_of_a_gaussian(kind: str, assignment: str) -> None:
         assert router(x, d)[1].shape == (200,)
 
 
-def test_shapes_are_checked() -> None:
+def test_shapes_are_checked():
     router = VoronoiRouter(MipNeRF(width=8, depth=1, position_octaves=2), torch.zeros(2, 3))
     with pytest.raises(ValueError, match=r"positions must have shape \[n, 6\], got \[4, 3\]"):
         router(torch.zeros(4, 3), directions(4))

@@ -1,7 +1,5 @@
 """The NeRF field: its shapes against the published architecture, its start, its errors."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -12,7 +10,7 @@ from voronerf.fields.nerf import INITIAL_DENSITY
 from voronerf.ops import frequency_encode
 
 
-def published_nerf(field: NeRF, positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def published_nerf(field, positions, directions):
     """Figure 7 of the NeRF paper written out with the field's own layers."""
     x, d = frequency_encode(positions, 10), frequency_encode(directions, 4)
     h = x
@@ -26,13 +24,13 @@ def published_nerf(field: NeRF, positions: torch.Tensor, directions: torch.Tenso
 
 
 @pytest.fixture
-def inputs() -> tuple[torch.Tensor, torch.Tensor]:
+def inputs():
     generator = torch.Generator().manual_seed(0)
     positions = torch.randn(37, 3, generator=generator)
     return positions, F.normalize(torch.randn(37, 3, generator=generator), dim=-1)
 
 
-def test_is_the_published_architecture(inputs: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_is_the_published_architecture(inputs):
     torch.manual_seed(1)
     field = NeRF(width=256, depth=8)
     assert field.trunk[5].in_features == 256 + 63
@@ -46,9 +44,7 @@ def test_is_the_published_architecture(inputs: tuple[torch.Tensor, torch.Tensor]
 
 @pytest.mark.parametrize("depth", [1, 2, 5, 9])
 @pytest.mark.parametrize("view_directions", [True, False])
-def test_every_depth_has_gradients_everywhere(
-    inputs: tuple[torch.Tensor, torch.Tensor], depth: int, view_directions: bool
-) -> None:
+def test_every_depth_has_gradients_everywhere(inputs, depth, view_directions):
     skips = tuple(s for s in (0, 4) if s < depth - 1)
     field = NeRF(width=7, depth=depth, skips=skips, view_directions=view_directions)
     assert [layer.in_features for layer in field.trunk[1:]] == [7 + 63 * (i in skips) for i in range(depth - 1)]
@@ -60,7 +56,7 @@ def test_every_depth_has_gradients_everywhere(
     assert all(isinstance(layer, nn.Linear) for layer in field.linears())
 
 
-def test_per_ray_directions_equal_expanded_ones(inputs: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_per_ray_directions_equal_expanded_ones(inputs):
     field = NeRF(width=16, depth=2)
     index = torch.arange(37, dtype=torch.int32) // 5
     directions = inputs[1][:8]
@@ -70,13 +66,13 @@ def test_per_ray_directions_equal_expanded_ones(inputs: tuple[torch.Tensor, torc
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_starts_translucent(seed: int) -> None:
+def test_starts_translucent(seed):
     torch.manual_seed(seed)
     _, sigma = NeRF()(torch.randn(500, 3), F.normalize(torch.randn(500, 3), dim=-1))
     assert 0.3 * INITIAL_DENSITY < sigma.mean() < 5 * INITIAL_DENSITY
 
 
-def test_empty_batch() -> None:
+def test_empty_batch():
     rgb, sigma = NeRF(width=8, depth=2)(torch.empty(0, 3), torch.empty(0, 3))
     assert rgb.shape == (0, 3) and sigma.shape == (0,)
 
@@ -92,17 +88,17 @@ def test_empty_batch() -> None:
         ({"depth": 4, "skips": (3,)}, r"0\.\.2, got \(3,\)"),
     ],
 )
-def test_bad_settings(settings: dict[str, object], message: str) -> None:
+def test_bad_settings(settings, message):
     with pytest.raises(ValueError, match=message):
         NeRF(**settings)
 
 
-def test_missing_directions(inputs: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_missing_directions(inputs):
     with pytest.raises(ValueError, match="directions must be given"):
         NeRF()(inputs[0])
 
 
-def test_kilonerf_has_the_published_size() -> None:
+def test_kilonerf_has_the_published_size():
     """Two layers of 32, density, feature, and 32 channels that see the direction: 63 and 27 encoded inputs."""
     field = KiloNeRF()
     shapes = [tuple(layer.weight.shape) for layer in field.linears()]

@@ -1,7 +1,5 @@
 """Pixels to rays and back, against the definitions."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -22,14 +20,14 @@ FOX = (0.0578421, -0.0805099, -0.000980296, 0.00015575)
 STRONG = (-0.28, 0.09, 0.001, -0.002)
 
 
-def cameras(count: int = 3, distortion: tuple[float, ...] | None = None) -> Cameras:
+def cameras(count=3, distortion=None):
     base = orbit_cameras(count, radius=3, elevation=20, width=30, height=20, focal=25)
     bent = None if distortion is None else torch.tensor(distortion).repeat(count, 1)
     intrinsics = torch.tensor((25.0, 27.0, 14.2, 10.7)).repeat(count, 1)
     return Cameras(base.poses, intrinsics, 30, 20, bent)
 
 
-def test_axes_are_opengl() -> None:
+def test_axes_are_opengl():
     one = Cameras(torch.eye(4)[None], torch.tensor([[10.0, 10.0, 2.0, 1.0]]), 4, 2)
     middle = one.rays(torch.tensor([0, 0, 0]), torch.tensor([2.0, 4.0, 2.0]), torch.tensor([1.0, 1.0, 0.0]))
     expected = torch.nn.functional.normalize(torch.tensor([[0, 0, -1.0], [0.2, 0, -1], [0, 0.1, -1]]), dim=-1)
@@ -37,7 +35,7 @@ def test_axes_are_opengl() -> None:
     assert torch.equal(middle.origins, torch.zeros(3, 3))
 
 
-def test_integers_name_pixel_centres() -> None:
+def test_integers_name_pixel_centres():
     some = cameras()
     index = torch.tensor([0, 2])
     whole = some.rays(index, torch.tensor([3, 29]), torch.tensor([0, 19]))
@@ -46,7 +44,7 @@ def test_integers_name_pixel_centres() -> None:
 
 
 @pytest.mark.parametrize("distortion", [None, FOX, STRONG])
-def test_image_rays_are_row_major_unit_and_agree_with_rays(distortion: tuple[float, ...] | None) -> None:
+def test_image_rays_are_row_major_unit_and_agree_with_rays(distortion):
     some = cameras(distortion=distortion)
     rays = some.image_rays(1)
     assert len(rays) == 600
@@ -56,7 +54,7 @@ def test_image_rays_are_row_major_unit_and_agree_with_rays(distortion: tuple[flo
 
 
 @pytest.mark.parametrize("distortion", [None, FOX, STRONG])
-def test_project_inverts_rays(distortion: tuple[float, ...] | None) -> None:
+def test_project_inverts_rays(distortion):
     some = cameras(distortion=distortion)
     rays = some.image_rays(2)
     distance = torch.linspace(0.5, 9, 600)[:, None]
@@ -66,14 +64,14 @@ def test_project_inverts_rays(distortion: tuple[float, ...] | None) -> None:
     torch.testing.assert_close(depth, distance[:, 0] * (rays.directions @ some.forward[2]), rtol=1e-4, atol=1e-5)
 
 
-def test_points_behind_have_negative_depth() -> None:
+def test_points_behind_have_negative_depth():
     one = cameras(1)
     _, depth = one.project(one.origins - 2 * one.forward, 0)
     torch.testing.assert_close(depth, torch.tensor([-2.0]), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("coefficients", [FOX, STRONG, (0.0, 0.0, 0.01, -0.02)])
-def test_undistort_to_a_millionth_of_a_pixel(coefficients: tuple[float, ...]) -> None:
+def test_undistort_to_a_millionth_of_a_pixel(coefficients):
     focal = 1375.0
     u, v = torch.meshgrid(
         torch.linspace(-0.4, 0.4, 41, dtype=torch.float64),
@@ -88,7 +86,7 @@ def test_undistort_to_a_millionth_of_a_pixel(coefficients: tuple[float, ...]) ->
     assert float((a - u).abs().max()) * focal > 0.1  # the lens does something
 
 
-def test_distort_follows_opencv() -> None:
+def test_distort_follows_opencv():
     x, y, k1, k2, p1, p2 = 0.3, -0.2, 0.1, -0.05, 0.01, 0.02
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2 * r2
@@ -100,7 +98,7 @@ def test_distort_follows_opencv() -> None:
     assert [float(value) for value in found] == pytest.approx(expected, abs=1e-6)
 
 
-def test_downscaled_keeps_directions() -> None:
+def test_downscaled_keeps_directions():
     some = cameras(distortion=FOX)
     small = some.downscaled(4)
     assert (small.width, small.height) == (7, 5)
@@ -110,12 +108,12 @@ def test_downscaled_keeps_directions() -> None:
 
 
 @pytest.mark.parametrize("factor", [0, -1, 21])
-def test_downscaled_rejects(factor: int) -> None:
+def test_downscaled_rejects(factor):
     with pytest.raises(ValueError, match="downscaled: factor"):
         cameras().downscaled(factor)
 
 
-def test_indexing_and_no_rays() -> None:
+def test_indexing_and_no_rays():
     some = cameras(5, FOX)
     assert len(some[1:4]) == 3
     chosen = some[torch.tensor([True, False, False, True, False])]
@@ -135,13 +133,13 @@ def test_indexing_and_no_rays() -> None:
         ((2, 4, 4), (2, 4), None, 0, "width and height must be >= 1, got 0 x 1"),
     ],
 )
-def test_cameras_reject(poses, intrinsics, distortion, size, message) -> None:
+def test_cameras_reject(poses, intrinsics, distortion, size, message):
     bent = None if distortion is None else torch.zeros(distortion)
     with pytest.raises(ValueError, match=message):
         Cameras(torch.zeros(poses), torch.zeros(intrinsics), size, 1, bent)
 
 
-def test_look_at_is_a_rotation_that_looks_there() -> None:
+def test_look_at_is_a_rotation_that_looks_there():
     origins = torch.tensor([[3.0, 1, 2], [0, 0, 4], [0, 0, -2], [1e-3, 0, 3]], dtype=torch.float64)
     poses = look_at(origins, torch.zeros(3, dtype=torch.float64), torch.tensor((0, 0, 1.0), dtype=torch.float64))
     rotation = poses[:, :3, :3]
@@ -151,7 +149,7 @@ def test_look_at_is_a_rotation_that_looks_there() -> None:
     assert float(poses[0, 2, 1]) > 0  # up in the image is up in the world
 
 
-def test_orbit_and_turntable() -> None:
+def test_orbit_and_turntable():
     orbit = orbit_cameras(8, radius=2.5, elevation=30, width=9, height=9, focal=9, centre=(1, 2, 3), start=10)
     offset = orbit.origins - torch.tensor((1.0, 2.0, 3.0))
     torch.testing.assert_close(offset.norm(dim=-1), torch.full((8,), 2.5))
@@ -167,7 +165,7 @@ def test_orbit_and_turntable() -> None:
         orbit_cameras(0, radius=1, elevation=0, width=1, height=1, focal=1)
 
 
-def test_no_focus_of_parallel_or_outward_axes() -> None:
+def test_no_focus_of_parallel_or_outward_axes():
     parallel = torch.eye(4).repeat(3, 1, 1)
     parallel[:, 0, 3] = torch.arange(3.0)
     assert focus_point(Cameras(parallel, torch.ones(3, 4), 1, 1)) is None

@@ -1,7 +1,5 @@
 """Cones: the radius of a pixel's cone, and the Gaussians of its frustums, against random points and a finer sum."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -13,7 +11,7 @@ from voronerf.rendering.cones import frustum_gaussians, frustum_moments
 WIDE = torch.float64
 
 
-def cone_points(edges: tuple[float, float], radius: float, count: int) -> torch.Tensor:
+def cone_points(edges, radius, count):
     """Points spread evenly over a conical frustum: [count, 2], distance along the axis and from it."""
     generator = torch.Generator().manual_seed(0)
     u = torch.rand(count, 3, generator=generator, dtype=WIDE)
@@ -28,7 +26,7 @@ def cone_points(edges: tuple[float, float], radius: float, count: int) -> torch.
 @pytest.mark.parametrize(
     ("edges", "radius"), [((2.0, 3.0), 0.1), ((0.0, 1.0), 0.5), ((3.0, 3.2), 0.8), ((0.5, 6), 0.05)]
 )
-def test_moments_against_monte_carlo(edges: tuple[float, float], radius: float) -> None:
+def test_moments_against_monte_carlo(edges, radius):
     points = cone_points(edges, radius, 400_000)
     mean, along, across = frustum_moments(torch.tensor([edges], dtype=WIDE), torch.tensor([radius], dtype=WIDE))
     # Errors of a mean and of a variance of 400,000 draws: well below a hundredth of the spread.
@@ -38,7 +36,7 @@ def test_moments_against_monte_carlo(edges: tuple[float, float], radius: float) 
     assert float(across) == pytest.approx(float(points[:, 1].var()), rel=0.02)
 
 
-def test_moments_in_float32_of_thin_frustums() -> None:
+def test_moments_in_float32_of_thin_frustums():
     """The stable form keeps its digits where t1 - t0 is a thousandth of t0; the plain one loses all of them."""
     edges = torch.tensor([[4.0, 4.004, 4.008]])
     radii = torch.tensor([0.002])
@@ -47,7 +45,7 @@ def test_moments_in_float32_of_thin_frustums() -> None:
         torch.testing.assert_close(got.to(WIDE), expected, rtol=2e-3, atol=0)
 
 
-def test_gaussians_against_monte_carlo() -> None:
+def test_gaussians_against_monte_carlo():
     edges, radius = (2.0, 3.5), 0.3
     axis = torch.nn.functional.normalize(torch.tensor([0.3, -0.8, 0.4], dtype=WIDE), dim=0)
     side = torch.nn.functional.normalize(torch.linalg.cross(axis, torch.tensor([0.0, 0, 1], dtype=WIDE)), dim=0)
@@ -60,7 +58,7 @@ def test_gaussians_against_monte_carlo() -> None:
     torch.testing.assert_close(gaussian[3:], points.var(0), rtol=0.02, atol=0)
 
 
-def test_radii_are_those_of_pixels() -> None:
+def test_radii_are_those_of_pixels():
     cameras = orbit_cameras(3, radius=4.0, elevation=20, width=80, height=60, focal=90.0)
     x, y = torch.tensor([40, 3, 79]), torch.tensor([30, 58, 0])
     rays = cameras.rays(1, x, y, cones=True)
@@ -79,25 +77,25 @@ def test_radii_are_those_of_pixels() -> None:
     assert cameras.image_rays(0, cones=True).radii is not None
 
 
-def test_rays_without_radii_are_no_cones() -> None:
+def test_rays_without_radii_are_no_cones():
     with pytest.raises(ValueError, match="rays must have radii, got none"):
         frustum_gaussians(Rays(torch.zeros(1, 3), torch.ones(1, 3)), torch.tensor([[1.0, 2.0]]))
 
 
-def test_an_empty_frustum_is_a_point() -> None:
+def test_an_empty_frustum_is_a_point():
     rays = Rays(torch.zeros(2, 3), torch.eye(3)[:2], torch.full((2,), 0.1))
     gaussians = frustum_gaussians(rays, torch.tensor([[0.0, 0.0], [3.0, 3.0]]))
     assert gaussians.isfinite().all() and not gaussians[0].any()
     assert gaussians[1, 0, :3].tolist() == [0, 3, 0] and gaussians[1, 0, 4] == 0
 
 
-def slow_contract(x: torch.Tensor, centre: torch.Tensor, radius: float) -> torch.Tensor:
+def slow_contract(x, centre, radius):
     y = (x - centre) / radius
     length = float(y.norm())
     return x if length <= 1 else centre + radius * (2 - 1 / length) * y / length
 
 
-def test_contraction_against_the_formula() -> None:
+def test_contraction_against_the_formula():
     space = Contraction(torch.tensor([0.5, -1, 2], dtype=WIDE), 1.5)
     points = 6 * torch.randn(200, 3, generator=torch.Generator().manual_seed(1), dtype=WIDE)
     points[0] = space.centre
@@ -108,7 +106,7 @@ def test_contraction_against_the_formula() -> None:
     assert 1 < int(inside.sum()) < 200
 
 
-def test_contracted_gaussians_against_the_jacobian() -> None:
+def test_contracted_gaussians_against_the_jacobian():
     space = Contraction(torch.tensor([0.2, 0, -0.1], dtype=WIDE), 1.2)
     generator = torch.Generator().manual_seed(2)
     means = 3 * torch.randn(40, 3, generator=generator, dtype=WIDE)
@@ -124,7 +122,7 @@ def test_contracted_gaussians_against_the_jacobian() -> None:
         torch.testing.assert_close(got[i], (jacobian @ covariance @ jacobian.T).diagonal())
 
 
-def test_contracted_cones_are_those_of_space_inside_of_the_sphere() -> None:
+def test_contracted_cones_are_those_of_space_inside_of_the_sphere():
     cameras = orbit_cameras(1, radius=2.0, elevation=10, width=4, height=4, focal=8.0)
     rays, edges = cameras.image_rays(0, cones=True), torch.linspace(1.5, 2.5, 9).repeat(16, 1)
     plain = frustum_gaussians(rays, edges)
@@ -134,6 +132,6 @@ def test_contracted_cones_are_those_of_space_inside_of_the_sphere() -> None:
 
 
 @pytest.mark.parametrize(("centre", "radius"), [(3, 0.0), (3, float("inf")), (3, float("nan")), (2, 1.0)])
-def test_a_sphere_has_a_centre_and_a_radius(centre: int, radius: float) -> None:
+def test_a_sphere_has_a_centre_and_a_radius(centre, radius):
     with pytest.raises(ValueError, match=r"centre must have shape \[3\] and radius be positive and finite, got "):
         Contraction(torch.zeros(centre), radius)

@@ -1,13 +1,9 @@
 """The grid, and rendering through it: what is left out must not be seen."""
 
-from __future__ import annotations
-
 import pytest
 import torch
-from torch import Tensor
 
 from voronerf.rendering import (
-    Cameras,
     OccupancyGrid,
     Rays,
     intersect_box,
@@ -25,20 +21,20 @@ WHITE = torch.ones(3)
 class Ball:
     """A coloured ball of radius 0.5 in empty space; counts what it is asked."""
 
-    def __init__(self, density: float = 60.0) -> None:
+    def __init__(self, density=60.0):
         self.density, self.asked = density, 0
 
-    def __call__(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, positions, directions, ray_index):
         assert len(ray_index) == len(positions) and (not len(ray_index) or int(ray_index.max()) < len(directions))
         self.asked += len(positions)
         return (positions + 1) / 2, self.density * (positions.norm(dim=-1) < 0.5)
 
 
-def cameras(size: int = 24) -> Cameras:
+def cameras(size=24):
     return orbit_cameras(2, radius=3.0, elevation=20.0, width=size, height=size, focal=size * 1.1)
 
 
-def grid_of(field, resolution=8, looks: int = 3) -> OccupancyGrid:
+def grid_of(field, resolution=8, looks=3):
     grid = OccupancyGrid(BOX, resolution, threshold=0.1)
     generator = torch.Generator().manual_seed(0)
     for look in range(looks):
@@ -46,7 +42,7 @@ def grid_of(field, resolution=8, looks: int = 3) -> OccupancyGrid:
     return grid
 
 
-def tight_grid(resolution: int = 24) -> OccupancyGrid:
+def tight_grid(resolution=24):
     """All cells that the ball reaches into, however little, and few others."""
     grid = OccupancyGrid(BOX, resolution, threshold=0.1)
     middles = grid.points(torch.arange(resolution**3)).norm(dim=-1)
@@ -54,7 +50,7 @@ def tight_grid(resolution: int = 24) -> OccupancyGrid:
     return grid
 
 
-def test_a_grid_finds_what_is_empty() -> None:
+def test_a_grid_finds_what_is_empty():
     grid = OccupancyGrid(BOX, (8, 10, 12), threshold=0.1)
     assert grid.share == 1 and grid.occupied.shape == (8, 10, 12)
     for look in range(20):
@@ -65,7 +61,7 @@ def test_a_grid_finds_what_is_empty() -> None:
     assert not bool(grid.occupied[middles > 0.5 + half].any())
 
 
-def test_points_lie_in_their_cells() -> None:
+def test_points_lie_in_their_cells():
     grid = OccupancyGrid(torch.tensor([[0.0, 10.0, -4.0], [2.0, 13.0, 0.0]]), (2, 3, 4), threshold=1)
     cells = torch.arange(24)
     assert grid.points(cells)[0].tolist() == [0.5, 10.5, -3.5]
@@ -76,7 +72,7 @@ def test_points_lie_in_their_cells() -> None:
     assert all(torch.equal(cell, cells) for cell in found)
 
 
-def test_cells_that_are_looked_at_fade_and_the_others_stay() -> None:
+def test_cells_that_are_looked_at_fade_and_the_others_stay():
     grid = OccupancyGrid(BOX, 4, threshold=0.1)
     grid.update(lambda p, d, i: (p, torch.full((len(p),), 8.0)))
     seen = torch.arange(0, 64, 2)
@@ -90,7 +86,7 @@ def test_cells_that_are_looked_at_fade_and_the_others_stay() -> None:
     assert bool((density[1::2] == 8).all())
 
 
-def test_cells_are_those_of_their_points() -> None:
+def test_cells_are_those_of_their_points():
     grid = OccupancyGrid(torch.tensor([[0.0, 10.0, -4.0], [2.0, 13.0, 0.0]]), (2, 3, 4), threshold=1)
     every = torch.arange(24)
     for _ in range(4):
@@ -99,7 +95,7 @@ def test_cells_are_those_of_their_points() -> None:
     assert grid.cells(border).tolist() == [0, 23, 20] and grid.cells(border).dtype == torch.int32
 
 
-def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden() -> None:
+def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
     """Rays from all around a ball: its shell stays, the air around it and the inside that no light reaches fade."""
     grid, ball = OccupancyGrid(BOX, 16, threshold=0.1), Ball(200.0)
     random = torch.Generator().manual_seed(0)
@@ -133,7 +129,7 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden() -> None:
         grid.observe(*[torch.zeros(1, 3), *[torch.zeros(1)] * 3], decay=-1)
 
 
-def test_images_are_the_same_with_a_fraction_of_the_samples() -> None:
+def test_images_are_the_same_with_a_fraction_of_the_samples():
     dense, sparse = Ball(), Ball()
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 96, "background": WHITE}
     plain = render_image(dense, cameras(), 0, **options)
@@ -154,7 +150,7 @@ def test_images_are_the_same_with_a_fraction_of_the_samples() -> None:
         render_image(Ball(), cameras(), 0, occupancy=grid, chunk=0, **options)
 
 
-def test_a_translucent_field_is_walked_to_its_end() -> None:
+def test_a_translucent_field_is_walked_to_its_end():
     """Rays that never become opaque need every wave."""
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 128, "background": WHITE}
     plain = render_image(Ball(0.7), cameras(), 1, **options)
@@ -165,7 +161,7 @@ def test_a_translucent_field_is_walked_to_its_end() -> None:
 
 
 @pytest.mark.parametrize("backend", ["auto", "reference"])
-def test_training_samples_and_gradients_are_those_of_the_dense_form(backend: str) -> None:
+def test_training_samples_and_gradients_are_those_of_the_dense_form(backend):
     rays = cameras(9).image_rays(0)
     near, far, hit = intersect_box(rays.origins, rays.directions, BOX, 1.0, 5.0)
     rays, near, far = rays[hit], near[hit], far[hit]
@@ -193,7 +189,7 @@ def test_training_samples_and_gradients_are_those_of_the_dense_form(backend: str
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
 
 
-def test_rays_that_meet_nothing_show_the_background() -> None:
+def test_rays_that_meet_nothing_show_the_background():
     grid = grid_of(lambda p, d, i: (p, torch.zeros(len(p))))
     assert grid.share == 0
     rays = Rays(torch.zeros(3, 3), torch.eye(3))
@@ -209,7 +205,7 @@ def test_rays_that_meet_nothing_show_the_background() -> None:
     assert torch.equal(marched.colour.detach(), torch.zeros(3, 3)) and parameter.grad == 0
 
 
-def test_state_goes_round() -> None:
+def test_state_goes_round():
     grid = grid_of(Ball(), resolution=(3, 4, 5))
     other = OccupancyGrid.from_state(grid.state_dict())
     for name, value in grid.state_dict().items():
@@ -222,7 +218,7 @@ def test_state_goes_round() -> None:
         OccupancyGrid.from_state(grid.state_dict() | {"density": torch.zeros(3)})
 
 
-def test_refuses_what_is_no_grid() -> None:
+def test_refuses_what_is_no_grid():
     with pytest.raises(ValueError, match="box must be finite corners"):
         OccupancyGrid(BOX.flip(0), threshold=1)
     with pytest.raises(ValueError, match="box must be finite corners"):

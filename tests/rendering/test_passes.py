@@ -1,10 +1,7 @@
 """Several passes along a ray, against slow loops and pictures that are known."""
 
-from __future__ import annotations
-
 import itertools
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -28,24 +25,24 @@ WHITE = torch.ones(3)
 class Slab:
     """Red fog of a density between two heights, nothing elsewhere; counts what it is asked."""
 
-    def __init__(self, low: float = -0.05, high: float = 0.05, density: float = 30.0) -> None:
+    def __init__(self, low=-0.05, high=0.05, density=30.0):
         self.low, self.high, self.density = low, high, density
         self.asked: list[Tensor] = []
 
-    def __call__(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, positions, directions, ray_index):
         self.asked.append(positions)
         inside = (positions[:, 2] > self.low) & (positions[:, 2] < self.high)
         return torch.tensor((0.9, 0.2, 0.1)).expand(len(positions), 3), self.density * inside
 
 
-def rays(count: int = 3) -> Rays:
+def rays(count=3):
     """Straight down from height 2, one beside the other."""
     origins = torch.tensor((0.0, 0.0, 2.0)).repeat(count, 1)
     origins[:, 0] = torch.arange(count)
     return Rays(origins, torch.tensor((0.0, 0.0, -1.0)).repeat(count, 1), torch.full((count,), 0.01))
 
 
-def test_a_second_pass_finds_a_thin_surface() -> None:
+def test_a_second_pass_finds_a_thin_surface():
     """A slab a fortieth of the ray thick: 16 strata see it with a wrong thickness, the second pass does not."""
     expected = 1 - math.exp(-30 * 0.1)
     one = Renderer({"field": Slab()}, samples=17).render(rays(), 0.0, 4.0)
@@ -59,8 +56,8 @@ def test_a_second_pass_finds_a_thin_surface() -> None:
         assert float(passes[1].depth[0]) == pytest.approx(1.95 + within, abs=0.005)
 
 
-def test_who_is_asked_about_what() -> None:
-    def shapes(**fields: Slab) -> dict[str, list[list[int]]]:
+def test_who_is_asked_about_what():
+    def shapes(**fields):
         return {name: [list(p.shape) for p in field.asked] for name, field in fields.items()}
 
     field, first = Slab(), Slab()
@@ -77,8 +74,8 @@ def test_who_is_asked_about_what() -> None:
     assert shapes(field=field) == {"field": [[3 * 8, 3]]}
 
 
-def test_one_pass_is_render_rays() -> None:
-    options: dict[str, Any] = {"background": WHITE, "jitter": True}
+def test_one_pass_is_render_rays():
+    options = {"background": WHITE, "jitter": True}
     got = Renderer({"field": Slab()}, samples=9, spacing="disparity").render(
         rays(), 1.0, 3.0, generator=torch.Generator().manual_seed(4), **options
     )
@@ -89,7 +86,7 @@ def test_one_pass_is_render_rays() -> None:
         assert torch.equal(a, b)
 
 
-def test_union_against_slow_loop() -> None:
+def test_union_against_slow_loop():
     generator = torch.Generator().manual_seed(0)
     edges = torch.rand(5, 9, generator=generator).cumsum(1)
     weights = torch.rand(5, 8, generator=generator)
@@ -112,7 +109,7 @@ def test_union_against_slow_loop() -> None:
         assert ends[ray, 0] == edges[ray, 0] and ends[ray, -1] == edges[ray, -1]
 
 
-def test_blurred_weights_against_slow_loop() -> None:
+def test_blurred_weights_against_slow_loop():
     weights = torch.rand(4, 7, generator=torch.Generator().manual_seed(0))
     got = blurred_weights(weights)
     for ray in range(4):
@@ -125,7 +122,7 @@ def test_blurred_weights_against_slow_loop() -> None:
     assert float(blurred_weights(torch.ones(1, 1))) == pytest.approx(1 + PADDING)
 
 
-def test_interlevel_loss_against_slow_loop() -> None:
+def test_interlevel_loss_against_slow_loop():
     generator = torch.Generator().manual_seed(0)
     edges = torch.rand(6, 6, generator=generator).cumsum(1) + 0.5
     found = torch.rand(6, 5, generator=generator).cumsum(1)
@@ -149,7 +146,7 @@ def test_interlevel_loss_against_slow_loop() -> None:
     assert float(bounds.grad.max()) < 1e-6 and float(bounds.grad.min()) < -0.01
 
 
-def test_a_proposal_that_bounds_the_weights_costs_nothing() -> None:
+def test_a_proposal_that_bounds_the_weights_costs_nothing():
     edges = torch.linspace(0, 1, 9)[None]
     weights = torch.rand(1, 8)
     assert float(
@@ -157,7 +154,7 @@ def test_a_proposal_that_bounds_the_weights_costs_nothing() -> None:
     ) == pytest.approx(0, abs=1e-9)
 
 
-def test_distortion_loss_against_slow_loop() -> None:
+def test_distortion_loss_against_slow_loop():
     generator = torch.Generator().manual_seed(0)
     edges = torch.rand(6, 8, generator=generator).sort(dim=1).values
     weights = torch.rand(6, 7, generator=generator).requires_grad_()
@@ -181,7 +178,7 @@ def test_distortion_loss_against_slow_loop() -> None:
     assert float(distortion_loss(ends[None], mass[None])) == pytest.approx(integral, rel=1e-3)
 
 
-def test_distances_as_fractions() -> None:
+def test_distances_as_fractions():
     near, far = torch.tensor([1.0, 2.0, 3.0, 0.0]), torch.tensor([4.0, 2.0, 30.0, 5.0])
     for spacing in ("linear", "disparity"):
         edges = stratified_edges(near, far, 5, jitter=False, spacing=spacing)
@@ -192,10 +189,10 @@ def test_distances_as_fractions() -> None:
         assert torch.equal(found[1], torch.zeros(6)) and bool(((found[3] >= 0) & (found[3] <= 1)).all())
 
 
-def test_a_spread_along_the_ray_costs_by_its_factor() -> None:
+def test_a_spread_along_the_ray_costs_by_its_factor():
     target, fog = torch.rand(3, 3), Slab(-0.6, 0.8, density=1.0)
     for spacing, fields in (("linear", {"field": fog}), ("disparity", {"field": fog, "proposal": fog})):
-        options: dict[str, Any] = {"samples": 6, "fine_samples": 5 * (len(fields) - 1), "spacing": spacing}
+        options = {"samples": 6, "fine_samples": 5 * (len(fields) - 1), "spacing": spacing}
         passes = Renderer(fields, **options).render(rays(), 1.0, 4.0)
         plain, with_it = (Renderer(fields, distortion=d, **options).loss(passes, target) for d in (0.0, 0.5))
         last = passes[-1]
@@ -204,7 +201,7 @@ def test_a_spread_along_the_ray_costs_by_its_factor() -> None:
         assert float(spread) > 0
 
 
-def test_a_proposal_is_asked_in_rounds() -> None:
+def test_a_proposal_is_asked_in_rounds():
     field, proposal = Slab(), Slab()
     renderer = Renderer({"field": field, "proposal": proposal}, samples=8, fine_samples=4, rounds=3)
     passes = renderer.render(rays(), 0.0, 4.0, jitter=True, generator=torch.Generator().manual_seed(0))
@@ -221,7 +218,7 @@ def test_a_proposal_is_asked_in_rounds() -> None:
     torch.testing.assert_close(renderer.loss(passes, target), expected)
 
 
-def test_a_proposal_sharpens() -> None:
+def test_a_proposal_sharpens():
     """From even intervals to those of its weights, while training; pictures are made with its weights as they are."""
     inside, edges = [], []
     for sharpness in (0.0, 0.4, 1.0):
@@ -242,7 +239,7 @@ def test_a_proposal_sharpens() -> None:
     assert torch.equal(edges[0], edges[2]) and torch.equal(edges[1], edges[2])
 
 
-def test_losses() -> None:
+def test_losses():
     target = torch.rand(3, 3)
     for fields, share in (({"field": Slab()}, 0.1), ({"field": Slab(), "coarse": Slab(0.2, 0.8)}, 1.0)):
         renderer = Renderer(fields, samples=6, fine_samples=5)
@@ -261,7 +258,7 @@ def test_losses() -> None:
 
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])
 @pytest.mark.parametrize("samples", [1, 2, 33])
-def test_jittered_edges_cover_the_ray(spacing: str, samples: int) -> None:
+def test_jittered_edges_cover_the_ray(spacing, samples):
     near, far = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 2.0, 30.0])
     even = stratified_edges(near, far, samples, jitter=False, spacing=spacing)
     for seed in range(5):
@@ -274,14 +271,14 @@ def test_jittered_edges_cover_the_ray(spacing: str, samples: int) -> None:
             assert not torch.equal(edges, even)
 
 
-def test_uniforms_are_one_in_each_stratum() -> None:
+def test_uniforms_are_one_in_each_stratum():
     u = strata_uniforms(500, 7, torch.zeros(()), True, torch.Generator().manual_seed(0))
     assert u is not None and torch.equal((u * 7).floor(), torch.arange(7.0).expand(500, 7))
     assert float((u * 7 % 1).mean()) == pytest.approx(0.5, abs=0.02)
     assert strata_uniforms(5, 7, torch.zeros(()), False, None) is None
 
 
-def test_training_draws_differ_and_pictures_do_not() -> None:
+def test_training_draws_differ_and_pictures_do_not():
     for fields, cones in (({"field": Slab(), "coarse": Slab()}, False), ({"field": Slab(), "proposal": Slab()}, False),
                           ({"field": Slab()}, True)):  # fmt: skip
         renderer = Renderer(fields, samples=8, fine_samples=8, cones=cones)
@@ -292,7 +289,7 @@ def test_training_draws_differ_and_pictures_do_not() -> None:
         assert torch.equal(*still)
 
 
-def test_contracted_positions_are_what_the_field_sees() -> None:
+def test_contracted_positions_are_what_the_field_sees():
     space = Contraction(torch.zeros(3), 0.5)
     for cones in (False, True):
         field = Slab()
@@ -301,7 +298,7 @@ def test_contracted_positions_are_what_the_field_sees() -> None:
         assert float(passes[0].positions.norm(dim=-1).max()) < 1
 
 
-def test_refusals() -> None:
+def test_refusals():
     with pytest.raises(ValueError, match=r"fields must be field, and coarse or proposal, got \['coarse'\]"):
         Renderer({"coarse": Slab()}, samples=3)
     with pytest.raises(ValueError, match="fine_samples must be >= 1 with two fields, got 0"):

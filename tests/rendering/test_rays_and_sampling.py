@@ -1,7 +1,5 @@
 """Box intersection and stratified sampling, against slow loops and their properties."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -19,7 +17,7 @@ def slow_interval(origin, direction, box, near, far):
     return (float(steps[inside][0]), float(steps[inside][-1])) if inside.any() else None
 
 
-def test_box_against_slow_loop() -> None:
+def test_box_against_slow_loop():
     generator = torch.Generator().manual_seed(0)
     origins = torch.randn(60, 3, generator=generator) * 2
     origins[:5] *= 0.1  # some start inside
@@ -35,7 +33,7 @@ def test_box_against_slow_loop() -> None:
             assert (float(near[i]), float(far[i])) == pytest.approx(expected, abs=1e-3)
 
 
-def test_box_axis_parallel_rays_and_origin_on_a_face() -> None:
+def test_box_axis_parallel_rays_and_origin_on_a_face():
     origins = torch.tensor([[-3.0, 0, 1], [-3, 0.6, 1], [-1, 0, 1], [0, 0.5, 1], [-3, 0.5, 2], [0, 0, -1]])
     directions = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, -0.0, 1]])
     near, far, hit = intersect_box(origins, directions, BOX, 0.0, 10.0)
@@ -46,14 +44,14 @@ def test_box_axis_parallel_rays_and_origin_on_a_face() -> None:
     assert not near.isnan().any() and not far.isnan().any()
 
 
-def test_box_that_is_behind_or_beyond_is_missed() -> None:
+def test_box_that_is_behind_or_beyond_is_missed():
     origins, directions = torch.tensor([[5.0, 0, 1], [-9, 0, 1]]), torch.tensor([[1.0, 0, 0], [1, 0, 0]])
     near, far, hit = intersect_box(origins, directions, BOX, 1.0, 6.0)
     assert not hit.any()
     assert torch.equal(near, far)
 
 
-def test_no_box_no_rays_and_errors() -> None:
+def test_no_box_no_rays_and_errors():
     origins = torch.zeros(4, 3)
     near, far, hit = intersect_box(origins, origins + 1, None, 2.0, 6.0)
     assert near.tolist() == [2] * 4 and far.tolist() == [6] * 4 and hit.all()
@@ -68,7 +66,7 @@ def test_no_box_no_rays_and_errors() -> None:
 
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])
 @pytest.mark.parametrize("samples", [1, 7, 64])
-def test_strata(spacing: str, samples: int) -> None:
+def test_strata(spacing, samples):
     near = torch.tensor([2.0, 0.05, 1.0, 3.0])
     far = torch.tensor([6.0, 20.0, 1.0, 3.5])
     generator = torch.Generator().manual_seed(1)
@@ -83,7 +81,7 @@ def test_strata(spacing: str, samples: int) -> None:
     assert torch.equal(middle, stratified_depths(near, far, samples, jitter=False, spacing=spacing)[0])
 
 
-def test_spacing_against_slow_loop() -> None:
+def test_spacing_against_slow_loop():
     near, far, samples = 0.5, 8.0, 5
     for spacing in ("linear", "disparity"):
         depths, _, edges = stratified_depths(
@@ -99,7 +97,7 @@ def test_spacing_against_slow_loop() -> None:
             assert float(depths[0, i]) == pytest.approx(expected, rel=1e-6)
 
 
-def test_disparity_from_distance_0_is_finite() -> None:
+def test_disparity_from_distance_0_is_finite():
     near, far = torch.zeros(3), torch.tensor([4.0, 1e-6, 0.0])
     depths, deltas, edges = stratified_depths(near, far, 5, jitter=True, spacing="disparity")
     for part in (depths, deltas, edges):
@@ -107,7 +105,7 @@ def test_disparity_from_distance_0_is_finite() -> None:
     assert torch.equal(edges[:, -1], far) and torch.equal(edges[:, :-1], torch.zeros(3, 5))
 
 
-def test_jitter_is_uniform_and_reproducible() -> None:
+def test_jitter_is_uniform_and_reproducible():
     near, far = torch.zeros(4000), torch.full((4000,), 4.0)
     first = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
     again = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
@@ -117,7 +115,7 @@ def test_jitter_is_uniform_and_reproducible() -> None:
     assert float(inside.var()) == pytest.approx(1 / 12, abs=0.003)
 
 
-def test_a_generator_of_another_device_draws_there() -> None:
+def test_a_generator_of_another_device_draws_there():
     one = torch.ones(4, device="meta")
     generator = torch.Generator().manual_seed(3)
     parts = stratified_depths(one, one, 2, jitter=True, generator=generator)
@@ -128,7 +126,7 @@ def test_a_generator_of_another_device_draws_there() -> None:
 
 
 @pytest.mark.cuda
-def test_a_generator_of_the_cpu_gives_cuda_rays_the_same_jitter() -> None:
+def test_a_generator_of_the_cpu_gives_cuda_rays_the_same_jitter():
     near, far = torch.zeros(40), torch.full((40,), 4.0)
     expected = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
     depths = stratified_depths(near.cuda(), far.cuda(), 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
@@ -138,7 +136,7 @@ def test_a_generator_of_the_cpu_gives_cuda_rays_the_same_jitter() -> None:
     assert stratified_depths(near.cuda(), far.cuda(), 4, jitter=True, generator=own)[0].is_cuda
 
 
-def test_no_rays_and_errors() -> None:
+def test_no_rays_and_errors():
     none = torch.zeros(0)
     assert [tuple(t.shape) for t in stratified_depths(none, none, 3, jitter=True)] == [(0, 3), (0, 3), (0, 4)]
     one = torch.ones(1)

@@ -1,14 +1,11 @@
 """Volume rendering against slow loops and against integrals that are known."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
-from torch import Tensor
 
-from voronerf.rendering.cameras import Cameras, Rays, orbit_cameras
+from voronerf.rendering.cameras import Rays, orbit_cameras
 from voronerf.rendering.renderer import render_image
 from voronerf.rendering.volume import render_rays
 
@@ -16,29 +13,29 @@ BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])
 WHITE = torch.ones(3)
 
 
-def ball(positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+def ball(positions, directions, ray_index):
     """A dense ball of radius 0.6, coloured by position and by the ray's direction."""
     rgb = 0.5 + 0.4 * positions * directions[ray_index.long()]
     return rgb, torch.where(positions.norm(dim=-1) < 0.6, 30.0, 0.0)
 
 
-def rays(count: int = 9) -> Rays:
+def rays(count=9):
     generator = torch.Generator().manual_seed(0)
     origins = torch.tensor((0.0, 0.0, 3.0)).repeat(count, 1)
     targets = torch.randn(count, 3, generator=generator) * 0.4
     return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1))
 
 
-def cameras() -> Cameras:
+def cameras():
     return orbit_cameras(2, radius=3, elevation=25, width=13, height=9, focal=9)
 
 
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])
-def test_against_slow_loop(spacing: str) -> None:
+def test_against_slow_loop(spacing):
     some, samples, near, far = rays(), 17, 1.5, 4.5
     result = render_rays(ball, some, near, far, samples=samples, background=WHITE, spacing=spacing)
 
-    def distance(fraction: float) -> float:
+    def distance(fraction):
         if spacing == "linear":
             return near + fraction * (far - near)
         return 1 / ((1 - fraction) / near + fraction / far)
@@ -63,10 +60,10 @@ def test_against_slow_loop(spacing: str) -> None:
         assert float(result.depth[r]) == pytest.approx(depth / opacity if opacity > 1e-7 else far, abs=1e-4)
 
 
-def test_homogeneous_medium() -> None:
+def test_homogeneous_medium():
     """Constant density: opacity is 1 - exp(-sigma length) whatever the sampling."""
 
-    def fog(positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def fog(positions, directions, ray_index):
         return torch.full_like(positions, 0.25), torch.full_like(positions[:, 0], 0.7)
 
     for samples in (1, 5, 32):
@@ -76,7 +73,7 @@ def test_homogeneous_medium() -> None:
         torch.testing.assert_close(result.colour, torch.full((3, 3), 0.25 * opacity))
 
 
-def test_rays_of_no_extent_show_the_background() -> None:
+def test_rays_of_no_extent_show_the_background():
     some = rays(2)
     near = torch.tensor([2.0, 2.0])
     result = render_rays(
@@ -87,11 +84,11 @@ def test_rays_of_no_extent_show_the_background() -> None:
     assert float(result.opacity[1]) > 0.9
 
 
-def test_gradients_reach_density_and_colour_and_not_nan_on_empty_rays() -> None:
+def test_gradients_reach_density_and_colour_and_not_nan_on_empty_rays():
     colour = torch.full((3,), 0.5, requires_grad=True)
     density = torch.tensor(0.0, requires_grad=True)
 
-    def learned(positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def learned(positions, directions, ray_index):
         return colour.expand_as(positions), density.expand(len(positions))
 
     result = render_rays(learned, rays(2), 1.0, 2.0, samples=4, background=WHITE)
@@ -100,8 +97,8 @@ def test_gradients_reach_density_and_colour_and_not_nan_on_empty_rays() -> None:
     assert colour.grad is not None and colour.grad.isfinite().all()
 
 
-def test_a_half_precision_field_is_summed_in_float32() -> None:
-    def half(positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+def test_a_half_precision_field_is_summed_in_float32():
+    def half(positions, directions, ray_index):
         rgb, sigma = ball(positions, directions, ray_index)
         return rgb.bfloat16(), sigma.bfloat16()
 
@@ -110,7 +107,7 @@ def test_a_half_precision_field_is_summed_in_float32() -> None:
     torch.testing.assert_close(result.colour, render_rays(ball, rays(), 1.5, 4.5, samples=16).colour, atol=5e-3, rtol=0)
 
 
-def test_image_is_the_rays_of_its_pixels_whatever_the_chunk() -> None:
+def test_image_is_the_rays_of_its_pixels_whatever_the_chunk():
     some = cameras()
     options = {"near": 1.0, "far": 5.0, "samples": 24, "background": WHITE}
     image = render_image(ball, some, 1, **options)
@@ -126,10 +123,10 @@ def test_image_is_the_rays_of_its_pixels_whatever_the_chunk() -> None:
     torch.testing.assert_close(image.heaviest.reshape(-1, 3)[seen], direct.positions[torch.arange(len(top)), top][seen])
 
 
-def test_rays_that_miss_the_box_do_not_ask_the_field() -> None:
-    asked: list[int] = []
+def test_rays_that_miss_the_box_do_not_ask_the_field():
+    asked = []
 
-    def counting(positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def counting(positions, directions, ray_index):
         asked.append(len(directions))
         assert (positions.abs() <= 0.7 + 1e-4).all()
         return ball(positions, directions, ray_index)
@@ -146,10 +143,10 @@ def test_rays_that_miss_the_box_do_not_ask_the_field() -> None:
     assert float(nothing.colour.abs().max()) == 0 and float(nothing.depth.min()) == 5.0
 
 
-def test_no_gradient_and_errors() -> None:
+def test_no_gradient_and_errors():
     weight = torch.ones(3, requires_grad=True)
 
-    def learned(positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def learned(positions, directions, ray_index):
         return positions * 0 + weight, positions[:, 0] * 0 + 1
 
     assert not render_image(learned, cameras(), 0, near=1.0, far=5.0, samples=2).colour.requires_grad
@@ -157,6 +154,6 @@ def test_no_gradient_and_errors() -> None:
         render_image(ball, cameras(), 0, near=1.0, far=5.0, samples=2, chunk=0)
 
 
-def test_no_rays() -> None:
+def test_no_rays():
     result = render_rays(ball, Rays(torch.zeros(0, 3), torch.zeros(0, 3)), 1.0, 2.0, samples=3)
     assert result.colour.shape == (0, 3) and result.weights.shape == (0, 3)

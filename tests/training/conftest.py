@@ -1,10 +1,8 @@
-from __future__ import annotations
-
 import pytest
 
-from voronerf.data import Scene, builtin_scene
+from voronerf.data import builtin_scene
 
 
 @pytest.fixture(scope="session")
-def scene() -> Scene:
+def scene():
     return builtin_scene(16)

@@ -1,11 +1,8 @@
 """Checkpoint files: exact, atomic, refused with the file's name when they are broken."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pickle
-from pathlib import Path
 
 import pytest
 import torch
@@ -23,12 +20,12 @@ from voronerf.training.checkpoint import (
 )
 
 
-def example() -> Checkpoint:
+def example():
     tensors = {"a.x": torch.randn(3, 4), "a.y": torch.arange(5, dtype=torch.uint8), "b.z": torch.tensor(1.5)}
     return Checkpoint(tensors, {"step": 7, "name": "é", "none": None})
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_round_trip(tmp_path):
     saved = example()
     save_checkpoint(tmp_path / "new" / "last.safetensors", saved)
     loaded = load_checkpoint(tmp_path / "new" / "last.safetensors")
@@ -38,12 +35,12 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("failing", ["fsync", "replace"])
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str) -> None:
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, failing):
     path = tmp_path / "last.safetensors"
     save_checkpoint(path, example())
     before = path.read_bytes()
 
-    def full(*_: object) -> None:
+    def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, failing, full)
@@ -53,7 +50,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     assert [p.name for p in tmp_path.iterdir()] == ["last.safetensors"]
 
 
-def test_broken_files_are_named(tmp_path) -> None:
+def test_broken_files_are_named(tmp_path):
     path = tmp_path / "last.safetensors"
     refuses("last.safetensors: there is no checkpoint", load_checkpoint, path, error=CheckpointError)
     save_checkpoint(path, example())
@@ -66,11 +63,11 @@ def test_broken_files_are_named(tmp_path) -> None:
     refuses(other, load_checkpoint, path, error=CheckpointError)
 
 
-def test_optimizer_state_round_trips() -> None:
+def test_optimizer_state_round_trips():
     first = torch.nn.Parameter(torch.randn(4))
     optimizer = torch.optim.Adam([first], lr=0.1, fused=True)
 
-    def step(parameter, optimizer) -> None:
+    def step(parameter, optimizer):
         optimizer.zero_grad()
         parameter.square().sum().backward()
         optimizer.step()
@@ -84,7 +81,7 @@ def test_optimizer_state_round_trips() -> None:
     assert torch.equal(first, second)
 
 
-def test_text_is_replaced_whole_and_broken_lines_of_json_are_named(tmp_path) -> None:
+def test_text_is_replaced_whole_and_broken_lines_of_json_are_named(tmp_path):
     path = tmp_path / "metrics.jsonl"
     assert read_json_lines(path) == []
     write_text(path, '{"step": 1}\n{"step": 2}\n')

@@ -1,10 +1,7 @@
 """Settings: every rule has its message, and JSON gives back what went in."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import pytest
 from helpers import refuses
@@ -16,12 +13,12 @@ from voronerf.training.config_checks import check_device
 @pytest.mark.parametrize(
     ("cells", "expected"), [((), ()), ((4,), (0.2,)), ((4, 4), (0.15, 0.5)), ((2, 2, 2), (0.15, 0.325, 0.5))]
 )
-def test_default_splits(cells: tuple[int, ...], expected: tuple[float, ...]) -> None:
+def test_default_splits(cells, expected):
     assert TrainConfig().budget == 480 and TrainConfig().splits == (0.2,)
     assert TrainConfig(cells=cells).splits == pytest.approx(expected)
 
 
-def test_json_round_trip(tmp_path: Path) -> None:
+def test_json_round_trip(tmp_path):
     config = TrainConfig(data="x", out=tmp_path, steps=3, cells=(4, 4), split_at=(0.2, 0.7), skips=(1, 2))
     assert TrainConfig.from_json(config.to_json()) == config
     config = dataclasses.replace(config, split_at=None, split_at_steps=(1, 2), lpips=tmp_path, parameters=5000)
@@ -30,7 +27,7 @@ def test_json_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"out": null, "colour": 3}', '{"out": 3}'])
-def test_json_of_something_else(text: str) -> None:
+def test_json_of_something_else(text):
     with pytest.raises(ConfigError, match=r"run/config.json: not a configuration of this version"):
         TrainConfig.from_json(text, "run/config.json")
 
@@ -87,12 +84,12 @@ def test_json_of_something_else(text: str) -> None:
         ({"cells": (20_000,)}, r"--cells must not exceed --reservoir, the 10000 samples of a split, got \(20000,\)"),
     ],
 )
-def test_bad_settings(settings: dict[str, Any], message: str) -> None:
+def test_bad_settings(settings, message):
     with pytest.raises(ConfigError, match=message):
         TrainConfig(**settings)
 
 
-def test_every_choice_of_words_is_checked() -> None:
+def test_every_choice_of_words_is_checked():
     names = "sampling split centres balance init assignment contraction precision background"
     assert set(CHOICES) == set(names.split())
     for name in CHOICES:
@@ -105,11 +102,11 @@ def test_every_choice_of_words_is_checked() -> None:
     [(name, "be cpu or cuda") for name in ("meta", "mps")]
     + [(name, "name a device that is present") for name in ("gpu7", "cuda:99")],
 )
-def test_a_device_that_is_not_there(name: str, rule: str) -> None:
+def test_a_device_that_is_not_there(name, rule):
     refuses(f"--device must {rule}, got '{name}'", check_device, name, error=ConfigError)
 
 
-def test_defaults_of_the_architectures() -> None:
+def test_defaults_of_the_architectures():
     """Wide networks learn slower."""
     for settings, expected in (
         ({}, (64, 4, 0.02)),
@@ -123,7 +120,7 @@ def test_defaults_of_the_architectures() -> None:
         assert (config.width, config.depth, config.lr) == pytest.approx(expected)
 
 
-def test_differences_name_what_cannot_change() -> None:
+def test_differences_name_what_cannot_change():
     assert {f.name for f in dataclasses.fields(TrainConfig)} >= RESUMABLE
     a = TrainConfig(steps=10)
     assert differences(a, dataclasses.replace(a, steps=20, out=Path("x"), resume=True)) == []
@@ -131,7 +128,7 @@ def test_differences_name_what_cannot_change() -> None:
     assert differences(a, changed) == ["--width 64 -> 32", "--lr-final 0.05 -> 0.5"]
 
 
-def test_final_cells() -> None:
+def test_final_cells():
     assert [TrainConfig(cells=cells).final_cells for cells in ((), (12,), (4, 4))] == [1, 12, 16]
     assert TrainConfig(cells=(4, 3), split="worst").final_cells == 6
     assert TrainConfig(cells=(4, 3), split="worst", max_cells=15).final_cells == 15
@@ -150,7 +147,7 @@ def test_final_cells() -> None:
         ({"cells": (4,), "split": "worst", "max_cells": 5}, [(0.15, 4, "all"), (0.5, 4, "worst")]),
     ],
 )
-def test_planned_splits(settings: dict[str, Any], expected: list[tuple[float, int, str]]) -> None:
+def test_planned_splits(settings, expected):
     plan = TrainConfig(**settings).planned_splits
     assert [(round(p.at, 9), p.children, p.cells) for p in plan] == expected
     assert all(p.most == settings.get("max_cells") for p in plan if p.cells == "worst")

@@ -1,7 +1,5 @@
 """Steps for CUDA graphs, on a machine that has none: what they may not do, and when they are captured and replayed."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 from typing import Any
@@ -37,7 +35,7 @@ class NoReading(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def test_what_reads_is_noticed() -> None:
+def test_what_reads_is_noticed():
     x = torch.rand(5)
     for read in (lambda: float(x[0]), lambda: x.nonzero(), lambda: x[x > 0.5], lambda: torch.tensor([1.0])):
         with pytest.raises(AssertionError), NoReading():
@@ -54,7 +52,7 @@ def test_what_reads_is_noticed() -> None:
     ],
     ids=lambda settings: "-".join(settings.values()) or "plain",
 )
-def test_a_step_reads_nothing_on_the_host(tmp_path, scene, monkeypatch, settings) -> None:
+def test_a_step_reads_nothing_on_the_host(tmp_path, scene, monkeypatch, settings):
     """In the coarse stage and after the split; the first step of either may look at the network once."""
     trainer = Trainer(small(tmp_path, **settings), scene)
     for cells in (1, 4):
@@ -73,14 +71,14 @@ def test_a_step_reads_nothing_on_the_host(tmp_path, scene, monkeypatch, settings
 class FakeGraph:
     """Keeps what is done between a capture's begin and end, and does it at every replay."""
 
-    capturing: FakeGraph | None = None
+    capturing = None
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.work: list[Any] = []
         self.generators: list[torch.Generator] = []
         self.register_generator_state = self.generators.append
 
-    def replay(self) -> None:
+    def replay(self):
         for each in self.work:
             each()
 
@@ -88,7 +86,7 @@ class FakeGraph:
 @pytest.fixture
 def fake_cuda(monkeypatch):
     """Devices that were entered."""
-    entered: list[torch.device] = []
+    entered = []
 
     @contextlib.contextmanager
     def capture(graph):
@@ -97,7 +95,7 @@ def fake_cuda(monkeypatch):
         FakeGraph.capturing = None
 
     class FakeStream:
-        def wait_stream(self, other: FakeStream) -> None:
+        def wait_stream(self, other):
             pass
 
     fakes = {"CUDAGraph": FakeGraph, "graph": capture, "Stream": FakeStream, "current_stream": FakeStream}
@@ -108,11 +106,11 @@ def fake_cuda(monkeypatch):
     return entered
 
 
-def test_every_call_is_one_step(fake_cuda) -> None:
+def test_every_call_is_one_step(fake_cuda):
     """On the device of the trainer's generator, which need not be the current one."""
     result, launches = torch.zeros(()), []
 
-    def step() -> torch.Tensor:
+    def step():
         launches.append("called")
         add = lambda: result.add_(1)  # noqa: E731
         FakeGraph.capturing.work.append(add) if FakeGraph.capturing else add()
@@ -126,8 +124,8 @@ def test_every_call_is_one_step(fake_cuda) -> None:
     assert isinstance(graphed.graph, FakeGraph) and graphed.graph.generators == [generator]
 
 
-def test_a_split_ends_a_graph(tmp_path, scene, fake_cuda, monkeypatch) -> None:
-    made: list[GraphedStep] = []
+def test_a_split_ends_a_graph(tmp_path, scene, fake_cuda, monkeypatch):
+    made = []
     monkeypatch.setattr(trainer_module, "GraphedStep", lambda *given: made.append(GraphedStep(*given)) or made[-1])
     trainer = Trainer(small(tmp_path, cells=(2, 2), min_cell_samples=2), scene)
     object.__setattr__(trainer.config, "cuda_graph", True)  # which no configuration without a GPU may say
@@ -142,7 +140,7 @@ def test_a_split_ends_a_graph(tmp_path, scene, fake_cuda, monkeypatch) -> None:
     assert [graphed.runs for graphed in made] == [WARMUP, 1] and made[1].graph is None
 
 
-def test_a_learning_rate_in_a_tensor_is_changed_in_place() -> None:
+def test_a_learning_rate_in_a_tensor_is_changed_in_place():
     for rate in (torch.tensor(1.0), 1.0):
         optimizer = torch.optim.SGD([torch.zeros(2, requires_grad=True)], lr=rate)
         set_learning_rate(optimizer, 0.25)
@@ -150,7 +148,7 @@ def test_a_learning_rate_in_a_tensor_is_changed_in_place() -> None:
         assert found == 0.25 and (found is rate) == isinstance(rate, torch.Tensor)
 
 
-def test_half_types_learn_with_parameters_in_float32(tmp_path, scene) -> None:
+def test_half_types_learn_with_parameters_in_float32(tmp_path, scene):
     psnr = {}
     for precision in ("fp32", "bf16", "fp16"):
         trainer = Trainer(small(tmp_path / precision, precision=precision, steps=150, evaluations=1), scene)
@@ -161,12 +159,12 @@ def test_half_types_learn_with_parameters_in_float32(tmp_path, scene) -> None:
         assert psnr[precision] != psnr["fp32"] and psnr[precision] > psnr["fp32"] - 1.5 and psnr[precision] > 12
 
 
-def test_a_step_that_overflows_is_left_out_and_the_scale_halved(tmp_path, scene) -> None:
+def test_a_step_that_overflows_is_left_out_and_the_scale_halved(tmp_path, scene):
     trainer = Trainer(small(tmp_path, precision="fp16"), scene)
     for _ in range(2):
         trainer.train_step()
 
-    def state() -> list[torch.Tensor]:
+    def state():
         moments = [state["exp_avg"] for state in trainer.optimizer.state.values()]
         return [tensor.detach().clone() for tensor in (*trainer.router.parameters(), *moments)]
 
@@ -176,7 +174,7 @@ def test_a_step_that_overflows_is_left_out_and_the_scale_halved(tmp_path, scene)
     assert trainer.scaler.get_scale() == scale / 2 and same(before, state())
 
 
-def test_a_resumed_run_goes_on_with_its_scale(tmp_path, scene) -> None:
+def test_a_resumed_run_goes_on_with_its_scale(tmp_path, scene):
     """Bit for bit, a scale that has been halved and the steps since then included."""
     whole, begun = (Trainer(small(tmp_path / name, precision="fp16", steps=16), scene) for name in ("a", "b"))
     for trainer in (whole, begun):
@@ -194,7 +192,7 @@ def test_a_resumed_run_goes_on_with_its_scale(tmp_path, scene) -> None:
     assert same(whole.router.parameters(), resumed.router.parameters())
 
 
-def test_graphs_need_a_gpu_and_no_grid() -> None:
+def test_graphs_need_a_gpu_and_no_grid():
     for settings in ({}, {"device": "cuda", "occupancy": True}):
         with pytest.raises(ConfigError, match="--cuda-graph must come with --device cuda and without --occupancy"):
             TrainConfig(cuda_graph=True, **settings)
@@ -203,7 +201,7 @@ def test_graphs_need_a_gpu_and_no_grid() -> None:
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("settings", [{}, {"sampling": "hierarchical", "precision": "bf16"}, {"precision": "fp16"}])
-def test_replayed_steps_are_the_steps_themselves(tmp_path, scene, settings) -> None:
+def test_replayed_steps_are_the_steps_themselves(tmp_path, scene, settings):
     """The same seeds, the same draws: the losses of a graphed run and of a plain one agree."""
     losses = []
     for graphed in (False, True):
@@ -214,7 +212,7 @@ def test_replayed_steps_are_the_steps_themselves(tmp_path, scene, settings) -> N
     torch.testing.assert_close(torch.tensor(losses[1]), torch.tensor(losses[0]), rtol=0.02, atol=1e-4)
 
 
-def test_pictures_through_a_grid_of_a_run_that_was_graphed(tmp_path, scene) -> None:
+def test_pictures_through_a_grid_of_a_run_that_was_graphed(tmp_path, scene):
     trainer = Trainer(small(tmp_path, steps=2, cells=()), scene)
     trainer.run()
     config = replace(trainer.config, device="cuda", cuda_graph=True)

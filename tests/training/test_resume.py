@@ -1,7 +1,5 @@
 """Runs that are stopped, loaded and resumed: bit for bit, and refused where they are another's."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,11 +18,11 @@ from voronerf.training.trainer import Trainer
 
 
 @pytest.mark.parametrize("stop_at", [5, 11, 17])
-def test_resume_is_bit_for_bit(tmp_path, scene, stop_at) -> None:
+def test_resume_is_bit_for_bit(tmp_path, scene, stop_at):
     assert_resumes(tmp_path, scene, stop_at, assignment="stochastic")
 
 
-def test_resume_drops_evaluations_made_after_the_checkpoint(tmp_path, scene) -> None:
+def test_resume_drops_evaluations_made_after_the_checkpoint(tmp_path, scene):
     config = small(tmp_path)
     stopping(config, scene, 14).run()
     with open(tmp_path / "metrics.jsonl", "a") as file:
@@ -33,7 +31,7 @@ def test_resume_drops_evaluations_made_after_the_checkpoint(tmp_path, scene) -> 
     assert [step for step, _ in scores(tmp_path)] == [12, 24]
 
 
-def test_longer_resumed_runs_are_evaluated(tmp_path, scene) -> None:
+def test_longer_resumed_runs_are_evaluated(tmp_path, scene):
     config = small(tmp_path, steps=8, cells=(), evaluations=4)
     Trainer(config, scene).run()
     summary = Trainer(replace(config, steps=16, resume=True), scene).run()
@@ -41,14 +39,14 @@ def test_longer_resumed_runs_are_evaluated(tmp_path, scene) -> None:
     assert scores(tmp_path)[-1][1] == summary["psnr"]
 
 
-def test_seeds_decide_everything(tmp_path, scene) -> None:
+def test_seeds_decide_everything(tmp_path, scene):
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         Trainer(small(tmp_path / name, seed=seed), scene).run()
     a, b, c = (tensors(tmp_path / name) for name in "abc")
     assert same(a, b) and not same(a, c)
 
 
-def test_a_loaded_run_renders_the_same(tmp_path, scene) -> None:
+def test_a_loaded_run_renders_the_same(tmp_path, scene):
     trainer = Trainer(small(tmp_path, cells=(3, 2)), scene)
     trainer.run()
     run = open_run(tmp_path, scene=scene)
@@ -66,13 +64,13 @@ def test_a_loaded_run_renders_the_same(tmp_path, scene) -> None:
         restore_routers(make_routers(config, "cpu"), checkpoint)
 
 
-def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch) -> None:
+def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch):
     monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
     found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8)
     assert len(found["occupancy.density"].unique()) > 1
 
 
-def test_turns_leave_checkpoints(tmp_path, scene, monkeypatch) -> None:
+def test_turns_leave_checkpoints(tmp_path, scene, monkeypatch):
     ticks = iter(range(1000))
     monkeypatch.setattr(trainer_module, "time", SimpleNamespace(perf_counter=lambda: 0.01 * next(ticks)))
     trainer = Trainer(small(tmp_path, steps=100_000, checkpoint_every=0.05), scene)

@@ -1,7 +1,5 @@
 """The training loop on a tiny built-in scene: stages, files, resume, ablations, and that it never dies."""
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import replace
@@ -29,11 +27,11 @@ from voronerf.training.run_directory import checkpoint_path, choose_directory, h
 from voronerf.training.trainer import Trainer, TrainingError
 
 
-def weight_of(trainer) -> torch.Tensor:
+def weight_of(trainer):
     return trainer.router.module.trunk[0].weight.detach().clone()
 
 
-def test_a_run_and_its_directory(tmp_path, scene) -> None:
+def test_a_run_and_its_directory(tmp_path, scene):
     lines, steps = [], []
     trainer = Trainer(small(tmp_path), scene, on_event=lines.append, on_step=lambda p: steps.append(p.step))
     assert trainer.lpips is None
@@ -58,7 +56,7 @@ def test_a_run_and_its_directory(tmp_path, scene) -> None:
     assert len(lines) == 3
 
 
-def test_training_learns(tmp_path, scene) -> None:
+def test_training_learns(tmp_path, scene):
     config = small(tmp_path, steps=150, rays=256, samples=24, width=32, evaluations=1)
     white = -10 * (scene.test.truth(0, torch.ones(3)) - 1).square().mean().log10()
     assert Trainer(config, scene).run()["psnr"] > float(white) + 3
@@ -66,7 +64,7 @@ def test_training_learns(tmp_path, scene) -> None:
 
 @pytest.mark.parametrize("background", ["white", "random"])
 @pytest.mark.parametrize("seed", range(4))
-def test_no_collapse_to_white(tmp_path, scene, seed, background) -> None:
+def test_no_collapse_to_white(tmp_path, scene, seed, background):
     """A NeRF that gives up paints every ray white; its opacity is then 0 and no gradient brings it back."""
     config = small(tmp_path, steps=100, seed=seed, rays=256, samples=24, width=32, cells=(), background=background)
     trainer = Trainer(replace(config, evaluations=1), scene)
@@ -76,7 +74,7 @@ def test_no_collapse_to_white(tmp_path, scene, seed, background) -> None:
     assert image.opacity[alpha > 0.99].mean() > 0.5
 
 
-def test_nested_levels_and_cells_too_small(tmp_path, scene) -> None:
+def test_nested_levels_and_cells_too_small(tmp_path, scene):
     coarse, first, second = Trainer(small(tmp_path / "a", cells=(3, 3), steps=30), scene).run()["stages"]
     assert (coarse["cells"], first["cells"], second["cells"]) == (1, 3, 3 + 2 * second["split_cells"])
     assert second["split_cells"] >= 2
@@ -86,7 +84,7 @@ def test_nested_levels_and_cells_too_small(tmp_path, scene) -> None:
     assert summary["stages"][2]["balance_after"] is None
 
 
-def test_splits_that_never_come_are_told(tmp_path, scene) -> None:
+def test_splits_that_never_come_are_told(tmp_path, scene):
     lines = []
     config = small(tmp_path, cells=(2, 2), split_at_steps=(12, 1000), steps=None, budget=0.2)
     trainer = Trainer(config, scene, on_event=lines.append)
@@ -96,19 +94,19 @@ def test_splits_that_never_come_are_told(tmp_path, scene) -> None:
     assert "1 of 2 planned splits not made: the run ended before" in lines
 
 
-def test_a_stop_in_the_last_step_leaves_nothing_out(tmp_path, scene) -> None:
+def test_a_stop_in_the_last_step_leaves_nothing_out(tmp_path, scene):
     summary = stopping(small(tmp_path, evaluations=1), scene, 24).run()
     assert summary["complete"] and summary["views"] == 2 and summary["psnr"] > 0
 
 
-def test_a_panorama_from_one_place_trains(tmp_path, scene) -> None:
+def test_a_panorama_from_one_place_trains(tmp_path, scene):
     poses = scene.train.cameras.poses.clone()
     poses[:, :3, 3] = 0
     train = replace(scene.train, cameras=replace(scene.train.cameras, poses=poses))
     assert 4 <= octaves_for(replace(scene, train=train, box=None, near=0.05)) <= 14
 
 
-def test_a_run_directory_has_one_run(tmp_path, scene, monkeypatch) -> None:
+def test_a_run_directory_has_one_run(tmp_path, scene, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = replace(small(tmp_path), out=None)
     names = [str(choose_directory(config, scene).out) for _ in range(3)]
@@ -125,7 +123,7 @@ def test_a_run_directory_has_one_run(tmp_path, scene, monkeypatch) -> None:
     assert other.is_dir() and not Path("runs/empty").exists()
 
 
-def test_the_final_scores_are_blended_as_the_pictures_are(tmp_path, scene) -> None:
+def test_the_final_scores_are_blended_as_the_pictures_are(tmp_path, scene):
     plain = Trainer(small(tmp_path / "plain"), scene).run()
     trainer = Trainer(small(tmp_path / "blended", blend=0.3), scene)
     blended = trainer.run()
@@ -135,7 +133,7 @@ def test_the_final_scores_are_blended_as_the_pictures_are(tmp_path, scene) -> No
     assert open_run(tmp_path / "blended", scene=scene, blend=0.0).evaluate(views=2)["psnr"] == plain["psnr"]
 
 
-def after_the_split(folder, scene, **settings) -> Trainer:
+def after_the_split(folder, scene, **settings):
     """A trainer of four cells that has made one step since its split."""
     trainer = stopping(small(folder, **settings), scene, 13)
     trainer.advance()
@@ -143,7 +141,7 @@ def after_the_split(folder, scene, **settings) -> Trainer:
     return trainer
 
 
-def test_centres_are_balanced_or_not(tmp_path, scene) -> None:
+def test_centres_are_balanced_or_not(tmp_path, scene):
     kinds = {"balanced": {}, "random": {"centres": "random"}, "uniform": {"centres": "uniform"}}
     trainers = {name: after_the_split(tmp_path / name, scene, **settings) for name, settings in kinds.items()}
     stages = {name: trainer.stages[-1] for name, trainer in trainers.items()}
@@ -159,11 +157,11 @@ def test_centres_are_balanced_or_not(tmp_path, scene) -> None:
     assert 0 < spread[0] < 0.05 < 0.1 < spread[1]
 
 
-def test_random_initialisation_leaves_cells_that_are_not_split(tmp_path, scene) -> None:
+def test_random_initialisation_leaves_cells_that_are_not_split(tmp_path, scene):
     trainer = Trainer(small(tmp_path, cells=(3, 2), split_at=(0.4, 0.8), split="worst", init="random"), scene)
     found = {}
 
-    def keep(progress) -> None:
+    def keep(progress):
         found[progress.cells] = weight_of(trainer)
         if progress.cells == 4:
             trainer.request_stop()
@@ -179,7 +177,7 @@ def test_random_initialisation_leaves_cells_that_are_not_split(tmp_path, scene) 
     [{"backend": "reference"}, {"view_directions": False}, {"cells": ()}, {"assignment": "stochastic"}],
     ids=str,
 )
-def test_further_settings_run(tmp_path, scene, settings) -> None:
+def test_further_settings_run(tmp_path, scene, settings):
     trainer = Trainer(small(tmp_path, temperature=0.7, **settings), scene)
     router = trainer.router
     assert (router.assignment, router.temperature) == (settings.get("assignment", "nearest"), 0.7)
@@ -188,7 +186,7 @@ def test_further_settings_run(tmp_path, scene, settings) -> None:
     assert router.field.layers.uses_directions == settings.get("view_directions", True)
 
 
-def test_the_reference_backend_trains_to_the_same_curve(tmp_path, scene) -> None:
+def test_the_reference_backend_trains_to_the_same_curve(tmp_path, scene):
     psnr = {}
     for backend in ("auto", "reference"):
         config = small(tmp_path / backend, backend=backend, steps=60, rays=128, width=16, evaluations=1)
@@ -196,7 +194,7 @@ def test_the_reference_backend_trains_to_the_same_curve(tmp_path, scene) -> None
     assert psnr["auto"] == pytest.approx(psnr["reference"], abs=0.5)
 
 
-def test_kept_samples_are_weight_times_ray_error(tmp_path, scene, monkeypatch) -> None:
+def test_kept_samples_are_weight_times_ray_error(tmp_path, scene, monkeypatch):
     """Importance w * E(r), E the squared error of the ray's colour summed over its channels."""
     rendered, targets = [], []
     whole, target = Renderer.render, Batch.target
@@ -226,7 +224,7 @@ def test_kept_samples_are_weight_times_ray_error(tmp_path, scene, monkeypatch) -
         ),
     ],
 )
-def test_when_and_into_what_is_split(tmp_path, scene, settings, started, cells) -> None:
+def test_when_and_into_what_is_split(tmp_path, scene, settings, started, cells):
     trainer = Trainer(small(tmp_path, **settings), scene)
     assert trainer.run()["cells"] == trainer.config.final_cells == cells[-1]
     assert [stage.started_at_step for stage in trainer.stages] == started
@@ -234,7 +232,7 @@ def test_when_and_into_what_is_split(tmp_path, scene, settings, started, cells) 
     assert all(stage.split_cells == 1 for stage in trainer.stages[1:])
 
 
-def test_the_learning_rate_changes_at_each_split(tmp_path, scene) -> None:
+def test_the_learning_rate_changes_at_each_split(tmp_path, scene):
     rates = []
     for factor in (1.0, 0.5):
         trainer = Trainer(small(tmp_path / f"{factor}", cells=(3, 2), lr_split=factor), scene)
@@ -246,7 +244,7 @@ def test_the_learning_rate_changes_at_each_split(tmp_path, scene) -> None:
         assert rate == pytest.approx(0.5**level * usual)
 
 
-def test_the_temperature_falls_to_its_last_value(tmp_path, scene) -> None:
+def test_the_temperature_falls_to_its_last_value(tmp_path, scene):
     settings = {"cells": (3,), "assignment": "stochastic", "temperature": 0.2, "temperature_final": 0.01, "steps": 40}
     trainer = Trainer(small(tmp_path, **settings, sampling="hierarchical"), scene)
     seen = []
@@ -257,7 +255,7 @@ def test_the_temperature_falls_to_its_last_value(tmp_path, scene) -> None:
         assert temperature == pytest.approx(0.2 * 0.01 ** ((step - 1) / 40))
 
 
-def test_a_proposal_is_annealed(tmp_path, scene) -> None:
+def test_a_proposal_is_annealed(tmp_path, scene):
     for slope in (0.0, 1.0, 10.0):
         trainer = Trainer(small(tmp_path / f"{slope}", sampling="proposal", proposal_anneal=slope, steps=10), scene)
         seen = []
@@ -268,7 +266,7 @@ def test_a_proposal_is_annealed(tmp_path, scene) -> None:
 
 
 @pytest.mark.parametrize("field", ["nerf", "kilonerf"])
-def test_parameters_decide_the_width(tmp_path, scene, field) -> None:
+def test_parameters_decide_the_width(tmp_path, scene, field):
     trainer = Trainer(small(tmp_path, width=None, depth=None, field=field, parameters=30_000), scene)
     summary, config = trainer.run(), trainer.config
     width = solve_width(config, 30_000)
@@ -280,14 +278,14 @@ def test_parameters_decide_the_width(tmp_path, scene, field) -> None:
     Trainer(replace(config, width=None, lr=None, resume=True), scene)
 
 
-def test_too_few_parameters(tmp_path, scene) -> None:
+def test_too_few_parameters(tmp_path, scene):
     with pytest.raises(ConfigError, match=r"--parameters must be at least \d+ for 4 cells, got 7"):
         resolve_config(small(tmp_path, parameters=7), scene)
     wide = resolve_config(small(tmp_path, cells=(), parameters=1_000_000), scene)
     assert wide.width is not None and wide.width > 256 and wide.lr == pytest.approx(0.02 * 64 / wide.width)
 
 
-def test_octaves_follow_the_pixels(scene) -> None:
+def test_octaves_follow_the_pixels(scene):
     """100 x 100 images of a Blender-like scene: 8 octaves; the paper's 10 at 400 x 400; one more for half the pixel.
 
     Of cones, those that a pixel leaves: at the middle of the scene the last keeps more than a thousandth, the next
@@ -306,7 +304,7 @@ def test_octaves_follow_the_pixels(scene) -> None:
         assert left[0] > 1e-4 and left[1] < 1e-9
 
 
-def test_a_loss_that_is_not_finite_stops_training(tmp_path, scene) -> None:
+def test_a_loss_that_is_not_finite_stops_training(tmp_path, scene):
     trainer = Trainer(small(tmp_path), scene)
     trainer.advance()
     trainer.save()
@@ -319,7 +317,7 @@ def test_a_loss_that_is_not_finite_stops_training(tmp_path, scene) -> None:
     assert same(before, tensors(tmp_path))
 
 
-def test_more_cells_than_samples(tmp_path, scene) -> None:
+def test_more_cells_than_samples(tmp_path, scene):
     config = small(tmp_path / "a", cells=(390,), split_at=(0.1,))
     with pytest.raises(TrainingError, match=r"more cells than samples: --cells asks for 390, .* in 3 steps"):
         Trainer(config, scene).run()
@@ -332,7 +330,7 @@ def test_more_cells_than_samples(tmp_path, scene) -> None:
     assert any(line.startswith("no cell split") and "40 samples kept" in line for line in lines)
 
 
-def test_refused_before_anything_is_written(tmp_path, scene) -> None:
+def test_refused_before_anything_is_written(tmp_path, scene):
     with pytest.raises(BackendUnavailable):
         Trainer(small(tmp_path, backend="warp"), scene)
     with pytest.raises(ConfigError, match="--occupancy needs a scene with a box around everything, builtin has none"):
@@ -340,11 +338,11 @@ def test_refused_before_anything_is_written(tmp_path, scene) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def only_below(grid, *_, **__) -> None:
+def only_below(grid, *_, **__):
     grid.occupied[:, :, grid.occupied.shape[2] // 2 :] = False
 
 
-def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch) -> None:
+def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
     monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
     config = small(tmp_path, split_at=(0.9,), reservoir_batches=5, occupancy=True, occupancy_resolution=8)
     trainer = Trainer(config, scene)
@@ -365,7 +363,7 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch) -> Non
 
 
 @pytest.mark.cuda
-def test_training_on_a_gpu(tmp_path, scene) -> None:
+def test_training_on_a_gpu(tmp_path, scene):
     config = small(tmp_path, device="cuda", assignment="stochastic")
     assert Trainer(config, scene).run()["cells"] == 4
     assert len(open_run(tmp_path, scene=scene, device="cpu").evaluate(views=1)["views"]) == 1

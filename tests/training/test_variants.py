@@ -1,7 +1,5 @@
 """Every field with every sampling: alone, with cells of every kind, inherited alike, resumed, and learning."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +48,7 @@ CELLS = {
 
 @pytest.mark.parametrize("cells", CELLS)
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_every_variant_with_every_kind_of_cells(tmp_path, scene, variant, cells) -> None:
+def test_every_variant_with_every_kind_of_cells(tmp_path, scene, variant, cells):
     trainer = Trainer(small(tmp_path, samples=10, **VARIANTS[variant][0], **CELLS[cells]), scene)
     summary, config = trainer.run(), trainer.config
     assert summary["complete"] and summary["cells"] == config.final_cells
@@ -69,24 +67,24 @@ def test_every_variant_with_every_kind_of_cells(tmp_path, scene, variant, cells)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_every_variant_resumes_bit_for_bit(tmp_path, scene, variant) -> None:
+def test_every_variant_resumes_bit_for_bit(tmp_path, scene, variant):
     assert_resumes(tmp_path, scene, 9, assignment="stochastic", cells=(3, 2), **VARIANTS[variant][0])
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_every_variant_learns(tmp_path, variant) -> None:
+def test_every_variant_learns(tmp_path, variant):
     settings, floor = VARIANTS[variant]
     size = {"steps": 200, "rays": 256, "samples": 16, "fine_samples": 16, "width": 32, "depth": 3}
     config = small(tmp_path, **settings, **size, cells=(6,), evaluations=1, final_views=4)
     assert Trainer(config, builtin_scene(25)).run()["psnr"] > floor
 
 
-def test_coarse_and_fine_inherit_alike(tmp_path, scene) -> None:
+def test_coarse_and_fine_inherit_alike(tmp_path, scene):
     """After the split every cell of both networks has its parent's parameters and Adam's moments."""
     trainer = stopping(small(tmp_path, **HIERARCHICAL), scene, 12)
     trainer.advance()
 
-    def state() -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    def state():
         weights = {name: router.module.trunk[0].weight for name, router in trainer.routers.items()}
         return {n: (w.detach().clone(), trainer.optimizer.state[w]["exp_avg"].clone()) for n, w in weights.items()}
 
@@ -99,7 +97,7 @@ def test_coarse_and_fine_inherit_alike(tmp_path, scene) -> None:
     assert torch.equal(trainer.routers["coarse"].diagram.centres, trainer.router.diagram.centres)
 
 
-def test_importance_is_that_of_the_last_pass(tmp_path, scene, monkeypatch) -> None:
+def test_importance_is_that_of_the_last_pass(tmp_path, scene, monkeypatch):
     trainer = stopping(small(tmp_path, **HIERARCHICAL, reservoir=50, reservoir_batches=1, split_at=(0.9,)), scene, 1)
     results, loss = [], trainer.renderer.loss
     monkeypatch.setattr(trainer.renderer, "loss", lambda *a: results.append(a) or loss(*a))
@@ -110,8 +108,8 @@ def test_importance_is_that_of_the_last_pass(tmp_path, scene, monkeypatch) -> No
     torch.testing.assert_close(trainer.reservoir.samples()[1].sort(descending=True).values, expected)
 
 
-def test_widths_count_all_networks(scene) -> None:
-    def solved(**options) -> int:
+def test_widths_count_all_networks(scene):
+    def solved(**options):
         config = resolve_config(small(Path("x"), cells=(12,), parameters=200_000, **options), scene)
         width = solve_width(config, 200_000)
         assert config.width == width and count_parameters(config) <= 200_000 < count_parameters(config, width + 1)
@@ -121,14 +119,14 @@ def test_widths_count_all_networks(scene) -> None:
     assert solved(**PROPOSAL, split_proposal=True) < solved(**PROPOSAL) <= solved()
 
 
-def test_the_occupancy_grid_says_what_it_works_with() -> None:
+def test_the_occupancy_grid_says_what_it_works_with():
     for settings in (HIERARCHICAL, CONES, CONTRACTION):
         with pytest.raises(ConfigError, match="--occupancy must come with --field nerf or kilonerf, --sampling strat"):
             TrainConfig(occupancy=True, **settings)
     assert TrainConfig(occupancy=True, **KILO).occupancy
 
 
-def test_the_sphere_of_a_contraction(tmp_path, scene) -> None:
+def test_the_sphere_of_a_contraction(tmp_path, scene):
     boxed = make_contraction(scene)
     assert torch.equal(boxed.centre, scene.box.mean(0)) and bool((boxed.points(scene.box) == scene.box).all())
     far = make_contraction(replace(scene, box=None))
@@ -145,7 +143,7 @@ def test_the_sphere_of_a_contraction(tmp_path, scene) -> None:
     assert float(heaviest.norm(dim=-1).max()) < 8.01 and float(centres.norm(dim=1).max()) < 8
 
 
-def test_the_command_line(tmp_path, capsys) -> None:
+def test_the_command_line(tmp_path, capsys):
     run = str(tmp_path / "run")
     tiny = "--downscale 6 --steps 12 --cells 3 --split-at-steps 5 --width 8 --rays 64 --samples 8 --fine-samples 4"
     tiny += " --eval-views 1 --final-views 1 --panels 1 --field mipnerf --sampling hierarchical"
@@ -163,7 +161,7 @@ def test_the_command_line(tmp_path, capsys) -> None:
 
 
 @pytest.mark.parametrize("field", [{}, CONES])
-def test_pictures_may_blend_cells(tmp_path, scene, field) -> None:
+def test_pictures_may_blend_cells(tmp_path, scene, field):
     trainer = Trainer(small(tmp_path, **HIERARCHICAL, **field), scene)
     trainer.advance()
     plain = render_view(trainer.renderer, scene, 0).colour
@@ -173,7 +171,7 @@ def test_pictures_may_blend_cells(tmp_path, scene, field) -> None:
     assert not torch.equal(plain, blended) and float((plain - blended).abs().max()) < 0.5
 
 
-def test_a_worst_cell_without_samples_is_split_when_it_has_them(tmp_path, scene) -> None:
+def test_a_worst_cell_without_samples_is_split_when_it_has_them(tmp_path, scene):
     """Few samples a step, 5 of them, and splits planned sooner than enough are kept."""
     kept = {"samples": 10, "reservoir": 200, "reservoir_batches": 40, "min_cell_samples": 20}
     config = small(tmp_path, cells=(2,), split="worst", max_cells=4, split_at_steps=(4, 6), **kept)
@@ -184,7 +182,7 @@ def test_a_worst_cell_without_samples_is_split_when_it_has_them(tmp_path, scene)
     assert started[1] == 4 and started[2] > 6 and all(step % 5 == 0 for step in started[2:])
 
 
-def test_a_cell_of_a_proposal_is_a_module(tmp_path, scene) -> None:
+def test_a_cell_of_a_proposal_is_a_module(tmp_path, scene):
     router, points = Trainer(small(tmp_path, **PROPOSAL), scene).routers["proposal"], torch.rand(5, 3)
     for found, expected in zip(router.cell(0)(points), router(points, torch.rand(5, 3), torch.arange(5).int())):
         torch.testing.assert_close(found, expected)

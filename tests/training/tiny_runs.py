@@ -1,22 +1,16 @@
 """Runs of a few steps on a scene of 16 x 16 pixels, for all tests of training."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
-import torch
 from helpers import same
 
-from voronerf.data import Scene
 from voronerf.files import read_json_lines
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.trainer import Trainer
 
-SMALL: dict[str, Any] = {
+SMALL = {
     "steps": 24,
     "cells": (4,),
     "width": 8,
@@ -33,30 +27,30 @@ SMALL: dict[str, Any] = {
 }
 
 
-def small(out: Path, **settings: Any) -> TrainConfig:
+def small(out, **settings):
     """24 steps, split into four cells after 12 of them where neither cells nor splits are given."""
     if not any(name == "cells" or name.startswith("split_at") for name in settings):
         settings["split_at"] = (0.5,)
     return TrainConfig(out=out, **{**SMALL, **settings})
 
 
-def stopping(config: TrainConfig, scene: Scene, step: int, **options: Any) -> Trainer:
+def stopping(config, scene, step, **options):
     """A trainer that stops after a step, as after Ctrl-C."""
     trainer = Trainer(config, scene, **options)
     trainer.on_step = lambda progress: trainer.request_stop() if progress.step == step else None
     return trainer
 
 
-def tensors(run: Path) -> dict[str, torch.Tensor]:
+def tensors(run):
     return load_checkpoint(checkpoint_path(run)).tensors
 
 
-def scores(run: Path) -> list[tuple[int, float]]:
+def scores(run):
     """Step and PSNR of every evaluation."""
     return [(line["step"], line["psnr"]) for line in read_json_lines(run / "metrics.jsonl")]
 
 
-def assert_resumes(folder: Path, scene: Scene, stop_at: int, **settings: Any) -> dict[str, torch.Tensor]:
+def assert_resumes(folder, scene, stop_at, **settings):
     """A run that is stopped and resumed ends bit for bit as one that is not; returns the tensors of its checkpoint."""
     whole = small(folder / "whole", **settings)
     Trainer(whole, scene).run()
