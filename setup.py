@@ -55,6 +55,9 @@ class NinjaBuildExt(build_ext):
         target = Path(self.get_ext_fullpath(ext.name))
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(module, target)
+        if stub := stub_of(module):
+            for folder in (ROOT / "voronerf", target.parent):
+                write_if_changed(folder / "_C.pyi", stub)
         print(f"voronerf: {cuda.outcome}")
 
 
@@ -133,7 +136,7 @@ def build_info(cuda: Cuda) -> str:
     values = {
         "VN_COMPILER": f'"{version.splitlines()[0]}"',
         "VN_OPENMP": str(int(sys.platform != "darwin")),
-        "VN_CUDA": str(int(cuda.nvcc is not None)),
+        "VN_CUDA_BUILT": str(int(cuda.nvcc is not None)),
         "VN_CUDA_OUTCOME": f'"{cuda.outcome}"',
         "VN_CUDA_ARCHITECTURES": f'"{";".join(cuda.architectures)}"',
     }
@@ -180,15 +183,16 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
         ]
     objects = []
     for source in sorted(SOURCES.rglob("*.c*")):
+        name = source.relative_to(SOURCES).as_posix()  # files of two rooms may share theirs
         if source.name.endswith("_isa.cpp"):
             for isa, flags_of_isa in isas().items():
-                objects.append(f"{source.stem}.{isa}.o")
+                objects.append(f"{name}.{isa}.o")
                 lines += [f"build {objects[-1]}: cxx {quote(str(source))}", f"  flags = {join(flags_of_isa)}"]
         elif source.suffix == ".cpp":
-            objects.append(f"{source.name}.o")
+            objects.append(f"{name}.o")
             lines.append(f"build {objects[-1]}: cxx {quote(str(source))}")
         elif source.suffix == ".cu" and cuda.nvcc is not None:
-            objects.append(f"{source.name}.o")
+            objects.append(f"{name}.o")
             lines.append(f"build {objects[-1]}: nvcc {quote(str(source))}")
     lines.append(f"build {quote(module.name)}: link {' '.join(objects)}")
     return "\n".join([*lines, f"default {quote(module.name)}", ""])
@@ -206,6 +210,26 @@ def pybind11_headers() -> str:
             raise SystemExit("voronerf: pybind11 is missing; pip install pybind11") from None
         return str(Path(torch.origin).parent / "include")
     return str(pybind11.get_include())
+
+
+def stub_of(module: Path) -> str:
+    """What a module binds, as it says itself; nothing of one for another machine, which keeps the stub that is there.
+
+    In a process of its own, with some OpenMP runtime in the place of torch's.
+    """
+    code = f"""
+import ctypes, importlib.util, sys
+if sys.platform.startswith("linux"):
+    ctypes.CDLL("libgomp.so.1", mode=ctypes.RTLD_GLOBAL)
+spec = importlib.util.spec_from_file_location("_C", {str(module)!r})
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+print(module.stub, end="")
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    if found.returncode != 0:
+        print(f"voronerf: voronerf/_C.pyi is left as it is: {found.stderr.strip()}")
+    return found.stdout
 
 
 def quote(path: str) -> str:
@@ -227,6 +251,7 @@ def write_if_changed(path: Path, text: str) -> None:
 setup(
     packages=[*find_packages(include=["voronerf", "voronerf.*"]), "voronerf.kernels"],
     package_dir={"voronerf": "voronerf", "voronerf.kernels": "kernels"},
+    package_data={"voronerf": ["_C.pyi"]},  # which the compiled module is compared with
     ext_modules=[Extension("voronerf._C", sources=[])],
     cmdclass={"build_ext": NinjaBuildExt},
 )

@@ -206,11 +206,11 @@ class Peaks:
             return self._keep(f"{kind}, torch", _cuda_peak(kind, self.device))
         if backends.missing("native", self.device) is not None:
             return None
-        from voronerf import native as _native
+        from voronerf import native
 
-        isa = _native.ISAS[_native._ISA]
+        isa = native.describe()["instruction set"]
         try:
-            return self._keep(f"{kind}, {isa}" if kind != "copy" else "copy", _native.measure_peak(kind))
+            return self._keep(f"{kind}, {isa}" if kind != "copy" else "copy", native.measure_peak(kind))
         except ValueError:
             return None if kind != "bfloat16" else self("float32")
 
@@ -255,13 +255,9 @@ def instruction_set(name: str | None) -> Iterator[None]:
     if name is None:
         yield
         return
-    from voronerf import native as _native
+    from voronerf import native
 
-    if name not in _native.ISAS or not _native._C.isa_supported(_native.ISAS.index(name)):
+    if name not in native.SUPPORTED_ISAS:
         raise ValueError(f"this processor has no {name}")
-    before = _native._ISA
-    _native._ISA = _native.ISAS.index(name)
-    try:
+    with native.using_isa(name):
         yield
-    finally:
-        _native._ISA = before

@@ -63,7 +63,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
             metafunc.parametrize("device", devices, indirect=True)
         return
     mark = metafunc.definition.get_closest_marker("op")
-    names = [b for b in backends.BACKENDS if mark is None or (mark.args[0], b) in backends._REGISTRY]
+    names = backends.BACKENDS if mark is None else backends.implemented(mark.args[0])
     if wants_device:
         pairs = [(backend, device) for device in devices for backend in names]
         metafunc.parametrize(("backend", "device"), pairs, indirect=["device"], ids=["-".join(pair) for pair in pairs])
@@ -74,6 +74,37 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 @pytest.fixture
 def device(request: pytest.FixtureRequest) -> torch.device:
     return torch.device(request.param)
+
+
+@pytest.fixture(params=["portable", "avx2", "avx512"])
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Native CPU kernels with each instruction set that this processor has."""
+    native = pytest.importorskip("voronerf.native")
+    if request.param not in native.SUPPORTED_ISAS:
+        pytest.skip(f"this processor has no {request.param}")
+    with native.using_isa(request.param):
+        yield request.param
+
+
+@pytest.fixture
+def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
+    """Whatever ``Tensor.new_empty`` gives in the test holds NaN or a large number, and lies between guards of the same,
+    which must survive. The guards there are so far."""
+    guards: list[torch.Tensor] = []
+
+    def new_empty(like: torch.Tensor, *shape: Any, dtype: torch.dtype | None = None) -> torch.Tensor:
+        size = torch.Size(shape if not shape or isinstance(shape[0], int) else shape[0])
+        kind = dtype or like.dtype
+        poison = float("nan") if kind.is_floating_point else False if kind == torch.bool else 121
+        memory = torch.full((size.numel() + 64,), poison, dtype=kind, device=like.device)
+        guards.extend((memory[:32], memory[size.numel() + 32 :]))
+        return memory[32 : size.numel() + 32].view(size)
+
+    monkeypatch.setattr(torch.Tensor, "new_empty", new_empty)
+    yield guards
+    for guard in guards:
+        whole = guard.isnan() if guard.is_floating_point() else guard == (0 if guard.dtype == torch.bool else 121)
+        assert whole.all(), "something was written outside of a tensor"
 
 
 @pytest.fixture(scope="module")

@@ -1,16 +1,321 @@
-# The compiled module (csrc/bindings/bindings.cpp). Addresses are those of contiguous tensors, 0 for an absent one.
-from collections.abc import Callable
-from typing import Any
+# The compiled module, written by its build from what csrc/bindings binds; the checksum is its interface.
+# A comment has the exact types of the C++ function, whose parameters these are. A tensor is contiguous, or becomes
+# so where it is const; None is a null pointer.
+from collections.abc import Sequence
+from typing import NamedTuple, overload
+
+import torch
+from torch import Tensor
 
 interface: int
+stub: str
 compiler: str
 openmp: bool
 cuda: bool
 cuda_outcome: str
 cuda_architectures: str
 
-def isa_supported(isa: int) -> bool: ...
-def locate_cell_fault(child_offsets: int, child: int, g: int, m: int) -> str | None: ...
-def locate_cell_workspace(m: int, threads: int) -> int: ...
-def cell_sort_workspace(n: int, k: int) -> int: ...
-def __getattr__(name: str) -> Callable[..., Any]: ...
+def name_dtypes(names: dict[str, torch.dtype]) -> None: ...
+
+Activation: tuple[str, ...]  # none relu softplus sigmoid sine
+
+class BalanceInputs(NamedTuple):
+    samples: Tensor | None  # const float32*
+    masses: Tensor | None  # const float64*
+    m: int  # int64
+    k: int  # int64
+    steps: int  # int64
+    alpha: float  # float64
+    neighbours: int  # int64
+    of_all: bool
+
+CellSortWay: tuple[str, ...]  # automatic counting radix
+
+class CentreGrid(NamedTuple):
+    frame: Tensor | None  # const float32*
+    entries: Tensor | None  # const int32*
+    lists: Tensor | None  # const int32*
+    table: Tensor | None  # const float32*
+    bits: int  # int32
+
+class CentreGridTables: ...
+
+class CompositeGradients(NamedTuple):
+    colour: Tensor | None  # const float32*
+    opacity: Tensor | None  # const float32*
+    depth: Tensor | None  # const float32*
+    weights: Tensor | None  # const float32*
+    sigma: Tensor | None  # float32*
+    rgb: Tensor | None  # float32*
+    depths: Tensor | None  # float32*
+    deltas: Tensor | None  # float32*
+    background: Tensor | None  # float32*
+    left: Tensor | None  # float32*
+
+class CompositeInputs(NamedTuple):
+    sigma: Tensor | None  # const float32*
+    rgb: Tensor | None  # const float32*
+    depths: Tensor | None  # const float32*
+    deltas: Tensor | None  # const float32*
+    offsets: Tensor | None  # const int32*
+    background: Tensor | None  # const float32*
+    background_per_ray: bool
+    r: int  # int64
+    s: int  # int64
+    m: int  # int64
+    c: int  # int64
+
+class CompositeOutputs(NamedTuple):
+    colour: Tensor | None  # float32*
+    opacity: Tensor | None  # float32*
+    depth: Tensor | None  # float32*
+    weights: Tensor | None  # float32*
+
+class Cpu(NamedTuple):
+    isa: str  # Isa
+    threads: int  # int32
+
+class Cuda(NamedTuple):
+    device: int  # int32
+    stream: int  # uint64
+
+class Encoding(NamedTuple):
+    x: Tensor | None  # const float32*
+    variances: Tensor | None  # const float32*
+    n: int  # int64
+    d: int  # int64
+    octaves: int  # int64
+    include_input: bool
+    width: int  # int64
+
+Isa: tuple[str, ...]  # portable avx2 avx512
+
+class LinearGradients(NamedTuple):
+    out: Tensor | None  # const any*
+    x: Tensor | None  # any*
+    weight: Tensor | None  # any*
+    bias: Tensor | None  # any*
+
+class LinearInputs(NamedTuple):
+    x: Tensor | None  # const any*
+    offsets: Tensor | None  # const int32*
+    weight: Tensor | None  # const any*
+    bias: Tensor | None  # const any*
+    n: int  # int64
+    k: int  # int64
+    i: int  # int64
+    o: int  # int64
+    activation: str  # Activation
+    bfloat16: bool
+
+class MarchInputs(NamedTuple):
+    origins: Tensor | None  # const float32*
+    directions: Tensor | None  # const float32*
+    near: Tensor | None  # const float32*
+    far: Tensor | None  # const float32*
+    occupied: Tensor | None  # const uint8*
+    box: Tensor | None  # const float32*
+    uniforms: Tensor | None  # const float32*
+    start: Tensor | None  # const int32*
+    r: int  # int64
+    s: int  # int64
+    x: int  # int64
+    y: int  # int64
+    z: int  # int64
+    disparity: bool
+    most: int  # int64
+
+MlpCaller: tuple[str, ...]  # grouped_mlp grouped_linear routed_mlp
+
+MlpCudaWay: tuple[str, ...]  # auto chain tiles layers wgmma
+
+class MlpGradients(NamedTuple):
+    output: Tensor | None  # const float32*
+    weights: Sequence[Tensor | None] | None  # float32**
+    biases: Sequence[Tensor | None] | None  # float32**
+    positions: Tensor | None  # float32*
+    directions: Tensor | None  # float32*
+
+class MlpInputs(NamedTuple):
+    positions: Tensor | None  # const float32*
+    directions: Tensor | None  # const float32*
+    direction_index: Tensor | None  # const int32*
+    offsets: Tensor | None  # const int32*
+    weights: Sequence[Tensor | None] | None  # const float32**
+    biases: Sequence[Tensor | None] | None  # const float32**
+    n: int  # int64
+    r: int  # int64
+    k: int  # int64
+    order: Tensor | None  # const int32*
+
+class MlpLayer(NamedTuple):
+    width: int  # int64
+    activation: str  # Activation
+    inputs: Sequence[int]  # int32[]
+
+MlpPrecision: tuple[str, ...]  # float32 bfloat16 float16 tf32
+
+class MlpTable(NamedTuple):
+    layers: Sequence[MlpLayer]  # MlpLayer[]
+    outputs: Sequence[int]  # int32[]
+    positions: int  # int64
+    directions: int  # int64
+    position_octaves: int  # int32
+    direction_octaves: int  # int32
+    integrated: bool
+    half: bool
+    caller: str  # MlpCaller
+
+Peak: tuple[str, ...]  # float32 bfloat16 copy
+
+# any*, int64
+def advise_huge_pages(_0: Tensor | None, _1: int) -> None: ...
+
+# BalanceInputs, float32*, float64*, int32*, float64*, Cpu
+def balance_centres(_0: BalanceInputs, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
+
+# int64
+def balance_centres_workspace(_0: int) -> int: ...
+
+# const int32*, int32*, int32*, int32*, int64, int64, Cpu
+@overload
+def cell_sort(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: Cpu) -> bool: ...
+# const int32*, int32*, int32*, uint8*, int64, int64, CellSortWay, Cuda
+@overload
+def cell_sort(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: str, _7: Cuda) -> None: ...
+
+# int64, int64
+@overload
+def cell_sort_workspace(_0: int, _1: int) -> int: ...
+# int64, int64, CellSortWay, Cuda
+@overload
+def cell_sort_workspace(_0: int, _1: int, _2: str, _3: Cuda) -> int: ...
+
+# const float64*, const float64*, int64, Cpu
+def centre_grid_build(_0: Tensor | None, _1: Tensor | None, _2: int, _3: Cpu) -> CentreGridTables: ...
+
+# CentreGridTables, int32, float32*, int32*, int32*
+def centre_grid_copy(_0: CentreGridTables, _1: int, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None) -> bool: ...
+
+# CentreGridTables
+def centre_grid_entries(_0: CentreGridTables) -> int: ...
+
+# CentreGridTables
+def centre_grid_lists(_0: CentreGridTables) -> int: ...
+
+# CompositeInputs, CompositeOutputs, Cpu
+@overload
+def composite(_0: CompositeInputs, _1: CompositeOutputs, _2: Cpu) -> None: ...
+# CompositeInputs, CompositeOutputs, Cuda
+@overload
+def composite(_0: CompositeInputs, _1: CompositeOutputs, _2: Cuda) -> None: ...
+
+# CompositeInputs, CompositeGradients, Cpu
+@overload
+def composite_backward(_0: CompositeInputs, _1: CompositeGradients, _2: Cpu) -> None: ...
+# CompositeInputs, CompositeGradients, Cuda
+@overload
+def composite_backward(_0: CompositeInputs, _1: CompositeGradients, _2: Cuda) -> None: ...
+
+# const float32*, const float32*, const float32*, const int32*, const int32*, const float32*, int32*, int32*, float32*, int64, int64, int32, float64, Cpu
+@overload
+def draw_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: Tensor | None, _8: Tensor | None, _9: int, _10: int, _11: int, _12: float, _13: Cpu) -> bool: ...
+# const float32*, const float32*, const float32*, const int32*, const int32*, const float32*, int32*, int64, int64, int64, int32, float64, Cuda
+@overload
+def draw_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: int, _8: int, _9: int, _10: int, _11: float, _12: Cuda) -> None: ...
+
+# int64, Cpu
+def draw_cell_places(_0: int, _1: Cpu) -> int: ...
+
+# int64, Cpu
+def draw_cell_sums(_0: int, _1: Cpu) -> int: ...
+
+# Encoding, float32*, float32*, Cpu
+@overload
+def encode(_0: Encoding, _1: Tensor | None, _2: Tensor | None, _3: Cpu) -> None: ...
+# Encoding, float32*, Cuda
+@overload
+def encode(_0: Encoding, _1: Tensor | None, _2: Cuda) -> None: ...
+
+# Encoding, const float32*, float32*, float32*, float32*, Cpu
+@overload
+def encode_backward(_0: Encoding, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
+# Encoding, const float32*, float32*, float32*, Cuda
+@overload
+def encode_backward(_0: Encoding, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Cuda) -> None: ...
+
+# int64, int64, Cpu
+def encode_workspace(_0: int, _1: int, _2: Cpu) -> int: ...
+
+# LinearInputs, any*, Cpu
+def grouped_linear(_0: LinearInputs, _1: Tensor | None, _2: Cpu) -> None: ...
+
+# LinearInputs, LinearGradients, Cpu
+def grouped_linear_backward(_0: LinearInputs, _1: LinearGradients, _2: Cpu) -> None: ...
+
+# MlpTable, MlpInputs, float32*, Cpu
+@overload
+def grouped_mlp(_0: MlpTable, _1: MlpInputs, _2: Tensor | None, _3: Cpu) -> None: ...
+# MlpTable, MlpInputs, float32*, MlpPrecision, MlpCudaWay, uint8*, Cuda
+@overload
+def grouped_mlp(_0: MlpTable, _1: MlpInputs, _2: Tensor | None, _3: str, _4: str, _5: Tensor | None, _6: Cuda) -> None: ...
+
+# MlpTable, MlpInputs, MlpGradients, Cpu
+@overload
+def grouped_mlp_backward(_0: MlpTable, _1: MlpInputs, _2: MlpGradients, _3: Cpu) -> None: ...
+# MlpTable, MlpInputs, MlpGradients, MlpPrecision, MlpCudaWay, uint8*, Cuda
+@overload
+def grouped_mlp_backward(_0: MlpTable, _1: MlpInputs, _2: MlpGradients, _3: str, _4: str, _5: Tensor | None, _6: Cuda) -> None: ...
+
+# MlpTable, int64, int64, bool, bool, MlpPrecision, MlpCudaWay, Cuda
+def grouped_mlp_workspace(_0: MlpTable, _1: int, _2: int, _3: bool, _4: bool, _5: str, _6: str, _7: Cuda) -> int: ...
+
+# Isa
+def isa_supported(_0: str) -> bool: ...
+
+# const float32*, const float32*, const float32*, const int32*, const int32*, int32*, int32*, int64, int64, int32, Cpu
+@overload
+def locate_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: int, _8: int, _9: int, _10: Cpu) -> bool: ...
+# const float64*, const float64*, const float64*, const int32*, const int32*, int32*, int32*, int64, int64, int32, Cpu
+# const float32*, const float32*, const float32*, const int32*, const int32*, int32*, int64, int64, int64, int32, Cuda
+@overload
+def locate_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: int, _7: int, _8: int, _9: int, _10: Cuda) -> None: ...
+# const float64*, const float64*, const float64*, const int32*, const int32*, int32*, int64, int64, int64, int32, Cuda
+
+# const int32*, const int32*, int64, int64
+def locate_cell_fault(_0: Tensor | None, _1: Tensor | None, _2: int, _3: int) -> str | None: ...
+
+# int64, Cpu
+def locate_cell_workspace(_0: int, _1: Cpu) -> int: ...
+
+# MarchInputs, int32*, int32*, int64, Cpu
+def march_rays_count(_0: MarchInputs, _1: Tensor | None, _2: Tensor | None, _3: int, _4: Cpu) -> None: ...
+
+# MarchInputs, const int32*, const int32*, int64, int32*, float32*, float32*, float32*, int32*, Cpu
+def march_rays_fill(_0: MarchInputs, _1: Tensor | None, _2: Tensor | None, _3: int, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: Tensor | None, _8: Tensor | None, _9: Cpu) -> None: ...
+
+# Peak, Cpu
+def measure_peak(_0: str, _1: Cpu) -> float: ...
+
+# const float32*, const float32*, const float32*, int32*, int64, int64, Cpu
+@overload
+def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: Cpu) -> None: ...
+# const float64*, const float64*, const float64*, int32*, int64, int64, Cpu
+# const float32*, const float32*, const float32*, int32*, int64, int64, Cuda
+@overload
+def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: Cuda) -> None: ...
+# const float64*, const float64*, const float64*, int32*, int64, int64, Cuda
+
+# const float32*, const float32*, const float32*, CentreGrid, int32*, int64, int64, Cpu
+def nearest_centre_grid(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: CentreGrid, _4: Tensor | None, _5: int, _6: int, _7: Cpu) -> None: ...
+# const float64*, const float64*, const float64*, CentreGrid, int32*, int64, int64, Cpu
+
+# const float32*, const float32*, const float32*, float32*, int64, int64, int64, Cpu
+@overload
+def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: int, _7: Cpu) -> None: ...
+# const float32*, const float32*, const float32*, float32*, float64*, int64, int64, int64, Cuda
+@overload
+def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: int, _8: Cuda) -> None: ...
+
+# const float32*, const int32*, const float32*, float32*, uint8*, int64, int64, float32, float32, Cpu
+def update_occupancy(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: float, _8: float, _9: Cpu) -> bool: ...

@@ -1,4 +1,5 @@
-"""Which implementation of an op runs: one fixed table, one predicate that both selects and explains.
+"""Which implementation of an op runs: one table, of which each op declares its own row (``voronerf/ops``), and one
+predicate that both selects and explains.
 
 An op has up to three implementations with one signature, that of its reference function:
 
@@ -27,28 +28,8 @@ import torch
 from voronerf.compiler import constant_result
 
 BACKENDS = ("reference", "native", "warp")
+_PACKAGES = {"reference": "voronerf.reference", "native": "voronerf.native", "warp": "voronerf.kernels"}
 ORDER = {"cpu": ("native", "reference"), "cuda": ("native", "warp", "reference")}
-OPS = (
-    "nearest_centre",
-    "centre_grid",
-    "nearest_centre_grid",
-    "locate_cell",
-    "draw_cell",
-    "cell_sort",
-    "grouped_linear",
-    "grouped_mlp",
-    "routed_mlp",
-    "frequency_encode",
-    "integrated_encode",
-    "composite",
-    "resample",
-    "march_rays",
-    "update_occupancy",
-    "balance_centres",
-    "camera_rays",
-    "select_heaviest",
-    "cast_solids",
-)
 
 
 class BackendUnavailable(RuntimeError):
@@ -57,17 +38,17 @@ class BackendUnavailable(RuntimeError):
 
 @dataclass(frozen=True)
 class Implementation:
-    """Where one implementation of an op lives and what it takes.
+    """What one implementation of an op takes, and where it lives.
 
     Attributes:
-        target: ``"module:function"``, imported on first use.
         devices: device types it runs on; empty means any.
         dtypes: dtypes of the op's first tensor it takes; empty means any.
+        file: module below the backend's package that has the function; None for the op's name.
     """
 
-    target: str
     devices: tuple[str, ...] = ()
     dtypes: tuple[torch.dtype, ...] = ()
+    file: str | None = None
 
 
 @dataclass(frozen=True)
@@ -94,63 +75,41 @@ class Row:
         return bool(self.devices)
 
 
-_FLOATS = (torch.float32, torch.float16, torch.bfloat16)
-_COORDINATES = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
+FLOATS = (torch.float32, torch.float16, torch.bfloat16)
+COORDINATES = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
+EVERYWHERE = ("cpu", "cuda")
 
-
-def _warp(op: str, *, file: str | None = None, dtypes: tuple[torch.dtype, ...] = _FLOATS) -> Implementation:
-    return Implementation(f"voronerf.kernels.{file or op}:{op}", ("cpu", "cuda"), dtypes)
-
-
-_REGISTRY: dict[tuple[str, str], Implementation] = {
-    **{(op, "reference"): Implementation(f"voronerf.reference.{op}:{op}") for op in OPS},
-    ("nearest_centre_grid", "reference"): Implementation("voronerf.reference.centre_grid:nearest_centre_grid"),
-    ("nearest_centre", "native"): Implementation("voronerf.native:nearest_centre", ("cpu", "cuda"), _COORDINATES),
-    ("centre_grid", "native"): Implementation("voronerf.native.centre_grid:centre_grid", ("cpu",), _COORDINATES),
-    ("nearest_centre_grid", "native"): Implementation(
-        "voronerf.native.centre_grid:nearest_centre_grid", ("cpu",), _COORDINATES
-    ),
-    ("locate_cell", "native"): Implementation("voronerf.native:locate_cell", ("cpu", "cuda"), _COORDINATES),
-    ("draw_cell", "native"): Implementation("voronerf.native.sampling:draw_cell", ("cpu", "cuda"), (torch.float32,)),
-    ("cell_sort", "native"): Implementation("voronerf.native:cell_sort", ("cpu", "cuda"), (torch.int32,)),
-    ("grouped_linear", "native"): Implementation(
-        "voronerf.native.grouped_linear:grouped_linear", ("cpu", "cuda"), _FLOATS
-    ),
-    ("grouped_mlp", "native"): Implementation("voronerf.native.grouped_mlp:grouped_mlp", ("cpu", "cuda"), _FLOATS),
-    ("routed_mlp", "native"): Implementation("voronerf.native.routed_mlp:routed_mlp", ("cpu", "cuda"), _FLOATS),
-    ("composite", "native"): Implementation("voronerf.native.composite:composite", ("cpu", "cuda"), _FLOATS),
-    ("frequency_encode", "native"): Implementation(
-        "voronerf.native.sampling:frequency_encode", ("cpu", "cuda"), _FLOATS
-    ),
-    ("integrated_encode", "native"): Implementation(
-        "voronerf.native.sampling:integrated_encode", ("cpu", "cuda"), _FLOATS
-    ),
-    ("resample", "native"): Implementation("voronerf.native.sampling:resample", ("cpu", "cuda"), _FLOATS),
-    ("march_rays", "native"): Implementation("voronerf.native.march_rays:march_rays", ("cpu",), (torch.float32,)),
-    ("update_occupancy", "native"): Implementation(
-        "voronerf.native.march_rays:update_occupancy", ("cpu",), (torch.float32,)
-    ),
-    ("nearest_centre", "warp"): _warp("nearest_centre", dtypes=_COORDINATES),
-    ("nearest_centre_grid", "warp"): _warp("nearest_centre_grid", dtypes=_COORDINATES),
-    ("locate_cell", "warp"): _warp("locate_cell", dtypes=_COORDINATES),
-    ("draw_cell", "warp"): _warp("draw_cell", dtypes=(torch.float32,)),
-    ("cell_sort", "warp"): _warp("cell_sort", dtypes=(torch.int32,)),
-    ("composite", "warp"): _warp("composite"),
-    ("frequency_encode", "warp"): _warp("frequency_encode", file="encode"),
-    ("integrated_encode", "warp"): _warp("integrated_encode", file="encode"),
-    ("resample", "warp"): _warp("resample"),
-    ("march_rays", "warp"): _warp("march_rays", dtypes=(torch.float32,)),
-    ("balance_centres", "native"): Implementation(
-        "voronerf.native.balance_centres:balance_centres", ("cpu",), (torch.float32,)
-    ),
-    ("balance_centres", "warp"): _warp("balance_centres", dtypes=(torch.float32,)),
-    ("camera_rays", "warp"): _warp("camera_rays", dtypes=(torch.float32,)),
-    ("select_heaviest", "warp"): _warp("select_heaviest", dtypes=(torch.float32,)),
-    ("cast_solids", "warp"): _warp("cast_solids", dtypes=(torch.float32,)),
-    ("update_occupancy", "warp"): _warp("update_occupancy", dtypes=(torch.float32,)),
-}
-
+_TABLE: dict[tuple[str, str], Implementation] = {}
 _FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {}
+
+
+def declare(
+    op: str,
+    *,
+    native: Implementation | None = None,
+    warp: Implementation | None = None,
+    reference: Implementation = Implementation(),
+) -> str:
+    """Puts the row of an op into the table, and returns its name. None: the op has no such implementation.
+
+    An implementation is the function of the op's name in a module of the op's name, unless ``file`` says another:
+    ``voronerf.reference.<op>``, ``voronerf.native.<op>`` or ``voronerf.kernels.<op>``; it is imported on first use.
+    """
+    for backend, implementation in zip(BACKENDS, (reference, native, warp), strict=True):
+        if implementation is not None:
+            _TABLE[op, backend] = implementation
+    return op
+
+
+def ops() -> tuple[str, ...]:
+    """Names of the ops, in the order of ``voronerf.ops``."""
+    importlib.import_module("voronerf.ops")  # which declares them
+    return tuple(dict.fromkeys(op for op, _ in _TABLE))
+
+
+def implemented(op: str) -> tuple[str, ...]:
+    """Backends that have an implementation of an op, whether or not it can run here."""
+    return tuple(backend for backend in BACKENDS if op in ops() and (op, backend) in _TABLE)
 
 
 def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
@@ -159,7 +118,7 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
     Works inside ``torch.compile(fullgraph=True)``: the choice is made while tracing.
 
     Args:
-        op: name of the op, one of ``OPS``.
+        op: name of the op, one of ``ops()``.
         backend: ``"auto"`` or a name from ``BACKENDS``.
         device: device of the op's tensors.
         dtype: dtype of the op's first tensor argument.
@@ -180,10 +139,9 @@ def why_not(op: str, backend: str, device: torch.device, dtype: torch.dtype | No
         device: device of the op's tensors.
         dtype: dtype of the op's first tensor argument; None leaves it out of the question.
     """
-    implementation = _REGISTRY.get((op, backend))
+    implementation = _TABLE.get((op, backend))
     if implementation is None:
-        others = [other for other in BACKENDS if (op, other) in _REGISTRY]
-        return f"there is no {backend} implementation of {op}; use backend={_choices(others)}"
+        return f"there is no {backend} implementation of {op}; use backend={_choices(implemented(op))}"
     if implementation.devices and device.type not in implementation.devices:
         return f"the {backend} implementation of {op} runs on {_choices(implementation.devices)}, not on {device.type}"
     if dtype is not None and implementation.dtypes and dtype not in implementation.dtypes:
@@ -200,7 +158,7 @@ def missing(backend: str, device: torch.device) -> str | None:
     if backend == "reference":
         return None
     try:
-        module = _import("voronerf.native" if backend == "native" else "voronerf.kernels")
+        module = _import(_PACKAGES[backend])
     except BackendUnavailable as error:
         return str(error)
     reason: str | None = module.missing(device)
@@ -224,10 +182,10 @@ def _import(module: str) -> ModuleType:
 def table() -> list[Row]:
     """Every op and backend: where it runs here, which dtypes it takes, and what is missing."""
     rows = []
-    for op in OPS:
+    for op in ops():
         for backend in BACKENDS:
             reasons = {device: why_not(op, backend, torch.device(device)) for device in ORDER}
-            implementation = _REGISTRY.get((op, backend))
+            implementation = _TABLE.get((op, backend))
             dtypes = () if implementation is None else _names(implementation.dtypes) or ("any",)
             devices = tuple(device for device, reason in reasons.items() if reason is None)
             distinct = dict.fromkeys(reason for reason in reasons.values() if reason is not None)
@@ -267,8 +225,8 @@ def _choose(op: str, backend: str, device: str, index: int | None, dtype: torch.
 
 @functools.cache
 def _choose_once(op: str, backend: str, device_type: str, index: int | None, dtype: torch.dtype) -> str:
-    if op not in OPS:
-        raise ValueError(f"resolve: op must be one of {_choices(OPS)}, got {op!r}")
+    if (op, "reference") not in _TABLE:
+        raise ValueError(f"resolve: op must be one of {_choices(ops())}, got {op!r}")
     if backend != "auto" and backend not in BACKENDS:
         raise ValueError(f"{op}: backend must be one of {_choices(('auto', *BACKENDS))}, got {backend!r}")
     device = torch.device(device_type) if index is None else torch.device(device_type, index)
@@ -280,8 +238,8 @@ def _choose_once(op: str, backend: str, device_type: str, index: int | None, dty
         reason = why_not(op, backend, device, dtype)
         if reason is not None:
             raise BackendUnavailable(f"{op}: backend {backend!r} is not available: {reason}")
-    module, _, function = _REGISTRY[op, backend].target.partition(":")
-    _FUNCTIONS[op, backend] = getattr(importlib.import_module(module), function)
+    module = importlib.import_module(f"{_PACKAGES[backend]}.{_TABLE[op, backend].file or op}")
+    _FUNCTIONS[op, backend] = getattr(module, op)
     return backend
 
 

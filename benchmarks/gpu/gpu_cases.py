@@ -43,10 +43,10 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     )
 
     import voronerf
-    from voronerf import native as _native
     from voronerf.fields import NeRF
     from voronerf.layers import MLP, POSITIONS, Layer
-    from voronerf.native import grouped_mlp as _native_mlp
+    from voronerf.native.cell_sort import sort as sort_cells
+    from voronerf.native.grouped_mlp import using_way
     from voronerf.reference.cell_sort import cell_sort as specified
 
     where = torch.device(device)
@@ -70,7 +70,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32, device=where)
         expected = specified(cells.cpu().clamp(-1, k) + 1, k + 2)
         order, offsets = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)
-        _native.sort_cells(cells, order, offsets, "cell_sort", way)
+        sort_cells(cells, order, offsets, "cell_sort", way)
         assert torch.equal(order.cpu(), expected[0]) and torch.equal(offsets.cpu(), expected[1][1:-1])
 
     def close(run: Callable[..., Any], leaves: list[Any]) -> None:
@@ -155,11 +155,11 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         assert not all(gradient.isfinite().all() for gradient in overflowing)
 
     def network(layers: Any, counts: list[int], d: int, precision: str, way: str = "auto") -> None:
-        with where, _native_mlp.taking(way):
+        with where, using_way(way):
             check(layers, counts, d, precision)
 
     def forward(layers: Any, precision: str, way: str) -> None:
-        with where, _native_mlp.taking(way):
+        with where, using_way(way):
             check_forward(layers, [37, 0, 60], 3, precision)
 
     networks = {"branched": (BRANCHED, 3), "wide": (WIDE, 7), "gaussians": (GAUSSIANS, 6), "broad": (BROAD, 3)}

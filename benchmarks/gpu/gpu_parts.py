@@ -312,8 +312,8 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     from ops.networks import NETS, cost, make_batch
 
     import voronerf
-    from voronerf import native as _native
-    from voronerf.native import grouped_mlp as _native_mlp
+    from voronerf.native.cell_sort import sort as sort_cells
+    from voronerf.native.grouped_mlp import using_way
 
     where = torch.device(device)
     journal = Journal(out, "roofs", begun=again.start > 0)
@@ -350,7 +350,7 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
             return lambda: torch.sort(next(keys), stable=True)
         order, offsets = torch.empty_like(sets[0]), sets[0].new_empty(k + 1)
         given = itertools.cycle(sets)
-        return lambda: _native.sort_cells(next(given), order, offsets, "cell_sort", way)
+        return lambda: sort_cells(next(given), order, offsets, "cell_sort", way)
 
     def network(name: str, k: int, backward: bool, way: str = "auto") -> Callable[[], Any]:
         if where.type == "cuda":
@@ -360,7 +360,7 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         given = batch.positions[0], batch.offsets, batch.weights, batch.biases
 
         def run() -> None:
-            with torch.set_grad_enabled(backward), _native_mlp.taking(way):
+            with torch.set_grad_enabled(backward), using_way(way):
                 result = voronerf.grouped_mlp(*given, **options, backend="native")
                 if backward:
                     torch.autograd.grad(result, [*batch.weights, *batch.biases], batch.gradients[1])

@@ -1,4 +1,4 @@
-#include "bindings/launchers.h"
+#include "common/cuda_device.h"
 #include "common/common.h"
 
 namespace voronerf {

@@ -2,8 +2,8 @@
 // sine and cosine apart costs less than passing one of them through shared memory. Backward, a thread a feature of a
 // point; it computes its sines and cosines again, and its gradients, a row of 4 (1 + 2 L) d bytes apart, share their
 // cache lines with the neighbouring threads'.
-#include "bindings/launchers.h"
 #include "common/cuda_wrappers.h"
+#include "encoding/encode.h"
 #include "encoding/encode_math.h"
 
 namespace voronerf {
@@ -67,19 +67,17 @@ unsigned blocks_of(int64_t size) {
 
 }  // namespace
 
-void encode_cuda(const float* x, const float* variances, float* out, int64_t n, int64_t d, int64_t octaves,
-                 bool include_input, void* stream) {
-  if (n * d * (2 * octaves + (include_input ? 1 : 0)) == 0) return;
-  VN_LAUNCH(encode_kernel, static_cast<unsigned>(ceil_div<int64_t>(n, kRows)), kThreads, 0, stream, x, variances, out,
-            n, static_cast<int>(d), static_cast<int>(octaves), include_input ? 1 : 0);
+void encode_cuda(const Encoding& in, float* out, void* stream) {
+  if (in.n * in.width == 0) return;
+  VN_LAUNCH(encode_kernel, static_cast<unsigned>(ceil_div<int64_t>(in.n, kRows)), kThreads, 0, stream, in.x,
+            in.variances, out, in.n, static_cast<int>(in.d), static_cast<int>(in.octaves), in.include_input ? 1 : 0);
 }
 
-void encode_backward_cuda(const float* gradient, const float* x, const float* variances, float* grad_x,
-                          float* grad_variances, int64_t n, int64_t d, int64_t octaves, bool include_input,
+void encode_backward_cuda(const Encoding& in, const float* gradient, float* grad_x, float* grad_variances,
                           void* stream) {
-  if (n * d == 0) return;
-  VN_LAUNCH(encode_backward_kernel, blocks_of(n * d), kThreads, 0, stream, gradient, x, variances, grad_x,
-            grad_variances, n, static_cast<int>(d), static_cast<int>(octaves), include_input ? 1 : 0);
+  if (in.n * in.d == 0) return;
+  VN_LAUNCH(encode_backward_kernel, blocks_of(in.n * in.d), kThreads, 0, stream, gradient, in.x, in.variances, grad_x,
+            grad_variances, in.n, static_cast<int>(in.d), static_cast<int>(in.octaves), in.include_input ? 1 : 0);
 }
 
 }  // namespace voronerf

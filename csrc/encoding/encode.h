@@ -26,6 +26,10 @@ void encode_cpu(const Encoding& in, float* out, float* workspace, Isa isa, int t
 void encode_backward_cpu(const Encoding& in, const float* gradient, float* grad_x, float* grad_variances,
                          float* workspace, Isa isa, int threads);
 
+void encode_cuda(const Encoding& in, float* out, void* stream);
+void encode_backward_cuda(const Encoding& in, const float* gradient, float* grad_x, float* grad_variances,
+                          void* stream);
+
 // Rows in cache at a time, and floats of a row of the encoding there.
 constexpr int64_t kEncodeRows = 32;
 constexpr int64_t kEncodeLanes = 16;  // the widest vector

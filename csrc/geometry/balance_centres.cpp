@@ -70,7 +70,7 @@ void balance_centres_cpu(const BalanceInputs& in, float* centres, double* weight
           shift[axis] += way * (weights[j] - weights[i]);
         }
       }
-      if (in.global) heaviest = heaviest_of_all;
+      if (in.of_all) heaviest = heaviest_of_all;
       // A neighbourhood without any weight has only zero differences.
       const double scale = heaviest > 0.0 ? in.alpha / (heaviest * static_cast<double>(in.neighbours)) : 0.0;
       for (int axis = 0; axis < 3; ++axis) moved[3 * i + axis] = centres[3 * i + axis] + scale * shift[axis];

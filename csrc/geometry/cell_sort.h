@@ -50,4 +50,10 @@ struct CellSortPlan {
 // `temporary`: bytes that the radix sort takes (radix_sort.h). Throws std::runtime_error where cells cannot be counted.
 CellSortPlan cell_sort_plan(int64_t n, int64_t k, CellSortWay way, int64_t temporary);
 
+// A cell below 0 sorts before offsets[0], one from k on after offsets[k]: raising would need a host read.
+// The workspace's size depends on the current device and is known to the host; aligned as torch's allocations are.
+int64_t cell_sort_workspace_cuda(int64_t n, int64_t k, CellSortWay way);
+void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, unsigned char* workspace, int64_t n,
+                    int64_t k, CellSortWay way, void* stream);
+
 }  // namespace voronerf

@@ -26,6 +26,11 @@ bool draw_cell_cpu(const float* points, const float* centres, const float* weigh
                    const int32_t* child, const float* uniforms, int32_t* leaves, int32_t* places, float* sums,
                    int64_t n, int64_t m, int depth, double temperature, Isa isa, int threads);
 
+// g diagrams. Of unsound tables what locate_cell_cuda says.
+void draw_cell_cuda(const float* points, const float* centres, const float* weights, const int32_t* child_offsets,
+                    const int32_t* child, const float* uniforms, int32_t* leaves, int64_t n, int64_t m, int64_t g,
+                    int depth, double temperature, void* stream);
+
 // One diagram of k centres for n points: uniforms [n] -> cells [n]. sums: kDrawLanes * k floats.
 constexpr int kDrawLanes = 16;
 VN_DECLARE_FOR_ISA(void draw_cell(const float* points, const float* centres, const float* weights,

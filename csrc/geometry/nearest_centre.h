@@ -11,6 +11,9 @@ namespace voronerf {
 template <typename T>
 void nearest_centre_cpu(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
                         Isa isa, int threads);
+template <typename T>
+void nearest_centre_cuda(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
+                         void* stream);
 
 // The same on the calling thread. `weight_bound` is nearest_centre_weight_bound(weights, k).
 template <typename T>

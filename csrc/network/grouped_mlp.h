@@ -26,14 +26,15 @@ enum class MlpCaller : int { grouped_mlp = 0, grouped_linear, routed_mlp };
 constexpr int kFromPositions = -1;
 constexpr int kFromDirections = -2;
 
+struct MlpLayer {
+  int64_t width;
+  Activation activation;
+  std::vector<int> inputs;  // earlier layers, kFromPositions or kFromDirections
+};
+
 // The layer table of voronerf/layers.py; octaves -1: taken as they come.
 struct MlpTable {
-  struct Layer {
-    int64_t width;
-    Activation activation;
-    std::vector<int> inputs;  // earlier layers, kFromPositions or kFromDirections
-  };
-  std::vector<Layer> layers;
+  std::vector<MlpLayer> layers;
   std::vector<int> outputs;
   int64_t positions = 0, directions = 0;  // p and q
   int position_octaves = -1, direction_octaves = -1;
@@ -68,5 +69,25 @@ void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& inputs, float* out,
 // Activations are computed again, tile by tile, rather than kept since the forward pass.
 void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& inputs, const MlpGradients& gradients, Isa isa,
                               int threads);
+
+// On CUDA: what is multiplied (sums are float32), and the way a call goes: fused with values in registers
+// (grouped_mlp_cuda_chain.h), fused with values in shared memory (grouped_mlp_cuda_plan.h), layer by layer
+// (grouped_mlp_cuda_layers.h). One can be asked for, to compare them. groups: the chain with products of four warps,
+// never by itself.
+enum class MlpPrecision : int { float32 = 0, bfloat16, float16, tf32 };
+enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers, groups };
+
+// Bytes of workspace of a call on the current device; parameters: whether their gradients are wanted. Throws
+// std::invalid_argument for a table that breaks a rule of its way.
+int64_t grouped_mlp_workspace_cuda(const MlpTable& table, int64_t n, int64_t k, bool backward, bool parameters,
+                                   MlpPrecision precision, MlpCudaWay way);
+
+// Offsets that fall or exceed n cannot be refused without a host read: rows outside are not touched.
+void grouped_mlp_cuda(const MlpTable& table, const MlpInputs& inputs, float* out, MlpPrecision precision,
+                      MlpCudaWay way, unsigned char* workspace, void* stream);
+
+// Gradients of directions are one row a sample.
+void grouped_mlp_backward_cuda(const MlpTable& table, const MlpInputs& inputs, const MlpGradients& gradients,
+                               MlpPrecision precision, MlpCudaWay way, unsigned char* workspace, void* stream);
 
 }  // namespace voronerf

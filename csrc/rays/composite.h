@@ -39,4 +39,8 @@ struct CompositeGradients {
 void composite_cpu(const CompositeInputs& in, const CompositeOutputs& out, Isa isa, int threads);
 void composite_backward_cpu(const CompositeInputs& in, const CompositeGradients& gradients, Isa isa, int threads);
 
+// Offsets that fall or exceed m are not refused: samples outside are not touched.
+void composite_cuda(const CompositeInputs& in, const CompositeOutputs& out, void* stream);
+void composite_backward_cuda(const CompositeInputs& in, const CompositeGradients& gradients, void* stream);
+
 }  // namespace voronerf

@@ -19,7 +19,7 @@ struct MarchInputs {
   const float* uniforms;              // [r,s], or null for the middles
   const int32_t* start;               // [r], or null for 0
   int64_t r, s;
-  int64_t size[3];
+  int64_t x, y, z;
   bool disparity;
   int64_t most;  // samples of a ray
 };

@@ -46,10 +46,8 @@ VN_INLINE void cells_of(const MarchInputs& in, const Ray& ray, const float* orig
                         const float* scale, const float* uniforms, int64_t first, int32_t* cells) {
   float edges[kMarchWord + 1];
   for (int64_t j = 0; j <= kMarchWord; ++j) edges[j] = edge_at<Disparity>(ray, first + j);
-  const float size[3] = {static_cast<float>(in.size[0]), static_cast<float>(in.size[1]),
-                         static_cast<float>(in.size[2])};
-  const int32_t count[3] = {static_cast<int32_t>(in.size[0]), static_cast<int32_t>(in.size[1]),
-                            static_cast<int32_t>(in.size[2])};
+  const float size[3] = {static_cast<float>(in.x), static_cast<float>(in.y), static_cast<float>(in.z)};
+  const int32_t count[3] = {static_cast<int32_t>(in.x), static_cast<int32_t>(in.y), static_cast<int32_t>(in.z)};
   for (int64_t j = 0; j < kMarchWord; ++j) {
     const float at = sample_at<Disparity>(ray, first + j, Jittered ? uniforms[j] : 0.5f, edges[j], edges[j + 1]);
     int32_t cell = 0;
@@ -72,9 +70,10 @@ VN_INLINE int bits_of(uint32_t word) {
 template <bool Jittered, bool Disparity>
 VN_INLINE void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
+  const int64_t size[3] = {in.x, in.y, in.z};
   float scale[3];
   for (int axis = 0; axis < 3; ++axis) {
-    scale[axis] = static_cast<float>(in.size[axis]) / (in.box[3 + axis] - in.box[axis]);
+    scale[axis] = static_cast<float>(size[axis]) / (in.box[3 + axis] - in.box[axis]);
   }
   for (int64_t i = begin; i < end; ++i) {
     const Ray ray = ray_of(in, i);

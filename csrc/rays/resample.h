@@ -9,4 +9,8 @@ namespace voronerf {
 void resample_cpu(const float* weights, const float* edges, const float* uniforms, float* depths, int64_t r, int64_t s,
                   int64_t count, int threads);
 
+// workspace: r s doubles.
+void resample_cuda(const float* weights, const float* edges, const float* uniforms, float* depths, double* workspace,
+                   int64_t r, int64_t s, int64_t count, void* stream);
+
 }  // namespace voronerf

@@ -27,7 +27,7 @@ from ops import (
 )
 
 import voronerf
-from voronerf import native as _native
+from voronerf import native
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 CPU = torch.device("cpu")
@@ -114,10 +114,10 @@ def test_quartiles():
 
 @pytest.mark.native
 def test_instruction_set_is_forced_and_put_back():
-    before = _native._ISA
+    before = native.describe()["instruction set"]
     with harness.instruction_set("portable"):
-        assert _native._ISA == 0
-    assert before == _native._ISA
+        assert native.describe()["instruction set"] == "portable"
+    assert before == native.describe()["instruction set"]
     with pytest.raises(ValueError, match="no sse9"), harness.instruction_set("sse9"):
         pass
 

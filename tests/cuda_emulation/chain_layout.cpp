@@ -2,7 +2,7 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include "bindings/bindings_mlp_table.h"
+#include "bindings/grouped_mlp.h"
 #include "emulation.h"
 #include "encoding/encode_math.h"
 #include "network/cuda/grouped_mlp_cuda_chain.h"
@@ -53,12 +53,12 @@ void bind_chain_layout(py::module_& module) {
   module.def("chain_weight_column", voronerf::chain_weight_column);
   // The plan of a table, or the rule that it breaks.
   module.def("chain_plan",
-             [](const std::vector<int64_t>& table, int precision, int64_t n, int64_t k, int capability,
+             [](voronerf::Argument<voronerf::MlpTable> table, int precision, int64_t n, int64_t k, int capability,
                 int shared_bytes, int multiprocessors, bool groups, bool compiled) -> py::object {
                voronerf::MlpChainPlan plan;
                const voronerf::MlpCudaDevice device = {capability, shared_bytes, multiprocessors, 1 << 20, compiled};
                const char* fault =
-                   voronerf::mlp_chain_plan(mlp_arguments::read_table(table),
+                   voronerf::mlp_chain_plan(table.get(),
                                             static_cast<voronerf::MlpPrecision>(precision), n, k, device, groups, plan);
                if (fault != nullptr) return py::str(fault);
                py::dict told;

@@ -21,7 +21,9 @@ from voronerf import native as _native
 @functools.cache
 def module() -> ModuleType:
     """The emulated module, built if need be."""
-    return load(build())
+    loaded = load(build())
+    loaded.name_dtypes(_native.DTYPES)
+    return loaded
 
 
 class _Both:
@@ -45,11 +47,9 @@ def emulated(
     loaded = module()
     loaded.seed(seed)
     loaded.device(capability, compiled, shared_bytes)
-    _native._entry.cache_clear()
     with (
-        mock.patch.object(_native, "_C", _Both(loaded, _native._C)),
+        mock.patch.object(_native, "compiled", _Both(loaded, _native.compiled)),
         mock.patch.object(_native, "on_cuda", lambda tensor: True),
         mock.patch.object(_native, "stream", lambda tensor: (0, 0)),
     ):
         yield loaded
-    _native._entry.cache_clear()

@@ -16,11 +16,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent.parent
 HERE = Path(__file__).resolve().parent
 SANITIZERS = {"none": [], "address": ["-fsanitize=address"], "thread": ["-fsanitize=thread"]}
-PLAIN = {
-    *("emulation.cpp", "module.cpp", "index_maps.cpp", "chain_layout.cpp", "group_bindings.cpp", "plans.cpp"),
-    "bindings_cuda.cpp",
-}
-"""Files with nothing to watch."""
+PLAIN = {"emulation.cpp", "module.cpp", "index_maps.cpp", "chain_layout.cpp", "group_bindings.cpp", "plans.cpp"}
+"""Files with nothing to watch, as are those of csrc/bindings."""
 SHARED = (
     "cell_sort_plan.cpp",
     "grouped_mlp_cuda_plan.cpp",
@@ -47,7 +44,10 @@ def _build(out, sanitizer):
     module = out / sanitizer / f"voronerf_emulation{sysconfig.get_config_var('EXT_SUFFIX')}"
     kernels = [source for source in sorted((ROOT / "csrc").rglob("*.cu")) if source.name not in REPLACED]
     sources = [*kernels, *sorted(HERE.glob("*.cu")), *sorted(HERE.glob("*.cpp"))]
-    sources += [path for path in sorted((ROOT / "csrc").rglob("*.cpp")) if path.name in ("bindings_cuda.cpp", *SHARED)]
+    sources += [path for path in sorted((ROOT / "csrc").rglob("*.cpp")) if path.name in SHARED]
+    # Those of ops that have CUDA kernels.
+    bindings = [path for path in (ROOT / "csrc" / "bindings").glob("*.cpp") if "VN_CUDA(" in path.read_text()]
+    sources += sorted(bindings)
     includes = [ROOT / "csrc", HERE, Path(pybind11.get_include()), Path(sysconfig.get_path("include"))]
     flags = ["-std=c++17", "-O1", "-g1", "-fPIC", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=hidden"]
     flags += ["-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-DVN_EMULATE", "-DVN_WITH_CUDA"]
@@ -63,8 +63,8 @@ def _build(out, sanitizer):
     ]
     objects = []
     for source in sources:
-        plain = source.name in PLAIN
-        objects.append(f"{'plain' if plain else sanitizer}/{source.name}.o")
+        plain = source.name in PLAIN or source in bindings
+        objects.append(f"{'plain' if plain else sanitizer}/{source.parent.name}/{source.name}.o")
         lines += [f"build {objects[-1]}: cxx {source}", f"  flags = {shlex.join([] if plain else watched)}"]
     lines += [f"build {sanitizer}/{module.name}: link {' '.join(objects)}", ""]
     (out / f"{sanitizer}.ninja").write_text("\n".join(lines))

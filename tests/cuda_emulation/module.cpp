@@ -1,9 +1,9 @@
-// The CUDA half of voronerf._C, emulated: the bindings of csrc/bindings/bindings_cuda.cpp over .cu files compiled by g++.
+// The CUDA half of voronerf._C, emulated: the bindings of csrc/bindings over .cu files compiled by g++.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include "bindings/bindings_cuda.h"
-#include "bindings/bindings_mlp_table.h"
+#include "bindings/grouped_mlp.h"
+#include "bindings/module.h"
 #include "geometry/cell_sort.h"
 #include "emulation.h"
 #include "network/cuda/grouped_mlp_cuda_layers.h"
@@ -17,7 +17,7 @@ void bind_chain_layout(py::module_& module);
 void planted(const float* values, float* out, int* counter, int blocks, int threads, int bug);
 
 PYBIND11_MODULE(voronerf_emulation, module) {
-  bind_cuda(module);
+  voronerf::bind_all(module);
   bind_groups(module);
   bind_index_maps(module);
   bind_plans(module);
@@ -30,12 +30,12 @@ PYBIND11_MODULE(voronerf_emulation, module) {
   // What a call's plan says.
   module.def(
       "grouped_mlp_plan",
-      [](const std::vector<int64_t>& table, int precision, int64_t n, int64_t k, bool backward, int way) {
+      [](voronerf::Argument<voronerf::MlpTable> table, int precision, int64_t n, int64_t k, bool backward, int way) {
         voronerf::MlpCudaChoice choice;
         voronerf::MlpCudaDevice device = voronerf::mlp_cuda_device();
         device.groups = voronerf::mlp_chain_groups_compiled();
         const char* fault =
-            voronerf::mlp_cuda_choose(mlp_arguments::read_table(table), static_cast<voronerf::MlpPrecision>(precision),
+            voronerf::mlp_cuda_choose(table.get(), static_cast<voronerf::MlpPrecision>(precision),
                                       n, k, backward, static_cast<voronerf::MlpCudaWay>(way), device, choice);
         VN_CHECK(fault == nullptr, fault);
         py::dict plan;

@@ -5,11 +5,10 @@ from emulated import module
 from emulated_networks import KIB
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.native import grouped_mlp as native_mlp
+from voronerf.native import compiled, grouped_mlp, layer_table
 
-PRECISIONS = ("float32", "bfloat16", "float16", "tf32")
-"""By the numbers of MlpPrecision."""
-WAYS = native_mlp.WAYS
+PRECISIONS = compiled.MlpPrecision
+WAYS = grouped_mlp.WAYS
 MANY = 1 << 22
 SHARED = {75: 64 * KIB, 80: 163 * KIB, 86: 99 * KIB, 90: 227 * KIB, 120: 99 * KIB}
 """Shared memory that a block may ask for, by compute capability."""
@@ -29,19 +28,19 @@ def plain(width, depth):
     return MLP((*hidden, Layer((depth - 1,), 4)), (depth,), position_octaves=10)
 
 
-def numbers(layers, d=None):
+def table(layers, d=None):
     """A table as the compiled module takes it."""
     d = d or (6 if layers.integrated else 3)
     seen = torch.zeros(1, 3) if layers.uses_directions else None
     weights = [torch.zeros(1, o, i) for o, i in layers.weight_shapes(d, 3 if layers.uses_directions else 0)]
-    given = native_mlp.network(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
-    return native_mlp._numbers(given.table, given.positions, given.weights, given.directions)
+    given = layer_table.network(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
+    return layer_table.compiled_table(given.table, given.positions, given.weights, given.directions)
 
 
 def plan(layers, n=MANY, k=16, *, precision="bfloat16", backward=True, d=None, asked="auto"):
     """What the launches would be on the emulated device."""
     operands = PRECISIONS.index(precision)
-    return module().grouped_mlp_plan(numbers(layers, d), operands, n, k, backward, WAYS.index(asked))
+    return module().grouped_mlp_plan(table(layers, d), operands, n, k, backward, WAYS.index(asked))
 
 
 def way(layers, precision, *, backward=False, **options):
@@ -49,11 +48,11 @@ def way(layers, precision, *, backward=False, **options):
     return WAYS[plan(layers, precision=precision, backward=backward, **options)["way"]]
 
 
-def chain(layers, *, d=None, precision="bfloat16", n=MANY, k=16, groups=False, compiled=True, **device):
+def chain(layers, *, d=None, precision="bfloat16", n=MANY, k=16, groups=False, built=True, **device):
     """The chained plan, or the rule that the table breaks, on an H200 unless another device is given."""
     known = {"capability": 90, "shared_bytes": 227 * KIB, "multiprocessors": 132} | device
     operands = PRECISIONS.index(precision)
-    return module().chain_plan(numbers(layers, d), operands, n, k, *known.values(), groups, compiled)
+    return module().chain_plan(table(layers, d), operands, n, k, *known.values(), groups, built)
 
 
 def assert_covers(found, n, k):

@@ -4,7 +4,7 @@
 
 #include <vector>
 
-#include "bindings/bindings_mlp_table.h"
+#include "bindings/grouped_mlp.h"
 #include "network/cuda/grouped_mlp_cuda_layers.h"
 
 namespace py = pybind11;
@@ -14,13 +14,13 @@ namespace {
 // Capability, shared memory of a block, multiprocessors and bytes of cache.
 using Device = std::vector<int64_t>;
 
-py::dict plan_for(const std::vector<int64_t>& flat, int precision, int64_t n, int64_t k, bool backward,
+py::dict plan_for(voronerf::Argument<voronerf::MlpTable> table, int precision, int64_t n, int64_t k, bool backward,
                   const Device& given) {
   const voronerf::MlpCudaDevice device{static_cast<int>(given[0]), static_cast<int>(given[1]),
                                        static_cast<int>(given[2]), given[3]};
   voronerf::MlpCudaChoice choice;
   const char* fault =
-      voronerf::mlp_cuda_choose(mlp_arguments::read_table(flat), static_cast<voronerf::MlpPrecision>(precision), n, k,
+      voronerf::mlp_cuda_choose(table.get(), static_cast<voronerf::MlpPrecision>(precision), n, k,
                                 backward, voronerf::MlpCudaWay::automatic, device, choice);
   if (fault != nullptr) throw std::runtime_error(fault);
   py::dict plan;

@@ -12,13 +12,32 @@ import sys
 import numpy as np
 from emulation_build import load
 
-GPU = (0, 0)
-"""Device and stream."""
 RANDOM = np.random.default_rng(0)
+DTYPES = {name: name for name in ("float32", "float64", "int32", "int64", "uint8", "bool")}
+
+
+class Memory:
+    """An array as the module takes tensors."""
+
+    def __init__(self, array):
+        self.array, self.dtype = array, DTYPES[array.dtype.name]
+
+    def contiguous(self):
+        return self
+
+    def is_contiguous(self):
+        return True
+
+    def data_ptr(self):
+        return self.array.ctypes.data
 
 
 def at(array):
-    return 0 if array is None else array.ctypes.data
+    return None if array is None else Memory(array)
+
+
+def every(arrays):
+    return [at(array) for array in arrays]
 
 
 def floats(*shape, dtype=np.float32):
@@ -39,70 +58,78 @@ def written(*arrays):
 
 
 def nearest_centre(module):
-    for dtype, name in ((np.float32, "float32"), (np.float64, "float64")):
-        points, centres, weights, cells = floats(300, 3, dtype=dtype), floats(530, 3, dtype=dtype), None, None
+    for dtype in (np.float32, np.float64):
+        points, centres = floats(300, 3, dtype=dtype), floats(530, 3, dtype=dtype)
         for weights in (None, floats(530, dtype=dtype)):
             cells = unwritten(300, dtype=np.int32)
-            arguments = at(points), at(centres), at(weights), at(cells), 300, 530
-            getattr(module, f"nearest_centre_cuda_{name}")(*arguments, *GPU)
+            module.nearest_centre(*every((points, centres, weights, cells)), 300, 530, module.Cuda(0, 0))
             written(cells)
 
 
 def locate_cell(module):
     points, centres, leaves = floats(300, 3), floats(5, 3), unwritten(300, dtype=np.int32)
-    child_offsets, child = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
-    addresses = at(points), at(centres), 0, at(child_offsets), at(child), at(leaves)
-    module.locate_cell_cuda_float32(*addresses, 300, 5, 2, 2, *GPU)
+    tables = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
+    module.locate_cell(*every((points, centres, None, *tables, leaves)), 300, 5, 2, 2, module.Cuda(0, 0))
     written(leaves)
 
 
 def draw_cell(module):
     points, centres, uniforms = floats(300, 3), floats(5, 3), floats(300, 2)
-    child_offsets, child = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
+    tables = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
     for weights in (None, floats(5)):
         leaves = unwritten(300, dtype=np.int32)
-        addresses = at(points), at(centres), at(weights), at(child_offsets), at(child), at(uniforms), at(leaves)
-        module.draw_cell_cuda(*addresses, 300, 5, 2, 2, 0.3, *GPU)
+        given = every((points, centres, weights, *tables, uniforms, leaves))
+        module.draw_cell(*given, 300, 5, 2, 2, 0.3, module.Cuda(0, 0))
         written(leaves)
+
+
+def sort(module, cells, k, way):
+    n, gpu = len(cells), module.Cuda(0, 0)
+    order, offsets = unwritten(n, dtype=np.int32), unwritten(k + 1, dtype=np.int32)
+    workspace = np.full(module.cell_sort_workspace(n, k, way, gpu), 255, np.uint8)
+    module.cell_sort(*every((cells, order, offsets, workspace)), n, k, way, gpu)
+    assert (np.sort(order) == np.arange(n)).all()
+    return order, offsets
 
 
 def cell_sort(module):
     # By counting and by radix. Keys of 4 bytes would need 65,535 cells, each a thread: too many for a sanitizer.
-    for n, k, way in ((3000, 5, 0), (9000, 2, 1), (600, 3, 2), (300, 1100, 0)):
-        cells = RANDOM.integers(-1, k + 1, n).astype(np.int32)
-        order, offsets = unwritten(n, dtype=np.int32), unwritten(k + 1, dtype=np.int32)
-        workspace = np.full(module.cell_sort_workspace_cuda(n, k, way, GPU[0]), 255, np.uint8)
-        module.cell_sort_cuda(at(cells), at(order), at(offsets), at(workspace), n, k, way, *GPU)
-        assert (np.sort(order) == np.arange(n)).all()
+    for n, k, way in ((3000, 5, "automatic"), (9000, 2, "counting"), (600, 3, "radix"), (300, 1100, "automatic")):
+        _, offsets = sort(module, RANDOM.integers(-1, k + 1, n).astype(np.int32), k, way)
         written(offsets)
 
 
 def composite(module):
     m, r = 180, 5
-    ray_offsets = integers(2, 2, 3, 73, 140, 177)
     for c, background in ((3, floats(3)), (5, floats(r, 5)), (1, None)):
-        inputs = floats(m), floats(m, c), floats(m), floats(m), ray_offsets, background
-        sizes = [r, 0, m, c, int(background is not None and background.ndim == 2)]
-        results = unwritten(r, c), unwritten(r), unwritten(r), unwritten(m)
-        module.composite_cuda([at(x) for x in inputs], sizes, [at(x) for x in results], *GPU)
-        written(*results)
-        incoming = floats(r, c), floats(r), floats(r), floats(m)
-        outgoing = [unwritten(*x.shape) for x in inputs[:4]]
-        outgoing += [] if background is None else [unwritten(*background.shape)]
-        targets = [at(x) for x in outgoing] + [0] * (5 - len(outgoing)) + [at(workspace := unwritten(r))]
-        module.composite_backward_cuda([at(x) for x in inputs], sizes, [at(x) for x in incoming], targets, *GPU)
-        written(*outgoing, *([] if background is None else [workspace]))
+        inputs = floats(m), floats(m, c), floats(m), floats(m), integers(2, 2, 3, 73, 140, 177), background
+        results, outgoing = composited(module, inputs, r, c)
+        written(*results, *(x for x in outgoing if x is not None))
+
+
+def composited(module, inputs, r, c):
+    """Results, and the gradients of them with the workspace."""
+    background, gpu = inputs[-1], module.Cuda(0, 0)
+    m, per_ray = len(inputs[0]), background is not None and background.ndim == 2
+    given = module.CompositeInputs(*every(inputs), per_ray, r, 0, m, c)
+    results = [unwritten(r, c), unwritten(r), unwritten(r), unwritten(m)]
+    module.composite(given, module.CompositeOutputs(*every(results)), gpu)
+    outgoing = [unwritten(*x.shape) for x in inputs[:4]]
+    outgoing += [None, None] if background is None else [unwritten(*background.shape), unwritten(r)]
+    incoming = floats(r, c), floats(r), floats(r), floats(m)
+    module.composite_backward(given, module.CompositeGradients(*every((*incoming, *outgoing))), gpu)
+    return results, outgoing
 
 
 def encode(module):
-    x, gradient = floats(90, 3), floats(90, 27)
+    x, gradient, gpu = floats(90, 3), floats(90, 27), module.Cuda(0, 0)
     for variances, include in ((None, True), (None, False), (floats(90, 3), False)):
         width = 3 * (8 + include)
         out, grad_x, grad_variances = unwritten(90, width), unwritten(90, 3), unwritten(90, 3)
-        module.encode_cuda(at(x), at(variances), at(out), 90, 3, 4, include, *GPU)
         second = None if variances is None else grad_variances
-        addresses = at(gradient), at(x), at(variances), at(grad_x), at(second)
-        module.encode_backward_cuda(*addresses, 90, 3, 4, include, *GPU)
+        given = module.Encoding(at(x), at(variances), 90, 3, 4, include, width)
+        module.encode(given, at(out), gpu)
+        module.encode_backward(given, *every((gradient, grad_x, second)), gpu)
         written(out, grad_x, *([] if second is None else [second]))
 
 
@@ -111,121 +138,110 @@ def resample(module):
     for uniforms in (None, floats(r, count)):
         weights, edges = floats(r, s), np.cumsum(floats(r, s + 1), axis=1)
         depths, workspace = unwritten(r, count), unwritten(r, s, dtype=np.float64)
-        addresses = at(weights), at(edges), at(uniforms), at(depths), at(workspace)
-        module.resample_cuda(*addresses, r, s, count, *GPU)
+        module.resample(*every((weights, edges, uniforms, depths, workspace)), r, s, count, module.Cuda(0, 0))
         written(depths)
 
 
-# Sine 20 of 2 octaves of positions, softplus 70 of that and positions, sigmoid 18 of that and directions; out come the
-# last and the first. As voronerf/native/grouped_mlp.py writes it.
-TABLE = [3, 3, 2, -1, 0, 0, 0, 3, 2, 20, 4, 1, -1, 70, 2, 2, 0, -1, 18, 3, 2, 1, -2, 2, 0]
 SHAPES = [(20, 15), (70, 35), (18, 73)]
 
 
-def grouped_mlp(module):
-    counts = [37, 0, 20, 3]
-    n, k, r = 64, len(counts), 5
-    offsets = np.cumsum([2, *counts]).astype(np.int32)
+def table(module):
+    """Sine 20 of 2 octaves of positions (-1), softplus 70 of that and positions, sigmoid 18 of that and directions
+    (-2); out come the last and the first."""
+    layers = (module.MlpLayer(20, "sine", (-1,)), module.MlpLayer(70, "softplus", (0, -1)))
+    return module.MlpTable(
+        layers=(*layers, module.MlpLayer(18, "sigmoid", (1, -2))),
+        outputs=(2, 0),
+        positions=3,
+        directions=3,
+        position_octaves=2,
+        direction_octaves=-1,
+        integrated=False,
+        half=False,
+        caller="grouped_mlp",
+    )
+
+
+def network(module, n, k, offsets, precision, ways):
+    """Forward and backward of random numbers; the output and the gradients of everything."""
+    r, gpu = 5, module.Cuda(0, 0)
     positions, directions, gradient = floats(n, 3), floats(r, 3), floats(n, 38)
     index, order = RANDOM.integers(0, r, n).astype(np.int32), RANDOM.permutation(n).astype(np.int32)
     weights, biases = [floats(k, o, i) for o, i in SHAPES], [floats(k, o) for o, _ in SHAPES]
-    arguments = [at(positions), at(directions), at(index), at(offsets), at(order), n, r, k]
-    given = TABLE, arguments, [at(x) for x in weights], [at(x) for x in biases]
+    given = module.MlpInputs(
+        *every((positions, directions, index, offsets)), every(weights), every(biases), n, r, k, at(order)
+    )
+
+    def rest(backward):
+        way = ways[backward]
+        size = module.grouped_mlp_workspace(table(module), n, k, backward, True, precision, way, gpu)
+        return precision, way, at(np.full(size, 255, np.uint8)), gpu
+
+    out, grad_positions, grad_directions = unwritten(n, 38), unwritten(n, 3), unwritten(n, 3)
+    grad_weights, grad_biases = [unwritten(*x.shape) for x in weights], [unwritten(*x.shape) for x in biases]
+    module.grouped_mlp(table(module), given, at(out), *rest(False))
+    gradients = module.MlpGradients(
+        at(gradient), every(grad_weights), every(grad_biases), at(grad_positions), at(grad_directions)
+    )
+    module.grouped_mlp_backward(table(module), given, gradients, *rest(True))
+    return [out, *grad_weights, *grad_biases, grad_positions, grad_directions]
+
+
+def grouped_mlp(module):
     # Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; and what
     # fits no fused network: layer by layer. Last, in registers with products of four warps.
     for precision, shared, way in (
-        *((0, 227, 0), (1, 40, 2), (3, 64, 0), (1, 227, 0), (2, 30, 0), (1, 1, 0)),
-        *((1, 227, 4), (2, 40, 4)),
+        *(("float32", 227, "auto"), ("bfloat16", 40, "tiles"), ("tf32", 64, "auto"), ("bfloat16", 227, "auto")),
+        *(("float16", 30, "auto"), ("bfloat16", 1, "auto"), ("bfloat16", 227, "wgmma"), ("float16", 40, "wgmma")),
     ):
         module.device(90, 120, shared * 1024)
-
-        def workspace(backward, precision=precision, way=way):
-            size = module.grouped_mlp_workspace_cuda(TABLE, precision, n, k, backward, True, 0, way)
-            assert isinstance(size, int), size
-            return np.full(size, 255, np.uint8)
-
-        out, memory = unwritten(n, 38), workspace(False)
-        module.grouped_mlp_cuda(*given, at(out), precision, at(memory), *GPU, way)
-        grad_weights, grad_biases = [unwritten(*x.shape) for x in weights], [unwritten(*x.shape) for x in biases]
-        grad_positions, grad_directions, memory = unwritten(n, 3), unwritten(n, 3), workspace(True)
-        results = [at(x) for x in grad_weights], [at(x) for x in grad_biases], at(grad_positions), at(grad_directions)
-        module.grouped_mlp_backward_cuda(*given, at(gradient), *results, precision, at(memory), *GPU, way)
-        written(out, *grad_weights, *grad_biases, grad_positions, grad_directions)
+        offsets = np.cumsum([2, 37, 0, 20, 3]).astype(np.int32)
+        written(*network(module, 64, 4, offsets, precision, (way, way)))
 
 
 def hostile(module):
-    least, most = -(2**31), 2**31 - 1
+    least, most, gpu = -(2**31), 2**31 - 1, module.Cuda(0, 0)
     cells = RANDOM.choice([least, -1, 0, 4, 5, 6, 65_536, most], 700).astype(np.int32)
-    for k, way in ((1, 1), (5, 1), (5, 2), (1100, 0)):
+    for k, way in ((1, "counting"), (5, "counting"), (5, "radix"), (1100, "automatic")):
         for n in (0, 1, 700):
-            order, offsets = unwritten(n, dtype=np.int32), unwritten(k + 1, dtype=np.int32)
-            workspace = np.full(module.cell_sort_workspace_cuda(n, k, way, 0), 255, np.uint8)
-            module.cell_sort_cuda(at(cells), at(order), at(offsets), at(workspace), n, k, way, *GPU)
-            assert (np.sort(order) == np.arange(n)).all() and (np.diff(offsets) >= 0).all()
+            _, offsets = sort(module, cells[:n].copy(), k, way)
+            assert (np.diff(offsets) >= 0).all()
 
     points, centres = floats(300, 3), floats(5, 3)
     points[::3] = np.array([np.nan, np.inf, 1e38])
     trees = [([0, 3, 5], [-1, 1, 2, -2, most]), ([0, 3, 5], [0, 1, 1, 0, 1]), ([-4, 9, 5], [1] * 5)]
     for child_offsets, child in [*trees, ([3, 3, 0], [-1] * 5), ([0, most, least], [1, 1, 1, 0, 0])]:
         tables, leaves = [integers(*child_offsets), integers(*child)], unwritten(300, dtype=np.int32)
-        addresses = at(points), at(centres), 0, *(at(table) for table in tables), at(leaves)
-        module.locate_cell_cuda_float32(*addresses, 300, 5, 2, 3, *GPU)
+        module.locate_cell(*every((points, centres, None, *tables, leaves)), 300, 5, 2, 3, gpu)
         written(leaves)
         uniforms, leaves = floats(300, 3), unwritten(300, dtype=np.int32)
         uniforms[::4] = np.array([np.nan, -1, 7])
-        addresses = at(points), at(centres), 0, *(at(table) for table in tables), at(uniforms), at(leaves)
-        module.draw_cell_cuda(*addresses, 300, 5, 2, 3, 0.1, *GPU)
+        module.draw_cell(*every((points, centres, None, *tables, uniforms, leaves)), 300, 5, 2, 3, 0.1, gpu)
         written(leaves)
 
     m, r, c = 180, 5, 3
     for offsets in ([5, 3, -4, 500, 90, 7], [least, most, least, most, 0, 180], [180, 180, 181, 0, -1, most]):
         inputs = floats(m), floats(m, c), floats(m), floats(m), integers(*offsets), floats(c)
         inputs[0][::5], inputs[2][::7] = np.inf, np.nan
-        sizes, results = [r, 0, m, c, 0], [floats(r, c), floats(r), floats(r), floats(m)]
-        module.composite_cuda([at(x) for x in inputs], sizes, [at(x) for x in results], *GPU)
-        outgoing = [*(unwritten(*x.shape) for x in inputs[:4]), unwritten(c), unwritten(r)]
-        addresses = [at(x) for x in inputs], sizes, [at(x) for x in results], [at(x) for x in outgoing]
-        module.composite_backward_cuda(*addresses, *GPU)
+        composited(module, inputs, r, c)
 
     weights, edges, depths = floats(6, 45), floats(6, 46), unwritten(6, 70)
     weights[0], weights[1, ::2], weights[2], weights[3] = 0, np.nan, np.inf, -1
     edges[4, 3], uniforms = np.nan, floats(6, 70)
     uniforms[:, ::4], uniforms[:, 1::8] = np.nan, 1e30
     workspace = unwritten(6, 45, dtype=np.float64)
-    module.resample_cuda(at(weights), at(edges), at(uniforms), at(depths), at(workspace), 6, 45, 70, *GPU)
+    module.resample(*every((weights, edges, uniforms, depths, workspace)), 6, 45, 70, gpu)
 
-    n, k = 64, 4
     for offsets in ([9, 3, -5, 200, 64], [least, most, least, most, 0], [64, 0, 64, 0, 64], [-7, -5, -3, -2, -1]):
         # Chained forward, also by four warps, in tiles and layer by layer forward and backward.
-        for forward, backward in ((1, 2), (4, 2), (2, 2), (3, 3)):
+        for ways in (("chain", "tiles"), ("wgmma", "tiles"), ("tiles", "tiles"), ("layers", "layers")):
             module.device(90, 120, 227 * 1024)
-            given, sums = network(n, k, integers(*offsets))
-            ways = ((False, forward), (True, backward))
-            sizes = [module.grouped_mlp_workspace_cuda(TABLE, 1, n, k, back, True, 0, way) for back, way in ways]
-            memory = [np.full(size, 255, np.uint8) for size in sizes]
-            module.grouped_mlp_cuda(*given[:4], at(sums[0]), 1, at(memory[0]), *GPU, forward)
-            addresses = at(sums[1]), *given[4:], at(sums[2]), at(sums[3]), 1, at(memory[1])
-            module.grouped_mlp_backward_cuda(*given[:4], *addresses, *GPU, backward)
-
-
-KEPT = []
-"""What addresses have been taken of."""
-
-
-def network(n, k, offsets):
-    """Arguments up to the gradients of biases; output, its gradient, and those of positions and directions."""
-    positions, directions, index = floats(n, 3), floats(5, 3), RANDOM.integers(0, 5, n).astype(np.int32)
-    weights, biases = [floats(k, o, i) for o, i in SHAPES], [floats(k, o) for o, _ in SHAPES]
-    grad_weights, grad_biases = [unwritten(*x.shape) for x in weights], [unwritten(*x.shape) for x in biases]
-    order = RANDOM.permutation(n).astype(np.int32)
-    arguments = [at(positions), at(directions), at(index), at(offsets), at(order), n, 5, k]
-    KEPT.append((positions, directions, index, weights, biases, grad_weights, grad_biases, order, offsets))
-    lists = [[at(x) for x in part] for part in (weights, biases, grad_weights, grad_biases)]
-    return (TABLE, arguments, *lists), [unwritten(n, 38), floats(n, 38), unwritten(n, 3), unwritten(n, 3)]
+            network(module, 64, 4, integers(*offsets), "bfloat16", ways)
 
 
 def main(path, kind="usual"):
     module = load(path)
+    module.name_dtypes(DTYPES)
     usual = (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, resample, grouped_mlp)
     for run in (hostile,) if kind == "hostile" else usual:
         run(module)

@@ -202,4 +202,4 @@ def test_four_warps_multiply_only_on_hopper_and_for_those_who_ask():
     assert not chain(plain(64, 4))["groups"]
     for capability in (75, 80, 89, 100, 103, 120):
         assert chain(plain(64, 4), precision="float16", groups=True, capability=capability) == rule
-    assert chain(plain(64, 4), groups=True, compiled=False) == rule
+    assert chain(plain(64, 4), groups=True, built=False) == rule

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -25,11 +24,12 @@ from emulated_networks import (
     run,
 )
 from helpers import refuses, same
-from network_plans import WAYS, native_mlp, plain, plan, way
+from network_plans import PRECISIONS, WAYS, plain, plan, way
 
 import voronerf
 from voronerf.fields import NeRF
 from voronerf.layers import MLP, POSITIONS, Layer
+from voronerf.native.grouped_mlp import _choose_way, using_way
 
 HALVES = ("bfloat16", "float16")
 FUSED = (227, 99, 64, 40, 20)
@@ -128,7 +128,7 @@ def test_outputs_and_gradients(case: Case, precision: str, shared: int) -> None:
 def test_outputs_of_chained_networks(case: Case, precision: str, shared: int, asked: str) -> None:
     """Gradients of ReLU differ where a rounding moves a sample across its kink."""
     options = {"seed": case.seeds[0], "capability": case.capability, "shared_bytes": shared * KIB}
-    with emulated(**options), native_mlp.taking(asked):
+    with emulated(**options), using_way(asked):
         found = plan(case.layers, precision=precision, backward=False, d=case.d, asked=asked)
         assert WAYS[found["way"]] == "chain" and found["groups"] == (asked == "wgmma")
         check_forward(case.layers, case.counts, case.d, precision)
@@ -137,7 +137,7 @@ def test_outputs_of_chained_networks(case: Case, precision: str, shared: int, as
 @pytest.mark.parametrize("precision", HALVES)
 def test_gradients_where_four_warps_multiply(precision: str) -> None:
     """Cells of fewer rows than four warps have, and gradients, which go as without."""
-    with emulated(seed=1), native_mlp.taking("wgmma"):
+    with emulated(seed=1), using_way("wgmma"):
         check(BRANCHED, [129, 0, 1, 70], 3, precision)
 
 
@@ -145,7 +145,7 @@ def test_four_warps_multiply_as_each_alone() -> None:
     """The same products in the same order: not a bit differs in the emulation."""
     given, results = case(plain(64, 3), [200, 0, 31], 3, torch.bfloat16), []
     for asked in ("wgmma", "chain"):
-        with emulated(), native_mlp.taking(asked):
+        with emulated(), using_way(asked):
             results.append(run(given, plain(64, 3), torch.bfloat16, "native")[0])
     assert torch.equal(*results)
 
@@ -194,20 +194,20 @@ def test_cells_that_overlap_stay_inside_the_workspace(monkeypatch) -> None:
     leaves = [leaf.requires_grad_() for leaf in (torch.rand(n, 3), torch.rand(5, 8, 3), torch.rand(5, 2, 8))]
     sizes = []
     with emulated() as loaded:
-        size_of, backward = loaded.grouped_mlp_workspace_cuda, loaded.grouped_mlp_backward_cuda
+        size_of, backward = loaded.grouped_mlp_workspace, loaded.grouped_mlp_backward
 
-        def larger(numbers: list[int], precision: int, *others: int) -> int:
-            plan = module().grouped_mlp_plan(numbers, precision, *others[:3])
+        def larger(table, n: int, k: int, backward: bool, parameters: bool, precision: str, *others) -> int:
+            plan = module().grouped_mlp_plan(table, PRECISIONS.index(precision), n, k, backward)
             assert not plan["by_layers"] and 3 * -(-n // plan["task_rows"]) > plan["tasks"]
-            sizes.append(size_of(numbers, precision, *others) + beyond)
+            sizes.append(size_of(table, n, k, backward, parameters, precision, *others) + beyond)
             return sizes[-1]
 
-        def poisoned(*given: object) -> None:
-            ctypes.memset(given[-4], 0xFF, sizes[-1])
+        def poisoned(*given: Any) -> None:
+            given[-2].fill_(0xFF)
             backward(*given)
 
-        monkeypatch.setattr(loaded, "grouped_mlp_workspace_cuda", larger)
-        monkeypatch.setattr(loaded, "grouped_mlp_backward_cuda", poisoned)
+        monkeypatch.setattr(loaded, "grouped_mlp_workspace", larger)
+        monkeypatch.setattr(loaded, "grouped_mlp_backward", poisoned)
         offsets = torch.tensor([0, n, 0, n, 0, n], dtype=torch.int32)
         out = voronerf.grouped_mlp(leaves[0], offsets, leaves[1:], [None, None], layers=layers, backend="native")
         gradients = torch.autograd.grad(out.sum(), leaves)
@@ -239,7 +239,7 @@ def test_tensors_that_are_not_aligned(asked: str) -> None:
     weights, offsets = [torch.rand(1, 8, 8).bfloat16()], torch.tensor([0, 40], dtype=torch.int32)
     x, off = torch.rand(40, 8), torch.empty(1 + 40 * 8)
     off[1:] = x.flatten()
-    with emulated(), native_mlp.taking(asked):
+    with emulated(), using_way(asked):
         aligned, shifted = (
             voronerf.grouped_mlp(rows, offsets, weights, [None], layers=layers, backend="native")
             for rows in (x, off[1:].view(40, 8))
@@ -251,7 +251,7 @@ def test_tensors_that_are_not_aligned(asked: str) -> None:
 def test_numbers_that_are_none_stay_in_their_rows(asked: str) -> None:
     given = case(plain(64, 2), [40], 3, torch.bfloat16)
     given["positions"][5, 1], given["positions"][9, 0] = torch.nan, torch.inf
-    with emulated(), native_mlp.taking(asked):
+    with emulated(), using_way(asked):
         out = run(given, plain(64, 2), torch.bfloat16, "native")[0]
     assert out.isnan().any(1).nonzero().flatten().tolist() == [5, 9]
 
@@ -283,14 +283,14 @@ def test_rows_are_gathered_and_scattered_and_every_order_of_threads_gives_the_sa
 def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch) -> None:
     given, results = case(BRANCHED, [40, 5], 3, torch.bfloat16), []
     for name in ("chain", "tiles", "layers"):
-        with emulated(), native_mlp.taking(name):
+        with emulated(), using_way(name):
             assert way(BRANCHED, "bfloat16", asked=name) == name
             results.append(run(given, BRANCHED, torch.bfloat16, "native")[0])
     for other in results[1:]:
         torch.testing.assert_close(other, results[0], rtol=2e-2, atol=2e-2)
 
     def asked(name: str, layers: MLP, d: int, **device: int) -> None:
-        with emulated(**device), native_mlp.taking(name):
+        with emulated(**device), using_way(name):
             run(case(layers, [4], d, torch.bfloat16), layers, torch.bfloat16, "native")
 
     refuses("grouped_mlp: a layer must have at most 128 features on CUDA", asked, "chain", WIDE, 7)
@@ -302,7 +302,7 @@ def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch) -> None:
     often = MLP((Layer((POSITIONS,), 2),), (0,) * 9)
     refuses("among the outputs at most 8 times", asked, "auto", often, 3, shared_bytes=SMALL * KIB)
     monkeypatch.setenv("VORONERF_CUDA_MLP", "tiles")
-    assert WAYS[native_mlp._choose_way()] == "tiles"
+    assert WAYS[_choose_way()] == "tiles"
     monkeypatch.setenv("VORONERF_CUDA_MLP", "fast")
     rule = "must be one of auto, chain, tiles, layers, wgmma, got 'fast'"
-    refuses(rule, native_mlp._choose_way)
+    refuses(rule, _choose_way)

@@ -51,14 +51,14 @@ def test_every_small_case_is_right_on_the_emulated_device(parts):
 def test_steps_to_capture_are_right_on_the_emulated_device(parts, monkeypatch):
     ways = []
     with emulated() as loaded:
-        entry = loaded.grouped_mlp_cuda
+        entry = loaded.grouped_mlp
 
-        def forward(numbers, arguments, *others):
-            sizes = arguments[5], arguments[7]
-            ways.append(module().grouped_mlp_plan(numbers, numbers[4], *sizes, False)["by_layers"])
-            entry(numbers, arguments, *others)
+        def forward(table, inputs, out, precision, *others):
+            plan = module().grouped_mlp_plan(table, loaded.MlpPrecision.index(precision), inputs.n, inputs.k, False)
+            ways.append(plan["by_layers"])
+            entry(table, inputs, out, precision, *others)
 
-        monkeypatch.setattr(loaded, "grouped_mlp_cuda", forward)
+        monkeypatch.setattr(loaded, "grouped_mlp", forward)
         for name, step in parts.captured_steps("cpu", 40):
             allowed = 8e-2 if "bfloat16" in name else 1e-5  # rounding moves samples across kinks
             for found, exact in zip(step(), step("reference", torch.float64)):

@@ -10,7 +10,8 @@ from helpers import same
 
 import voronerf
 from voronerf import VoronoiDiagram
-from voronerf import native as _native
+from voronerf.native.cell_sort import WAYS
+from voronerf.native.cell_sort import sort as sort_cells
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)
@@ -74,11 +75,11 @@ SIZES = [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600), (2100, 1022), (2100, 1
 def sorted_by(way, cells, k):
     """Into memory that is poisoned."""
     order, offsets = torch.full_like(cells, -7), torch.full((k + 1,), -7, dtype=torch.int32)
-    _native.sort_cells(cells, order, offsets, "cell_sort", way)
+    sort_cells(cells, order, offsets, "cell_sort", way)
     return order, offsets
 
 
-@pytest.mark.parametrize("way", _native.SORTS)
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize(("n", "k"), SIZES)
 def test_cell_sort(n, k, way):
     if way == "counting" and k > 1022:

@@ -5,7 +5,7 @@ import itertools
 import pytest
 from emulated import emulated, module
 from emulated_networks import BRANCHED, GAUSSIANS, KIB, WIDE, check
-from network_plans import PRECISIONS, SHARED, SIZES, assert_covers, nerf, numbers, plan
+from network_plans import PRECISIONS, SHARED, SIZES, assert_covers, nerf, plan, table
 
 from voronerf.fields import density_table, nerf_table
 
@@ -38,9 +38,9 @@ MORE = [*SIZES, (1, 4096), (4_000_000, 16), (4_000_000, 256), (2**31 - 1, 16)]
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("gpu", GPUS)
 def test_every_launch_can_be_made(gpu, network):
-    table, device = numbers(NETWORKS[network]), GPUS[gpu]
+    layers, device = table(NETWORKS[network]), GPUS[gpu]
     for (n, k), precision, backward in itertools.product(MORE, range(4), (False, True)):
-        plan = module().plan_for(table, precision, n, k, backward, device)
+        plan = module().plan_for(layers, precision, n, k, backward, device)
         x, y, z = plan["grid"]
         assert 0 < x < 2**31 and 0 < y < 65_536 and 0 < z < 65_536
         ends = [*plan["starts"][1:], plan["bytes"]]
@@ -66,7 +66,7 @@ def test_workspaces_are_moderate(gpu):
     """Of 4 M rows: what is kept between layers does not grow with the batch, nor do partial gradients beyond 1 GiB."""
     device = GPUS[gpu]
     for network, k, backward in itertools.product(("w64d4", "mlp32", "nerf64", "nerf256"), (16, 256), (False, True)):
-        plan = module().plan_for(numbers(NETWORKS[network]), 1, 4_000_000, k, backward, device)
+        plan = module().plan_for(table(NETWORKS[network]), 1, 4_000_000, k, backward, device)
         assert plan["bytes"] <= 2 * 1024 * MIB, (network, k, plan["sizes"])
 
 
@@ -74,11 +74,11 @@ def test_workspaces_are_moderate(gpu):
 @pytest.mark.parametrize("network", ["w64d4", "mlp32", "nerf64"])
 def test_networks_of_the_benchmarks_are_fused(network, gpu):
     """Forward, and chained, wherever tensor cores multiply them; backward where a block can hold a tile's values."""
-    table, device = numbers(NETWORKS[network]), GPUS[gpu]
+    layers, device = table(NETWORKS[network]), GPUS[gpu]
     precision = PRECISIONS.index("bfloat16" if device[0] >= 80 else "float16")
-    assert module().plan_for(table, precision, 1 << 22, 16, False, device)["chained"]
+    assert module().plan_for(layers, precision, 1 << 22, 16, False, device)["chained"]
     if device[1] >= 163 * KIB:
-        assert not module().plan_for(table, precision, 1 << 22, 16, True, device)["by_layers"]
+        assert not module().plan_for(layers, precision, 1 << 22, 16, True, device)["by_layers"]
 
 
 @pytest.mark.parametrize("capability", SHARED)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from voronerf import backends
+from voronerf import backends, cell_sort, locate_cell, nearest_centre
 from voronerf.reference.cell_sort import cell_sort as reference_sort
 from voronerf.reference.locate_cell import locate_cell as reference_locate
 from voronerf.reference.nearest_centre import distances
@@ -21,24 +21,13 @@ from voronerf.reference.nearest_centre import nearest_centre as reference_neares
 pytestmark = pytest.mark.native
 
 if backends.missing("native", torch.device("cpu")) is None:
-    from voronerf import _C
     from voronerf import native as _native
 
-ISAS = ("portable", "avx2", "avx512")
 CELLS = (1, 2, 15, 16, 17, 255, 256, 257, 4096)
 # Around the lanes and tiles of every instruction set and the block of a task.
 ROWS = (0, 1, 3, 7, 8, 9, 15, 17, 31, 33, 63, 64, 65, 129)
 BLOCK = 2048
 DTYPES = (torch.float32, torch.float64)
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    index = ISAS.index(request.param)
-    if not _C.isa_supported(index):
-        pytest.skip(f"this processor has no {request.param}")
-    monkeypatch.setattr(_native, "_ISA", index)
-    return request.param
 
 
 @pytest.fixture
@@ -50,7 +39,7 @@ def threads() -> Iterator[None]:
 
 def chosen(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
     """Cells, checked against the definition: at the float64 minimum, and the reference's very index."""
-    cells = _native.nearest_centre(points, centres, weights=weights)
+    cells = nearest_centre(points, centres, weights=weights, backend="native")
     assert cells.dtype == torch.int32
     table = distances(points, centres, weights)
     own = table.gather(1, cells.long()[:, None])[:, 0]
@@ -70,8 +59,10 @@ def test_nearest_of_random_points(isa: str, dtype: torch.dtype, k: int) -> None:
         weights = torch.rand(k, dtype=dtype) - 0.5
         for n in rows:
             points = (4 * torch.rand(n, 3, dtype=dtype) - 2) + shift
-            chosen(points, centres) if n else _native.nearest_centre(points, centres)
-            chosen(points, centres, weights) if n else _native.nearest_centre(points, centres, weights=weights)
+            chosen(points, centres) if n else nearest_centre(points, centres, backend="native")
+            chosen(points, centres, weights) if n else nearest_centre(
+                points, centres, weights=weights, backend="native"
+            )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -125,8 +116,8 @@ def test_nearest_sends_non_finite_points_to_cell_0(isa: str) -> None:
             points = torch.rand(67, 3, dtype=dtype)
             points[::5, 1] = bad
             centres = torch.rand(20, 3, dtype=dtype)
-            assert _native.nearest_centre(points, centres)[::5].eq(0).all()
-            assert torch.equal(_native.nearest_centre(points, centres), reference_nearest(points, centres))
+            assert nearest_centre(points, centres, backend="native")[::5].eq(0).all()
+            assert torch.equal(nearest_centre(points, centres, backend="native"), reference_nearest(points, centres))
 
 
 def test_nearest_of_mixed_and_half_types_and_strided_tensors(isa: str) -> None:
@@ -144,8 +135,10 @@ def test_threads_do_not_change_a_bit(threads: None) -> None:
     results = []
     for count in (1, 2, 3):
         torch.set_num_threads(count)
-        sort = _native.cell_sort(cells.int(), 50)
-        results.append((_native.nearest_centre(points, centres), *sort, _native.locate_cell(points, **tree)))
+        sort = cell_sort(cells.int(), 50, backend="native")
+        results.append(
+            (nearest_centre(points, centres, backend="native"), *sort, locate_cell(points, **tree, backend="native"))
+        )
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
 
@@ -156,7 +149,7 @@ def test_sort(n: int, k: int) -> None:
     # Half of the cells stay empty, one holds half of the rows.
     cells = torch.randint(0, max(1, k // 2), (n,), dtype=torch.int32)
     cells[torch.rand(n) < 0.5] = k - 1
-    order, offsets = _native.cell_sort(cells, k)
+    order, offsets = cell_sort(cells, k, backend="native")
     expected_order, expected_offsets = reference_sort(cells, k)
     assert torch.equal(order, expected_order)
     assert torch.equal(offsets, expected_offsets)
@@ -165,7 +158,7 @@ def test_sort(n: int, k: int) -> None:
 
 def test_sort_of_a_strided_tensor() -> None:
     cells = torch.randint(0, 9, (101, 2), dtype=torch.int32)[:, 0]
-    assert all(torch.equal(a, b) for a, b in zip(_native.cell_sort(cells, 9), reference_sort(cells, 9)))
+    assert all(torch.equal(a, b) for a, b in zip(cell_sort(cells, 9, backend="native"), reference_sort(cells, 9)))
 
 
 @pytest.mark.parametrize("bad", [-1, 7, 2**31 - 1, -(2**31)])
@@ -174,7 +167,7 @@ def test_sort_refuses_cells_out_of_range(bad: int, row: int) -> None:
     cells = torch.randint(0, 7, (10_000,), dtype=torch.int32)
     cells[row] = bad
     with pytest.raises(ValueError, match=rf"cell_sort: cells must lie in 0 to 6, got values from .*{bad}"):
-        _native.cell_sort(cells, 7)
+        cell_sort(cells, 7, backend="native")
 
 
 def random_tree(sizes: tuple[int, ...], uneven: bool = True) -> dict[str, Tensor | int]:
@@ -216,7 +209,7 @@ def test_locate(isa: str, sizes: tuple[int, ...], uneven: bool) -> None:
             if n > 30:
                 points[30] = torch.nan
             for power in (None, weights):
-                leaves = _native.locate_cell(points, **tree, weights=power)
+                leaves = locate_cell(points, **tree, weights=power, backend="native")
                 assert torch.equal(leaves, reference_locate(points, **tree, weights=power))
 
 
@@ -224,7 +217,7 @@ def test_locate_breaks_ties_as_nearest_centre_does(isa: str) -> None:
     tree = random_tree((8, 8), uneven=False)
     tree["centres"] = torch.randint(-2, 3, tree["centres"].shape).float()
     points = torch.randint(-4, 5, (3000, 3)).float() / 2
-    assert torch.equal(_native.locate_cell(points, **tree), reference_locate(points, **tree))
+    assert torch.equal(locate_cell(points, **tree, backend="native"), reference_locate(points, **tree))
 
 
 @pytest.mark.parametrize(
@@ -240,19 +233,19 @@ def test_locate_refuses_unsound_tables(change: dict[str, object], message: str) 
     tree = random_tree((2, 2), uneven=False)
     tables = {name: value if name == "depth" else torch.tensor(value).int() for name, value in change.items()}
     with pytest.raises(ValueError, match=f"locate_cell: {message}"):
-        _native.locate_cell(torch.rand(10, 3), **{**tree, **tables})
+        locate_cell(torch.rand(10, 3), **{**tree, **tables}, backend="native")
 
 
 @pytest.mark.cuda
 def test_locate_on_cuda_stays_inside_unsound_tables() -> None:
     points = torch.rand(100, 3)
     tree = random_tree((2, 2), uneven=False)
-    sound = _native.locate_cell(points, **tree)
+    sound = locate_cell(points, **tree, backend="native")
     second = reference_nearest(points, tree["centres"][:2]) == 1
     for change in ({"child": [1, 7, -1, -2, -3, -4]}, {"child_offsets": [0, 2, 4, 9]}, {"child_offsets": [0, 2, 4, 4]}):
         tables = {**tree, **{name: torch.tensor(value).int() for name, value in change.items()}}
         on_device = {name: value.cuda() if isinstance(value, Tensor) else value for name, value in tables.items()}
-        leaves = _native.locate_cell(points.cuda(), **on_device).cpu()
+        leaves = locate_cell(points.cuda(), **on_device, backend="native").cpu()
         assert (leaves[second] < 0).all() and torch.equal(leaves[~second], sound[~second])
 
 
@@ -267,8 +260,8 @@ def test_ops_pass_opcheck_and_compile_whole() -> None:
     torch.library.opcheck(ops.locate_cell.default, located)
 
     def run(points: Tensor, centres: Tensor) -> tuple[Tensor, ...]:
-        cells = _native.nearest_centre(points * 2, centres)
-        return (cells + 1, *_native.cell_sort(cells, 7), _native.locate_cell(points, **tree))
+        cells = nearest_centre(points * 2, centres, backend="native")
+        return (cells + 1, *cell_sort(cells, 7, backend="native"), locate_cell(points, **tree, backend="native"))
 
     compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
     assert all(torch.equal(a, b) for a, b in zip(compiled(points, centres), run(points, centres)))
@@ -276,7 +269,7 @@ def test_ops_pass_opcheck_and_compile_whole() -> None:
 
 def test_gradients_stop_at_the_cells() -> None:
     points = torch.rand(5, 3, requires_grad=True)
-    cells = _native.nearest_centre(points, torch.rand(4, 3, requires_grad=True))
+    cells = nearest_centre(points, torch.rand(4, 3, requires_grad=True), backend="native")
     assert not cells.requires_grad
 
 
@@ -288,13 +281,13 @@ def run_python(code: str, **environment: str) -> None:
 
 def test_one_openmp_runtime_and_a_forced_instruction_set() -> None:
     code = """
-import torch
+import torch, voronerf
 from voronerf import native as _native
 assert _native.describe()["instruction set"] == "portable"
-_native.nearest_centre(torch.rand(10000, 3), torch.rand(9, 3))
+voronerf.nearest_centre(torch.rand(10000, 3), torch.rand(9, 3), backend="native")
 names = ("libgomp", "libiomp", "libomp")
 loaded = {line.split()[-1] for line in open("/proc/self/maps") if line.split()[-1].split("/")[-1].startswith(names)}
-assert len(loaded) == 1 or (not loaded and not _native._C.openmp), loaded
+assert len(loaded) == 1 or (not loaded and not _native.describe()["openmp"]), loaded
 """
     run_python(code, OMP_NUM_THREADS="2", VORONERF_ISA="portable")
 

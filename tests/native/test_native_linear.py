@@ -22,17 +22,6 @@ OFFSETS = (2, 2, 3, 99, 99, 298, 300)
 ROWS = 303
 
 
-@pytest.fixture(params=["portable", "avx2", "avx512"])
-def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Every instruction set that this processor has."""
-    module = native._native
-    index = module.ISAS.index(request.param)
-    if not module._C.isa_supported(index):
-        pytest.skip(f"this processor has no {request.param}")
-    monkeypatch.setattr(module, "_ISA", index)
-    return str(request.param)
-
-
 def inputs(i: int, o: int, dtype: torch.dtype, *, seed: int = 0) -> list[Tensor]:
     generator = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
@@ -159,10 +148,12 @@ def test_large_results_ask_for_huge_pages() -> None:
         pytest.skip("huge pages are switched off here")
     program = """
 import resource, torch
-from voronerf import native as _native
+from voronerf.native.custom_op import on_huge_pages
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 before = faults()
-out = _native.fresh(torch.empty(1 << 24)).zero_()
+out = torch.empty(1 << 24)
+on_huge_pages(out)
+out.zero_()
 print(faults() - before, int(out.count_nonzero()))
 """
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()

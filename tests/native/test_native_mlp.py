@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -140,16 +139,6 @@ def _largest(x: Tensor) -> Tensor:
     return x.abs().max() if x.numel() else x.new_zeros(())
 
 
-@pytest.fixture(params=["portable", "avx2", "avx512"])
-def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    native = pytest.importorskip("voronerf.native")
-    number = native.ISAS.index(request.param)
-    if not native._C.isa_supported(number):
-        pytest.skip(f"{request.param}: not supported by this processor")
-    monkeypatch.setattr(native, "_ISA", number)
-    yield request.param
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_matches_float64(name: str, isa: str) -> None:
     assert_close(arguments(NETWORKS[name], [0, 61, 1, 0, 100, 7, 0]))
@@ -282,39 +271,16 @@ def test_several_python_threads_at_once() -> None:
     assert all(torch.equal(a, b) for one, other in zip(alone, together) for a, b in zip(one, other))
 
 
-def test_every_output_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Allocations come poisoned, between guards that must survive."""
-    guards: list[Tensor] = []
-
-    def poisoned(shape: tuple[int, ...]) -> Tensor:
-        size = torch.Size(shape).numel()
-        memory = torch.full((size + 64,), float("nan"))
-        guards.extend((memory[:32], memory[size + 32 :]))
-        return memory[32 : size + 32].view(shape)
-
-    native = pytest.importorskip("voronerf.native.grouped_mlp")
+def test_every_output_is_written(request: pytest.FixtureRequest) -> None:
     given = arguments(NETWORKS["graph"], [0, 50, 13, 0], rays=4)
     given["positions"] = torch.cat([given["positions"], torch.ones(6, 3, dtype=torch.float64)])  # rows of no cell
     given["direction_index"] = torch.cat([given["direction_index"], torch.zeros(6, dtype=torch.int32)])
     want = evaluate(given, torch.float32, "native")
-    allocate, allocate_gradients = native._allocate, native._allocate_gradients
-    monkeypatch.setattr(native, "_allocate", lambda *a: poisoned(allocate(*a).shape))
-    monkeypatch.setattr(
-        native, "_allocate_gradients", lambda *a: [poisoned(tensor.shape) for tensor in allocate_gradients(*a)]
-    )
+    guards = request.getfixturevalue("poisoned")
     got = evaluate(given, torch.float32, "native")
     assert all(torch.equal(a, b) for a, b in zip(want, got))
-    assert len(guards) > 10 and all(guard.isnan().all() for guard in guards)
+    assert len(guards) > 10
     assert (got[0][-6:] == 0).all() and (got[1][-6:] == 0).all()
-
-
-def test_memory_only_for_the_gradients_asked_for() -> None:
-    native = pytest.importorskip("voronerf.native.grouped_mlp")
-    x, tensor, empty = torch.zeros(9, 3), torch.zeros(2, 4, 3), torch.Size([0])
-    sizes = [result.shape for result in native._allocate_gradients(x, [tensor] * 2, [tensor] * 2, x, [False] * 3)]
-    assert sizes == [empty] * 6
-    sizes = [result.shape for result in native._allocate_gradients(x, [tensor], [tensor], None, [True, False, True])]
-    assert sizes == [tensor.shape] * 2 + [empty] * 2
 
 
 def test_only_the_gradients_asked_for() -> None:
@@ -453,17 +419,21 @@ def test_second_derivatives() -> None:
 
 
 def test_opcheck() -> None:
-    native = pytest.importorskip("voronerf.native.grouped_mlp")
+    layer_table, ops = pytest.importorskip("voronerf.native.layer_table"), torch.ops.voronerf
     given = cast(arguments(nerf(6, 2), [5, 0, 8], rays=4), torch.float32)
     passed = [given[name] for name in ("positions", "weights", "biases", "layers", "directions")]
-    table = native.network(*passed).table
+    table = layer_table.network(*passed).table
     shared = (given["positions"], given["offsets"], given["weights"], given["biases"], table)
     directions = (given["directions"], given["direction_index"])
-    torch.library.opcheck(native._forward, (*shared, *directions))
+    torch.library.opcheck(ops.grouped_mlp_native.default, (*shared, *directions))
     gradient = torch.randn(13, 4, requires_grad=True)
     order = torch.randperm(13, dtype=torch.int32)
-    torch.library.opcheck(native._backward, (gradient, *shared, *directions, order, [True, True, True]))
-    assert native._layers(table, given["weights"]) == given["layers"]
+    backward = ops.grouped_mlp_native_backward.default
+    torch.library.opcheck(backward, (gradient, *shared, *directions, order, [True, True, True]))
+    # Memory only for the gradients that are asked for.
+    sizes = [each.numel() for each in backward(gradient, *shared, *directions, None, [False, True, False])]
+    assert [size > 0 for size in sizes] == [False] * (len(sizes) - 2) + [True, False]
+    assert layer_table.Table.parse(table).with_widths(given["weights"]) == given["layers"]
 
 
 def test_compiles_whole() -> None:

@@ -246,17 +246,9 @@ def test_half_types_and_float64() -> None:
 
 
 @pytest.mark.native
-@pytest.mark.parametrize("isa", ["portable", "avx2", "avx512"])
 @pytest.mark.parametrize("shape", [(12,), (1000,), (4, 5)])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_every_instruction_set_and_number_of_threads(
-    isa: str, shape: tuple[int, ...], weighted: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from voronerf import native as _native
-
-    if not _native._C.isa_supported(_native.ISAS.index(isa)):
-        pytest.skip(f"this processor has no {isa}")
-    monkeypatch.setattr(_native, "_ISA", _native.ISAS.index(isa))
+def test_every_instruction_set_and_number_of_threads(isa: str, shape: tuple[int, ...], weighted: bool) -> None:
     diagram = VoronoiDiagram(torch.rand(shape[0], 3), weights=0.1 * torch.rand(shape[0]) if weighted else None)
     for k in shape[1:]:
         diagram, _ = diagram.refine(

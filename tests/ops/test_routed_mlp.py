@@ -437,16 +437,16 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name: str
 @pytest.mark.native
 @pytest.mark.parametrize("source", ["flat", "tree", "cells", "one"])
 def test_opcheck(source: str) -> None:
-    native = pytest.importorskip("voronerf.native.routed_mlp")
+    layer_table = pytest.importorskip("voronerf.native.layer_table")
     case = Case.make("integrated", source, n=7)
     given = case.given()
     count = len(case.bias)
     parameters = iter(given[2 + count :])
     biases = [next(parameters) if has else torch.empty(0) for has in case.bias]
-    network = native._native_mlp.network(given[0], given[2 : 2 + count], biases, case.table, given[1], "routed_mlp")
+    network = layer_table.network(given[0], given[2 : 2 + count], biases, case.table, given[1], "routed_mlp")
     options = {} if source == "one" else case.options
     names = ("direction_index", "cells", "coords", "centres", "child_offsets", "child", "centre_weights")
     options = {"coords": given[0][:, :3].detach() if "centres" in options else None, **options}
     values = [case.options["direction_index"], *(options.get(name) for name in names[1:])]
     arguments = (network.positions, network.weights, network.biases, network.table, network.directions)
-    torch.library.opcheck(native._forward, (*arguments, *values, options.get("depth", 1)))
+    torch.library.opcheck(torch.ops.voronerf.routed_mlp_native.default, (*arguments, *values, options.get("depth", 1)))

@@ -60,9 +60,6 @@ def test_infinite_values_strides_and_compile(device: torch.device, backend: str)
 
 @pytest.mark.native
 def test_native_op_passes_opcheck() -> None:
-    from voronerf.native import march_rays as _native_march
-
-    assert _native_march.update_occupancy
     cells = torch.tensor([3, 0], dtype=torch.int32)
     arguments = (torch.rand(2, 2, 2), cells, torch.rand(2), 0.5, 0.1)
     torch.library.opcheck(torch.ops.voronerf.update_occupancy_native.default, arguments)

@@ -218,7 +218,7 @@ def info() -> int:
     missing = dict.fromkeys(row.reason for row in rows.values() if row.dtypes and row.reason)
     numbers = {reason: number for number, reason in enumerate(missing, 1)}
     table = Table("op", *backends.BACKENDS, title="where each implementation runs, and for which dtypes")
-    for op in backends.OPS:
+    for op in backends.ops():
         texts = []
         for row in (rows[op, backend] for backend in backends.BACKENDS):
             where = f"{', '.join(row.devices)}: {', '.join(row.dtypes)}" if row.devices else ""

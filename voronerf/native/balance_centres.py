@@ -1,11 +1,14 @@
-"""Balancing with the compiled module, as a PyTorch op. m samples, k centres."""
+"""``balance_centres`` of the compiled module. m samples, k centres."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-from voronerf import native as _native
+from voronerf import native
+from voronerf.native.custom_op import custom_op
 
 
 def balance_centres(
@@ -16,23 +19,24 @@ def balance_centres(
     return moved, weights
 
 
-@torch.library.custom_op("voronerf::balance_centres_native", mutates_args=(), device_types="cpu")
+@custom_op("balance_centres_native", devices=("cpu",))
 def _balance(
     samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int, global_norm: bool
-) -> tuple[Tensor, Tensor]:
+) -> Iterator[tuple[Tensor, Tensor]]:
     m, k = samples.shape[0], centres.shape[0]
-    samples, masses = samples.contiguous(), masses.contiguous()
-    moved, weights = centres.clone(memory_format=torch.contiguous_format), masses.new_empty(k)
+    moved, weights = centres.new_empty(centres.shape), masses.new_empty(k)
+    yield moved, weights
+    compiled = native.compiled
+    given = compiled.BalanceInputs(
+        samples=samples,
+        masses=masses,
+        m=m,
+        k=k,
+        steps=steps,
+        alpha=alpha,
+        neighbours=min(neighbours, k - 1),
+        of_all=global_norm,
+    )
     cells = samples.new_empty(m, dtype=torch.int32)
-    workspace = masses.new_empty(_native._C.balance_centres_workspace(k))
-    addresses = (tensor.data_ptr() for tensor in (samples, masses, moved, weights, cells, workspace))
-    rest = (steps, alpha, min(neighbours, k - 1), global_norm, _native._ISA, torch.get_num_threads())
-    _native._C.balance_centres(*addresses, m, k, *rest)
-    return moved, weights
-
-
-@_balance.register_fake
-def _(
-    samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int, global_norm: bool
-) -> tuple[Tensor, Tensor]:
-    return centres.new_empty(centres.shape), masses.new_empty(centres.shape[0])
+    workspace = masses.new_empty(compiled.balance_centres_workspace(k))
+    compiled.balance_centres(given, moved.copy_(centres), weights, cells, workspace, native.cpu())

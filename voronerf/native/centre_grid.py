@@ -1,14 +1,14 @@
-"""The centre grid of the compiled module, as PyTorch ops. n points, k centres.
-
-Arguments have been validated by ``voronerf.ops``.
-"""
+"""``centre_grid`` of the compiled module. k centres."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-from voronerf import native as _native
+from voronerf import native
+from voronerf.native.custom_op import custom_op
 from voronerf.reference.centre_grid import GridTables, centre_table, root_bits
 
 
@@ -19,61 +19,20 @@ def centre_grid(centres: Tensor, *, weights: Tensor | None = None) -> GridTables
     return GridTables(frame, entries, lists, centre_table(centres.detach(), weights), root_bits(centres.shape[0]))
 
 
-def nearest_centre_grid(points: Tensor, centres: Tensor, grid: GridTables, *, weights: Tensor | None = None) -> Tensor:
-    """Index of the nearest centre by the candidates of a point's cell; see ``voronerf.ops.nearest_centre``."""
-    cells: Tensor = _nearest_centre_grid(points, centres, weights, *grid)
-    return cells
-
-
-# How large the tables become depends on where the centres are.
-@torch.library.custom_op("voronerf::centre_grid", mutates_args=(), device_types="cpu")
-def _centre_grid(centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    centres, weights = centres.contiguous(), None if weights is None else weights.contiguous()
-    addresses = centres.data_ptr(), 0 if weights is None else weights.data_ptr()
-    built = _native._C.CentreGridTables(*addresses, centres.shape[0], _native._ISA, torch.get_num_threads())
-    assert built.bits == root_bits(centres.shape[0])
-    entries, lists = (centres.new_empty(size, dtype=torch.int32) for size in built.sizes)
-    frame = centres.new_empty(2, 3, dtype=torch.float32)
-    built.copy_to(frame.data_ptr(), entries.data_ptr(), lists.data_ptr())
-    return frame, entries, lists
-
-
-@_centre_grid.register_fake
-def _(centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _unknown_sizes(centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """How large the tables become depends on where the centres are."""
     context = torch.library.get_ctx()
     entries, lists = (centres.new_empty(context.new_dynamic_size(), dtype=torch.int32) for _ in range(2))
     return centres.new_empty(2, 3, dtype=torch.float32), entries, lists
 
 
-@torch.library.custom_op("voronerf::nearest_centre_grid", mutates_args=(), device_types="cpu")
-def _nearest_centre_grid(
-    points: Tensor,
-    centres: Tensor,
-    weights: Tensor | None,
-    frame: Tensor,
-    entries: Tensor,
-    lists: Tensor,
-    table: Tensor,
-    bits: int,
-) -> Tensor:
-    cells = points.new_empty(points.shape[0], dtype=torch.int32)
-    kept = [points.contiguous(), centres.contiguous(), None if weights is None else weights.contiguous()]
-    tensors = [*kept, frame, entries, lists, table, cells]
-    addresses = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
-    run = _native._entry("nearest_centre_grid", points.dtype)
-    run(*addresses, points.shape[0], centres.shape[0], bits, _native._ISA, torch.get_num_threads())
-    return cells
-
-
-@_nearest_centre_grid.register_fake
-def _(
-    points: Tensor,
-    centres: Tensor,
-    weights: Tensor | None,
-    frame: Tensor,
-    entries: Tensor,
-    lists: Tensor,
-    table: Tensor,
-    bits: int,
-) -> Tensor:
-    return points.new_empty(points.shape[0], dtype=torch.int32)
+@custom_op("centre_grid", devices=("cpu",), fake=_unknown_sizes)
+def _centre_grid(centres: Tensor, weights: Tensor | None) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    compiled, k = native.compiled, centres.shape[0]
+    built = compiled.centre_grid_build(centres, weights, k, native.cpu())
+    entries = centres.new_empty(compiled.centre_grid_entries(built), dtype=torch.int32)
+    lists = centres.new_empty(compiled.centre_grid_lists(built), dtype=torch.int32)
+    frame = centres.new_empty(2, 3, dtype=torch.float32)
+    yield frame, entries, lists
+    same = compiled.centre_grid_copy(built, root_bits(k), frame, entries, lists)
+    assert same

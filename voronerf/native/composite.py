@@ -1,24 +1,23 @@
-"""Volume rendering of the compiled module as PyTorch ops.
+"""``composite`` of the compiled module, and its gradients.
 
-r rays, s samples of a ray, m samples of all rays (packed), c channels. A custom op each way, functional both: they make
-inputs contiguous, allocate outputs, and pass addresses. The arithmetic is float32; half types are cast on the way in
-and out. Second derivatives come from the reference formula. Shapes and dtypes have been validated by ``voronerf.ops``.
+r rays, s samples of a ray, m samples of all rays (packed), c channels. The arithmetic is float32; half types are cast
+on the way in and out. Second derivatives come from the reference formula.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-import torch
 from torch import Tensor
 
-from voronerf import native as _native
+from voronerf import native
 from voronerf.derivatives import (
     composite_backward_backward,
     composite_backward_setup,
     composite_forward_backward,
     composite_forward_setup,
 )
+from voronerf.native.custom_op import custom_op
 from voronerf.reference.composite import Composite
 
 
@@ -38,21 +37,21 @@ def composite(
     return Composite(*(part.to(rgb.dtype) for part in parts))
 
 
-@torch.library.custom_op("voronerf::composite_native", mutates_args=(), device_types=("cpu", "cuda"))
+@custom_op("composite_native")
 def _forward(
     sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    inputs = _contiguous(sigma, rgb, depths, deltas, ray_offsets, background)
-    results = _allocate(sigma, rgb, ray_offsets)
-    arguments = _addresses(inputs), _sizes(sigma, rgb, ray_offsets, background), _addresses(results)
-    if _native.on_cuda(sigma):
-        _native._C.composite_cuda(*arguments, *_native.stream(sigma))
-    else:
-        _native._C.composite(*arguments, *_machine())
-    return results
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    r = _rays(sigma, ray_offsets)
+    colour, opacity, depth = rgb.new_empty(r, rgb.shape[-1]), sigma.new_empty(r), sigma.new_empty(r)
+    weights = sigma.new_empty(sigma.shape)
+    yield colour, opacity, depth, weights
+    compiled = native.compiled
+    given = _inputs(sigma, rgb, depths, deltas, ray_offsets, background)
+    results = compiled.CompositeOutputs(colour=colour, opacity=opacity, depth=depth, weights=weights)
+    compiled.composite(given, results, native.machine(sigma))
 
 
-@torch.library.custom_op("voronerf::composite_native_backward", mutates_args=(), device_types=("cpu", "cuda"))
+@custom_op("composite_native_backward")
 def _backward(
     colour: Tensor | None,
     opacity: Tensor | None,
@@ -65,90 +64,56 @@ def _backward(
     ray_offsets: Tensor | None,
     background: Tensor | None,
     wanted: Sequence[bool],
-) -> list[Tensor]:
+) -> Iterator[list[Tensor]]:
     """Gradients to sigma, rgb, depths, deltas and background, empty where not wanted; that to sigma is always there.
 
     The first four arguments are the gradients of the outputs, None for zero.
     """
-    inputs = _contiguous(sigma, rgb, depths, deltas, ray_offsets, background)
-    gradients = _contiguous(colour, opacity, depth, weights)
-    workspace = sigma.new_empty(0 if background is None else _rays(sigma, ray_offsets))
-    results = _allocate_gradients(sigma, rgb, depths, deltas, background, wanted)
-    arguments = (
-        _addresses(inputs),
-        _sizes(sigma, rgb, ray_offsets, background),
-        _addresses(gradients),
-        [
-            *(address if want else 0 for address, want in zip(_addresses(results), [True, *wanted[1:]])),
-            workspace.data_ptr(),
-        ],
+    chosen = [
+        tensor if want else None for tensor, want in zip((sigma, rgb, depths, deltas, background), [True, *wanted[1:]])
+    ]
+    results = [sigma.new_empty(0 if tensor is None else tensor.shape) for tensor in chosen]
+    yield results
+    compiled = native.compiled
+    given = _inputs(sigma, rgb, depths, deltas, ray_offsets, background)
+    of_sigma, of_rgb, of_depths, of_deltas, of_background = (
+        None if tensor is None else result for tensor, result in zip(chosen, results)
     )
-    if _native.on_cuda(sigma):
-        _native._C.composite_backward_cuda(*arguments, *_native.stream(sigma))
-    else:
-        _native._C.composite_backward(*arguments, *_machine())
-    return results
+    gradients = compiled.CompositeGradients(
+        colour=colour,
+        opacity=opacity,
+        depth=depth,
+        weights=weights,
+        sigma=of_sigma,
+        rgb=of_rgb,
+        depths=of_depths,
+        deltas=of_deltas,
+        background=of_background,
+        left=None if background is None else sigma.new_empty(given.r),
+    )
+    compiled.composite_backward(given, gradients, native.machine(sigma))
 
 
-def _machine() -> tuple[int, int]:
-    return _native._ISA, torch.get_num_threads()
-
-
-def _contiguous(*tensors: Tensor | None) -> list[Tensor | None]:
-    return [None if tensor is None else tensor.contiguous() for tensor in tensors]
-
-
-def _addresses(tensors: Sequence[Tensor | None]) -> list[int]:
-    return [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
-
-
-def _sizes(sigma: Tensor, rgb: Tensor, ray_offsets: Tensor | None, background: Tensor | None) -> list[int]:
-    """r, s, m, c and whether the background is per ray, as csrc/bindings/bindings_composite.cpp reads them."""
-    per_ray = background is not None and background.dim() == 2
-    s = sigma.shape[1] if ray_offsets is None else 0
-    return [_rays(sigma, ray_offsets), s, sigma.numel(), rgb.shape[-1], int(per_ray)]
+def _inputs(
+    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
+) -> native.compiled.CompositeInputs:
+    return native.compiled.CompositeInputs(
+        sigma=sigma,
+        rgb=rgb,
+        depths=depths,
+        deltas=deltas,
+        offsets=ray_offsets,
+        background=background,
+        background_per_ray=background is not None and background.dim() == 2,
+        r=_rays(sigma, ray_offsets),
+        s=sigma.shape[1] if ray_offsets is None else 0,
+        m=sigma.numel(),
+        c=rgb.shape[-1],
+    )
 
 
 def _rays(sigma: Tensor, ray_offsets: Tensor | None) -> int:
     return sigma.shape[0] if ray_offsets is None else ray_offsets.shape[0] - 1
-
-
-def _allocate(sigma: Tensor, rgb: Tensor, ray_offsets: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r = _rays(sigma, ray_offsets)
-    return rgb.new_empty(r, rgb.shape[-1]), sigma.new_empty(r), sigma.new_empty(r), sigma.new_empty(sigma.shape)
-
-
-def _allocate_gradients(
-    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, background: Tensor | None, wanted: Sequence[bool]
-) -> list[Tensor]:
-    return [
-        sigma.new_empty(0 if tensor is None or not want else tensor.shape)
-        for tensor, want in zip((sigma, rgb, depths, deltas, background), [True, *wanted[1:]])
-    ]
-
-
-@_forward.register_fake
-def _(
-    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return _allocate(sigma, rgb, ray_offsets)
-
-
-@_backward.register_fake
-def _(
-    colour: Tensor | None,
-    opacity: Tensor | None,
-    depth: Tensor | None,
-    weights: Tensor | None,
-    sigma: Tensor,
-    rgb: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor | None,
-    background: Tensor | None,
-    wanted: Sequence[bool],
-) -> list[Tensor]:
-    return _allocate_gradients(sigma, rgb, depths, deltas, background, wanted)
 
 
 _forward.register_autograd(composite_forward_backward(_backward), setup_context=composite_forward_setup)

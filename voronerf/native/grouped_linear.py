@@ -9,16 +9,16 @@ and dtypes have been validated by ``voronerf.ops``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from voronerf import native as _native
+from voronerf import native
 from voronerf.derivatives import asked_for
-from voronerf.layers import ACTIVATIONS
-from voronerf.native import grouped_mlp as _native_mlp
+from voronerf.native import grouped_mlp
+from voronerf.native.custom_op import custom_op, on_huge_pages
 
 _STORED = (torch.float32, torch.bfloat16)
 
@@ -27,8 +27,8 @@ def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``."""
-    if _native.on_cuda(x):
-        return _native_mlp.grouped_linear(x, offsets, weight, bias, activation=activation)
+    if native.on_cuda(x):
+        return grouped_mlp.grouped_linear(x, offsets, weight, bias, activation=activation)
     dtype = x.dtype
     if torch.is_autocast_enabled(x.device.type) and dtype != torch.float64:
         dtype = torch.get_autocast_dtype(x.device.type)
@@ -38,15 +38,15 @@ def grouped_linear(
     return out.to(dtype)
 
 
-@torch.library.custom_op("voronerf::grouped_linear_native", mutates_args=(), device_types="cpu")
-def _forward(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None, activation: str) -> Tensor:
-    kept = [None if tensor is None else tensor.contiguous() for tensor in (x, offsets, weight, bias)]
-    out = _native.fresh(_allocate(x, weight))
-    _native._C.grouped_linear(*_call(kept, activation), out.data_ptr(), _native._ISA, torch.get_num_threads())
-    return out
+@custom_op("grouped_linear_native", devices=("cpu",))
+def _forward(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None, activation: str) -> Iterator[Tensor]:
+    out = x.new_empty(x.shape[0], weight.shape[1])
+    yield out
+    on_huge_pages(out)
+    native.compiled.grouped_linear(_inputs(x, offsets, weight, bias, activation), out, native.cpu())
 
 
-@torch.library.custom_op("voronerf::grouped_linear_native_backward", mutates_args=(), device_types="cpu")
+@custom_op("grouped_linear_native_backward", devices=("cpu",))
 def _backward(
     gradient: Tensor,
     x: Tensor,
@@ -55,55 +55,34 @@ def _backward(
     bias: Tensor | None,
     activation: str,
     wanted: Sequence[bool],
-) -> list[Tensor]:
+) -> Iterator[list[Tensor]]:
     """Gradients of x, weight and bias, empty where not wanted: (x, weight and bias)."""
-    kept = [None if tensor is None else tensor.contiguous() for tensor in (x, offsets, weight, bias)]
-    gradient = gradient.contiguous()
-    results = [_native.fresh(result) for result in _allocate_gradients(x, weight, bias, wanted)]
-    _native._C.grouped_linear_backward(
-        *_call(kept, activation),
-        gradient.data_ptr(),
-        *[result.data_ptr() if result.numel() else 0 for result in results],
-        _native._ISA,
-        torch.get_num_threads(),
-    )
-    return results
+    chosen = (x if wanted[0] else None, weight if wanted[1] else None, bias if wanted[1] else None)
+    results = [x.new_empty(0 if tensor is None else tensor.shape) for tensor in chosen]
+    yield results
+    for result in results:
+        on_huge_pages(result)
+    of_x, of_weight, of_bias = (None if tensor is None else result for tensor, result in zip(chosen, results))
+    gradients = native.compiled.LinearGradients(out=gradient, x=of_x, weight=of_weight, bias=of_bias)
+    native.compiled.grouped_linear_backward(_inputs(x, offsets, weight, bias, activation), gradients, native.cpu())
 
 
-def _call(tensors: Sequence[Tensor | None], activation: str) -> list[Any]:
-    """Addresses of contiguous x, offsets, weight and bias, then sizes, as csrc/bindings/bindings_mlp.cpp takes them."""
-    x, _, weight, _ = tensors
-    assert x is not None and weight is not None
+def _inputs(
+    x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None, activation: str
+) -> native.compiled.LinearInputs:
     k, o, i = weight.shape
-    addresses = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
-    return [*addresses, x.shape[0], k, i, o, ACTIVATIONS.index(activation), x.dtype == torch.bfloat16]
-
-
-def _allocate(x: Tensor, weight: Tensor) -> Tensor:
-    return x.new_empty(x.shape[0], weight.shape[1])
-
-
-def _allocate_gradients(x: Tensor, weight: Tensor, bias: Tensor | None, wanted: Sequence[bool]) -> list[Tensor]:
-    chosen = ((x, wanted[0]), (weight, wanted[1]), (bias, wanted[1]))
-    return [x.new_empty(tensor.shape if tensor is not None and want else 0) for tensor, want in chosen]
-
-
-@_forward.register_fake
-def _(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None, activation: str) -> Tensor:
-    return _allocate(x, weight)
-
-
-@_backward.register_fake
-def _(
-    gradient: Tensor,
-    x: Tensor,
-    offsets: Tensor,
-    weight: Tensor,
-    bias: Tensor | None,
-    activation: str,
-    wanted: Sequence[bool],
-) -> list[Tensor]:
-    return _allocate_gradients(x, weight, bias, wanted)
+    return native.compiled.LinearInputs(
+        x=x,
+        offsets=offsets,
+        weight=weight,
+        bias=bias,
+        n=x.shape[0],
+        k=k,
+        i=i,
+        o=o,
+        activation=activation,
+        bfloat16=x.dtype == torch.bfloat16,
+    )
 
 
 def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -9,15 +9,16 @@ read on the host. The backward op is that of ``grouped_mlp``, given the order. S
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from voronerf import native as _native
 from voronerf.layers import MLP
-from voronerf.native import grouped_mlp as _native_mlp
+from voronerf.native import cell_sort, grouped_mlp, locate_cell, nearest_centre
+from voronerf.native.custom_op import custom_op
+from voronerf.native.layer_table import network
 
 
 def routed_mlp(
@@ -37,7 +38,7 @@ def routed_mlp(
     direction_index: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
-    given = _native_mlp.network(positions, weights, biases, layers, directions, "routed_mlp")
+    given = network(positions, weights, biases, layers, directions, "routed_mlp")
     tables = centres, child_offsets, child, centre_weights
     if cells is None and weights[0].shape[0] == 1:
         coords, tables = None, (None, None, None, None)
@@ -56,7 +57,7 @@ def routed_mlp(
     return out.to(given.dtype), found if cells is None else cells
 
 
-@torch.library.custom_op("voronerf::routed_mlp_native", mutates_args=(), device_types=("cpu", "cuda"))
+@custom_op("routed_mlp_native")
 def _forward(
     positions: Tensor,
     weights: Sequence[Tensor],
@@ -71,88 +72,31 @@ def _forward(
     child: Tensor | None,
     centre_weights: Tensor | None,
     depth: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Output, cells (empty where they are given), order (empty where there is one cell) and offsets.
 
     With neither cells nor centres there is one cell.
     """
     n, k = positions.shape[0], weights[0].shape[0]
-    found, order, offsets = _allocate(positions, k, cells, centres)
-    if cells is None and centres is None:
+    alone = cells is None and centres is None
+    out = grouped_mlp.new_output(positions, table, weights)
+    found = positions.new_empty(n if cells is None else 0, dtype=torch.int32)
+    order = positions.new_empty(0 if alone else n, dtype=torch.int32)
+    offsets = positions.new_empty(k + 1, dtype=torch.int32)
+    yield out, found, order, offsets
+    if alone:
         found.zero_()
         offsets[0], offsets[1] = 0, n
     else:
-        if centres is not None:
-            assert coords is not None
-            _locate(found, coords, centres, child_offsets, child, centre_weights, depth)
-        _native.sort_cells(found if cells is None else cells.contiguous(), order, offsets, "routed_mlp")
-    out = _native_mlp.run(
-        positions, offsets, weights, biases, table, directions, direction_index, order if order.numel() else None
+        if coords is not None and centres is not None:
+            if child_offsets is None or child is None:
+                nearest_centre.find(found, coords, centres, centre_weights)
+            else:
+                locate_cell.find(found, coords, centres, child_offsets, child, depth, centre_weights, "routed_mlp")
+        cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
+    grouped_mlp.run(
+        out, positions, offsets, weights, biases, table, directions, direction_index, None if alone else order
     )
-    return out, found, order, offsets
-
-
-def _locate(
-    cells: Tensor,
-    coords: Tensor,
-    centres: Tensor,
-    child_offsets: Tensor | None,
-    child: Tensor | None,
-    centre_weights: Tensor | None,
-    depth: int,
-) -> None:
-    """Fills ``cells``: the centres of a flat diagram, or the leaves of a tree."""
-    c, threads = _native._C, torch.get_num_threads()
-    coords, centres, centre_weights = coords.contiguous(), centres.contiguous(), _native._contiguous(centre_weights)
-    n, m, cuda = coords.shape[0], centres.shape[0], _native.on_cuda(coords)
-    if child_offsets is None or child is None:
-        arguments = _native._addresses(coords, centres, centre_weights, cells)
-        if cuda:
-            _native._entry("nearest_centre_cuda", coords.dtype)(*arguments, n, m, *_native.stream(coords))
-        else:
-            _native._entry("nearest_centre", coords.dtype)(*arguments, n, m, _native._ISA, threads)
-        return
-    child_offsets, child = child_offsets.contiguous(), child.contiguous()
-    if cuda:
-        arguments = _native._addresses(coords, centres, centre_weights, child_offsets, child, cells)
-        g = child_offsets.shape[0] - 1
-        _native._entry("locate_cell_cuda", coords.dtype)(*arguments, n, m, g, depth, *_native.stream(coords))
-        return
-    fault = c.locate_cell_fault(child_offsets.data_ptr(), child.data_ptr(), child_offsets.shape[0] - 1, m)
-    if fault is not None:
-        raise ValueError(f"routed_mlp: {fault}")
-    workspace = cells.new_empty(c.locate_cell_workspace(m, threads))
-    arguments = _native._addresses(coords, centres, centre_weights, child_offsets, child, cells, workspace)
-    if not _native._entry("locate_cell", coords.dtype)(*arguments, n, m, depth, _native._ISA, threads):
-        raise ValueError(f"routed_mlp: depth must be the number of levels of the tree, got {depth}, which is too few")
-
-
-def _allocate(positions: Tensor, k: int, cells: Tensor | None, centres: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    n = positions.shape[0]
-    alone = cells is None and centres is None
-    sizes = (n if cells is None else 0, 0 if alone else n, k + 1)
-    found, order, offsets = (positions.new_empty(size, dtype=torch.int32) for size in sizes)
-    return found, order, offsets
-
-
-@_forward.register_fake
-def _(
-    positions: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    table: str,
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    cells: Tensor | None,
-    coords: Tensor | None,
-    centres: Tensor | None,
-    child_offsets: Tensor | None,
-    child: Tensor | None,
-    centre_weights: Tensor | None,
-    depth: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    out = _native_mlp._allocate(positions, table, weights)
-    return out, *_allocate(positions, weights[0].shape[0], cells, centres)
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
@@ -171,7 +115,7 @@ def _backward(ctx: Any, gradient: Tensor | None, *_: None) -> tuple[Any, ...]:
     positions, directions, direction_index, order, offsets, *parameters = ctx.saved_tensors
     weights, biases = parameters[: ctx.count], parameters[ctx.count :]
     needs = ctx.needs_input_grad
-    results = _native_mlp._backward(
+    results = grouped_mlp.backward(
         gradient,
         positions,
         offsets,

@@ -6,9 +6,14 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_shape
 
-_OP = "balance_centres"
+_OP = backends.declare(
+    "balance_centres",
+    native=Implementation(("cpu",), (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 def balance_centres(

@@ -6,9 +6,13 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
 
-_OP = "camera_rays"
+_OP = backends.declare(
+    "camera_rays",
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 def camera_rays(

@@ -6,9 +6,13 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
 
-_OP = "cast_solids"
+_OP = backends.declare(
+    "cast_solids",
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 def cast_solids(

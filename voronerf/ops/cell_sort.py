@@ -5,9 +5,14 @@ from __future__ import annotations
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_shape
 
-_OP = "cell_sort"
+_OP = backends.declare(
+    "cell_sort",
+    native=Implementation(EVERYWHERE, INDEX),
+    warp=Implementation(EVERYWHERE, INDEX),
+)
 
 
 def cell_sort(cells: Tensor, k: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:

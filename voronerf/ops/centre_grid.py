@@ -8,10 +8,14 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import COORDINATES, Implementation
 from voronerf.checks import check_dtype, check_same_device, check_shape
 from voronerf.reference.centre_grid import GridTables
 
-_OP = "centre_grid"
+_OP = backends.declare(
+    "centre_grid",
+    native=Implementation(("cpu",), COORDINATES),
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,15 @@ from __future__ import annotations
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
 from voronerf.reference.composite import Composite
 
-_OP = "composite"
+_OP = backends.declare(
+    "composite",
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+)
 
 
 def composite(

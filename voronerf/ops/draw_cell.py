@@ -7,9 +7,14 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
 
-_OP = "draw_cell"
+_OP = backends.declare(
+    "draw_cell",
+    native=Implementation(EVERYWHERE, (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 def draw_cell(

@@ -5,9 +5,14 @@ from __future__ import annotations
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import check_count, check_dtype, check_integer, check_shape
 
-_OP = "frequency_encode"
+_OP = backends.declare(
+    "frequency_encode",
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS, "encode"),
+)
 
 
 def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, backend: str = "auto") -> Tensor:

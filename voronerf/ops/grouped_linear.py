@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import (
     INDEX,
     check_choice,
@@ -17,7 +18,10 @@ from voronerf.checks import (
 )
 from voronerf.layers import ACTIVATIONS
 
-_OP = "grouped_linear"
+_OP = backends.declare(
+    "grouped_linear",
+    native=Implementation(EVERYWHERE, FLOATS),
+)
 
 
 def grouped_linear(

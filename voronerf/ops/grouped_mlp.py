@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
 from voronerf.layers import MLP
 from voronerf.ops.network import check_network
 
-_OP = "grouped_mlp"
+_OP = backends.declare(
+    "grouped_mlp",
+    native=Implementation(EVERYWHERE, FLOATS),
+)
 
 
 def grouped_mlp(

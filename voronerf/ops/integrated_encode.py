@@ -5,9 +5,14 @@ from __future__ import annotations
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_same_dtype, check_shape
 
-_OP = "integrated_encode"
+_OP = backends.declare(
+    "integrated_encode",
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS, "encode"),
+)
 
 
 def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend: str = "auto") -> Tensor:

@@ -7,9 +7,14 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import COORDINATES, EVERYWHERE, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
 
-_OP = "locate_cell"
+_OP = backends.declare(
+    "locate_cell",
+    native=Implementation(EVERYWHERE, COORDINATES),
+    warp=Implementation(EVERYWHERE, COORDINATES),
+)
 
 
 def locate_cell(

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import (
     INDEX,
     check_choice,
@@ -18,7 +19,11 @@ from voronerf.checks import (
 )
 from voronerf.reference.march_rays import March
 
-_OP = "march_rays"
+_OP = backends.declare(
+    "march_rays",
+    native=Implementation(("cpu",), (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 _SPACINGS = ("linear", "disparity")
 
 

@@ -6,10 +6,21 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import COORDINATES, EVERYWHERE, Implementation
 from voronerf.checks import check_count, check_dtype, check_same_device, check_shape
 from voronerf.ops.centre_grid import CentreGrid
 
-_OP = "nearest_centre"
+_OP = backends.declare(
+    "nearest_centre",
+    native=Implementation(EVERYWHERE, COORDINATES),
+    warp=Implementation(EVERYWHERE, COORDINATES),
+)
+_BY_GRID = backends.declare(
+    "nearest_centre_grid",
+    native=Implementation(("cpu",), COORDINATES),
+    warp=Implementation(EVERYWHERE, COORDINATES),
+    reference=Implementation(file="centre_grid"),
+)
 
 
 def nearest_centre(
@@ -84,6 +95,6 @@ def _by_grid(points: Tensor, centres: Tensor, weights: Tensor | None, grid: Cent
     belongs = grid.fits if torch.compiler.is_compiling() else grid.belongs_to
     if not belongs(centres, weights):
         raise ValueError(f"{_OP}: grid must be made from these centres and weights, got that of others")
-    run = backends.resolve("nearest_centre_grid", backend=backend, device=points.device, dtype=points.dtype)
+    run = backends.resolve(_BY_GRID, backend=backend, device=points.device, dtype=points.dtype)
     cells: Tensor = run(points, centres, grid.tables, weights=weights)
     return cells

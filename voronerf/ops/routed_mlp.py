@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
 from voronerf.compiler import constant_result
 from voronerf.layers import MLP
@@ -17,7 +18,10 @@ from voronerf.ops.network import check_network
 from voronerf.reference.routed_mlp import Operations
 from voronerf.reference.routed_mlp import routed_mlp as compose
 
-_OP = "routed_mlp"
+_OP = backends.declare(
+    "routed_mlp",
+    native=Implementation(EVERYWHERE, FLOATS),
+)
 
 
 def routed_mlp(

@@ -6,9 +6,13 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_shape
 
-_OP = "select_heaviest"
+_OP = backends.declare(
+    "select_heaviest",
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 def select_heaviest(points: Tensor, importance: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:

@@ -6,9 +6,14 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
 
-_OP = "update_occupancy"
+_OP = backends.declare(
+    "update_occupancy",
+    native=Implementation(("cpu",), (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 def update_occupancy(

@@ -36,11 +36,11 @@ unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements);
 // Properties of the current device.
 MlpCudaDevice mlp_cuda_device();
 
-void grouped_mlp_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
+void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
                       unsigned char* workspace, void* stream);
 
 // gradients: null without those of parameters.
-void grouped_mlp_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
+void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
                                const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream);
 
 // Steps around the kernel of rows: weights packed and tasks mapped before it, rows of no cell cleared, partials summed.

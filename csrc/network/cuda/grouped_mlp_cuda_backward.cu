@@ -256,7 +256,7 @@ void launch(const MlpCudaPlan& plan, const MlpCudaData& data, void* stream) {
 
 }  // namespace
 
-void grouped_mlp_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
+void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
                                const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream) {
   const MlpCudaWorkspace parts = mlp_cuda_workspace(plan, data.k, gradients != nullptr);
   data.packed = workspace + parts.packed;

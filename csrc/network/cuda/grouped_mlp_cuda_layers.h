@@ -69,12 +69,8 @@ struct MlpLayersPlan {
 const char* mlp_layers_plan(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
                             const MlpCudaDevice& device, MlpLayersPlan& plan);
 
-// The ways a call can go: fused with values in registers (grouped_mlp_cuda_chain.h), fused with values in shared memory
-// (grouped_mlp_cuda_plan.h), layer by layer. By itself the first that takes the table, except where fusing would move
-// more than twice the memory; to compare them one can be asked for, and then nothing else is taken. groups: the chain
-// with products of four warps, never by itself.
-enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers, groups };
-
+// Of the ways a call can go the automatic one is the first that takes the table, except where fusing would move more
+// than twice the memory; of one that is asked for nothing else is taken.
 struct MlpCudaChoice {
   MlpCudaWay way;  // not automatic, nor groups, which is the chain's
   MlpChainPlan chain;

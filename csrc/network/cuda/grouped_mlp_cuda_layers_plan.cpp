@@ -31,7 +31,7 @@ MlpLayersInput input_of(int64_t raw, int octaves, bool integrated) {
 const char* copy_table(const MlpTable& table, MlpLayersPlan& plan) {
   plan.positions = input_of(table.positions, table.position_octaves, table.integrated);
   plan.directions = input_of(table.directions, table.direction_octaves, false);
-  for (const MlpTable::Layer& given : table.layers) {
+  for (const MlpLayer& given : table.layers) {
     MlpLayersLayer layer{};
     if (given.inputs.size() > kLayersParts) return "a layer must have at most 64 sources";
     layer.width = given.width;

@@ -106,7 +106,7 @@ const char* mlp_cuda_read_table(const MlpTable& table, MlpCudaPlan& plan) {
   plan.directions = input_of(table.directions, table.direction_octaves, false);
   plan.layer_count = static_cast<int>(table.layers.size());
   for (int l = 0; l < plan.layer_count; ++l) {
-    const MlpTable::Layer& given = table.layers[l];
+    const MlpLayer& given = table.layers[l];
     MlpCudaLayer& layer = plan.layers[l];
     layer = {};
     if (given.inputs.size() > kMlpCudaSources) return "a layer must have at most 4 sources";

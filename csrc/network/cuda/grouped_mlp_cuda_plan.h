@@ -20,9 +20,6 @@ constexpr int kMlpCudaOutputs = 8;
 constexpr int kMlpChunk = 64;  // outputs of a layer that a warp has in registers
 constexpr int kMlpDepth = 16;  // widths are padded to it
 
-// What is multiplied; sums are float32.
-enum class MlpPrecision : int { float32 = 0, bfloat16, float16, tf32 };
-
 struct MlpCudaSource {
   int from;    // an earlier layer, kFromPositions or kFromDirections
   int width;   // features, columns of the caller's weight from `column` on

@@ -1,0 +1,13 @@
+#include "bindings/grouped_mlp.h"
+
+namespace voronerf {
+
+VN_BINDINGS(module) {
+  module.cpu("grouped_mlp", VN_CPU(grouped_mlp_cpu));
+  module.cpu("grouped_mlp_backward", VN_CPU(grouped_mlp_backward_cpu));
+  module.cuda("grouped_mlp", VN_CUDA(grouped_mlp_cuda));
+  module.cuda("grouped_mlp_backward", VN_CUDA(grouped_mlp_backward_cuda));
+  module.cuda("grouped_mlp_workspace", VN_CUDA(grouped_mlp_workspace_cuda));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,14 @@
+#include "rays/march_rays.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_STRUCT(MarchInputs, origins, directions, near, far, occupied, box, uniforms, start, r, s, x, y, z, disparity, most);
+
+VN_BINDINGS(module) {
+  module.cpu("march_rays_count", VN_CPU(march_rays_count_cpu));
+  module.cpu("march_rays_fill", VN_CPU(march_rays_fill_cpu));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,14 @@
+// The Python module voronerf._C, which knows tensors by their dtypes and addresses alone and owns nothing.
+// voronerf/native is its only importer, and has validated shapes and devices and allocated outputs and workspaces.
+#include "bindings/module.h"
+
+#include "build_info.h"
+
+PYBIND11_MODULE(_C, module) {
+  module.attr("compiler") = VN_COMPILER;
+  module.attr("openmp") = static_cast<bool>(VN_OPENMP);
+  module.attr("cuda") = static_cast<bool>(VN_CUDA_BUILT);
+  module.attr("cuda_outcome") = VN_CUDA_OUTCOME;
+  module.attr("cuda_architectures") = VN_CUDA_ARCHITECTURES;
+  voronerf::bind_all(module);
+}

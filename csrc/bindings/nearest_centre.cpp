@@ -1,0 +1,14 @@
+#include "geometry/nearest_centre.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_BINDINGS(module) {
+  module.cpu("nearest_centre", VN_CPU(nearest_centre_cpu<float>));
+  module.cpu("nearest_centre", VN_CPU(nearest_centre_cpu<double>));
+  module.cuda("nearest_centre", VN_CUDA(nearest_centre_cuda<float>));
+  module.cuda("nearest_centre", VN_CUDA(nearest_centre_cuda<double>));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,11 @@
+#include "rays/update_occupancy.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_BINDINGS(module) {
+  module.cpu("update_occupancy", VN_CPU(update_occupancy_cpu));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,109 @@
+// grouped_mlp on CUDA: plans a call for the device that is current, and goes the way of the plan.
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "common/common.h"
+#include "network/cuda/grouped_mlp_cuda.h"
+#include "network/cuda/grouped_mlp_cuda_layers.h"
+#include "network/grouped_mlp.h"
+
+namespace voronerf {
+
+namespace {
+
+MlpCudaChoice choose(const MlpTable& table, int64_t n, int64_t k, bool backward, MlpPrecision precision,
+                     MlpCudaWay way) {
+  MlpCudaDevice device = mlp_cuda_device();
+  device.groups = way == MlpCudaWay::groups && mlp_chain_groups_compiled();
+  MlpCudaChoice choice;
+  if (const char* fault = mlp_cuda_choose(table, precision, n, k, backward, way, device, choice)) {
+    const char* callers[] = {"grouped_mlp", "grouped_linear", "routed_mlp"};
+    throw std::invalid_argument(std::string(callers[static_cast<int>(table.caller)]) + ": " + fault +
+                                " on CUDA; use backend='reference'");
+  }
+  return choice;
+}
+
+MlpCudaData data_of(const MlpInputs& in) {
+  MlpCudaData data{};
+  data.positions = in.positions;
+  data.directions = in.directions;
+  data.direction_index = in.direction_index;
+  data.order = in.order;
+  data.offsets = in.offsets;
+  data.n = in.n;
+  data.k = in.k;
+  return data;
+}
+
+// Of any number of layers.
+MlpLayersParameters layers_of(const MlpTable& table, const MlpInputs& in) {
+  const size_t count = table.layers.size();
+  return {{in.weights, in.weights + count}, {in.biases, in.biases + count}};
+}
+
+// Of as many as the fused kernels take.
+MlpCudaParameters parameters_of(const MlpTable& table, const MlpInputs& in) {
+  MlpCudaParameters parameters{};
+  for (size_t l = 0; l < table.layers.size() && l < kMlpCudaLayers; ++l) {
+    parameters.weights[l] = in.weights[l];
+    parameters.biases[l] = in.biases[l];
+  }
+  return parameters;
+}
+
+}  // namespace
+
+int64_t grouped_mlp_workspace_cuda(const MlpTable& table, int64_t n, int64_t k, bool backward, bool parameters,
+                                   MlpPrecision precision, MlpCudaWay way) {
+  const MlpCudaChoice choice = choose(table, n, k, backward, precision, way);
+  switch (choice.way) {
+    case MlpCudaWay::chain:
+      return mlp_chain_workspace(choice.chain, k).bytes;
+    case MlpCudaWay::tiles:
+      return mlp_cuda_workspace(choice.fused, k, parameters).bytes;
+    default:
+      return mlp_layers_workspace(choice.layers, k, parameters).bytes;
+  }
+}
+
+void grouped_mlp_cuda(const MlpTable& table, const MlpInputs& in, float* out, MlpPrecision precision, MlpCudaWay way,
+                      unsigned char* workspace, void* stream) {
+  const MlpCudaChoice choice = choose(table, in.n, in.k, false, precision, way);
+  MlpCudaData data = data_of(in);
+  data.out = out;
+  switch (choice.way) {
+    case MlpCudaWay::chain:
+      return mlp_chain_cuda(choice.chain, data, parameters_of(table, in), workspace, stream);
+    case MlpCudaWay::tiles:
+      return mlp_tiles_cuda(choice.fused, data, parameters_of(table, in), workspace, stream);
+    default:
+      return mlp_layers_cuda(choice.layers, data, layers_of(table, in), workspace, stream);
+  }
+}
+
+void grouped_mlp_backward_cuda(const MlpTable& table, const MlpInputs& in, const MlpGradients& gradients,
+                               MlpPrecision precision, MlpCudaWay way, unsigned char* workspace, void* stream) {
+  const MlpCudaChoice choice = choose(table, in.n, in.k, true, precision, way);
+  MlpCudaData data = data_of(in);
+  data.grad_out = gradients.output;
+  data.grad_positions = gradients.positions;
+  data.grad_directions = gradients.directions;
+  const size_t count = gradients.weights == nullptr ? 0 : table.layers.size();
+  if (choice.way == MlpCudaWay::layers) {
+    const MlpLayersGradients results = {{gradients.weights, gradients.weights + count},
+                                        {gradients.biases, gradients.biases + count}};
+    return mlp_layers_backward_cuda(choice.layers, data, layers_of(table, in), count == 0 ? nullptr : &results,
+                                    workspace, stream);
+  }
+  MlpCudaParameterGradients results{};
+  for (size_t l = 0; l < count && l < kMlpCudaLayers; ++l) {
+    results.weights[l] = gradients.weights[l];
+    results.biases[l] = gradients.biases[l];
+  }
+  mlp_tiles_backward_cuda(choice.fused, data, parameters_of(table, in), count == 0 ? nullptr : &results, workspace,
+                          stream);
+}
+
+}  // namespace voronerf

@@ -1,0 +1,48 @@
+"""What the compiled module says of itself, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import voronerf
+from voronerf.layers import ACTIVATIONS
+
+pytestmark = pytest.mark.native
+native = pytest.importorskip("voronerf.native")
+
+
+def test_the_stub_is_what_the_build_bound() -> None:
+    stub = Path(voronerf.__file__).with_name("_C.pyi").read_text()
+    assert native.compiled.stub == stub, "build the extension again and commit voronerf/_C.pyi"
+
+
+def test_enumerations_have_the_names_that_users_write() -> None:
+    assert native.compiled.Activation == ACTIVATIONS
+    assert set(native.SUPPORTED_ISAS) <= set(native.ISAS) == {"portable", "avx2", "avx512"}
+
+
+def test_what_does_not_fit_a_signature_is_refused() -> None:
+    compiled, cpu = native.compiled, native.cpu()
+    points, cells = torch.rand(4, 3), torch.empty(4, dtype=torch.int32)
+    compiled.nearest_centre(points, points.clone(), None, cells, 4, 4, cpu)
+    for wrong in (points.half(), points.double(), points.tolist(), 0):
+        with pytest.raises(TypeError, match="incompatible function arguments"):
+            compiled.nearest_centre(points, wrong, None, cells, 4, 4, cpu)
+    with pytest.raises(TypeError, match="incompatible function arguments"):  # a result that is not contiguous
+        compiled.nearest_centre(points, points, None, torch.empty(8, dtype=torch.int32)[::2], 4, 4, cpu)
+    sizes = {"n": 4, "d": 3, "octaves": 1, "include_input": True, "width": 9}
+    with pytest.raises(TypeError, match=r"^Encoding: x is no const float32\*$"):
+        compiled.encode(compiled.Encoding(points.double(), None, **sizes), torch.empty(4, 9), torch.empty(999), cpu)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'y'"):
+        compiled.Encoding(y=points, variances=None, **sizes)
+
+
+def test_an_instruction_set_that_is_not_there_is_refused() -> None:
+    with (
+        pytest.raises(ValueError, match=r"^using_isa: isa must be one of portable.*got 'sse9'$"),
+        native.using_isa("sse9"),
+    ):
+        pass

@@ -1,0 +1,49 @@
+"""``cell_sort`` of the compiled module. n samples, k cells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from voronerf import native
+from voronerf.native.custom_op import custom_op
+
+WAYS = native.compiled.CellSortWay
+"""Of sorting on CUDA; "automatic" is by the number of cells."""
+
+
+def cell_sort(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Stable order and cell offsets; see ``voronerf.ops.cell_sort``."""
+    order, offsets = _cell_sort(cells, k)
+    return order, offsets
+
+
+@custom_op("cell_sort")
+def _cell_sort(cells: Tensor, k: int) -> Iterator[tuple[Tensor, Tensor]]:
+    order, offsets = cells.new_empty(cells.shape[0]), cells.new_empty(k + 1)
+    yield order, offsets
+    sort(cells, order, offsets, "cell_sort")
+
+
+def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = "automatic") -> None:
+    """Fills the order and the offsets of cells.
+
+    Args:
+        cells: int32 [n].
+        order: int32 [n].
+        offsets: int32 [k + 1].
+        caller: the operation that errors name.
+        way: of sorting on CUDA, one of ``WAYS``, for measurements.
+    """
+    compiled, machine = native.compiled, native.machine(cells)
+    n, k = cells.shape[0], offsets.shape[0] - 1
+    if isinstance(machine, compiled.Cuda):
+        workspace = cells.new_empty(compiled.cell_sort_workspace(n, k, way, machine), dtype=torch.uint8)
+        compiled.cell_sort(cells, order, offsets, workspace, n, k, way, machine)
+        return
+    workspace = cells.new_empty(compiled.cell_sort_workspace(n, k))
+    if not compiled.cell_sort(cells, order, offsets, workspace, n, k, machine):
+        low, high = (int(bound) for bound in cells.aminmax())
+        raise ValueError(f"{caller}: cells must lie in 0 to {k - 1}, got values from {low} to {high}")

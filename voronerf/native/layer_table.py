@@ -1,0 +1,155 @@
+"""Layer tables as the ops of whole networks take them. n samples, k cells, p and q features of a position and a
+direction.
+
+An op takes a table as a string, since a list of numbers costs a call of ``torch.library`` 15 us, and since a graph
+that ``torch.compile`` keeps may be read by another process. It is JSON with names, read once.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf import native
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.reference.frequency_encode import frequency_encode
+from voronerf.reference.specification import encode_positions
+
+_OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
+
+
+class Network(NamedTuple):
+    """Arguments of the ops, in float32, and the storage type of their result (autocast's, where it is on)."""
+
+    positions: Tensor
+    weights: list[Tensor]
+    biases: list[Tensor]  # Autograd takes no list of optional tensors; an empty one stands for no bias.
+    table: str
+    directions: Tensor | None
+    dtype: torch.dtype
+
+
+def network(
+    positions: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    layers: MLP,
+    directions: Tensor | None,
+    caller: str = "grouped_mlp",
+) -> Network:
+    """What the ops take for a layer table. Positions and directions in float64 are encoded in float64, beforehand."""
+    encoded = ""
+    if positions.dtype == torch.float64 and layers.position_octaves is not None:
+        positions = encode_positions(positions, layers)
+        encoded += POSITIONS
+    if directions is not None and directions.dtype == torch.float64 and layers.direction_octaves is not None:
+        directions = frequency_encode(directions, layers.direction_octaves)
+        encoded += DIRECTIONS
+    return in_float32(positions, weights, biases, layers.text, directions, caller, encoded)
+
+
+def in_float32(
+    positions: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    text: str,
+    directions: Tensor | None,
+    caller: str,
+    encoded: str = "",
+) -> Network:
+    """Everything in float32, with a table of which the layers are ``text`` (``MLP.text``).
+
+    No number is written into it, since it may be symbolic under ``torch.compile``; widths are those of the weights.
+    ``encoded``: what is encoded already, whatever ``text`` says.
+    """
+    dtype, kind = weights[0].dtype, positions.device.type
+    if torch.is_autocast_enabled(kind):
+        dtype = torch.get_autocast_dtype(kind)
+    operands = _operands(positions, dtype)
+    return Network(
+        positions.float(),
+        [weight.float() for weight in weights],
+        [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in biases],
+        f'{{"caller": "{caller}", "operands": "{operands}", "encoded": "{encoded}", "layers": {text}}}',
+        None if directions is None else directions.float(),
+        dtype,
+    )
+
+
+def _operands(positions: Tensor, dtype: torch.dtype) -> str:
+    """Type of what is multiplied; CUDA alone has float16."""
+    if dtype == torch.float16 and native.on_cuda(positions):
+        return "float16"
+    return "bfloat16" if dtype == torch.bfloat16 else "float32"
+
+
+@dataclass(frozen=True)
+class Table:
+    """What the string of an op says.
+
+    Attributes:
+        caller: the operation that errors name.
+        operands: type of what is multiplied, one of ``compiled.MlpPrecision``.
+        layers: the layer table, without the encodings of what is encoded already. Its widths are not those of the
+            weights.
+    """
+
+    caller: str
+    operands: str
+    layers: MLP
+
+    @staticmethod
+    @functools.lru_cache(maxsize=256)
+    def parse(text: str) -> Table:
+        """The table of a string."""
+        said = json.loads(text)
+        layers = MLP.parse(json.dumps(said["layers"]))
+        if POSITIONS in said["encoded"]:
+            layers = replace(layers, position_octaves=None, position_encoding="frequency")
+        if DIRECTIONS in said["encoded"]:
+            layers = replace(layers, direction_octaves=None)
+        return Table(said["caller"], said["operands"], layers)
+
+    def with_widths(self, weights: Sequence[Tensor]) -> MLP:
+        """The layer table, with the widths of the weights."""
+        given = zip(self.layers.layers, weights)
+        layers = tuple(replace(layer, width=int(weight.shape[1])) for layer, weight in given)
+        return replace(self.layers, layers=layers)
+
+
+def compiled_table(
+    text: str, positions: Tensor, weights: Sequence[Tensor], directions: Tensor | None
+) -> native.compiled.MlpTable:
+    """The table of a string as compiled functions take it."""
+    q = 0 if directions is None else directions.shape[1]
+    return _compiled(text, positions.shape[1], q, tuple([weight.shape[1] for weight in weights]))
+
+
+@functools.lru_cache(maxsize=256)
+def _compiled(text: str, p: int, q: int, widths: tuple[int, ...]) -> native.compiled.MlpTable:
+    table, compiled = Table.parse(text), native.compiled
+    layers = table.layers
+    return compiled.MlpTable(
+        layers=tuple(
+            compiled.MlpLayer(
+                width=width,
+                activation=layer.activation,
+                inputs=tuple(_OUTSIDE[source] if isinstance(source, str) else source for source in layer.inputs),
+            )
+            for layer, width in zip(layers.layers, widths)
+        ),
+        outputs=layers.outputs,
+        positions=p,
+        directions=q,
+        position_octaves=-1 if layers.position_octaves is None else layers.position_octaves,
+        direction_octaves=-1 if layers.direction_octaves is None else layers.direction_octaves,
+        integrated=layers.integrated,
+        half=table.operands != "float32",
+        caller=table.caller,
+    )

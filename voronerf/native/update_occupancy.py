@@ -1,0 +1,32 @@
+"""``update_occupancy`` of the compiled module. n cells of a grid, q of them looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from voronerf import native
+from voronerf.native.custom_op import custom_op
+
+
+def update_occupancy(
+    density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
+) -> tuple[Tensor, Tensor]:
+    """The larger of what was found and what is remembered; see ``voronerf.ops.update_occupancy``."""
+    remembered, occupied = _update(density, cells, values, decay, threshold)
+    return remembered, occupied
+
+
+@custom_op("update_occupancy_native", devices=("cpu",))
+def _update(
+    density: Tensor, cells: Tensor, values: Tensor, decay: float, threshold: float
+) -> Iterator[tuple[Tensor, Tensor]]:
+    remembered, occupied = density.new_empty(density.shape), density.new_empty(density.shape, dtype=torch.bool)
+    yield remembered, occupied
+    n, q = density.numel(), cells.shape[0]
+    results = remembered, occupied.view(torch.uint8)
+    if not native.compiled.update_occupancy(density, cells, values, *results, n, q, decay, threshold, native.cpu()):
+        low, high = (int(bound) for bound in cells.aminmax())
+        raise ValueError(f"update_occupancy: cells must lie in 0 to {n - 1}, got values from {low} to {high}")
