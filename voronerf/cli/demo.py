@@ -63,7 +63,7 @@ def demo(
 
 
 def _report(out: Path, scene: Scene, results: dict[str, dict[str, Any]]) -> None:
-    """The table and the picture that the demo is about."""
+    """Prints the comparison of the two runs and plots their curves."""
     curves = {name: [(m["seconds"], m["psnr"]) for m in read_metrics(out / name)] for name in results}
     splits = {name: [s["started_at_second"] for s in r["stages"][1:]] for name, r in results.items()}
     plot_curves(out / "psnr.png", curves, splits=splits, title="built-in scene, equal training time")
@@ -84,7 +84,7 @@ def _report(out: Path, scene: Scene, results: dict[str, dict[str, Any]]) -> None
 
 
 def _remove_run(run: Path) -> None:
-    """Removes the files of an earlier demo, and nothing that a run does not write."""
+    """Removes the files of an earlier demo, and no file that a run does not write."""
     for pattern in ("config.json", "metrics.jsonl", "summary.json", "eval.json"):
         (run / pattern).unlink(missing_ok=True)
     for folder in ("checkpoints", "images", "plots", "samples"):

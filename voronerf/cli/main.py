@@ -20,7 +20,7 @@ from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
 from voronerf.training.run_directory import stored_config
 
-#: What a user can cause, told in one line. ValueError includes the project's own SceneError and CheckpointError.
+#: Errors that a user can cause; they are printed as one line. ValueError includes SceneError and CheckpointError.
 EXPECTED = (
     *(ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError),
     *(MemoryError, torch.OutOfMemoryError),
@@ -68,7 +68,7 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _train_command(args: list[str]) -> Callable[..., int]:
-    """``train``, with the stored settings of the run in --out as defaults where --resume is given."""
+    """The function behind ``train``; with --resume the settings of the run in --out are its defaults."""
     if "train" not in args[:1] or "--resume" not in args:
         return commands.train
     out = next((after for word, after in itertools.pairwise(args) if word == "--out"), None)
@@ -76,7 +76,7 @@ def _train_command(args: list[str]) -> Callable[..., int]:
     stored = None if out is None else stored_config(Path(out))
     if stored is None:
         return commands.train
-    # One of the two replaces the other; its own value is read behind this.
+    # A given --steps replaces a stored budget and the other way round; the number that is set here is replaced in turn.
     given = {name for name in ("budget", "steps") if any(w == f"--{name}" or w.startswith(f"--{name}=") for w in args)}
     if given == {"steps"} and stored.budget is not None:
         stored = replace(stored, budget=None, steps=sys.maxsize)

@@ -1,4 +1,4 @@
-"""Scenes: the files of Blender synthetic scenes and of real captures, and three computed from formulas."""
+"""Scenes: loaders of Blender synthetic scenes and of real captures, and three scenes computed from formulas."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
     Args:
         source: "builtin", "builtin-rich" or "builtin-translucent", or a folder with `transforms_train.json` (Blender
             synthetic) or `transforms.json` (capture).
-        downscale: factor by which images are made smaller, >= 1. Divides the built-in scenes' 100 pixels too.
+        downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it.
 
     Raises:
-        SceneError: one line that names what is wrong with which file.
+        SceneError: the data cannot be used; one line that names the file and what is wrong with it.
 
     Examples:
         >>> from voronerf.data import load_scene

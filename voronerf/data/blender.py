@@ -1,6 +1,6 @@
 """Blender synthetic scenes (Mildenhall et al. 2020): `transforms_train.json`, `transforms_test.json`, RGBA images.
 
-The object sits at the origin, cameras look at it from about 4 units away; what is transparent is white.
+The object sits at the origin, cameras look at it from about 4 units away, and the background is white.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ NEAR, FAR = 2.0, 6.0
 def load_blender(folder: Path, downscale: int) -> Scene:
     """Loads a Blender synthetic scene.
 
-    The test views are those of `transforms_test.json`, or of `transforms_val.json` where there is none. Files that say
-    more of their cameras than Blender's, such as `fl_x`, `cx` or `k1`, are those of a capture that was split by others:
-    they are loaded as `load_capture` loads its own, but for which images are held out.
+    The test views are those of `transforms_test.json`, or of `transforms_val.json` if the former is missing. Entries
+    such as `fl_x`, `cx` or `k1`, which Blender's files do not have, mark a capture that was split before. It is loaded
+    like `load_capture` does, with that split.
 
     Args:
         folder: holds `transforms_train.json`.
-        downscale: factor by which images are made smaller, averaging areas of the composited image.
+        downscale: factor by which images are reduced, averaging areas of the composited image.
 
     Returns:
         The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
-        the training views; without alpha the box is None. Of a capture, what `load_capture` says.
+        the training views; without alpha the box is None. For a capture see `load_capture`.
 
     Raises:
         SceneError: a file is missing, broken or inconsistent.

@@ -21,9 +21,9 @@ from voronerf.data.transforms import Frame, distinct_names, number, read_transfo
 from voronerf.rendering.cameras import Cameras, distort, focus_point, undistort
 
 HOLD_OUT = 8
-# share of the distance from the focus to the nearest camera: what is closer than this was not photographed sharply
+# Near bound as a share of the distance from the focus to the nearest camera; closer things are rarely in focus.
 NEAR = 0.35
-# share of the distance of the farthest camera from the origin: near is no less, since disparity has no place for 0
+# Smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
 NEAREST = 0.05
 FAR = 4.0
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
@@ -34,18 +34,17 @@ UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 def load_capture(folder: Path, downscale: int) -> Scene:
     """Loads a capture; every 8th image in the order of their names is held out for testing.
 
-    Rays of an opaque capture reach from near the cameras to four times their distance, sampled in disparity: a plain
-    network in such coordinates learns the object and, coarsely, the room. "Near the cameras" is a share of the distance
-    to the nearest one and at least 0.05 of that to the farthest: cameras that look outwards or in parallel may stand at
-    the origin. With alpha it is an object on white, in a box
-    carved from the masks.
+    Rays of an opaque capture end at four times the distance of the farthest camera and are sampled in disparity. A
+    plain network then learns the object and, coarsely, the room. The near bound is 0.35 of the distance to the nearest
+    camera and at least 0.05 of that to the farthest one, because cameras that look outwards or in parallel may stand at
+    the origin. A capture with alpha is an object on white, in a box carved from the masks.
 
     Args:
         folder: holds `transforms.json`.
-        downscale: factor by which images are made smaller.
+        downscale: factor by which images are reduced.
 
     Raises:
-        SceneError: the file is broken, its lens model is not supported, it has fewer than two images.
+        SceneError: the file is broken, its lens model is not supported, or it has fewer than two images.
     """
     path = folder / "transforms.json"
     entries, frames = read_transforms(path)
@@ -57,7 +56,7 @@ def load_capture(folder: Path, downscale: int) -> Scene:
 
 
 class Listed(NamedTuple):
-    """A frame with the file that lists it, and that file's own entries, over which the frame's go."""
+    """A frame, the file that lists it, and the entries of that file, which the frame may override."""
 
     path: Path
     entries: dict[str, Any]
@@ -65,18 +64,18 @@ class Listed(NamedTuple):
 
 
 def has_lens(entries: dict[str, Any], frames: Sequence[Frame]) -> bool:
-    """Whether a transforms file tells of its cameras what Blender's files do not: that of a capture."""
+    """Whether a transforms file describes lenses as captures do; Blender's files give the field of view alone."""
     return any(given.get(key) is not None for given in (entries, *(f.entries for f in frames)) for key in LENS)
 
 
 def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, downscale: int) -> Scene:
-    """The scene of a capture's images, as :func:`load_capture` says.
+    """Makes the scene of a capture from its frames, see :func:`load_capture`.
 
     Args:
         folder: of the scene.
         listed: its c images.
-        held_out: bool [c], those for testing.
-        downscale: factor by which images are made smaller.
+        held_out: bool [c], the test views.
+        downscale: factor by which images are reduced.
 
     Raises:
         SceneError: as :func:`load_capture`.
@@ -156,11 +155,11 @@ def _split(cameras: Cameras, images: Tensor, names: list[str], chosen: Tensor) -
 
 
 def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> list[float]:
-    """(fx, fy, cx, cy) in pixels, of a frame's entries over those of the whole file."""
+    """(fx, fy, cx, cy) in pixels."""
     width, height = size
     for key, actual in (("w", width), ("h", height)):
         stated = number(values, key, path, positive=True)
-        if stated is not None and abs(stated - actual) >= 1:  # exporters that scale leave fractions
+        if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
             raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {path} says {key} = {stated:g}")
     fx, fy = (number(values, key, path, positive=True) for key in ("fl_x", "fl_y"))
     angles = {}
@@ -192,7 +191,7 @@ def _check_lens_model(values: dict[str, Any], path: Path) -> None:
 
 
 def _check_lens_inverts(cameras: Cameras, path: Path) -> None:
-    """Pixels of the image's border must have a ray; a lens model that folds over inside the image has none."""
+    """Checks that every pixel of the border has a ray; a lens model that folds over inside the image has none there."""
     if cameras.distortion is None:
         return
     edge = torch.linspace(0, 1, 33, dtype=torch.float64)

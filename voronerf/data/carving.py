@@ -1,7 +1,7 @@
 """A tight box around an object, from its silhouettes (space carving; Kutulakos and Seitz 2000, without colours).
 
-c images of h x w pixels, n voxels. The work is NumPy's, a view a thread: parallel sections inside of small array
-operations would cost more than the operations on a busy machine.
+c images of h x w pixels, n voxels. NumPy does the work, one thread for each view: parallel loops inside small array
+operations would cost more than the operations themselves on a busy machine.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ OUTSIDE = 1e-3  # share of the masks' pixels whose rays may miss the box
 
 
 def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tensor | None:
-    """The bounding box of the space that all masks leave.
+    """The bounding box of the voxels that no mask rules out.
 
-    A voxel stays unless two views see it entirely outside of their mask. It is compared with the mask widened by the
-    voxel's own size in pixels, so that the box does not cut what a mask shows; it is larger than the object by a voxel
-    or two (a fortieth of the object's size each) and by what no silhouette can carve.
+    A voxel is removed if two views see it entirely outside their mask. Each mask is widened by the size of the voxel in
+    pixels, so that the box does not cut the object. The box is larger than the object by one or two voxels, each about
+    a fortieth of the object's size, and by concave parts that no silhouette shows.
 
     Args:
         cameras: c cameras without lens distortion that look at the object from around it.
@@ -42,8 +42,8 @@ def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tenso
         far: distance behind which there is nothing; the search covers a cube of half side (far - near) / 2.
 
     Returns:
-        float32 [2, 3], or None where there is no such box: nothing or everything is opaque, the lens distorts, the
-        cameras have no common focus, or the box would miss more than a thousandth of what the masks show.
+        float32 [2, 3], or None if there is no such box: nothing or everything is opaque, the lens distorts, the cameras
+        have no common focus, or the rays of more than a thousandth of the masks' pixels would miss the box.
     """
     every = -(-len(cameras) // VIEWS)
     cameras, visible = cameras[::every], (alpha[::every] > 0).numpy()
@@ -71,7 +71,7 @@ class _View:
         self.fx, self.fy, self.cx, self.cy = (cameras.intrinsics[index] / shrink).tolist()
         mask = _block_any(visible, shrink)
         self.height, self.width = mask.shape
-        # a view that shows all of the object says that there is none of it outside of the picture either
+        # A view that shows the whole object also rules out what lies outside its picture.
         self.whole = not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
         mask = np.pad(mask, MARGIN)
         levels = []
@@ -81,15 +81,15 @@ class _View:
                 mask = _widen(mask)
             levels.append(mask)
             done = grow
-        levels.append(np.ones_like(mask))  # whatever is wider still
+        levels.append(np.ones_like(mask))  # for voxels that are wider still
         self.masks = np.stack(levels)
 
     def judge(self, points: Array, radius: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(seen [n], missed [n]): balls that this view sees, and those of them that are outside of its mask."""
+        """(seen [n], missed [n]): the balls that this view sees, and those of them that lie outside its mask."""
         x, y, z = (points - self.pose[:3, 3]).T
         local = [self.pose[0, i] * x + self.pose[1, i] * y + self.pose[2, i] * z for i in range(3)]
         depth = -local[2]
-        ahead = depth > 2 * radius  # balls that reach behind the camera say nothing
+        ahead = depth > 2 * radius  # a ball that reaches behind the camera is not judged
         safe = np.maximum(depth, radius)
         column = np.floor(self.cx + self.fx * local[0] / safe)
         row = np.floor(self.cy - self.fy * local[1] / safe)
@@ -104,7 +104,7 @@ class _View:
 
 
 def _carve(views: list[_View], pool: ThreadPoolExecutor, box: Array, resolution: int) -> Array | None:
-    """One pass over a grid of resolution^3 voxels in `box`; the box of the voxels that stay."""
+    """Carves a grid of resolution^3 voxels in `box`; returns the box of the voxels that are left."""
     size = (box[1] - box[0]) / np.float32(resolution)
     steps = np.arange(resolution, dtype=np.float32) + np.float32(0.5)
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -122,7 +122,7 @@ def _carve(views: list[_View], pool: ThreadPoolExecutor, box: Array, resolution:
 
 
 def _block_any(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
-    """Whether any pixel of each block is set; incomplete blocks at the right and bottom count."""
+    """For each block whether any pixel is set; incomplete blocks at the right and bottom count."""
     height, width = mask.shape
     padded = np.pad(mask, ((0, -height % size), (0, -width % size)))
     blocks = padded.reshape(padded.shape[0] // size, size, padded.shape[1] // size, size)

@@ -1,4 +1,4 @@
-"""Image files to uint8 tensors, made smaller on the way."""
+"""Reads image files as uint8 tensors and reduces them on the way."""
 
 from __future__ import annotations
 
@@ -24,9 +24,8 @@ THREADS = 4
 def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """Averages blocks of `factor` x `factor` pixels; columns and rows that fill no block are dropped.
 
-    With alpha the average is taken of premultiplied colours, which is the average of the image composited on any
-    background, and given back as straight colour and alpha. Rounding both to 8 bits moves the composited colour by at
-    most one level.
+    With alpha, premultiplied colours are averaged, which equals averaging the image composited on any background. The
+    result is straight colour and alpha. Rounding both to 8 bits changes the composited colour by at most one level.
 
     Args:
         image: [h, w, 3] or [h, w, 4].
@@ -51,7 +50,7 @@ def read_image(path: Path, factor: int) -> tuple[NDArray[np.uint8], tuple[int, i
     """Decodes one image file.
 
     Orientation tags are ignored: poses and intrinsics belong to the pixels as stored. JPEG files are reduced by up to 8
-    while they are decoded (the average of a block is what the format stores).
+    while they are decoded, since the format stores the average of each block.
 
     Args:
         path: the file.

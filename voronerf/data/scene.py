@@ -1,4 +1,4 @@
-"""A scene: images with their cameras, and the space that it takes up.
+"""A scene: images with their cameras, and the space that it fills.
 
 c images of h x w pixels. World units and axes as in `voronerf.rendering.cameras`.
 """

@@ -1,4 +1,4 @@
-"""The parts that Blender's `transforms_*.json` and a capture's `transforms.json` share: frames, poses, numbers."""
+"""Reads what Blender's `transforms_*.json` and the `transforms.json` of captures share: frames, poses, numbers."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 ORTHONORMAL = 2e-3
-LARGEST = float(np.finfo(np.float32).max)  # what cameras can hold
+LARGEST = float(np.finfo(np.float32).max)  # cameras are float32
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of a transforms file: where it lies, its pose float64 [4, 4], and its own entries."""
+    """One image of a transforms file: its path, its pose float64 [4, 4], and its entries."""
 
     path: Path
     pose: Tensor
@@ -48,7 +48,10 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
     """
     try:
         entries = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # ValueError: of the syntax, the encoding, or an integer's digits
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # ValueError: syntax, encoding, too long an integer
         raise SceneError(f"{path}: is no JSON: {error}") from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
@@ -76,7 +79,7 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
 
 
 def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = False) -> float | None:
-    """A finite number of a transforms file, None where there is no such entry.
+    """A finite number of a transforms file; None if the entry is missing.
 
     Raises:
         SceneError: the entry is no number, not finite in float32, or not positive where it must be.
@@ -93,10 +96,10 @@ def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = Fa
 
 
 def distinct_names(paths: list[Path], folder: Path) -> list[str]:
-    """A name for each image that no other has, since pictures are stored under it: the shortest of three that will do.
+    """A unique name for each image, under which pictures of it are stored.
 
-    The stem; the path inside the scene's folder, a/00.png becoming a_00; or that behind the image's number, for a file
-    that is listed twice.
+    The names are the stems of the files if these differ; otherwise the paths inside the folder of the scene, such as
+    a_00 for a/00.png; and if a file is listed twice, the paths behind the number of the image.
     """
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
@@ -108,7 +111,7 @@ def distinct_names(paths: list[Path], folder: Path) -> list[str]:
 
 
 def _image_path(folder: Path, name: str) -> Path | None:
-    """The file itself, or with the suffix that Blender's files leave out, or with the separators of Windows."""
+    """Finds an image file; Blender's files leave out the suffix, and files from Windows may have its separators."""
     path = folder / name
     if path.is_file():
         return path

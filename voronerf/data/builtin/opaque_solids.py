@@ -1,4 +1,4 @@
-"""What the built-in scene is made of: its solids, and the textures of their surfaces."""
+"""The solids of the built-in scene, and the textures of their surfaces."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def globe(points: Array, normals: Array) -> Array:
 
 
 def spiral(points: Array, normals: Array) -> Array:
-    """Bands wound around the tube, in step with itself after a full turn of either."""
+    """Bands wound around the tube that meet themselves after a full turn in either direction."""
     outward = (normals[:, :2] * points[:, :2]).sum(axis=-1) / np.hypot(points[:, 0], points[:, 1])
     tube = np.arctan2(normals[:, 2], outward) / (2 * math.pi)
     return _pick(((0.20, 0.66, 0.34), (0.56, 0.84, 0.40), (0.86, 0.92, 0.52)), _azimuth(points) * 12 + 3 * tube)

@@ -90,7 +90,7 @@ def caster(solids: Sequence[Solid], backend: str = "auto") -> Hits:
         depths, found = cast_solids(*tables, *rays, backend=backend)
         return depths.numpy(), found.clamp(min=0).numpy().astype(np.int64)
 
-    # Whatever has to be compiled, before several threads ask for it.
+    # Compile kernels before several threads need them.
     hits(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     return hits
 

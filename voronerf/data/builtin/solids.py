@@ -252,5 +252,5 @@ def first_hits(solids: Sequence[Solid], origins: Array, directions: Array) -> tu
 
 
 def _rows_of(vectors: Array, rows: Rows) -> Array:
-    """Rows of vectors [r, 3]; all of [1, 3], which stands for each."""
+    """Rows of vectors [r, 3]; vectors [1, 3] stand for every row and are returned whole."""
     return vectors if len(vectors) == 1 else vectors[rows]

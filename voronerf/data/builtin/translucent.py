@@ -25,7 +25,7 @@ Vector = tuple[float, float, float]
 Doubles = NDArray[np.float64]
 
 NOWHERE: Vector = (-math.inf,) * 3
-SUPERSAMPLES = 2  # on each side of a pixel: what is translucent has few hard edges
+SUPERSAMPLES = 2  # on each side of a pixel; translucent media have few hard edges
 EMPTY = 1e-9  # sums of densities and their negatives below this are rounding
 
 
@@ -186,7 +186,7 @@ def integrate(origin: Array, directions: Array, media: tuple[Medium, ...] = MEDI
     depths = np.stack([enter for enter, _ in spans] + [leave for _, leave in spans], axis=-1)
     density = np.array([medium.density for medium in media])
     glow = density[:, None] * np.array([medium.colour for medium in media])
-    # What a ray does not meet stands at depth 0, before everything else, and counts nothing.
+    # Media that a ray misses have depth 0, before all others, and add nothing.
     met = int((depths[:, len(media) :] > 0).sum(axis=-1).max(initial=0))
     order = np.argsort(depths, axis=-1)[:, 2 * (len(media) - met) :]
     depths = np.take_along_axis(depths, order, -1)
