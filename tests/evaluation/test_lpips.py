@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import refuses
 from pictures_by_formula import FIGURES, pictures_by_formula
 from safetensors.torch import save_file
 
@@ -41,12 +42,11 @@ def patches(x, size, stride, padding):
     """[c, h, w] -> [rows, columns, c, size, size], each filter's view of it copied out."""
     x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
     rows, columns = ((extent - size) // stride + 1 for extent in x.shape[1:])
-    return np.stack(
-        [
-            np.stack([x[:, i * stride : i * stride + size, j * stride : j * stride + size] for j in range(columns)])
-            for i in range(rows)
-        ]
-    )
+    views = [
+        [x[:, i : i + size, j : j + size] for j in range(0, columns * stride, stride)]
+        for i in range(0, rows * stride, stride)
+    ]
+    return np.array(views)
 
 
 def slow_lpips(image, truth, weights):
@@ -95,10 +95,10 @@ def test_against_the_lpips_package(figures):
 
 def test_shapes_and_small_images(weights):
     score = Lpips(weights)
-    with pytest.raises(ValueError, match=r"same shape \[h, w, 3\], got \[40, 40, 3\] and \[40, 41, 3\]"):
-        score(torch.zeros(40, 40, 3), torch.zeros(40, 41, 3))
-    with pytest.raises(ValueError, match="at least 31 x 31, AlexNet's smallest, got 30 x 40"):
-        score(torch.zeros(30, 40, 3), torch.zeros(30, 40, 3))
+    rule = "same shape [h, w, 3], got [40, 40, 3] and [40, 41, 3]"
+    refuses(rule, score, torch.zeros(40, 40, 3), torch.zeros(40, 41, 3))
+    rule = "at least 31 x 31, AlexNet's smallest, got 30 x 40"
+    refuses(rule, score, torch.zeros(30, 40, 3), torch.zeros(30, 40, 3))
 
 
 def test_where_weights_are_looked_for(tmp_path, weights, monkeypatch):
@@ -119,17 +119,16 @@ def test_where_weights_are_looked_for(tmp_path, weights, monkeypatch):
     monkeypatch.setenv("VORONERF_LPIPS", "off")
     assert find_lpips(None, str(scenes / "lego"))[0] is None
     monkeypatch.setenv("VORONERF_LPIPS", str(tmp_path / "gone"))
-    with pytest.raises(LpipsError, match="gone: there is no such file or folder, asked for by VORONERF_LPIPS"):
-        find_lpips(None)
-    with pytest.raises(LpipsError, match="away: there is no such file or folder, asked for by --lpips"):
-        find_lpips(tmp_path / "away")
+    absent = "there is no such file or folder, asked for by"
+    refuses(f"gone: {absent} VORONERF_LPIPS", find_lpips, None, error=LpipsError)
+    refuses(f"away: {absent} --lpips", find_lpips, tmp_path / "away", error=LpipsError)
     file = scenes / "lpips" / "lpips_alex.safetensors"
     assert find_lpips(file)[0] is not None
     monkeypatch.setenv("VORONERF_LPIPS", str(file))
     found, line = find_lpips(None, size=(16, 40))
     assert found is None and "images of 16 x 40 are below AlexNet's smallest, 31 x 31" in line
-    with pytest.raises(LpipsError, match="--lpips must be off or come with larger images: images of 16 x 40"):
-        find_lpips(file, size=(16, 40))
+    rule = "--lpips must be off or come with larger images: images of 16 x 40"
+    refuses(rule, find_lpips, file, size=(16, 40), error=LpipsError)
 
 
 def test_the_installed_package(tmp_path, weights, monkeypatch):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import refuses
 from PIL import Image
 
 from voronerf.evaluation import panels
@@ -64,8 +65,7 @@ def test_panel_file(tmp_path):
     pixels = np.asarray(Image.open(path))
     truth = panels.picture_of_colour(colour)
     assert pixels[6 + 18, 6].tolist() == truth[0, 0].tolist()
-    with pytest.raises(ValueError, match="one size"):
-        panels.contact_sheet({"a": truth, "b": truth[1:]})
+    refuses("one size", panels.contact_sheet, {"a": truth, "b": truth[1:]})
 
 
 def test_depths_of_more_pixels_than_torch_takes_quantiles_of(monkeypatch):
@@ -99,25 +99,21 @@ def test_a_video_that_ffmpeg_did_not_finish(tmp_path, monkeypatch):
             Path(name).write_bytes(Path(name).read_bytes()[:200])
 
     monkeypatch.setattr(imageio_ffmpeg, "write_frames", broken)
-    with pytest.raises(OSError, match="ffmpeg could not write it, 0 of 3 frames"):
-        write_video(path, frames, 10)
+    refuses("ffmpeg could not write it, 0 of 3 frames", write_video, path, frames, 10, error=OSError)
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
 def test_what_no_video_can_be_written_to(tmp_path, monkeypatch):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    with pytest.raises(ValueError, match=r"turn: a video must end in \.mp4, \.m4v"):
-        check_video(tmp_path / "turn")
+    refuses("turn: a video must end in .mp4, .m4v", check_video, tmp_path / "turn")
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="file"):
-        check_video(tmp_path / "file" / "turn.mp4")
+    refuses("file", check_video, tmp_path / "file" / "turn.mp4", error=OSError)
 
     def missing():
         raise RuntimeError("No ffmpeg exe could be found")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
-    with pytest.raises(ImportError, match="imageio-ffmpeg and its ffmpeg"):
-        check_video(tmp_path / "turn.mp4")
+    refuses("imageio-ffmpeg and its ffmpeg", check_video, tmp_path / "turn.mp4", error=ImportError)
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 
@@ -130,10 +126,8 @@ def test_video(tmp_path, monkeypatch):
     assert next(reader)["source_size"] == (22, 18)
     assert len(list(reader)) == 5
     assert [entry.name for entry in path.parent.iterdir()] == ["turn.mp4"]
-    with pytest.raises(ValueError, match=r"frames must have shape \[f, h, w, 3\] with pixels, got \[0, 17, 21, 3\]"):
-        write_video(path, frames[:0], 10)
-    with pytest.raises(ValueError, match="fps must be positive, got 0"):
-        write_video(path, frames, 0)
+    rule = "frames must have shape [f, h, w, 3] with pixels, got [0, 17, 21, 3]"
+    refuses(rule, write_video, path, frames[:0], 10)
+    refuses("fps must be positive, got 0", write_video, path, frames, 0)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ImportError, match="pip install imageio-ffmpeg"):
-        write_video(path, frames, 10)
+    refuses("pip install imageio-ffmpeg", write_video, path, frames, 10, error=ImportError)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from helpers import refuses, seeded
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import DensityField, MipNeRF
@@ -12,13 +13,13 @@ from voronerf.router import VoronoiRouter
 
 
 def gaussians(n, seed=0):
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     means = 2 * torch.rand(n, 3, generator=generator) - 1
     return torch.cat((means, 0.02 * torch.rand(n, 3, generator=generator)), dim=1)
 
 
 def directions(n):
-    return F.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(9)), dim=1)
+    return F.normalize(torch.randn(n, 3, generator=seeded(9)), dim=1)
 
 
 def test_mipnerf_layer_by_layer():
@@ -57,8 +58,7 @@ def test_density_field():
     router = VoronoiRouter(field, VoronoiDiagram(torch.zeros(1, 3)))
     _, density = router(torch.rand(5, 3), directions(5))
     torch.testing.assert_close(density, torch.full((5,), INITIAL_DENSITY))
-    with pytest.raises(ValueError, match="width and depth must be at least 1, got 0 and 2"):
-        DensityField(width=0)
+    refuses("width and depth must be at least 1, got 0 and 2", DensityField, width=0)
 
 
 @pytest.mark.parametrize("kind", ["mipnerf", "density"])
@@ -92,13 +92,12 @@ def test_cells_by_the_mean_of_a_gaussian(kind, assignment):
     assert not torch.allclose(elsewhere, density)
     if assignment == "stochastic":
         router.train()
-        router.generator = torch.Generator().manual_seed(0)
+        router.generator = seeded(0)
         assert router(x, d)[1].shape == (200,)
 
 
 def test_shapes_are_checked():
     router = VoronoiRouter(MipNeRF(width=8, depth=1, position_octaves=2), torch.zeros(2, 3))
-    with pytest.raises(ValueError, match=r"positions must have shape \[n, 6\], got \[4, 3\]"):
-        router(torch.zeros(4, 3), directions(4))
-    with pytest.raises(ValueError, match=r"coords must have shape \[4, 3\], got \[4, 6\]"):
-        router(gaussians(4), directions(4), coords=gaussians(4))
+    refuses("positions must have shape [n, 6], got [4, 3]", router, torch.zeros(4, 3), directions(4))
+    rule = "coords must have shape [4, 3], got [4, 6]"
+    refuses(rule, router, gaussians(4), directions(4), coords=gaussians(4))

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import refuses, seeded
 
 from voronerf.rendering import (
     OccupancyGrid,
@@ -36,7 +37,7 @@ def cameras(size=24):
 
 def grid_of(field, resolution=8, looks=3):
     grid = OccupancyGrid(BOX, resolution, threshold=0.1)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     for look in range(looks):
         grid.update(field, decay=float(look > 0), generator=generator)
     return grid
@@ -54,22 +55,11 @@ def test_a_grid_finds_what_is_empty():
     grid = OccupancyGrid(BOX, (8, 10, 12), threshold=0.1)
     assert grid.share == 1 and grid.occupied.shape == (8, 10, 12)
     for look in range(20):
-        grid.update(Ball(), decay=float(look > 0), generator=torch.Generator().manual_seed(look))
+        grid.update(Ball(), decay=float(look > 0), generator=seeded(look))
     middles = grid.points(torch.arange(960)).norm(dim=-1).reshape(8, 10, 12)
     half = (torch.tensor([2 / 8, 2 / 10, 2 / 12]) / 2).norm()
     assert bool(grid.occupied[middles < 0.5 - half].all())
     assert not bool(grid.occupied[middles > 0.5 + half].any())
-
-
-def test_points_lie_in_their_cells():
-    grid = OccupancyGrid(torch.tensor([[0.0, 10.0, -4.0], [2.0, 13.0, 0.0]]), (2, 3, 4), threshold=1)
-    cells = torch.arange(24)
-    assert grid.points(cells)[0].tolist() == [0.5, 10.5, -3.5]
-    found = []
-    for _ in range(4):
-        place = (grid.points(cells, torch.rand(24, 3)) - grid.box[0]).long()
-        found.append((place[:, 0] * 3 + place[:, 1]) * 4 + place[:, 2])
-    assert all(torch.equal(cell, cells) for cell in found)
 
 
 def test_cells_that_are_looked_at_fade_and_the_others_stay():
@@ -86,11 +76,15 @@ def test_cells_that_are_looked_at_fade_and_the_others_stay():
     assert bool((density[1::2] == 8).all())
 
 
-def test_cells_are_those_of_their_points():
+def test_points_lie_in_their_cells():
     grid = OccupancyGrid(torch.tensor([[0.0, 10.0, -4.0], [2.0, 13.0, 0.0]]), (2, 3, 4), threshold=1)
     every = torch.arange(24)
+    assert grid.points(every)[0].tolist() == [0.5, 10.5, -3.5]
     for _ in range(4):
-        assert torch.equal(grid.cells(grid.points(every, torch.rand(24, 3))), every.int())
+        points = grid.points(every, torch.rand(24, 3))
+        place = (points - grid.box[0]).long()
+        assert torch.equal((place[:, 0] * 3 + place[:, 1]) * 4 + place[:, 2], every)
+        assert torch.equal(grid.cells(points), every.int())
     border = torch.tensor([[-1.0, 10.5, -3.5], [2.0, 13.0, 0.0], [9.0, 99.0, torch.nan]])
     assert grid.cells(border).tolist() == [0, 23, 20] and grid.cells(border).dtype == torch.int32
 
@@ -98,7 +92,7 @@ def test_cells_are_those_of_their_points():
 def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
     """Rays from all around a ball: its shell stays, the air around it and the inside that no light reaches fade."""
     grid, ball = OccupancyGrid(BOX, 16, threshold=0.1), Ball(200.0)
-    random = torch.Generator().manual_seed(0)
+    random = seeded(0)
     for _ in range(60):
         origins = 3 * torch.nn.functional.normalize(torch.randn(300, 3, generator=random), dim=1)
         towards = torch.rand(300, 3, generator=random) * 1.6 - 0.8
@@ -125,8 +119,7 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
     # What is not a number counts as dense.
     grid.observe(torch.full((1, 3), 0.95), torch.tensor([torch.nan]), torch.ones(1), torch.ones(1), decay=0.0)
     assert bool(grid.occupied[15, 15, 15])
-    with pytest.raises(ValueError, match=r"observe: decay must lie in 0..1, got -1"):
-        grid.observe(*[torch.zeros(1, 3), *[torch.zeros(1)] * 3], decay=-1)
+    refuses("observe: decay must lie in 0..1, got -1", grid.observe, torch.zeros(1, 3), *[torch.zeros(1)] * 3, decay=-1)
 
 
 def test_images_are_the_same_with_a_fraction_of_the_samples():
@@ -146,8 +139,7 @@ def test_images_are_the_same_with_a_fraction_of_the_samples():
     torch.testing.assert_close(chunked.colour, quick.colour)
     bare = render_image(Ball(), cameras(), 0, occupancy=grid, heaviest=False, **options)
     assert torch.equal(bare.colour, quick.colour) and not torch.equal(bare.heaviest, quick.heaviest)
-    with pytest.raises(ValueError, match="chunk must be >= 1, got 0"):
-        render_image(Ball(), cameras(), 0, occupancy=grid, chunk=0, **options)
+    refuses("chunk must be >= 1, got 0", render_image, Ball(), cameras(), 0, occupancy=grid, chunk=0, **options)
 
 
 def test_a_translucent_field_is_walked_to_its_end():
@@ -170,18 +162,9 @@ def test_training_samples_and_gradients_are_those_of_the_dense_form(backend):
     found = []
     for render, more in ((render_rays, ()), (render_marched, (grid,))):
         scale = torch.tensor(2.0, requires_grad=True)
-        result = render(
-            lambda p, d, i, scale=scale: ((p * scale).sigmoid(), (p.square().sum(-1) * scale)),
-            rays,
-            near,
-            far,
-            *more,
-            samples=20,
-            background=background,
-            jitter=True,
-            generator=torch.Generator().manual_seed(3),
-            backend=backend,
-        )
+        options = {"samples": 20, "background": background, "jitter": True, "generator": seeded(3), "backend": backend}
+        field = lambda p, d, i, scale=scale: ((p * scale).sigmoid(), p.square().sum(-1) * scale)  # noqa: E731
+        result = render(field, rays, near, far, *more, **options)
         result.colour.square().sum().backward()
         found.append((result.colour, result.opacity, result.depth, result.weights.reshape(-1), scale.grad))
         assert result.positions.reshape(-1, 3).shape == (20 * len(rays), 3)
@@ -212,26 +195,23 @@ def test_state_goes_round():
         assert torch.equal(value, other.state_dict()[name])
     state = grid.state_dict()
     del state["density"]
-    with pytest.raises(ValueError, match="OccupancyGrid: state must hold density, got box, occupied, threshold"):
-        OccupancyGrid.from_state(state)
-    with pytest.raises(ValueError, match=r"density and occupied of one shape \[x, y, z\], got \[3\] and \[3, 4, 5\]"):
-        OccupancyGrid.from_state(grid.state_dict() | {"density": torch.zeros(3)})
+    rule = "OccupancyGrid: state must hold density, got box, occupied, threshold"
+    refuses(rule, OccupancyGrid.from_state, state)
+    rule = "density and occupied of one shape [x, y, z], got [3] and [3, 4, 5]"
+    refuses(rule, OccupancyGrid.from_state, state | {"density": torch.zeros(3)})
 
 
 def test_refuses_what_is_no_grid():
-    with pytest.raises(ValueError, match="box must be finite corners"):
-        OccupancyGrid(BOX.flip(0), threshold=1)
-    with pytest.raises(ValueError, match="box must be finite corners"):
-        OccupancyGrid(BOX * torch.inf, threshold=1)
-    with pytest.raises(ValueError, match=r"resolution must be one or three numbers >= 1, got \(3, 0, 3\)"):
-        OccupancyGrid(BOX, (3, 0, 3), threshold=1)
-    with pytest.raises(ValueError, match="threshold must be positive and finite, got 0"):
-        OccupancyGrid(BOX, threshold=0)
-    with pytest.raises(ValueError, match=r"remembered must be at least 1 and finite, got 0.5"):
-        OccupancyGrid(BOX, threshold=1, remembered=0.5)
+    for box, resolution, options, message in (
+        (BOX.flip(0), 8, {}, "box must be finite corners"),
+        (BOX * torch.inf, 8, {}, "box must be finite corners"),
+        (BOX, (3, 0, 3), {}, "resolution must be one or three numbers >= 1, got (3, 0, 3)"),
+        (BOX, 8, {"threshold": 0}, "threshold must be positive and finite, got 0"),
+        (BOX, 8, {"remembered": 0.5}, "remembered must be at least 1 and finite, got 0.5"),
+    ):
+        refuses(message, OccupancyGrid, box, resolution, **{"threshold": 1, **options})
     # 2**32 would be cell 0 in the lowest 32 bits.
+    update = OccupancyGrid(BOX, 4, threshold=0.1).update
     for cell in (-1, 64, 2**32):
-        with pytest.raises(ValueError, match="cells must lie in 0 to 63, got"):
-            OccupancyGrid(BOX, 4, threshold=0.1).update(Ball(), torch.tensor([cell]))
-    with pytest.raises(ValueError, match=r"decay must lie in 0..1, got 2"):
-        OccupancyGrid(BOX, 4, threshold=1).update(Ball(), decay=2)
+        refuses("cells must lie in 0 to 63, got", update, Ball(), torch.tensor([cell]))
+    refuses("decay must lie in 0..1, got 2", update, Ball(), decay=2)

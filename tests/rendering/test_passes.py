@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from helpers import refuses, same, seeded
 from torch import Tensor
 
 from voronerf.rendering import Contraction, OccupancyGrid, Rays, Renderer, render_rays
@@ -57,37 +58,27 @@ def test_a_second_pass_finds_a_thin_surface():
 
 
 def test_who_is_asked_about_what():
-    def shapes(**fields):
-        return {name: [list(p.shape) for p in field.asked] for name, field in fields.items()}
-
-    field, first = Slab(), Slab()
-    Renderer({"field": field, "coarse": first}, samples=8, fine_samples=4).render(rays(), 0.0, 4.0)
-    assert shapes(field=field, first=first) == {"field": [[3 * 12, 3]], "first": [[3 * 8, 3]]}
-    field, first = Slab(), Slab()
-    Renderer({"field": field, "proposal": first}, samples=8, fine_samples=4).render(rays(), 0.0, 4.0)
-    assert shapes(field=field, first=first) == {"field": [[3 * 4, 3]], "first": [[3 * 8, 3]]}
-    field = Slab()
-    Renderer({"field": field}, samples=8, fine_samples=4, cones=True).render(rays(), 0.0, 4.0)
-    assert shapes(field=field) == {"field": [[3 * 8, 6], [3 * 4, 6]]}
-    field = Slab()
-    Renderer({"field": field}, samples=8).render(rays(), 0.0, 4.0)
-    assert shapes(field=field) == {"field": [[3 * 8, 3]]}
+    for first, options, of_first, of_field in (
+        ("coarse", {"fine_samples": 4}, [[3 * 8, 3]], [[3 * 12, 3]]),
+        ("proposal", {"fine_samples": 4}, [[3 * 8, 3]], [[3 * 4, 3]]),
+        (None, {"fine_samples": 4, "cones": True}, [], [[3 * 8, 6], [3 * 4, 6]]),
+        (None, {}, [], [[3 * 8, 3]]),
+    ):
+        field, other = Slab(), Slab()
+        fields = {"field": field} if first is None else {"field": field, first: other}
+        Renderer(fields, samples=8, **options).render(rays(), 0.0, 4.0)
+        assert [list(p.shape) for p in other.asked] == of_first
+        assert [list(p.shape) for p in field.asked] == of_field
 
 
 def test_one_pass_is_render_rays():
-    options = {"background": WHITE, "jitter": True}
-    got = Renderer({"field": Slab()}, samples=9, spacing="disparity").render(
-        rays(), 1.0, 3.0, generator=torch.Generator().manual_seed(4), **options
-    )
-    expected = render_rays(
-        Slab(), rays(), 1.0, 3.0, samples=9, spacing="disparity", generator=torch.Generator().manual_seed(4), **options
-    )
-    for a, b in zip(got[0], expected, strict=True):
-        assert torch.equal(a, b)
+    sampling, options = {"samples": 9, "spacing": "disparity"}, {"background": WHITE, "jitter": True}
+    (got,) = Renderer({"field": Slab()}, **sampling).render(rays(), 1.0, 3.0, generator=seeded(4), **options)
+    assert same(got, render_rays(Slab(), rays(), 1.0, 3.0, generator=seeded(4), **sampling, **options))
 
 
 def test_union_against_slow_loop():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     edges = torch.rand(5, 9, generator=generator).cumsum(1)
     weights = torch.rand(5, 8, generator=generator)
     weights[3] = 0
@@ -110,7 +101,7 @@ def test_union_against_slow_loop():
 
 
 def test_blurred_weights_against_slow_loop():
-    weights = torch.rand(4, 7, generator=torch.Generator().manual_seed(0))
+    weights = torch.rand(4, 7, generator=seeded(0))
     got = blurred_weights(weights)
     for ray in range(4):
         w = [float(x) for x in weights[ray]]
@@ -123,7 +114,7 @@ def test_blurred_weights_against_slow_loop():
 
 
 def test_interlevel_loss_against_slow_loop():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     edges = torch.rand(6, 6, generator=generator).cumsum(1) + 0.5
     found = torch.rand(6, 5, generator=generator).cumsum(1)
     found[0] = torch.linspace(0, 10, 5)  # reaches beyond at both ends
@@ -147,15 +138,13 @@ def test_interlevel_loss_against_slow_loop():
 
 
 def test_a_proposal_that_bounds_the_weights_costs_nothing():
-    edges = torch.linspace(0, 1, 9)[None]
-    weights = torch.rand(1, 8)
-    assert float(
-        interlevel_loss(edges, weights, edges[:, ::2].contiguous(), weights.reshape(1, 4, 2).sum(2))
-    ) == pytest.approx(0, abs=1e-9)
+    edges, weights = torch.linspace(0, 1, 9)[None], torch.rand(1, 8)
+    bounds = weights.reshape(1, 4, 2).sum(2)
+    assert float(interlevel_loss(edges, weights, edges[:, ::2].contiguous(), bounds)) == pytest.approx(0, abs=1e-9)
 
 
 def test_distortion_loss_against_slow_loop():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     edges = torch.rand(6, 8, generator=generator).sort(dim=1).values
     weights = torch.rand(6, 7, generator=generator).requires_grad_()
     expected = 0.0
@@ -204,7 +193,7 @@ def test_a_spread_along_the_ray_costs_by_its_factor():
 def test_a_proposal_is_asked_in_rounds():
     field, proposal = Slab(), Slab()
     renderer = Renderer({"field": field, "proposal": proposal}, samples=8, fine_samples=4, rounds=3)
-    passes = renderer.render(rays(), 0.0, 4.0, jitter=True, generator=torch.Generator().manual_seed(0))
+    passes = renderer.render(rays(), 0.0, 4.0, jitter=True, generator=seeded(0))
     assert [list(p.shape) for p in proposal.asked] == [[3 * 8, 3]] * 3
     assert [list(p.shape) for p in field.asked] == [[3 * 4, 3]] and len(passes) == 4
     # each round looks closer at what the one before has found
@@ -226,7 +215,7 @@ def test_a_proposal_sharpens():
             field = Slab()
             renderer = Renderer({"field": field, "proposal": Slab()}, samples=16, fine_samples=64)
             renderer.sharpness = sharpness
-            last = renderer.render(rays(), 0.0, 4.0, jitter=jitter, generator=torch.Generator().manual_seed(0))[-1]
+            last = renderer.render(rays(), 0.0, 4.0, jitter=jitter, generator=seeded(0))[-1]
             if jitter:
                 found = field.asked[0][:, 2]
                 inside.append(float(((found > -0.3) & (found < 0.3)).float().mean()))
@@ -241,19 +230,15 @@ def test_a_proposal_sharpens():
 
 def test_losses():
     target = torch.rand(3, 3)
-    for fields, share in (({"field": Slab()}, 0.1), ({"field": Slab(), "coarse": Slab(0.2, 0.8)}, 1.0)):
-        renderer = Renderer(fields, samples=6, fine_samples=5)
-        first, last = passes = renderer.render(rays(), 0.0, 4.0, background=WHITE)
+    higher = Slab(0.2, 0.8)
+    for others, fine, share in (({}, 5, 0.1), ({"coarse": higher}, 5, 1.0), ({"proposal": higher}, 5, 0), ({}, 0, 0)):
+        renderer = Renderer({"field": Slab(), **others}, samples=6, fine_samples=fine)
+        passes = renderer.render(rays(), 0.0, 4.0, background=WHITE)
+        first, last = passes[0], passes[-1]
         expected = (last.colour - target).square().mean() + share * (first.colour - target).square().mean()
+        if "proposal" in others:
+            expected = expected + interlevel_loss(last.edges, last.weights, first.edges, first.weights)
         torch.testing.assert_close(renderer.loss(passes, target), expected)
-    renderer = Renderer({"field": Slab(), "proposal": Slab(0.2, 0.8)}, samples=6, fine_samples=5)
-    first, last = passes = renderer.render(rays(), 0.0, 4.0, background=WHITE)
-    expected = (last.colour - target).square().mean()
-    expected = expected + interlevel_loss(last.edges, last.weights, first.edges, first.weights)
-    torch.testing.assert_close(renderer.loss(passes, target), expected)
-    renderer = Renderer({"field": Slab()}, samples=6)
-    passes = renderer.render(rays(), 0.0, 4.0, background=WHITE)
-    torch.testing.assert_close(renderer.loss(passes, target), (passes[0].colour - target).square().mean())
 
 
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])
@@ -262,7 +247,7 @@ def test_jittered_edges_cover_the_ray(spacing, samples):
     near, far = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 2.0, 30.0])
     even = stratified_edges(near, far, samples, jitter=False, spacing=spacing)
     for seed in range(5):
-        generator = torch.Generator().manual_seed(seed)
+        generator = seeded(seed)
         edges = stratified_edges(near, far, samples, jitter=True, spacing=spacing, generator=generator)
         assert edges.shape == even.shape == (3, samples + 1)
         assert torch.equal(edges[:, 0], near) and torch.equal(edges[:, -1], far)
@@ -272,7 +257,7 @@ def test_jittered_edges_cover_the_ray(spacing, samples):
 
 
 def test_uniforms_are_one_in_each_stratum():
-    u = strata_uniforms(500, 7, torch.zeros(()), True, torch.Generator().manual_seed(0))
+    u = strata_uniforms(500, 7, torch.zeros(()), True, seeded(0))
     assert u is not None and torch.equal((u * 7).floor(), torch.arange(7.0).expand(500, 7))
     assert float((u * 7 % 1).mean()) == pytest.approx(0.5, abs=0.02)
     assert strata_uniforms(5, 7, torch.zeros(()), False, None) is None
@@ -282,7 +267,7 @@ def test_training_draws_differ_and_pictures_do_not():
     for fields, cones in (({"field": Slab(), "coarse": Slab()}, False), ({"field": Slab(), "proposal": Slab()}, False),
                           ({"field": Slab()}, True)):  # fmt: skip
         renderer = Renderer(fields, samples=8, fine_samples=8, cones=cones)
-        seeds = [torch.Generator().manual_seed(seed) for seed in (0, 0, 1)]
+        seeds = [seeded(seed) for seed in (0, 0, 1)]
         a, b, c = (renderer.render(rays(), 0.0, 4.0, jitter=True, generator=seed)[-1] for seed in seeds)
         assert torch.equal(a.depths, b.depths) and not torch.equal(a.depths, c.depths)
         still = [renderer.render(rays(), 0.0, 4.0)[-1].depths for _ in range(2)]
@@ -299,19 +284,17 @@ def test_contracted_positions_are_what_the_field_sees():
 
 
 def test_refusals():
-    with pytest.raises(ValueError, match=r"fields must be field, and coarse or proposal, got \['coarse'\]"):
-        Renderer({"coarse": Slab()}, samples=3)
-    with pytest.raises(ValueError, match="fine_samples must be >= 1 with two fields, got 0"):
-        Renderer({"field": Slab(), "coarse": Slab()}, samples=3)
-    with pytest.raises(ValueError, match="samples must be >= 1 and fine_samples >= 0, got 0 and 0"):
-        Renderer({"field": Slab()}, samples=0)
-    for rounds, fields in ((0, {"field": Slab(), "proposal": Slab()}), (2, {"field": Slab(), "coarse": Slab()})):
-        with pytest.raises(ValueError, match=f"rounds must be >= 1, and 1 without a proposal, got {rounds}"):
-            Renderer(fields, samples=3, fine_samples=3, rounds=rounds)
-    with pytest.raises(ValueError, match="distortion must be >= 0 and finite, got -1"):
-        Renderer({"field": Slab()}, samples=3, distortion=-1)
+    one, proposal = {"field": Slab()}, {"field": Slab(), "proposal": Slab()}
+    coarse = {"field": Slab(), "coarse": Slab()}
     grid = OccupancyGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), 2, threshold=1.0)
-    with pytest.raises(ValueError, match="without contraction and distortion"):
-        Renderer({"field": Slab()}, samples=3, distortion=0.1, occupancy=grid)
-    with pytest.raises(ValueError, match="occupancy must come with a single pass over points"):
-        Renderer({"field": Slab()}, samples=3, fine_samples=3, occupancy=grid)
+    for fields, options, message in (
+        ({"coarse": Slab()}, {}, "fields must be field, and coarse or proposal, got ['coarse']"),
+        (coarse, {}, "fine_samples must be >= 1 with two fields, got 0"),
+        (one, {"samples": 0}, "samples must be >= 1 and fine_samples >= 0, got 0 and 0"),
+        (proposal, {"fine_samples": 3, "rounds": 0}, "rounds must be >= 1, and 1 without a proposal, got 0"),
+        (coarse, {"fine_samples": 3, "rounds": 2}, "rounds must be >= 1, and 1 without a proposal, got 2"),
+        (one, {"distortion": -1}, "distortion must be >= 0 and finite, got -1"),
+        (one, {"distortion": 0.1, "occupancy": grid}, "without contraction and distortion"),
+        (one, {"fine_samples": 3, "occupancy": grid}, "occupancy must come with a single pass over points"),
+    ):
+        refuses(message, Renderer, fields, **{"samples": 3, **options})

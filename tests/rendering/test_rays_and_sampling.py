@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import refuses, seeded
 
 from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.sampling import stratified_depths
@@ -18,7 +19,7 @@ def slow_interval(origin, direction, box, near, far):
 
 
 def test_box_against_slow_loop():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     origins = torch.randn(60, 3, generator=generator) * 2
     origins[:5] *= 0.1  # some start inside
     directions = torch.nn.functional.normalize(torch.randn(60, 3, generator=generator) - 0.5 * origins, dim=-1)
@@ -56,12 +57,9 @@ def test_no_box_no_rays_and_errors():
     near, far, hit = intersect_box(origins, origins + 1, None, 2.0, 6.0)
     assert near.tolist() == [2] * 4 and far.tolist() == [6] * 4 and hit.all()
     assert intersect_box(origins[:0], origins[:0], BOX, 2.0, 6.0)[0].shape == (0,)
-    with pytest.raises(ValueError, match="0 <= near < far, got 3 and 3"):
-        intersect_box(origins, origins, BOX, 3, 3)
-    with pytest.raises(ValueError, match=r"same shape \[r, 3\]"):
-        intersect_box(origins, origins[:2], BOX, 1, 3)
-    with pytest.raises(ValueError, match=r"box must have shape \[2, 3\], got \[3, 2\]"):
-        intersect_box(origins, origins, BOX.T, 1, 3)
+    refuses("0 <= near < far, got 3 and 3", intersect_box, origins, origins, BOX, 3, 3)
+    refuses("same shape [r, 3]", intersect_box, origins, origins[:2], BOX, 1, 3)
+    refuses("box must have shape [2, 3], got [3, 2]", intersect_box, origins, origins, BOX.T, 1, 3)
 
 
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])
@@ -69,7 +67,7 @@ def test_no_box_no_rays_and_errors():
 def test_strata(spacing, samples):
     near = torch.tensor([2.0, 0.05, 1.0, 3.0])
     far = torch.tensor([6.0, 20.0, 1.0, 3.5])
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     depths, deltas, edges = stratified_depths(near, far, samples, jitter=True, spacing=spacing, generator=generator)
     assert depths.shape == deltas.shape == (4, samples) and edges.shape == (4, samples + 1)
     torch.testing.assert_close(deltas.sum(-1), far - near, atol=1e-5, rtol=1e-5)
@@ -81,20 +79,14 @@ def test_strata(spacing, samples):
     assert torch.equal(middle, stratified_depths(near, far, samples, jitter=False, spacing=spacing)[0])
 
 
-def test_spacing_against_slow_loop():
+def test_spacing_is_the_formula():
     near, far, samples = 0.5, 8.0, 5
-    for spacing in ("linear", "disparity"):
-        depths, _, edges = stratified_depths(
-            torch.tensor([near]), torch.tensor([far]), samples, jitter=False, spacing=spacing
-        )
-        for i in range(samples + 1):
-            f = i / samples
-            expected = near + f * (far - near) if spacing == "linear" else 1 / ((1 - f) / near + f / far)
-            assert float(edges[0, i]) == pytest.approx(expected, rel=1e-6)
-        for i in range(samples):
-            f = (i + 0.5) / samples
-            expected = near + f * (far - near) if spacing == "linear" else 1 / ((1 - f) / near + f / far)
-            assert float(depths[0, i]) == pytest.approx(expected, rel=1e-6)
+    formulas = {"linear": lambda f: near + f * (far - near), "disparity": lambda f: 1 / ((1 - f) / near + f / far)}
+    for spacing, formula in formulas.items():
+        ends = torch.tensor([near]), torch.tensor([far])
+        depths, _, edges = stratified_depths(*ends, samples, jitter=False, spacing=spacing)
+        assert edges[0].tolist() == pytest.approx([formula(i / samples) for i in range(samples + 1)], rel=1e-6)
+        assert depths[0].tolist() == pytest.approx([formula((i + 0.5) / samples) for i in range(samples)], rel=1e-6)
 
 
 def test_disparity_from_distance_0_is_finite():
@@ -107,8 +99,8 @@ def test_disparity_from_distance_0_is_finite():
 
 def test_jitter_is_uniform_and_reproducible():
     near, far = torch.zeros(4000), torch.full((4000,), 4.0)
-    first = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
-    again = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
+    first = stratified_depths(near, far, 4, jitter=True, generator=seeded(3))[0]
+    again = stratified_depths(near, far, 4, jitter=True, generator=seeded(3))[0]
     assert torch.equal(first, again)
     inside = first - torch.arange(4.0)
     assert float(inside.mean()) == pytest.approx(0.5, abs=0.01)
@@ -117,7 +109,7 @@ def test_jitter_is_uniform_and_reproducible():
 
 def test_a_generator_of_another_device_draws_there():
     one = torch.ones(4, device="meta")
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
     parts = stratified_depths(one, one, 2, jitter=True, generator=generator)
     assert all(part.device.type == "meta" for part in parts)
     drawn = generator.get_state()
@@ -128,8 +120,8 @@ def test_a_generator_of_another_device_draws_there():
 @pytest.mark.cuda
 def test_a_generator_of_the_cpu_gives_cuda_rays_the_same_jitter():
     near, far = torch.zeros(40), torch.full((40,), 4.0)
-    expected = stratified_depths(near, far, 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
-    depths = stratified_depths(near.cuda(), far.cuda(), 4, jitter=True, generator=torch.Generator().manual_seed(3))[0]
+    expected = stratified_depths(near, far, 4, jitter=True, generator=seeded(3))[0]
+    depths = stratified_depths(near.cuda(), far.cuda(), 4, jitter=True, generator=seeded(3))[0]
     assert depths.is_cuda
     torch.testing.assert_close(depths.cpu(), expected)
     own = torch.Generator("cuda").manual_seed(3)
@@ -140,9 +132,7 @@ def test_no_rays_and_errors():
     none = torch.zeros(0)
     assert [tuple(t.shape) for t in stratified_depths(none, none, 3, jitter=True)] == [(0, 3), (0, 3), (0, 4)]
     one = torch.ones(1)
-    with pytest.raises(ValueError, match="samples must be >= 1, got 0"):
-        stratified_depths(one, one, 0, jitter=False)
-    with pytest.raises(ValueError, match="spacing must be one of linear, disparity, got 'log'"):
-        stratified_depths(one, one, 2, jitter=False, spacing="log")
-    with pytest.raises(ValueError, match=r"same shape \[r\], got \[1\] and \[2\]"):
-        stratified_depths(one, torch.ones(2), 2, jitter=False)
+    refuses("samples must be >= 1, got 0", stratified_depths, one, one, 0, jitter=False)
+    spacings = "spacing must be one of linear, disparity, got 'log'"
+    refuses(spacings, stratified_depths, one, one, 2, jitter=False, spacing="log")
+    refuses("same shape [r], got [1] and [2]", stratified_depths, one, torch.ones(2), 2, jitter=False)

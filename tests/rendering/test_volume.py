@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from helpers import refuses, seeded
 
 from voronerf.rendering.cameras import Rays, orbit_cameras
 from voronerf.rendering.renderer import render_image
@@ -20,7 +21,7 @@ def ball(positions, directions, ray_index):
 
 
 def rays(count=9):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     origins = torch.tensor((0.0, 0.0, 3.0)).repeat(count, 1)
     targets = torch.randn(count, 3, generator=generator) * 0.4
     return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1))
@@ -74,12 +75,9 @@ def test_homogeneous_medium():
 
 
 def test_rays_of_no_extent_show_the_background():
-    some = rays(2)
-    near = torch.tensor([2.0, 2.0])
-    result = render_rays(
-        ball, some, near, torch.tensor([2.0, 4.0]), samples=32, background=torch.tensor((0.1, 0.2, 0.3))
-    )
-    torch.testing.assert_close(result.colour[0], torch.tensor((0.1, 0.2, 0.3)))
+    ends, background = (torch.tensor([2.0, 2.0]), torch.tensor([2.0, 4.0])), torch.tensor((0.1, 0.2, 0.3))
+    result = render_rays(ball, rays(2), *ends, samples=32, background=background)
+    torch.testing.assert_close(result.colour[0], background)
     assert float(result.opacity[0]) == 0 and float(result.depth[0]) == 2
     assert float(result.opacity[1]) > 0.9
 
@@ -150,8 +148,8 @@ def test_no_gradient_and_errors():
         return positions * 0 + weight, positions[:, 0] * 0 + 1
 
     assert not render_image(learned, cameras(), 0, near=1.0, far=5.0, samples=2).colour.requires_grad
-    with pytest.raises(ValueError, match="chunk must be >= 1, got 0"):
-        render_image(ball, cameras(), 0, near=1.0, far=5.0, samples=2, chunk=0)
+    options = {"near": 1.0, "far": 5.0, "samples": 2}
+    refuses("chunk must be >= 1, got 0", render_image, ball, cameras(), 0, chunk=0, **options)
 
 
 def test_no_rays():
