@@ -150,7 +150,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
     includes = [f"-I{SOURCES}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
     # After CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h), fused ones are
-    # named, and NaN and infinity are told apart from numbers.
+    # named, and NaN and infinity are distinguished from numbers.
     extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off"]
     # libgomp is left out of the link: voronerf/native/__init__.py binds the module to the copy that torch has loaded.
     if cuda.nvcc is not None:

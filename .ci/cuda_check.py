@@ -4,9 +4,9 @@ Registers, spills, shared memory, and the warps that registers let a multiproces
 and compared with the table that is kept, .ci/cuda_resources.json: a spill that is not in it is a failure, and with the
 nvcc that it was made by so are registers or shared memory above it. ``--update`` writes it anew. The last architecture
 is compiled to PTX as well. Kernels of the toolkit's own (CUB) are counted and not judged: their names change with its
-version, and nobody here could mend them. A kernel whose resources are not reported for every architecture is a
-failure, and so is no kernel at all: nothing was checked then. So are products of four warps (wgmma) that ptxas
-serializes. The last line says in one sentence what was compiled and whether it held.
+version, and this project cannot change them. It is a failure if the resources of a kernel are not reported for every
+architecture, if there is no kernel at all, or if ptxas serializes products of four warps (wgmma). The last line says in
+one sentence what was compiled and whether it passed.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def main(architectures: list[str]) -> int:
         if f"sm_{arch}" not in found
     ]
     worse = [] if update else regressions(version, kernels)
-    # ptxas tells of products of four warps that it does not run side by side, but calls it no warning.
+    # ptxas reports products of four warps that it does not run side by side, but not as a warning.
     serial = [line.strip() for result in results for line in result.stderr.splitlines() if SERIAL in line]
     for line in [*worse, *serial]:
         print(line)

@@ -32,7 +32,7 @@ def on_stream(tensor: Tensor) -> AbstractContextManager[Any]:
 
 
 def launch(kernel: Any, threads: int | Sequence[int], inputs: Sequence[Any], tensor: Tensor) -> None:
-    """Runs a kernel with so many threads on a tensor's device, on torch's current stream there; none is no launch."""
+    """Runs a kernel on the device of a tensor, on torch's current stream; with 0 threads it launches nothing."""
     if (threads if isinstance(threads, int) else min(threads)) == 0:
         return
     stream = wp.stream_from_torch(tensor.device) if tensor.is_cuda else None

@@ -53,7 +53,7 @@ def _resample_kernel(
     for j in range(count):
         u = (wp.float64(j) + wp.float64(0.5)) / wp.float64(count)
         if given:
-            # Comparisons rather than min and max, here and below: what is not a number stays that.
+            # Comparisons rather than min and max, here and below: NaN stays NaN.
             u = wp.float64(uniforms[ray, j])
             if u < zero:
                 u = zero

@@ -64,7 +64,7 @@ def second_derivatives(
     Args:
         outputs: results of a formula, each with the gradient that arrives at it.
         firsts: tensors that the formula read, each with the cotangent of the gradient that it has got.
-        tensors: by which is differentiated, None where one is absent.
+        tensors: the inputs to differentiate by, None for an absent one.
         graph: whether the results are differentiated again.
 
     Returns:

@@ -35,7 +35,7 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     """The objects of a file with one JSON object a line; [] when there is no file.
 
     Raises:
-        ValueError: When a line is no JSON object; names the file and the line.
+        ValueError: When a line is not JSON object; names the file and the line.
     """
     if not path.is_file():
         return []
@@ -44,6 +44,6 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
         try:
             value = json.loads(line)
         except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: line {number} is no JSON: {error}") from None
+            raise ValueError(f"{path}: line {number} is not JSON: {error}") from None
         values.append(value)
     return values

@@ -66,7 +66,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         assert torch.equal(found, expected)
 
     def sort(n: int, k: int, way: str) -> None:
-        # Some cells that are none: they go to the ends.
+        # Some numbers that are not cells: they go to the ends.
         cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32, device=where)
         expected = specified(cells.cpu().clamp(-1, k) + 1, k + 2)
         order, offsets = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)

@@ -1,7 +1,7 @@
 """Everything to be learnt from a machine with a GPU, in one command: ``gpu_check.py --out DIR``.
 
 For a bare machine: torch with CUDA, nvcc and ninja, no network. Parts run one after another, each for itself: one that
-fails or runs into its limit is told with its last lines, and the next one begins. All of them together keep within
+fails or runs into its limit is reported with its last lines, and the next one begins. All of them together keep within
 --seconds, eight minutes by default, the most telling first: what finds no time any more is left out. ``--parts`` takes
 some of them, ``--data DIR`` is a Blender scene for the training.
 

@@ -67,7 +67,7 @@ class Journal:
         self.put(kind, [*self.found.get(kind, []), row])
 
     def put(self, kind: str, value: Any) -> None:
-        """A value in the place of the one that was there."""
+        """Replaces a value for a while."""
         self.found[kind] = value
         self.path.write_text(json.dumps(self.found, indent=1) + "\n")
 
@@ -141,7 +141,7 @@ class Again:
 
 
 Case = tuple[str, Callable[[], "str | None"]]
-"""A name, and what raises, or says something to be told."""
+"""A name, and a function that raises, or returns a line to print."""
 
 
 def one_by_one(cases: list[Case], again: Again, settle: Callable[[], None], journal: Journal) -> int:

@@ -177,7 +177,7 @@ def _keops_lookup(centres: Tensor) -> Lookup:
     def find(points: Tensor) -> Tensor:
         return (lazy(points[:, None, :]) - lazy(centres[None])).square().sum(2).argmin(1)[:, 0]
 
-    find(centres[:1])  # compiles, which is no part of the first call that is timed
+    find(centres[:1])  # compiles, which is not part of the first call that is timed
     return find
 
 

@@ -54,7 +54,7 @@ class Rows:
     ) -> list[float]:
         """Value of one variant less that of another, for each scene and seed that both have; PSNR by default.
 
-        Trainings of different machines are no pair: as many seconds are not as many steps there.
+        Trainings of different machines are not a pair: the same seconds are not the same number of steps there.
         """
         return list(self.paired(better, worse, scene, value).values())
 

@@ -113,7 +113,7 @@ def write_record(record: Path, results: Mapping[str, Row]) -> None:
 
 
 def keep(folders: Iterable[Path], record: Path) -> tuple[int, int]:
-    """Adds the results in run directories to a file, in the place of older ones; returns how many were new, and all.
+    """Adds the results in run directories to a file, instead of older ones; returns how many were new, and all.
 
     Results that do not say where they were made are taken to be of this machine, with as many threads.
     """

@@ -45,12 +45,12 @@ __device__ __forceinline__ int thread_again() {
 #endif
 }
 
-// Largest value of float16: what is larger would become infinite, and infinities in a network soon are no numbers.
+// Largest value of float16: larger values would become infinite, and infinities in a network soon become NaN.
 constexpr float kLargestHalf = 65504.0f;
 
 // Two floats, negative ones as zero if kRelu says so, rounded to 16 bits each, the first in the low half. Gradients are
 // not to be saturated: whoever scales a loss looks for the infinite ones. From sm_80 on all of it is one instruction;
-// what is no number stays that.
+// NaN stays NaN.
 template <bool kBfloat16, bool kSaturated = true, bool kRelu = false>
 __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
 #if !defined(VN_EMULATE) && __CUDA_ARCH__ >= 800
@@ -70,7 +70,7 @@ __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
   }
   return bits;
 #else
-  // Comparisons keep what is no number.
+  // Comparisons keep NaN.
   if constexpr (kRelu) {
     x = x < 0.0f ? 0.0f : x;
     y = y < 0.0f ? 0.0f : y;

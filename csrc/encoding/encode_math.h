@@ -12,7 +12,7 @@ namespace voronerf {
 
 // sin(angle + half pi): half 0 or 0.5, the cosine. With angle = (m - half) pi + r, |r| <= pi / 2, it is (-1)^m sin r.
 // pi in two parts and fused multiply-adds make r exact to rounding up to the largest angle; the polynomial's own error
-// is 5e-9. Beyond, and for what is no number, the library's own function with its long reduction.
+// is 5e-9. Beyond, and for NaN, the library's own function with its long reduction.
 constexpr float kLargestDeviceAngle = 65536.0f;
 
 VN_HD float sine_of_octave(float angle, float half) {
@@ -31,7 +31,7 @@ VN_HD float sine_of_octave(float angle, float half) {
 }
 
 // Turns of any angle that is not small, at least 1 in size: x / 2 pi less the nearest integer, to 2^-30; what is not
-// finite is no number. x is an integer of 24 bits times 2^shift, and of 1 / 2 pi only the bits count whose product with
+// finite is NaN. x is an integer of 24 bits times 2^shift, and of 1 / 2 pi only the bits count whose product with
 // it is below 1: 64 of them, from bit `shift` on, a method of Payne and Hanek (1983).
 VN_HD float turns_of_large(float x) {
   uint32_t bits;

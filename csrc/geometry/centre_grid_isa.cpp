@@ -53,7 +53,7 @@ VN_INLINE I32 cells_of(F32 x, float middle, float inverse, Mask& near) {
   const F32 drawn = add(min(size, one), mul(outside, splat(1.0f / 3.0f)));
   const F32 p = as_float(tag(as_integer(drawn), splat(0x7fffffff), both(as_integer(u), splat(INT32_MIN))));
   const F32 scaled = mul(add(p, splat(4.0f / 3.0f)), splat(0.375f * (1 << kCellBits)));
-  // What is not a number is looked up in cell 0.
+  // NaN is looked up in cell 0.
   return truncate(max(min(scaled, splat(static_cast<float>((1 << kCellBits) - 1))), splat(0.0f)));
 }
 

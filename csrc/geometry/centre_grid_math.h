@@ -25,7 +25,7 @@ constexpr double kWiden = 2e-6;
 constexpr double kReach = 1024.0;
 constexpr double kEdge = 1100.0;  // where the box of an outermost cell ends
 
-// Cell along an axis; -1 beyond reach and for what is not a number.
+// Cell along an axis; -1 beyond reach and for NaN.
 VN_HD int32_t grid_cell(double x, double middle, double inverse) {
   const double u = (x - middle) * inverse, size = u < 0.0 ? -u : u;
   if (!(size <= kReach)) return -1;

@@ -25,7 +25,7 @@ __device__ float squared_distance(const float* point, const Diagram& in, int32_t
   return in.weights == nullptr ? squared : squared + (in.heaviest - in.weights[j]);
 }
 
-// 0 for what is no number, as of a point that is not finite. 1 at most, which the device's exponential may exceed by
+// 0 for NaN, as of a point that is not finite. 1 at most, which the device's exponential may exceed by
 // its rounding.
 __device__ float mass_of(float nearest, float squared, float temperature) {
   const float mass = expf((nearest - sqrtf(squared)) / temperature);
@@ -42,7 +42,7 @@ __device__ int32_t drawn_in(const float* point, const float* centres, const floa
   float total = 0.0f;
   for (int32_t j = 0; j < k; ++j) total += mass_of(nearest, squared_distance(point, in, j), temperature);
   if (!(total > 0.0f)) return 0;
-  // The minimum of 1 and what is no number is 1: it counts as 0.
+  // The minimum of 1 and NaN is 1: NaN counts as 0.
   const float wanted = fmaxf(fminf(1.0f - uniform, 1.0f), kLeast) * total;
   float sum = 0.0f;
   for (int32_t j = 0; j < k; ++j) {

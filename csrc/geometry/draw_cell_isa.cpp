@@ -44,7 +44,7 @@ VN_INLINE I32 vector(const float* points, const float* uniforms, const float* ce
   F32 x, y, z;
   load_points(points, x, y, z);
   F32 near = splat(kInfinity);
-  // What is not a number is no minimum: `min` returns its second operand then.
+  // NaN is never the minimum: `min` returns its second operand then.
   for (int64_t j = 0; j < k; ++j) {
     near = min(squared_distance<Weighted>(x, y, z, centres, weights, heaviest, j), near);
   }
@@ -65,7 +65,7 @@ VN_INLINE I32 vector(const float* points, const float* uniforms, const float* ce
   F32 u;
   __builtin_memcpy(&u, uniforms, sizeof u);
   // 1 - u: above 0, so that a centre without mass is never drawn, at most 1, so that the last with mass is the last;
-  // one that is not a number counts as 0.
+  // NaN counts as 0.
   const F32 target = mul(max(min(sub(splat(1.0f), u), splat(1.0f)), splat(kLeast)), total);
   I32 cell = splat(int32_t{0});
   for (int64_t j = 0; j < k; ++j) {

@@ -33,7 +33,7 @@ void resample_ray(const float* weights, const float* edges, const float* uniform
   const auto mass = [&](int64_t i) { return even ? 1.0 : static_cast<double>(weight(i)); };
   if (uniforms != nullptr) {
     std::copy(uniforms, uniforms + count, depths);
-    // What is not a number goes last.
+    // NaN goes last.
     std::sort(depths, std::partition(depths, depths + count, [](float u) { return !std::isnan(u); }));
   }
 

@@ -17,7 +17,7 @@ __device__ double mass_of(float weight) {
   return weight > 0.0f && weight <= 3.402823466e38f ? static_cast<double>(weight) : 0.0;
 }
 
-// Before another in the order of depths: by value, what is no number last.
+// Before another in the order of depths: by value, NaN last.
 __device__ bool is_before(float a, float b) {
   return a < b || (b != b && a == a);
 }
@@ -79,7 +79,7 @@ __global__ void __launch_bounds__(kThreads)
         low = middle + 1;
       }
     }
-    // A target that is no number comes out as the last bin, and its depth as no number.
+    // A NaN target comes out as the last bin, with a NaN depth.
     const double mass = even ? 1.0 : mass_of(weight[low]);
     const double lower = even ? static_cast<double>(low) : (low == 0 ? 0.0 : upper[low - 1]);
     double inside = (target - lower) / mass;

@@ -7,7 +7,7 @@
 namespace voronerf {
 
 // density: [n], rows: [q] numbers of cells, values: [q] -> result: [n], occupied: [n], 0 or 1. Returns false, with
-// nothing of use written, if a number is no cell's.
+// nothing of use written, if a number is not that of a cell.
 bool update_occupancy_cpu(const float* density, const int32_t* rows, const float* values, float* result,
                           uint8_t* occupied, int64_t n, int64_t q, float decay, float threshold, int threads);
 

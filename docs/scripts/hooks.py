@@ -14,7 +14,7 @@ MARKER = "<!-- options -->"
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """Puts the tables of options in the place of the marker."""
+    """Replaces the marker by the tables of options."""
     if page.file.src_uri == "options.md":
         assert MARKER in markdown, f"docs/options.md must hold {MARKER}"
         return markdown.replace(MARKER, options.markdown())

@@ -175,7 +175,7 @@ def test_help_has_units(capsys):
 def test_bad_input_is_one_line(run, tmp_path, capsys):
     out = str(tmp_path / "out")
     assert "there is no such folder" in error_of(capsys, "train", "--data", str(tmp_path / "none"), "--out", out)
-    assert "is no scene" in error_of(capsys, "train", "--data", str(tmp_path), "--out", out)
+    assert "is not a scene" in error_of(capsys, "train", "--data", str(tmp_path), "--out", out)
     assert "--cells must be at least 2" in error_of(capsys, "train", "--cells", "0", "--out", out)
     assert "--device must name a device" in error_of(capsys, "train", "--device", "gpu", "--out", out)
     assert "must not hold a run already" in error_of(capsys, "train", "--out", str(run))

@@ -32,9 +32,9 @@ def fails(folder, *parts, downscale=1):
 
 def test_folder(tmp_path):
     fails(tmp_path / "nowhere", "nowhere: there is no such folder")
-    fails(tmp_path, "is no scene", "transforms_train.json", "transforms.json")
+    fails(tmp_path, "is not a scene", "transforms_train.json", "transforms.json")
     (tmp_path / "file").write_text("")
-    fails(tmp_path / "file", "file: is no folder")
+    fails(tmp_path / "file", "file: is not a folder")
 
 
 def test_downscale(tmp_path):
@@ -48,9 +48,9 @@ def test_downscale(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("{", "is no JSON"),
-        (b"\xff\xfe\x00", "is no JSON"),
-        ("", "is no JSON"),
+        ("{", "is not JSON"),
+        (b"\xff\xfe\x00", "is not JSON"),
+        ("", "is not JSON"),
         ("[]", "has no frames"),
         ("{}", "has no frames"),
         ('{"frames": []}', "has no frames"),
@@ -74,17 +74,17 @@ def edited(row, column, value):
 @pytest.mark.parametrize(
     ("matrix", "reason"),
     [
-        (edited(0, 0, 2.0), "is no rotation"),
+        (edited(0, 0, 2.0), "is not a rotation"),
         (edited(0, 0, -1.0), "determinant -1"),
-        (edited(0, 1, 0.1), "is no rotation"),
+        (edited(0, 1, 0.1), "is not a rotation"),
         (edited(1, 3, math.nan), "not finite"),
         (edited(1, 1, math.inf), "not finite"),
         (edited(3, 3, 2.0), "last row must be 0 0 0 1"),
-        (edited(0, 0, "one"), "no matrix of numbers"),
+        (edited(0, 0, "one"), "not a matrix of numbers"),
         (POSE[:2], "must be 4 x 4, got shape [2, 4]"),
-        ([[1, 2], [3]], "no matrix of numbers"),
+        ([[1, 2], [3]], "not a matrix of numbers"),
         (None, "must be 4 x 4"),
-        *[(edited(*at, 10**400), "is no matrix of numbers") for at in ((0, 0), (1, 3))],
+        *[(edited(*at, 10**400), "is not a matrix of numbers") for at in ((0, 0), (1, 3))],
         *[(edited(*at, 1e300), "are not finite") for at in ((0, 0), (1, 3))],
     ],
     ids=range(14),
@@ -106,8 +106,8 @@ def test_images(tmp_path):
     write_noise(tmp_path)
     path, whole = tmp_path / "2.png", (tmp_path / "2.png").read_bytes()
     for broken, reason in (
-        (b"no image at all", "is no image"),
-        (b"", "is no image"),
+        (b"no image at all", "is not an image"),
+        (b"", "is not an image"),
         (whole[: len(whole) // 2], "cannot be read"),
         (whole[:50] + bytes(40) + whole[90:], "cannot be read"),
     ):
@@ -155,7 +155,7 @@ def test_more_digits_than_python_reads(tmp_path):
     write_noise(tmp_path, k1=0)
     path = tmp_path / "transforms.json"
     path.write_text(path.read_text().replace('"k1": 0', '"k1": 1' + "0" * sys.get_int_max_str_digits()))
-    fails(tmp_path, "transforms.json: is no JSON")
+    fails(tmp_path, "transforms.json: is not JSON")
 
 
 def test_blender(tmp_path):

@@ -89,4 +89,4 @@ def test_text_is_replaced_whole_and_broken_lines_of_json_are_named(tmp_path):
     write_text(path, '{"step": 1}\n')
     assert read_json_lines(path) == [{"step": 1}]
     write_text(path, '{"step": 1}\n{"ste')
-    refuses("metrics.jsonl: line 2 is no JSON", read_json_lines, path)
+    refuses("metrics.jsonl: line 2 is not JSON", read_json_lines, path)

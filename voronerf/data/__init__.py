@@ -46,5 +46,5 @@ def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
     if (folder / "transforms.json").is_file():
         return load_capture(folder, downscale)
     if not folder.is_dir():
-        raise SceneError(f"{folder}: is no folder")
-    raise SceneError(f"{folder}: is no scene, it has neither transforms_train.json (Blender) nor transforms.json")
+        raise SceneError(f"{folder}: is not a folder")
+    raise SceneError(f"{folder}: is not a scene, it has neither transforms_train.json (Blender) nor transforms.json")

@@ -60,7 +60,7 @@ def read_image(path: Path, factor: int) -> tuple[NDArray[np.uint8], tuple[int, i
         (pixels [h, w, 3 or 4], (width, height) of the file before the reduction).
 
     Raises:
-        SceneError: the file is no image, is truncated, has more than 8 bits a channel or too few pixels.
+        SceneError: the file is not an image, is truncated, has more than 8 bits a channel or too few pixels.
     """
     try:
         with Image.open(path) as file:
@@ -79,7 +79,7 @@ def read_image(path: Path, factor: int) -> tuple[NDArray[np.uint8], tuple[int, i
     except SceneError:
         raise
     except UNREADABLE as error:
-        reason = "is no image" if isinstance(error, Image.UnidentifiedImageError) else f"cannot be read: {error}"
+        reason = "is not an image" if isinstance(error, Image.UnidentifiedImageError) else f"cannot be read: {error}"
         raise SceneError(f"{path}: {reason}") from None
     pixels = area_average(pixels, rest)
     return pixels[: size[1] // factor, : size[0] // factor], size

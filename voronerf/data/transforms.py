@@ -44,7 +44,7 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
         (the file's top-level entries, the frames whose image exists, in the file's order).
 
     Raises:
-        SceneError: the file does not parse, has no frames, no image of any frame exists, or a matrix is no pose.
+        SceneError: the file does not parse, has no frames, no image of any frame exists, or a matrix is not a pose.
     """
     try:
         entries = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -52,7 +52,7 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
         ValueError,
         RecursionError,
     ) as error:  # ValueError: syntax, encoding, too long an integer
-        raise SceneError(f"{path}: is no JSON: {error}") from None
+        raise SceneError(f"{path}: is not JSON: {error}") from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
     frames = entries.get("frames") if isinstance(entries, dict) else None
@@ -82,7 +82,7 @@ def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = Fa
     """A finite number of a transforms file; None if the entry is missing.
 
     Raises:
-        SceneError: the entry is no number, not finite in float32, or not positive where it must be.
+        SceneError: the entry is not a number, not finite in float32, or not positive where it must be.
     """
     value = entries.get(key)
     if value is None:
@@ -125,7 +125,7 @@ def _pose(matrix: object, where: str) -> Tensor:
     try:
         values = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise SceneError(f"{where}: transform_matrix is no matrix of numbers") from None
+        raise SceneError(f"{where}: transform_matrix is not a matrix of numbers") from None
     if values.shape not in ((4, 4), (3, 4)):
         raise SceneError(f"{where}: transform_matrix must be 4 x 4, got shape {list(values.shape)}")
     if not (np.abs(values) <= LARGEST).all():
@@ -134,11 +134,11 @@ def _pose(matrix: object, where: str) -> Tensor:
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > ORTHONORMAL or np.linalg.det(rotation) < 0:
         raise SceneError(
-            f"{where}: transform_matrix is no pose, its upper left 3 x 3 is no rotation "
+            f"{where}: transform_matrix is not a pose, its upper left 3 x 3 is not a rotation "
             f"(determinant {np.linalg.det(rotation):.3g}, off orthonormal by {error:.2g})"
         )
     if values.shape[0] == 4 and np.abs(values[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise SceneError(f"{where}: transform_matrix is no pose, its last row must be 0 0 0 1")
+        raise SceneError(f"{where}: transform_matrix is not a pose, its last row must be 0 0 0 1")
     pose = np.eye(4)
     pose[:3] = values[:3]
     return torch.from_numpy(pose)

@@ -135,7 +135,7 @@ def _soft_siblings(squared: Tensor, siblings: Tensor, apart: Tensor, margin: flo
     """The weights of siblings.
 
     Args:
-        squared: [e, k], squared distances less power weights; infinite for what is no sibling.
+        squared: [e, k], squared distances less power weights; infinite for entries that are not siblings.
         siblings: int64 [e, k], rows of the centres.
         apart: [m, >= k], what `_apart` gives.
         margin: M.

@@ -8,7 +8,7 @@ say, and cells that stay on one object share that among 10 or 11. The rest must 
 and a plain cell cannot: whatever lies on an object is closer to the centres on it. Power weights can. For given
 centres, the weights whose cells `|x - v_i|^2 - p_i` hold equal importance exist, and they are the maximum of the
 concave dual of an optimal transport problem (Aurenhammer, Hoffmann and Aronov 1998, "Minkowski-type theorems and
-least-squares clustering"; Merigot 2011), so that finding them is no matter of luck. Two stages:
+least-squares clustering"; Merigot 2011), so finding them does not depend on luck. Two stages:
 
 `anneal` finds them up to the granularity of the samples. Assignment is softened to a softmax of temperature T, which
 makes the dual smooth; one damped Newton step is made at each T while T falls from the size of the scene to below the

@@ -15,7 +15,7 @@ def check_video(path: Path) -> None:
     """Finds out before the frames are there whether :func:`write_video` can write them; makes the folder.
 
     Raises:
-        ValueError: a suffix that is no container of H.264 known here.
+        ValueError: an unknown suffix; it must be that of a container of H.264.
         ImportError: imageio-ffmpeg, or the ffmpeg that it brings, is not installed.
         OSError: the folder cannot be written.
     """
@@ -74,7 +74,7 @@ def write_video(path: Path, frames: Tensor, fps: float) -> None:
         for frame in even:
             writer.send(frame.cpu().contiguous().numpy())
         writer.close()
-        try:  # ffmpeg's own exit status is not told
+        try:  # imageio does not return the exit status of ffmpeg
             written, _ = imageio_ffmpeg.count_frames_and_secs(str(partial))
         except RuntimeError:
             written = 0

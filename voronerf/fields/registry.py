@@ -114,7 +114,7 @@ def register_field(name: str) -> Callable[[Network], Network]:
         >>> del FIELDS["tiny"]
 
     Raises:
-        ValueError: for a name that is no word, or inputs that are neither points nor Gaussians.
+        ValueError: for a name that is not a word, or inputs that are neither points nor Gaussians.
     """
     if not name or not all(part.isalnum() for part in name.replace("_", "-").split("-")):
         raise ValueError(f"register_field: name must be a word, got {name!r}")

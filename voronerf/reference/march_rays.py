@@ -76,7 +76,7 @@ def march_rays(
         place = origins[:, axis, None] + at * directions[:, axis, None]
         place = (place - box[0, axis]) * scale
         taken = taken & (place >= 0) & (place <= size)
-        # What is not a number has been left out; it may become any integer.
+        # NaN has been left out; it may become any integer.
         cell = cell * size + place.nan_to_num(0).clamp(0, size).long().clamp(max=size - 1)
     taken = taken & (occupied.reshape(-1)[cell] != 0)
     if start is not None:

@@ -226,7 +226,7 @@ class TrainConfig:
         """Reads what :meth:`to_json` wrote.
 
         Raises:
-            ConfigError: For text that is no configuration, or one of another version; names ``source``.
+            ConfigError: For text that is not a configuration, or one of another version; names ``source``.
         """
         try:
             values: dict[str, Any] = json.loads(text)

@@ -19,7 +19,7 @@
 #include "network/cpu/bfloat16_tile.h"
 
 #ifndef VN_HALF
-#error "define VN_HALF: 0 for float32 operands, 1 for a pair of bfloat16 in the place of each float"
+#error "define VN_HALF: 0 for float32 operands, 1 for a pair of bfloat16 instead of each float"
 #endif
 
 namespace voronerf {

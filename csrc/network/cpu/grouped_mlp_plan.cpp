@@ -69,7 +69,7 @@ void MlpPlanner::place_buffers() {
   for (int64_t l = 0; l < count; ++l) {
     MlpPlanLayer& layer = layers_[l];
     if (!layer.live) continue;
-    // With bfloat16 operands a value that is no output is read only while it is narrowed.
+    // With bfloat16 operands, a value that is not an output is read only while it is narrowed.
     const int64_t last = plan_.gradients ? end : plan_.half && !layer.from_output ? l + 1 : last_use[l];
     layer.value = buffer(layer.width, l + 1, last);
     if (plan_.half) layer.narrow = pairs(layer.width, l + 1, plan_.gradients ? end : last_use[l]);
