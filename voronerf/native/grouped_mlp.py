@@ -3,7 +3,8 @@
 n samples, r rays, k cells, p and q features of a raw position and direction, i inputs and o outputs of a layer. Tensors
 are cast to float32 on the way in and back on the way out, a cell having few weights. With bfloat16 storage, or under
 autocast to it, products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16), and float32
-ones elsewhere; sums are float32 always. Second derivatives come from the reference formula.
+ones elsewhere; sums are float32 always. Gradients that will be differentiated again are taken layer by layer
+(``layerwise.py``).
 """
 
 from __future__ import annotations
@@ -17,11 +18,10 @@ import torch
 from torch import Tensor
 
 from voronerf import native
-from voronerf.derivatives import aliases, second_derivatives
+from voronerf.derivatives import asked_for
 from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 from voronerf.native.custom_op import custom_op, on_huge_pages
 from voronerf.native.layer_table import Table, compiled_table, in_float32, network
-from voronerf.reference.grouped_mlp import grouped_mlp as _reference
 
 # Of one layer, whose width does not matter here.
 _LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
@@ -228,82 +228,44 @@ def _on_cuda(
 def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     positions, offsets, weights, biases, ctx.table, directions, direction_index = inputs
     ctx.count = len(weights)
-    ctx.save_for_backward(positions, offsets, directions, direction_index, *weights, *biases)
+    ctx.save_for_backward(positions, offsets, *weights, *biases, directions, direction_index)
 
 
 def _forward_backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
-    positions, offsets, directions, direction_index, *parameters = ctx.saved_tensors
-    weights, biases = parameters[: ctx.count], parameters[ctx.count :]
-    needs = ctx.needs_input_grad
-    wanted = [any(needs[2]) or any(needs[3]), needs[0], needs[5]]
-    results = backward(
-        gradient, positions, offsets, weights, biases, ctx.table, directions, direction_index, None, wanted
-    )
-    return (
-        results[-2] if needs[0] else None,
-        None,
-        [result if need else None for result, need in zip(results, needs[2])],
-        [result if need else None for result, need in zip(results[ctx.count :], needs[3])],
-        None,
-        results[-1] if needs[5] else None,
-        None,
-    )
+    positions, offsets, *parameters, directions, direction_index = ctx.saved_tensors
+    to_positions, _, *to_parameters, to_directions, _ = asked_for(ctx, ctx.saved_tensors)
+    network = positions, offsets, parameters[: ctx.count], parameters[ctx.count :], ctx.table, directions
+    found = gradients(gradient, *network, direction_index, None, asked=(*to_parameters, to_positions, to_directions))
+    *of_parameters, of_positions, of_directions = found
+    of_weights, of_biases = of_parameters[: ctx.count], of_parameters[ctx.count :]
+    return of_positions, None, of_weights, of_biases, None, of_directions, None
 
 
-def _backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
-    gradient, positions, offsets, weights, biases, ctx.table, directions, direction_index, order, ctx.wanted = inputs
-    ctx.count = len(weights)
-    ctx.save_for_backward(gradient, positions, offsets, directions, direction_index, order, *weights, *biases)
+def gradients(
+    gradient: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: str,
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    order: Tensor | None,
+    *,
+    asked: Sequence[bool],
+) -> list[Tensor | None]:
+    """Gradients of weights, biases, positions and directions, None for those that are not asked for."""
+    if torch.is_grad_enabled():
+        # Late: that module takes grouped_linear, which takes this one for CUDA.
+        from voronerf.native.layerwise import gradients as differentiable
 
-
-def _backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
-    """Derivative of the gradients, through the reference formula."""
-    gradient, positions, offsets, directions, direction_index, order, *parameters = ctx.saved_tensors
-    count = ctx.count
-    leaves, graph = aliases((*parameters, positions, directions, gradient))
-    with torch.enable_grad():
-        *inputs, gradient = leaves
-        rows, seen = _given(leaves[-3]), leaves[-2]
-        if order is not None:
-            rows, gradient = rows[order], _given(gradient)[order]
-            if direction_index is not None:
-                direction_index = direction_index[order]
-            elif seen is not None:
-                seen = seen[order]
-        out = _reference(
-            rows,
-            offsets,
-            [_given(weight) for weight in leaves[:count]],
-            [bias if _given(bias).numel() else None for bias in leaves[count : 2 * count]],
-            layers=Table.parse(ctx.table).with_widths(parameters[:count]),
-            directions=seen,
-            direction_index=direction_index,
-        )
-        chosen = [ctx.wanted[0]] * (2 * count) + [ctx.wanted[1], ctx.wanted[2]]
-        pairs = [
-            (tensor, cotangent)
-            for tensor, cotangent, want in zip(inputs, cotangents, chosen)
-            if want and tensor is not None and tensor.numel() and cotangent is not None
-        ]
-        results = second_derivatives([(out, gradient)], pairs, leaves, graph)
-    return (
-        results[-1],
-        results[-3],
-        None,
-        results[:count],
-        results[count : 2 * count],
-        None,
-        results[-2],
-        None,
-        None,
-        None,
-    )
-
-
-def _given(tensor: Tensor | None) -> Tensor:
-    assert tensor is not None
-    return tensor
+        layers = Table.parse(table).with_widths(weights)
+        given = gradient, positions, offsets, weights, biases, layers, directions, direction_index, order
+        return differentiable(*given, asked=asked)
+    *parameters, to_positions, to_directions = asked
+    wanted = [any(parameters), to_positions, to_directions]
+    results = backward(gradient, positions, offsets, weights, biases, table, directions, direction_index, order, wanted)
+    return [result if want else None for result, want in zip(results, asked)]
 
 
 _forward.register_autograd(_forward_backward, setup_context=_forward_setup)
-backward.register_autograd(_backward_backward, setup_context=_backward_setup)

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf.derivatives import asked_for
 from voronerf.layers import MLP
 from voronerf.native import cell_sort, grouped_mlp, locate_cell, nearest_centre
 from voronerf.native.custom_op import custom_op
@@ -105,36 +106,29 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tens
     ctx.count, ctx.alone = len(weights), cells is None and centres is None
     ctx.mark_non_differentiable(found, order, offsets)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(positions, directions, direction_index, order, offsets, *weights, *biases)
+    ctx.save_for_backward(order, offsets, positions, *weights, *biases, directions, direction_index)
 
 
-def _backward(ctx: Any, gradient: Tensor | None, *_: None) -> tuple[Any, ...]:
-    nothing = [None] * ctx.count
+def _backward(ctx: Any, gradient: Tensor | None, *_others: None) -> tuple[Any, ...]:
+    count = ctx.count
     if gradient is None:
-        return (None, nothing, nothing, *[None] * 10)
-    positions, directions, direction_index, order, offsets, *parameters = ctx.saved_tensors
-    weights, biases = parameters[: ctx.count], parameters[ctx.count :]
-    needs = ctx.needs_input_grad
-    results = grouped_mlp.backward(
+        return (None, [None] * count, [None] * count, *[None] * 10)
+    order, offsets, *inputs = ctx.saved_tensors
+    positions, *parameters, directions, direction_index = inputs
+    to_positions, *to_parameters, to_directions, _ = asked_for(ctx, inputs)
+    *of_parameters, of_positions, of_directions = grouped_mlp.gradients(
         gradient,
         positions,
         offsets,
-        weights,
-        biases,
+        parameters[:count],
+        parameters[count:],
         ctx.table,
         directions,
         direction_index,
         None if ctx.alone else order,
-        [any(needs[1]) or any(needs[2]), needs[0], needs[4]],
+        asked=(*to_parameters, to_positions, to_directions),
     )
-    return (
-        results[-2] if needs[0] else None,
-        [result if need else None for result, need in zip(results, needs[1])],
-        [result if need else None for result, need in zip(results[ctx.count :], needs[2])],
-        None,
-        results[-1] if needs[4] else None,
-        *[None] * 8,
-    )
+    return of_positions, of_parameters[:count], of_parameters[count:], None, of_directions, *[None] * 8
 
 
 _forward.register_autograd(_backward, setup_context=_setup)
