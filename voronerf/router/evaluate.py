@@ -96,7 +96,7 @@ class Choices:
             return
         self._said.add(topic)
         level, frame = 1, inspect.currentframe()
-        while frame is not None and is_inside(frame.f_code.co_filename):
+        while frame is not None and is_inside(frame.f_code.co_filename, package=True):
             level, frame = level + 1, frame.f_back
         warnings.warn(f"{_OP}: {message}", stacklevel=level)
 

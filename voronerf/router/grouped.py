@@ -148,9 +148,9 @@ def name_of(function: Any) -> str:
     return resolved or getattr(function, "__qualname__", None) or str(function)
 
 
-def is_inside(file: str) -> bool:
-    """Whether a file is one of PyTorch or the router."""
-    return file.startswith((_TORCH, _HERE))
+def is_inside(file: str, package: bool = False) -> bool:
+    """Whether a file is one of PyTorch or the router, or of this package."""
+    return file.startswith((_TORCH, os.path.dirname(_HERE[:-1]) if package else _HERE))
 
 
 def user_line() -> str:

@@ -94,7 +94,7 @@ class Trace:
         steps: In order.
         sizes: Of every value of rows, rows for each sample and the dimensions behind; None for one of parameters.
         parameters: Values that are parameters, with their owner in the routed module and their name.
-        result: What the module returned.
+        result: What the module returned, for its structure.
         outputs: For each tensor of the result a Ref, or the tensor where it depends on no sample.
     """
 
@@ -142,7 +142,7 @@ def trace_call(original: nn.Module, module: nn.Module, call: Call, given: Given)
     with in_place_of_parameters(module, single), recorder:
         result = call.function(module)(*given.args, **given.kwargs)
     recorder.trace.outputs = [recorder.ref(tensor) for tensor in tensors_of(result)]
-    recorder.trace.result = rebuild(result, recorder.trace.outputs)
+    recorder.trace.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
     return recorder.trace
 
 

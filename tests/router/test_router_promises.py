@@ -1,0 +1,512 @@
+"""What a user says of a module (`fuse`, `share`, `layout`, `register`), and what the router says back (`explain`)."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from convention_harness import randomised
+from convention_listed import LISTED, example, ngp, uniform
+from router_fields import SkipNet, gradients, masked_loop, perturb, tensors
+from torch import Tensor, nn
+
+from voronerf import NeRF, VoronoiRouter
+from voronerf.router import register
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(7)
+
+
+def centres(k: int = 6) -> Tensor:
+    return torch.rand(k, 3, generator=torch.Generator().manual_seed(k)) * 2 - 1
+
+
+def equal_to_loop(router: VoronoiRouter, args: list[Tensor], generator: torch.Generator, second: bool = False) -> None:
+    """Results and gradients against a mask and a module for each cell."""
+    args = [a.clone().requires_grad_() for a in args]
+    found = tensors(router(*args))
+    expected, modules = masked_loop(router, router.diagram.locate(args[0][:, :3].detach()), args)
+    factors = [torch.randn(e.shape, generator=generator) for e in expected]
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+    names = [name for name, _ in router.module.named_parameters()]
+    ours = gradients(found, factors, [*args, *router.module.parameters()], second)
+    theirs = gradients(expected, factors, [*args, *(m.get_parameter(n) for n in names for m in modules)], second)
+    for a, b in zip(ours[: len(args)], theirs[: len(args)], strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
+    for i, gradient in enumerate(ours[len(args) :]):
+        first = len(args) + i * len(modules)
+        parts = torch.stack(theirs[first : first + len(modules)])
+        shared = gradient.shape == parts.shape[1:]
+        torch.testing.assert_close(
+            gradient, parts.sum(0) if shared else parts, rtol=2e-3, atol=2e-3 if second else 2e-4
+        )
+
+
+# fuse -----------------------------------------------------------------------------------------------------------------
+
+
+class Siren(nn.Module):
+    """Sines of scaled layers; the last scale is a number on the left."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b, self.out = nn.Linear(3, 8), nn.Linear(8, 8), nn.Linear(8, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(torch.sin(3.0 * self.b(torch.sin(self.a(x) * 5))))
+
+
+class WeightNorm(nn.Module):
+    """Weights computed from parameters by hooks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.a, self.b = (nn.utils.weight_norm(nn.Linear(i, o)) for i, o in ((3, 8), (8, 4)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.b(F.relu(self.a(x)))
+
+
+class TruncExp(torch.autograd.Function):
+    """As torch-ngp's: the exponential of small numbers only in the backward pass, under automatic mixed precision."""
+
+    @staticmethod
+    @torch.amp.custom_fwd(device_type="cpu", cast_inputs=torch.float32)
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return torch.exp(x)
+
+    @staticmethod
+    @torch.amp.custom_bwd(device_type="cpu")
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        return gradient * torch.exp(x.clamp(max=-1))
+
+
+trunc_exp = TruncExp.apply
+
+
+class Truncated(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(3, 8), nn.ReLU(inplace=True), nn.Linear(8, 4))
+
+    def forward(self, x: Tensor) -> dict[str, Tensor]:
+        h = self.net(x)
+        return {"sigma": trunc_exp(h[..., 0]), "rgb": torch.sigmoid(h[..., 1:])}
+
+
+FUSED: list[tuple[type[nn.Module], int]] = [(SkipNet, 15), (Siren, 3), (WeightNorm, 3), (Truncated, 3)]
+
+
+@pytest.mark.parametrize(("make", "features"), FUSED)
+def test_fused_networks_equal_a_loop_over_masks(
+    make: type[nn.Module], features: int, generator: torch.Generator
+) -> None:
+    router = perturb(VoronoiRouter(make(), centres(), coords="first3", fuse=True), generator)
+    x = torch.rand(77, features, generator=generator) * 2 - 1
+    equal_to_loop(router, [x], generator)
+    assert router.explain() == "forward: fused"
+    if make in (SkipNet, Siren):
+        equal_to_loop(router, [x], generator, second=True)
+
+
+@pytest.mark.parametrize("case", [c for c in LISTED if "studio" not in c.name and "mega" not in c.name], ids=str)
+def test_the_codebases_of_examples_fuse(case: Any) -> None:
+    field = randomised(case.make())
+    if case.name == "torch-ngp color of a part of the samples":
+        return
+    router = VoronoiRouter(field, centres(), fuse=True, **case.options)
+    args, kwargs = case.arguments(case.lead)
+    found, expected = (tensors(case.call(module, args, kwargs)) for module in (router, field))
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+    assert f"{case.method}: fused" in router.explain()
+
+
+class Forward(nn.Module):
+    """Linear layers around a step."""
+
+    def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.a, self.b, self.step = nn.Linear(3, 8), nn.Linear(8, 2), [step]
+        self.norm, self.gain = nn.LayerNorm(8), nn.Parameter(torch.ones(8))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.b(self.step[0](self, F.relu(self.a(x))))
+
+
+@pytest.mark.parametrize(
+    ("step", "says"),
+    [
+        (lambda net, h: torch.tanh(h), r"reads the result of torch.tanh \(test_router_promises.py:\d+: \(lambda"),
+        (lambda net, h: net.norm(h), "parameters meet samples in torch.nn.functional.layer_norm"),
+        (lambda net, h: h * net.gain, r"parameters meet samples in torch.Tensor.mul \(test_router_promises.py"),
+        (lambda net, h: h + torch.rand_like(h), r"draws random numbers"),
+        (lambda net, h: F.dropout(h, 0.5), r"torch.nn.functional.dropout draws random numbers"),
+        (lambda net, h: h if h.max() > 0 else -h, r"has no row for each of 37 samples"),
+        (lambda net, h: torch.autograd.grad(h.sum(0)[None].sum(), h)[0], "no row for each"),
+        (lambda net, h: h.detach() if torch.set_grad_enabled(False) else h, "no"),
+    ],
+)
+def test_what_does_not_fuse_is_refused_with_its_line(step: Any, says: str) -> None:
+    router = VoronoiRouter(Forward(step), centres(), coords="first3", fuse=True)
+    before = torch.is_grad_enabled()
+    try:
+        with pytest.raises(
+            ValueError, match=r"VoronoiRouter: fuse=True needs a network that .* Forward.forward.*" + says
+        ):
+            router(uniform((50,)))
+    finally:
+        torch.set_grad_enabled(before)
+
+
+def test_a_network_that_could_fuse_is_said_once_where_the_router_is_called() -> None:
+    router = VoronoiRouter(SkipNet(), centres(), coords="first3")
+    with pytest.warns(UserWarning, match=r"SkipNet.forward runs grouped; .* fuse=True\) runs it") as said:
+        for n in (50, 60):
+            router(uniform((n,), 15))
+            router(uniform((n,), 15).requires_grad_())
+    assert [warning.filename for warning in said] == [__file__]
+    assert router.explain() == "forward: grouped"
+
+
+def test_fused_networks_follow_parameters_cells_and_copies(generator: torch.Generator) -> None:
+    x = torch.rand(60, 15, generator=generator) * 2 - 1
+    router = perturb(VoronoiRouter(SkipNet(), centres(), coords="first3", fuse=True), generator)
+    before = router(x)
+    perturb(router, generator)
+    assert not torch.allclose(router(x), before)
+    same = router(x)
+    finer, parents = router.diagram.refine({0: centres(3)})
+    router.subdivide(finer, parents)
+    torch.testing.assert_close(router(x), same)
+    for copied in (copy.deepcopy(router), pickle.loads(pickle.dumps(router))):
+        torch.testing.assert_close(copied(x), same)
+        assert copied.explain() == "forward: fused"
+    doubled = {name: value.double() for name, value in router.state_dict().items() if value.is_floating_point()}
+    assert torch.func.functional_call(router, doubled, (x.double(),)).dtype == torch.float64
+    with torch.no_grad():
+        torch.testing.assert_close(router.eval()(x.reshape(6, 10, 15)).reshape(60, 4), same)
+    for few in (0, 1, 7):
+        torch.testing.assert_close(router(x[:few]), same[:few])
+    router.blend = 0.3
+    assert not torch.allclose(router(x), same)
+
+
+# share ----------------------------------------------------------------------------------------------------------------
+
+
+class Encoded(nn.Module):
+    """An encoder that all cells share, and a network of each."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Sequential(nn.Linear(3, 6), nn.ReLU())
+        self.table, self.head = nn.Embedding(4, 2), nn.Linear(8, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.head(torch.cat([self.encoder(x), self.table((x[:, 0] > 0).long())], -1))
+
+
+@pytest.mark.parametrize("fuse", [False, True])
+def test_shared_parameters_are_one_copy(fuse: bool, generator: torch.Generator) -> None:
+    module = Encoded() if not fuse else nn.Sequential(nn.Linear(3, 6), nn.ReLU(), nn.Linear(6, 2))
+    names = ["encoder.*", "table.weight"] if not fuse else ["0.*"]
+    router = perturb(VoronoiRouter(module, centres(), coords="first3", share=names, fuse=fuse), generator)
+    shapes = {name: tuple(p.shape) for name, p in router.module.named_parameters()}
+    first = "encoder.0.weight" if not fuse else "0.weight"
+    assert shapes[first] == (6, 3) and shapes["head.bias" if not fuse else "2.bias"] == (6, 2)
+    x = torch.rand(80, 3, generator=generator) * 2 - 1
+    equal_to_loop(router, [x], generator)
+    assert router.explain() == f"forward: {'fused' if fuse else 'grouped'}"
+
+    same, optimizer = router(x), torch.optim.Adam(router.parameters())
+    finer, parents = router.diagram.refine({0: centres(3)})
+    router.subdivide(finer, parents, optimizer=optimizer)
+    torch.testing.assert_close(router(x), same)
+    other = VoronoiRouter(module, centres(2), coords="first3", share=names, fuse=fuse)
+    other.load_state_dict(router.state_dict())
+    torch.testing.assert_close(other(x), same)
+    cell = router.cell(1)
+    assert cell.get_parameter(first).shape == (6, 3)
+    assert cell.get_parameter(first) is not router.module.get_parameter(first)
+    joined = VoronoiRouter.from_modules(
+        [router.cell(c) for c in range(8)], router.diagram, coords="first3", share=names
+    )
+    torch.testing.assert_close(joined(x), same)
+    with torch.no_grad():
+        cell.get_parameter(first).add_(1)
+    with pytest.raises(ValueError, match=f"module's {first} must be that of the routed one, since cells share it"):
+        router.load_cell(0, cell)
+    assert router.module.get_parameter(first).shape == (6, 3)
+
+
+def test_share_must_name_parameters() -> None:
+    with pytest.raises(ValueError, match=r"share must name parameters of Encoded, such as .*, got 'decoder\.\*'"):
+        VoronoiRouter(Encoded(), centres(), share=["decoder.*"])
+    with pytest.raises(TypeError, match="share must be a list, got 'encoder'"):
+        VoronoiRouter(Encoded(), centres(), share="encoder")
+
+
+def test_a_field_with_a_table_may_share(generator: torch.Generator) -> None:
+    router = VoronoiRouter(NeRF(width=16, depth=2), centres(), share=["trunk.*"])
+    x, d = uniform((40,)), F.normalize(uniform((40,)), dim=1)
+    router(x, d)[0].sum().backward()
+    assert router.module.trunk[0].weight.grad.shape == router.cell(0).trunk[0].weight.shape
+
+
+# layout ---------------------------------------------------------------------------------------------------------------
+
+
+class Squeezes(nn.Module):
+    """A camera's number for each sample, squeezed, as old code has it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.table, self.fc = nn.Embedding(4, 2), nn.Linear(5, 3)
+
+    def forward(self, x: Tensor, cam: Tensor) -> Tensor:
+        return self.fc(torch.cat([x, self.table(cam.squeeze())], -1))
+
+
+class Dimensions(nn.Module):
+    """Takes [rays, samples, f] apart."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Linear(6, 3)
+
+    def forward(self, x: Tensor, d: Tensor) -> Tensor:
+        rays, samples, _ = x.shape
+        return self.fc(torch.cat([x, d[:, None].expand(rays, samples, 3)], -1))
+
+
+def test_flat_is_for_modules_that_squeeze() -> None:
+    module, x, cam = Squeezes(), uniform((9, 7)), torch.randint(0, 4, (9, 7, 1))
+    router = VoronoiRouter(module, centres(), coords="first3", layout="flat")
+    torch.testing.assert_close(router(x, cam), module(x, cam))
+    with pytest.raises((ValueError, RuntimeError)) as error:
+        VoronoiRouter(module, centres(), coords="first3")(x, cam)
+    assert "layout='flat'" in str(error.value) + "".join(getattr(error.value, "__notes__", []))
+    with pytest.raises(ValueError, match="layout must be 'rays' or 'flat', got 'row'"):
+        VoronoiRouter(module, centres(), layout="row")
+
+
+def test_rays_are_for_modules_that_count_dimensions() -> None:
+    module, x, d = Dimensions(), uniform((9, 7)), uniform((9,))
+    router = VoronoiRouter(module, centres(), coords="first3")
+    torch.testing.assert_close(router(x, d), module(x, d))
+    assert router.explain() == "forward: grouped"
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_one_ray_stays_one_ray(dim: int, generator: torch.Generator) -> None:
+    """Modules that are called with [1, n, f] index or squeeze the first dimension."""
+
+    class Field(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net, self.scale = (
+                nn.Sequential(nn.Linear(6, 8), nn.ReLU(), nn.Linear(8, 3)),
+                nn.Parameter(torch.ones(3)),
+            )
+
+        def forward(self, x: Tensor, d: Tensor) -> Tensor:
+            assert x.shape[0] == 1
+            out = self.net(torch.cat([x, d[:, None].expand_as(x) if d.dim() == 2 else d], -1)) * self.scale
+            return out if dim == 3 else out[0]
+
+    module, x, d = Field(), uniform((1, 60)), uniform((1,))
+    router = perturb(VoronoiRouter(module, centres(), coords="first3"), generator)
+    found = router(x, d)
+    assert found.shape == ((1, 60, 3) if dim == 3 else (60, 3))
+    cells = router.diagram.locate(x[0])
+    for cell in cells.unique().tolist():
+        part = router.cell(cell)(x[:, cells == cell], d).reshape(-1, 3)
+        torch.testing.assert_close(found.reshape(60, 3)[cells == cell], part)
+    assert router.explain() == "forward: grouped"
+
+
+# explain, register and single batches ---------------------------------------------------------------------------------
+
+
+def test_explain_names_each_method_and_the_step_in_the_way() -> None:
+    class Both(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.fc, self.mix = nn.Linear(3, 4), nn.Bilinear(3, 3, 2)
+
+        def density(self, x: Tensor) -> Tensor:
+            return F.softplus(self.fc(x)) * math.pi + self.fc.weight.sum()
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.mix(x, x)
+
+    router = VoronoiRouter(Both(), centres(), coords="first3", methods=["density"])
+    assert router.explain() == "forward: not called yet\ndensity: not called yet"
+    router.density(uniform((40,)))
+    with pytest.warns(
+        UserWarning, match=r"Both.forward runs cell by cell: torch.nn.functional.bilinear meets param"
+    ) as said:
+        router(uniform((40,)))
+    forward, density = router.explain().split("\n")
+    assert density == "density: grouped"
+    assert forward.startswith("forward: cell by cell: torch.nn.functional.bilinear meets parameters and has no rule")
+    assert "test_router_promises.py:" in forward and "return self.mix(x, x)" in forward
+    assert forward.partition("cell by cell: ")[2] in str(said[0].message)
+    with pytest.raises(AttributeError, match=r"colour"):
+        router.colour  # noqa: B018
+
+
+def test_a_method_that_is_not_routed_names_the_remedy() -> None:
+    router = VoronoiRouter(ngp.NeRFNetwork(8, 4), centres(), coords="first3", methods=["density"])
+    with pytest.raises(
+        AttributeError, match=r"color of NeRFNetwork is not routed; pass methods=\['density', 'color'\]"
+    ):
+        router.color(uniform((4,)), uniform((4,)))
+
+
+def scale_rows(rows: Tensor, factor: Tensor) -> Tensor:
+    """A function that PyTorch's function modes see."""
+    if torch.overrides.has_torch_function((rows, factor)):
+        return torch.overrides.handle_torch_function(scale_rows, (rows, factor), rows, factor)
+    return rows * factor.exp()
+
+
+class Scales(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc, self.factor = nn.Linear(3, 4), nn.Parameter(torch.randn(4))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return scale_rows(self.fc(x), self.factor)
+
+
+def test_a_rule_of_ones_own(generator: torch.Generator) -> None:
+    x = torch.rand(50, 3, generator=generator)
+    with pytest.warns(UserWarning, match="scale_rows meets parameters and has no rule"):
+        VoronoiRouter(Scales(), centres(), coords="first3")(x)
+    register(scale_rows, lambda run, rows, factor: rows * run.rows_of(factor).exp())
+    router = perturb(VoronoiRouter(Scales(), centres(), coords="first3"), generator)
+    equal_to_loop(router, [x], generator)
+    assert router.explain() == "forward: grouped"
+    register(scale_rows, lambda run, rows, factor: rows * run.rows_of(factor))
+    wrong = perturb(VoronoiRouter(Scales(), centres(), coords="first3"), generator)
+    with pytest.warns(UserWarning, match="gives other results than on those of one cell"):
+        equal_to_loop(wrong, [x], generator)
+
+
+class Box(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Linear(3, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        inside = (x.abs() <= 1).all(-1)
+        if inside.all():
+            return self.net(x)
+        out = x.new_zeros(len(x), 2)
+        out[inside] = self.net(x[inside])
+        return out
+
+
+@pytest.mark.filterwarnings("ignore:.*VoronoiRouter")
+def test_a_batch_that_needs_the_loop_uses_it_alone(generator: torch.Generator) -> None:
+    near, far = uniform((60,)), uniform((60,)) * 1.3
+    for batches in ((near, far, near), (far, near, far)):
+        router = perturb(VoronoiRouter(Box(), centres(), coords="first3"), generator)
+        for x in batches:
+            equal_to_loop(router, [x], generator)
+        assert "forward: grouped" in router.explain() and "cell by cell" in router.explain()
+
+
+def test_lists_may_hold_parameters_that_are_registered(generator: torch.Generator) -> None:
+    class Listed(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.fc = nn.Linear(3, 4)
+            self.weights, self.unregistered = [self.fc.weight, {"bias": self.fc.bias}], [1]
+
+        def forward(self, x: Tensor) -> Tensor:
+            return F.linear(x, self.weights[0], self.weights[1]["bias"])
+
+    router = perturb(VoronoiRouter(Listed(), centres(), coords="first3"), generator)
+    x = torch.rand(50, 3, generator=generator)
+    equal_to_loop(router, [x], generator)
+    assert router.explain() == "forward: grouped"
+    cell = router.cell(2)
+    assert cell.weights[0] is cell.fc.weight and cell.fc.weight.shape == (4, 3)
+
+
+# Resuming -------------------------------------------------------------------------------------------------------------
+
+
+def step(router: VoronoiRouter, optimizer: torch.optim.Optimizer, x: Tensor) -> None:
+    optimizer.zero_grad()
+    router(x).square().mean().backward()
+    optimizer.step()
+
+
+def test_resuming_after_a_split_in_the_order_of_nerf_pytorch(generator: torch.Generator) -> None:
+    """Build, make the optimiser, load the optimiser's state, then the network's; here after a split into 4 cells."""
+    module, x = example("nerf_pytorch").NeRF(D=2, W=8, input_ch=15, input_ch_views=0), uniform((90,), 15)
+    router = VoronoiRouter(module, torch.zeros(1, 3), coords="first3", fuse=True)
+    optimizer = torch.optim.Adam(router.parameters(), lr=1e-2)
+    step(router, optimizer, x)
+    router.subdivide(4, points=x[:, :3], weights=torch.ones(90), optimizer=optimizer)
+    step(router, optimizer, x)
+    saved = copy.deepcopy({"network": router.state_dict(), "optimizer": optimizer.state_dict()})
+
+    again = VoronoiRouter(module, torch.zeros(1, 3), coords="first3", fuse=True)
+    resumed = torch.optim.Adam(again.parameters(), lr=1e-2)
+    resumed.load_state_dict(saved["optimizer"])
+    again.load_state_dict(saved["network"])
+    for _ in range(2):
+        step(router, optimizer, x)
+        step(again, resumed, x)
+    for a, b in zip(again.parameters(), router.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("make", [torch.optim.Adam, torch.optim.Adagrad, torch.optim.SGD, torch.optim.LBFGS])
+@pytest.mark.parametrize("way", ["load", "split"])
+def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any, way: str) -> None:
+    x, options = uniform((60,)), {"momentum": 0.9} if make is torch.optim.SGD else {}
+    router = VoronoiRouter(nn.Linear(3, 2), torch.zeros(1, 3), coords="first3")
+    state = VoronoiRouter(nn.Linear(3, 2), centres(), coords="first3").state_dict()
+    optimizer = make(router.parameters(), lr=0.1, **options)
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        loss = router(x).square().mean()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    if way == "load":
+        router.load_state_dict(state)
+    else:
+        router.subdivide(3, points=x, weights=torch.ones(60))
+    with pytest.raises(
+        ValueError, match=rf"write router.{'load_state_dict' if way == 'load' else 'subdivide'}\(.*optimi"
+    ):
+        optimizer.step(closure)
+    router.load_state_dict(router.state_dict(), optimizer=optimizer)
+    before = router.module.weight.detach().clone()
+    optimizer.step(closure)
+    assert not torch.equal(before, router.module.weight)
+    with pytest.raises(ValueError, match="load_state_dict: optimizer must hold the router's parameters"):
+        router.load_state_dict(state, optimizer=torch.optim.SGD([nn.Parameter(torch.zeros(2))]))
