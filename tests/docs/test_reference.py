@@ -33,7 +33,7 @@ def public_objects() -> dict[str, Any]:
     return dict(found.values())
 
 
-PUBLIC = {name: value for name, value in public_objects().items() if "Router" not in name and "Layered" not in name}
+PUBLIC = public_objects()
 
 
 def listed() -> dict[str, Any]:

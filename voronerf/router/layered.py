@@ -13,7 +13,14 @@ from voronerf.layers import MLP
 
 @runtime_checkable
 class LayeredField(Protocol):
-    """A field that describes itself by a layer table, as :class:`voronerf.fields.NeRF` does."""
+    """A field that describes its network by a layer table, like :class:`voronerf.fields.NeRF`. It runs fused.
+
+    Examples:
+        >>> from voronerf import NeRF
+        >>> from voronerf.router import LayeredField
+        >>> isinstance(NeRF(width=16, depth=2), LayeredField)
+        True
+    """
 
     layers: MLP
 

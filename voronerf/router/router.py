@@ -51,56 +51,75 @@ Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
 
 class VoronoiRouter(nn.Module):
-    """k copies of a module, one per cell of a Voronoi diagram, each sample evaluated by the copy of its cell.
+    """k copies of a module, one for each cell of a Voronoi diagram; the copy of its cell evaluates each sample.
 
-    ``router(...)`` takes the arguments of the module's own ``forward`` and returns what it returns, in the same order
-    and with the same leading dimensions. Every cell starts as a copy of the module (inheritance, Adaptive Voronoi
-    NeRFs): positions stay global, so identical copies give exactly what the module gives, and no seam appears at the
-    split. The parameters of all copies are stacked, ``[k, ...]`` under the module's own names below ``module.``, so
-    that an optimiser sees as many tensors as for one module. Buffers are shared by all cells.
+    ``router(...)`` takes the arguments of the module's ``forward`` and returns what it returns, in the same order and
+    with the same leading dimensions. Every cell starts as a copy of the module (the inheritance of Adaptive Voronoi
+    NeRFs). Positions stay global, so identical copies give exactly the result of the module, and no seam appears at a
+    split. The parameters of all copies are stacked, ``[k, ...]``, under the module's own names below ``module.``: an
+    optimiser sees as many tensors as for one module. Buffers are shared by all cells.
 
-    How a call is carried out depends on the module:
+    The loop over cells defines the result. A call runs in the fastest of these ways, after one comparison with the loop
+    for each kind of call; :meth:`explain` says which, and why:
 
-    - A field with a layer table (:class:`LayeredField`) runs as one fused operation.
-    - A network that such a table describes, in whatever code, is recognised after two calls of a kind, by their steps,
-      and runs fused as well, without its ``forward``; changes of its flags, numbers, buffers and hooks are seen.
-    - Any other module runs its own ``forward`` once, on the samples of all cells sorted by cell. Linear layers (also
-      ``F.linear``, ``@``, ``einsum`` on a parameter), embeddings, normalisation layers, learned scales and PReLU have
-      forms for all cells at once; other functions of parameters run cell by cell on contiguous rows, which is said
-      once. Every step is followed to see that it treats samples one by one.
-    - Where that is not so, or a parameter's value is read, the module runs once for each cell that has samples, which
-      is said once. A module that mixes samples (BatchNorm, attention across samples) is refused.
+    - fused: one operation for the whole network. This needs a field with a layer table (:class:`LayeredField`), or
+      ``fuse=True``.
+    - grouped: the module's own ``forward`` runs once, on the samples of all cells sorted by cell. Functions that meet
+      parameters have a rule for all cells at once: linear layers (also ``F.linear``, ``@``, ``einsum``), embeddings,
+      normalisation layers, scales. :func:`voronerf.router.register` adds a rule.
+    - cell by cell: the module runs once for each cell that has samples. A warning names the step that needs it.
+
+    A module that mixes samples (BatchNorm, attention across samples) is refused.
 
     Arguments are per sample ``[..., f]``; per ray ``[rays, f]`` beside ``[rays, samples, f]``; numbers, flags, None and
     tensors of one element, which are passed on; and objects that hold tensors: dataclasses, and classes with ``shape``,
-    ``flatten()``, ``reshape(shape)`` and indexing, as nerfstudio's ``RaySamples``. A module called with [rays, samples,
-    f] sees [n, 1, f].
+    ``flatten()``, ``reshape(shape)`` and indexing, such as nerfstudio's ``RaySamples``.
 
     Args:
-        module: Any ``nn.Module`` that treats samples one by one; copied, never changed.
+        module: Any ``nn.Module`` that treats samples one by one; it is copied and never changed.
         diagram: A VoronoiDiagram, or centres [k, 3].
         coords: Where the positions are: ``"first3"``, the first three features of the first tensor; a slice of its
-            features; or a function of the call's arguments that returns positions [..., 3]. They may be given at the
-            call instead, ``router(x, coords=positions)``; not where the module has an argument of that name, which is
-            its own then. A field with a layer table has them as its first argument.
-        per_ray: Names or numbers of the arguments that have one row for each ray. None tells by shapes, and refuses
-            those that can be read in two ways.
+            features; or a function of the call's arguments that returns positions [..., 3]. They can be given at the
+            call instead, ``router(x, coords=positions)``, unless the module itself has an argument ``coords``. For a
+            field with a layer table they are its first argument.
+        per_ray: Names or numbers of the arguments that have one row for each ray. None decides by shapes, and refuses
+            shapes that fit both readings.
         shared: Names or numbers of tensor arguments that are the same for all samples.
-        methods: Names of further methods to route, ``router.density(x)``. Assignments are reused between methods that
-            are called with the same positions.
-        assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell from the
-            distances while training (:meth:`VoronoiDiagram.sample_cell`), and is "nearest" in eval mode.
+        methods: Names of further methods to route, ``router.density(x)``. Methods that are called with the same
+            positions share one assignment to cells.
+        share: Names of parameters that all cells have in common, with wildcards: ``["encoder.*"]``. There is one copy
+            of them, with ordinary gradients; the others are per cell.
+        fuse: Promises that ``forward`` does the same in every call. Its network is traced once and runs as one
+            operation, or is refused with the line that stands in the way.
+        layout: How the module sees samples ``[rays, samples, f]``: "rays" as ``[n, 1, f]``, "flat" as ``[n, f]``.
+        assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell by the distances
+            while training (:meth:`VoronoiDiagram.sample_cell`), and is "nearest" in eval mode.
         temperature: Of the stochastic assignment, in scene units.
         backend: Of every operation, see ``voronerf info``.
-        blend: Margin in scene units, an attribute as well: in eval mode samples this near to a border are evaluated in
-            the cells beyond it too, four cells at most, and the results are averaged by distance, so that nothing
-            jumps across borders (:mod:`voronerf.diagram`). Other samples are as without. Not within a full graph of
+        blend: Margin in scene units; also an attribute. In eval mode, samples closer to a border are evaluated in the
+            cells beyond it too, in at most four cells, and the results are averaged by distance, so that no step shows
+            at borders (:mod:`voronerf.diagram`). Other samples do not change. Not in a full graph of
             ``torch.compile``.
 
     Raises:
         TypeError: For a module that mixes samples, or that cannot be one network for each cell.
-        ValueError: For bad centres, coords, methods, an unknown assignment, a temperature that is not positive or a
-            margin that is negative.
+        ValueError: For bad centres, coords, methods or layout, an unknown assignment, a temperature that is not
+            positive, or a negative margin.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import VoronoiRouter
+        >>> field = torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.ReLU(), torch.nn.Linear(64, 4))
+        >>> router = VoronoiRouter(field, torch.rand(16, 3), coords="first3", fuse=True)
+        >>> points = torch.rand(1000, 3)
+        >>> router(points).shape
+        torch.Size([1000, 4])
+        >>> bool((router(points) - field(points)).abs().max() < 1e-5)  # all cells are copies
+        True
+        >>> [tuple(p.shape) for p in router.parameters()]
+        [(16, 64, 3), (16, 64), (16, 4, 64), (16, 4)]
+        >>> print(router.explain())
+        forward: fused
     """
 
     def __init__(
@@ -205,7 +224,7 @@ class VoronoiRouter(nn.Module):
 
     @property
     def field(self) -> LayeredField:
-        """The field whose parameters are stacked; its own ``forward`` is not usable any more."""
+        """The field with stacked parameters; its own ``forward`` cannot be called any more."""
         return cast(LayeredField, self.module)
 
     @property
@@ -222,13 +241,13 @@ class VoronoiRouter(nn.Module):
         return self.diagram.locate(positions, backend=self.backend)
 
     def forward(self, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
-        """Evaluates each sample in its cell; the order of the results is the order of the samples.
+        """Evaluates each sample in its cell; results are in the order of the samples.
 
         Args:
             *args: Those of the module's ``forward``. For a field with a layer table: positions [n, 3] in scene units,
                 directions, unit vectors [n, 3] or [r, 3] together with ray_index, int32 [n], the row of ``directions``
                 that belongs to each sample.
-            coords: Positions [..., 3] in scene units that decide the cells, in the place of the router's own rule.
+            coords: Positions [..., 3] in scene units that decide the cells, instead of the router's own rule.
             **kwargs: Those of the module's ``forward``.
 
         Returns:
@@ -236,9 +255,9 @@ class VoronoiRouter(nn.Module):
             density [n]).
 
         Raises:
-            ValueError: For shapes that disagree, positions that are not said, arguments that fit no reading or two, or
-                directions that the field needs and did not get.
-            TypeError: When the module turns out to mix samples.
+            ValueError: For shapes that disagree, positions that are not given, arguments that are neither per sample
+                nor per ray or could be both, or missing directions.
+            TypeError: For a module that mixes samples.
         """
         if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
             self._told = told_by_table(self.module) and not self.share
@@ -364,16 +383,16 @@ class VoronoiRouter(nn.Module):
         """A plain copy of one cell's module, with parameters of its own.
 
         Raises:
-            IndexError: When there is no such cell.
+            IndexError: If there is no such cell.
         """
         return take_cell(self.module, self._check_index("cell", index))
 
     def load_cell(self, index: int, module: nn.Module) -> None:
-        """Puts the parameters of a plain module into one cell; parameter objects stay, as do optimisers.
+        """Copies the parameters of a plain module into one cell. Parameter objects and optimisers stay the same.
 
         Raises:
-            IndexError: When there is no such cell.
-            ValueError: For parameters of other names or shapes, or buffers that are not those shared by the cells.
+            IndexError: If there is no such cell.
+            ValueError: For parameters of other names or shapes, or buffers that differ from those shared by the cells.
         """
         fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
 
@@ -394,32 +413,42 @@ class VoronoiRouter(nn.Module):
         weights: Tensor | None = None,
         **split: Any,
     ) -> Tensor:
-        """Replaces the diagram by a finer one; every new cell starts where its parent stands.
+        """Replaces the diagram by a finer one; every new cell starts as a copy of its parent.
 
-        Parameters and, with ``optimizer``, the state of Adam, AdamW, RAdam, SGD and their like are copied from the
-        parent; other optimisers begin anew, which is said. The parameter objects are new; those in the optimiser's
-        groups are replaced in place, so groups, learning rates and schedules go on. A wrapper that holds parameters of
-        its own, such as ``DistributedDataParallel``, has to be made again.
+        Parameters are copied from the parent and, with ``optimizer``, so is the state of Adam, AdamW, RAdam, SGD and
+        similar optimisers; others start afresh, with a warning. The parameter objects stay the same, so groups,
+        learning rates and schedules continue. A wrapper with parameters of its own, such as
+        ``DistributedDataParallel``, has to be made again.
 
         Args:
             diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children that
                 :func:`voronerf.split_diagram` gives each cell that has enough samples.
-            parents: int64 [new cells], the present cell that each new cell lies in. None takes for a diagram the cell
-                that holds the new centre.
+            parents: int64 [new cells], the present cell that each new cell lies in; None for the cell that holds the
+                new centre.
             optimizer: The optimiser that holds this router's parameters.
-            inherit: False draws fresh parameters for the children of every cell that is split, with moments of zero:
-                the ablation that shows ghosting.
-            points: [m, 3], for a number of children: samples, in scene units.
-            weights: [m], their importance, by which the new cells are balanced.
+            inherit: False draws new parameters for the children of every cell that is split, with moments of zero: the
+                ablation that shows ghosting.
+            points: [m, 3], samples in scene units, if ``diagram`` is a number of children.
+            weights: [m], the importance of the samples, by which the new cells are balanced.
             **split: Further options of ``split_diagram``, such as cells, centres, min_samples.
 
         Returns:
             int64 [new cells], the parents.
 
         Raises:
-            ValueError: When ``parents`` does not fit, ``points`` or ``weights`` are missing, or the module cannot draw
-                fresh parameters.
-            TypeError: When ``diagram`` is neither a diagram nor a number, or ``parents`` are not int64.
+            ValueError: If ``parents`` does not fit, ``points`` or ``weights`` are missing, or the module cannot draw
+                new parameters.
+            TypeError: If ``diagram`` is neither a diagram nor a number, or ``parents`` are not int64.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 1), torch.zeros(1, 3), coords="first3")
+            >>> optimizer = torch.optim.Adam(router.parameters())
+            >>> points, weights = torch.rand(500, 3), torch.rand(500)  # see SampleReservoir
+            >>> parents = router.subdivide(8, optimizer=optimizer, points=points, weights=weights)
+            >>> router.num_cells, router.module.weight.shape
+            (8, torch.Size([8, 1, 3]))
         """
         if not isinstance(diagram, VoronoiDiagram):
             if isinstance(diagram, bool) or not isinstance(diagram, int):
