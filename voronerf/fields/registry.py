@@ -7,6 +7,7 @@ say more about itself by attributes, all of which can be left out:
     inputs                   "points" (the default), or "gaussians": positions are [n, 6], means and variances
     training_defaults        options that differ in training from the defaults of the constructor
     learning_rate(**options) static method: Adam's rate at the start of a training; default ``LEARNING_RATE``
+    router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
     octaves(finest)          static method: position_octaves for images that show ``finest`` octaves; default all
 
 Its options are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is called with
@@ -57,6 +58,12 @@ class FieldType:
     def cones(self) -> bool:
         """Whether its rays are cones, which are cut into Gaussians."""
         return self.inputs == "gaussians"
+
+    @property
+    def router_options(self) -> Mapping[str, Any]:
+        """Further arguments of the router around it."""
+        options: Mapping[str, Any] = getattr(self.network, "router_options", {})
+        return options
 
     def build(self, options: Mapping[str, Any]) -> nn.Module:
         """A field with these options and the defaults of the others.

@@ -110,6 +110,7 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
             assignment=config.assignment,
             temperature=config.temperature,
             backend=config.backend,
+            **({} if name == "proposal" else config.field_type.router_options),
         ).to(device)
         for name, network in networks.items()
     }
