@@ -94,8 +94,8 @@ def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 def _forward_backward(ctx: Any, gradient: Tensor | None) -> tuple[Tensor | None, ...]:
     if gradient is None:
         return (None,) * 5
-    x, offsets, weight, bias = ctx.saved_tensors
-    to_x, _, to_weight, to_bias = asked_for(ctx, ctx.saved_tensors)
+    saved = x, offsets, weight, bias = ctx.saved_tensors  # once: a checkpoint gives each tensor a single time
+    to_x, _, to_weight, to_bias = asked_for(ctx, saved)
     results = _backward(gradient, x, offsets, weight, bias, ctx.activation, [to_x, to_weight or to_bias])
     found = [result if want else None for result, want in zip(results, (to_x, to_weight, to_bias))]
     return found[0], None, *found[1:], None
@@ -112,8 +112,8 @@ def _backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tuple[Tenso
 
     With z = W x + b and h = gradient * act'(z) the gradients are W^T h, sum h x^T and sum h.
     """
-    gradient, x, offsets, weight, bias = ctx.saved_tensors
-    to_gradient, to_x, _, to_weight, to_bias = asked_for(ctx, ctx.saved_tensors)
+    saved = gradient, x, offsets, weight, bias = ctx.saved_tensors
+    to_gradient, to_x, _, to_weight, to_bias = asked_for(ctx, saved)
     chosen = (ctx.wanted[0], ctx.wanted[1], ctx.wanted[1])
     of_x, of_weight, of_bias = (each if want else None for each, want in zip(cotangents, chosen))
 

@@ -232,8 +232,8 @@ def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 
 def _forward_backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
-    positions, offsets, *parameters, directions, direction_index = ctx.saved_tensors
-    to_positions, _, *to_parameters, to_directions, _ = asked_for(ctx, ctx.saved_tensors)
+    saved = positions, offsets, *parameters, directions, direction_index = ctx.saved_tensors
+    to_positions, _, *to_parameters, to_directions, _ = asked_for(ctx, saved)
     network = positions, offsets, parameters[: ctx.count], parameters[ctx.count :], ctx.table, directions
     found = gradients(gradient, *network, direction_index, None, asked=(*to_parameters, to_positions, to_directions))
     *of_parameters, of_positions, of_directions = found
