@@ -22,10 +22,11 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouping import Grouping
+from voronerf.router.grouping import Grouping, Part
 from voronerf.router.layout import Call, Layout, map_tree, tensors_of
 from voronerf.router.loop import Given, Results
 from voronerf.router.parameters import cell_parameters, in_place_of_parameters
+from voronerf.router.tables import Tables
 
 _MARK = "_voronerf_rows"
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
@@ -78,14 +79,16 @@ class PerCell(torch.Tensor):
 
     Attributes:
         stacked: [k, ...], one entry for each cell.
+        origin: The tensor of more cells that ``stacked`` is a part of, and its first cell there.
     """
 
     stacked: Tensor
+    origin: tuple[Tensor, int]
     # Shape and dtype are answered by the wrapper itself.
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
-    def __new__(cls, stacked: Tensor, is_parameter: bool = False) -> PerCell:
+    def __new__(cls, stacked: Tensor, is_parameter: bool = False, origin: tuple[Tensor, int] | None = None) -> PerCell:
         """Wraps [k, ...]; ``is_parameter`` makes it an instance of ``nn.Parameter``."""
         wrapper: PerCell = torch.Tensor._make_wrapper_subclass(
             cls,
@@ -94,7 +97,7 @@ class PerCell(torch.Tensor):
             device=stacked.device,
             requires_grad=stacked.requires_grad and stacked.is_floating_point(),
         )
-        wrapper.stacked = stacked
+        wrapper.stacked, wrapper.origin = stacked, origin or (stacked, 0)
         wrapper._is_param = is_parameter
         return wrapper
 
@@ -175,6 +178,7 @@ class GroupedRun(TorchFunctionMode):
     Args:
         grouping: Of the samples.
         axis: The dimension of the rows in what the module sees; 0 but for a call of one ray.
+        tables: Those that other parts of the call have looked up.
 
     Attributes:
         n: Samples.
@@ -182,9 +186,9 @@ class GroupedRun(TorchFunctionMode):
         widest: Bytes of the largest tensor of rows that was made.
     """
 
-    def __init__(self, grouping: Grouping, axis: int = 0) -> None:
+    def __init__(self, grouping: Grouping, axis: int = 0, tables: Tables | None = None) -> None:
         super().__init__()
-        self.grouping, self.n, self.axis = grouping, grouping.n, axis
+        self.grouping, self.n, self.axis, self.tables = grouping, grouping.n, axis, tables or Tables()
         self.failed: Ungroupable | None = None
         self.widest = 0
         self._token = object()
@@ -346,7 +350,11 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
         Ungroupable: Where that is not possible.
     """
     parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
-    found = [run_part(module, call, layout, Given(*call.arranged(layout, part)), part)[0] for part in parts]
+    tables, chunks = Tables(), _chunks(module, parts)
+    found = [
+        run_part(module, call, layout, Given(*call.arranged(layout, part)), part, chunk, tables)[0]
+        for part, chunk in zip(parts, chunks, strict=True)
+    ]
     first = found[0]
     if len(found) == 1:
         return first
@@ -357,12 +365,49 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
     return replace(first, tensors=tensors)
 
 
-def run_part(module: nn.Module, call: Call, layout: Layout, given: Given, part: Grouping) -> tuple[Results, GroupedRun]:
-    """The results for some rows, and the run that gave them."""
-    run = GroupedRun(part, layout.axis)
+def _chunks(module: nn.Module, parts: list[Grouping]) -> list[dict[int, Tensor] | None]:
+    """For each part the parameters of its cells, by the ids of those of all cells; None for all of them.
+
+    They are split once for all parts: their gradient is then put together once, where that of a slice would fill a
+    tensor of all cells for each part.
+    """
+    own = [part for part in parts if isinstance(part, Part)]
+    if not own:
+        return [None] * len(parts)
+    sizes = {part.start: part.k for part in own}
+    pieces = {id(p): p.split(list(sizes.values())) for _, _, p in cell_parameters(module)}
+    number = {start: i for i, start in enumerate(sizes)}
+    return [{key: split[number[part.start]] for key, split in pieces.items()} for part in own]
+
+
+def run_part(
+    module: nn.Module,
+    call: Call,
+    layout: Layout,
+    given: Given,
+    part: Grouping,
+    chunk: dict[int, Tensor] | None = None,
+    tables: Tables | None = None,
+) -> tuple[Results, GroupedRun]:
+    """The results for some rows, and the run that gave them.
+
+    Args:
+        module: With stacked parameters.
+        call: Of a method of it.
+        layout: Of its arguments.
+        given: The arguments of these rows.
+        part: Of these rows.
+        chunk: The parameters of the part's cells; None where they are those of all cells.
+        tables: What all parts of a call look up.
+    """
+    run = GroupedRun(part, layout.axis, tables)
     for tensor in given.rows:
         run.mark(tensor)
-    stand_ins = {id(p): PerCell(p, is_parameter=True) for _, _, p in cell_parameters(module)}
+    start = part.start if isinstance(part, Part) else 0
+    stand_ins: dict[int, Tensor] = {
+        id(p): PerCell(p if chunk is None else chunk[id(p)], is_parameter=True, origin=(p, start))
+        for _, _, p in cell_parameters(module)
+    }
     with in_place_of_parameters(module, stand_ins), run:
         value = call.function(module)(*given.args, **given.kwargs)
     if run.failed is not None:

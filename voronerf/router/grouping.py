@@ -42,6 +42,8 @@ class Grouping:
         self._inverse: Tensor | None = None
         self._sorted_cells: Tensor | None = None
         self._offsets: dict[int, Tensor] = {}
+        self._entry_offsets: dict[tuple[int, int], Tensor] = {}
+        self._slots: Tensor | None = None
         self._bounds: list[int] | None = None
 
     @property
@@ -108,12 +110,35 @@ class Grouping:
         return [(cell, first, last) for cell, (first, last) in enumerate(pairs) if last > first]
 
     def parts(self, rows: int) -> list[Grouping]:
-        """Consecutive sorted rows in parts of about equal size, at most ``rows`` each; itself where that is enough."""
-        count = -(-self.n // rows)
-        if count <= 1:
+        """Sorted rows in parts of whole cells, at most ``rows`` each; a cell of more is cut into parts of its own."""
+        if self.n <= rows:
             return [self]
-        edges = [self.n * i // count for i in range(count + 1)]
-        return [_Part(self, first, last) for first, last in itertools.pairwise(edges)]
+        groups, start, begin = [], 0, 0
+        for cell, first, last in self.occupied():
+            if last - begin > rows and first > begin:
+                groups.append((start, cell, begin, first))
+                start, begin = cell, first
+        groups.append((start, self.k, begin, self.n))
+        parts: list[Grouping] = []
+        for start, stop, first, last in groups:
+            count = -(-(last - first) // rows)
+            edges = [first + (last - first) * i // count for i in range(count + 1)]
+            parts += [Part(self, start, stop, *edge) for edge in itertools.pairwise(edges)]
+        return parts
+
+    def entry_offsets(self, entries: int, m: int) -> Tensor:
+        """int64 [n * m], where the entries of each row's cell begin in a table of all cells."""
+        if (entries, m) not in self._entry_offsets:
+            first = self.sorted_cells * entries
+            self._entry_offsets[entries, m] = first if m == 1 else first.repeat_interleave(m)
+        return self._entry_offsets[entries, m]
+
+    def slots(self, most: int) -> Tensor:
+        """int64 [n], the row of each sorted row where every cell has room for ``most``."""
+        if self._slots is None:
+            starts = torch.arange(self.k, device=self.device) * most - self.offsets[:-1]
+            self._slots = torch.arange(self.n, device=self.device) + starts[self.sorted_cells]
+        return self._slots
 
     def sort(self, x: Tensor) -> Tensor:
         """[n, ...] in the original order -> sorted by cell."""
@@ -175,19 +200,26 @@ class Entries(Grouping):
         return x.index_select(0, self._place)
 
 
-class _Part(Grouping):
-    """Sorted rows ``first`` to ``last`` of a grouping, whose arguments are found in those of all samples."""
+class Part(Grouping):
+    """Sorted rows ``first`` to ``last`` of cells ``start`` to ``stop`` of a grouping, as a grouping of these cells.
 
-    def __init__(self, whole: Grouping, first: int, last: int) -> None:
-        super().__init__(None, last - first, whole.k, whole.device, whole.backend)
+    Its arguments are found in those of all samples.
+    """
+
+    def __init__(self, whole: Grouping, start: int, stop: int, first: int, last: int) -> None:
+        super().__init__(None, last - first, stop - start, whole.device, whole.backend)
         order = whole.order
-        self._sorted = (None if order is None else order[first:last]), whole.offsets.clamp(first, last) - first
-        self._sorted_cells = whole.sorted_cells[first:last]
-        self._first = first
+        offsets = whole.offsets[start : stop + 1].clamp(first, last) - first
+        self._sorted = (None if order is None else order[first:last]), offsets
+        self._sorted_cells = whole.sorted_cells[first:last] - start
+        self._first, self.start, self.stop = first, start, stop
 
     def sort(self, x: Tensor) -> Tensor:
         """[samples of the whole, ...] in the original order -> this part's rows."""
-        return x[self._first : self._first + self.n] if self.order is None else x.index_select(0, self.order)
+        if self.order is None:
+            return x[self._first : self._first + self.n]
+        # The gradient is added three times as fast by int64 indices.
+        return x.index_select(0, self.order.long() if x.requires_grad else self.order)
 
     def rays(self, samples: int) -> Tensor:
         """int32 [n], the ray of each sorted row, for a number of samples a ray."""

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops import grouped_linear
+from voronerf.router import tables
 from voronerf.router.grouped import GroupedRun, PerCell, register
 from voronerf.router.layout import map_tree, tensors_of
 
@@ -24,6 +25,9 @@ _ELEMENTWISE = """
     __add__ __radd__ __iadd__ __sub__ __rsub__ __isub__ __mul__ __rmul__ __imul__ __truediv__ __rtruediv__ __itruediv__
     __div__ __rdiv__ __idiv__ __mod__ __pow__ __rpow__ __lt__ __le__ __gt__ __ge__ __eq__ __ne__
 """
+
+
+_INTEGERS = (torch.int32, torch.int64)
 
 
 def rule(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -56,7 +60,8 @@ def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None =
         raise RuntimeError(
             f"VoronoiRouter: a linear layer of the module takes {weight.shape[1]} features, got {list(input.shape)}"
         )
-    flat = input.reshape(-1, input.shape[-1])
+    # Contiguous here: the layer keeps what it is given, and would copy it once more for its gradients.
+    flat = (input if input.dim() == 2 else input.reshape(-1, input.shape[-1])).contiguous()
     m = run.entries(input) * (flat.shape[0] // input.shape[0])
     together = isinstance(weight, PerCell) and (bias is None or isinstance(bias, PerCell))
     if isinstance(weight, PerCell):
@@ -67,7 +72,8 @@ def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None =
         y = F.linear(flat, weight)
     if bias is not None and not together:
         y = y + (run.rows_of(bias, m) if isinstance(bias, PerCell) else bias)
-    return y.reshape(*input.shape[:-1], weight.shape[0])
+    # Not a view of rows that are these already: what is written into a view takes the gradient along a slow way.
+    return y if input.dim() == 2 else y.reshape(*input.shape[:-1], weight.shape[0])
 
 
 @rule(torch.matmul, torch.Tensor.matmul, torch.mm, torch.Tensor.mm, torch.Tensor.__matmul__)
@@ -281,20 +287,22 @@ def prelu(run: GroupedRun, input: Tensor, weight: Tensor) -> Any:
 # Look-ups -------------------------------------------------------------------------------------------------------------
 
 
-def _look_up(run: GroupedRun, table: PerCell, index: Tensor) -> Tensor:
-    """Entries [n * m, ..., c] of tables [k, e, c], for indices [n * m, ...] of rows."""
+def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Tensor:
+    """Entries [n * m, ..., *shape] of tables [e, *shape], for rows of indices [n * m, ...]."""
     entries, m = table.shape[0], run.entries(index)
-    cells = run.grouping.sorted_cells
-    cells = (cells if m == 1 else cells.repeat_interleave(m)).reshape(-1, *[1] * (index.dim() - 1))
-    return F.embedding(index + cells * entries, table.stacked.reshape(-1, *table.shape[1:]))
-
-
-def _check_index(index: Tensor, low: int, high: int) -> None:
-    if index.numel() and bool(((index < low) | (index >= high)).any()):
-        raise IndexError(
-            f"VoronoiRouter: indices of a table must lie in {low}..{high - 1}, got {int(index.min())}.."
-            f"{int(index.max())}"
-        )
+    low, high = (int(bound) for bound in torch.aminmax(index)) if index.numel() else (0, 0)
+    if low < lowest or high >= entries:
+        raise IndexError(f"VoronoiRouter: indices of a table must lie in {lowest}..{entries - 1}, got {low}..{high}")
+    index = index.long()
+    if low < 0:
+        index = torch.where(index < 0, index + entries, index)
+    whole, first = table.origin
+    occupied = run.grouping.occupied()
+    if len(occupied) == 1:
+        first += occupied[0][0]
+    else:
+        index = index + run.grouping.entry_offsets(entries, m).reshape(-1, *[1] * (index.dim() - 1))
+    return run.tables.look_up(whole, first * entries, index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
 
 
 @rule(F.embedding)
@@ -313,17 +321,31 @@ def embedding(
         return NotImplemented
     if padding_idx is not None or max_norm is not None or scale_grad_by_freq or sparse:
         return NotImplemented
-    _check_index(input, 0, weight.shape[0])
-    return _look_up(run, weight, input)
+    return _look_up(run, weight, input, 0)
 
 
 @rule(torch.Tensor.__getitem__)
 def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
     """``table[index]`` for a table [e, c] and rows of integers."""
-    if not isinstance(source, PerCell) or source.dim() != 2 or not run.is_rows(index):
+    if not isinstance(source, PerCell) or not source.dim() or not run.is_rows(index):
         return NotImplemented
-    if index.dtype not in (torch.int32, torch.int64):
+    return _look_up(run, source, index, -source.shape[0]) if index.dtype in _INTEGERS else NotImplemented
+
+
+@rule(F.grid_sample)
+def grid_sample(
+    run: GroupedRun,
+    input: Tensor,
+    grid: Tensor,
+    mode: str = "bilinear",
+    padding_mode: str = "zeros",
+    align_corners: bool | None = None,
+) -> Any:
+    """A plane [1, c, h, w] or volume [1, c, d, h, w] at rows [1, ..., 2] or [1, ..., 3]."""
+    if not isinstance(input, PerCell) or input.shape[0] != 1 or not run.is_rows(grid):
         return NotImplemented
-    entries = source.shape[0]
-    _check_index(index, -entries, entries)
-    return _look_up(run, source, torch.where(index < 0, index + entries, index))
+    places = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
+    if len(places) != 1 or grid.shape[0] != 1:
+        return NotImplemented
+    options = {"mode": mode, "padding_mode": padding_mode, "align_corners": align_corners}
+    return tables.grid_sample(run.grouping, input.stacked.squeeze(1), grid, places[0], **options)
