@@ -1,7 +1,7 @@
 """What the benchmarks share: the metadata of a result, and timings that can be compared.
 
 Every file under results/ says where it was measured. Timings of one table row come from one call of :func:`measure`:
-contenders take turns in one process, each call reads other inputs than the one before, and medians are reported.
+contenders take turns in one process, each call reads different inputs than the one before, and medians are reported.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Timing:
 
     @property
     def iqr_ms(self) -> float | None:
-        """Distance between the quartiles; None of fewer than two timings."""
+        """Distance between the quartiles; None for fewer than two timings."""
         if len(self.seconds) < 2:
             return None
         low, _, high = statistics.quantiles(self.seconds, n=4, method="inclusive")
@@ -116,8 +116,8 @@ def measure(
 ) -> dict[str, Timing]:
     """Times contenders in turns; each has been called once (call 0) before.
 
-    A contender is out of the game when its timings add up to its limit, but not before ``FEWEST`` timings. Where a
-    single call takes more than ``SLOW`` limits, that one is all there is, and the timing is capped.
+    A contender stops when its timings add up to its limit, but not before ``FEWEST`` timings. If a
+    single call takes more than ``SLOW`` limits, it is the only timing, and counts as capped.
 
     Args:
         contenders: what to run, by name, in the order of their turns.
@@ -162,7 +162,7 @@ def _done(seconds: list[float], batch: int, limit: float) -> bool:
 
 
 class Others:
-    """How busy everything else keeps the machine, since this was made: timings mean little where it is not idle."""
+    """The load of all other processes since this was made; timings mean little on a busy machine."""
 
     def __init__(self) -> None:
         self.start = self._now()
@@ -187,7 +187,7 @@ class Others:
 
 
 class Peaks:
-    """The machine's limits, measured whenever asked for, so that they keep step with the clock of the processor.
+    """The machine's limits, measured at every query, because the clock of the processor changes.
 
     On the CPU by ``voronerf.native.measure_peak``; on CUDA by torch's product of large matrices and a large copy,
     which are what a user can reach rather than the limit itself.
@@ -234,7 +234,7 @@ def _cuda_peak(kind: str, device: torch.device) -> float:
 
 @contextlib.contextmanager
 def threads(count: int | None) -> Iterator[None]:
-    """As many threads inside the block; None leaves them as they are."""
+    """Sets the number of threads inside the block; None does not change it."""
     before = torch.get_num_threads()
     torch.set_num_threads(before if count is None else count)
     try:
@@ -245,9 +245,9 @@ def threads(count: int | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def instruction_set(name: str | None) -> Iterator[None]:
-    """Native CPU kernels with this instruction set inside the block; None leaves it as it is.
+    """Native CPU kernels use this instruction set inside the block; None does not change it.
 
-    What VORONERF_ISA does for a whole process.
+    VORONERF_ISA does the same for a whole process.
 
     Raises:
         ValueError: this processor has none of that name.

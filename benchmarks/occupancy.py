@@ -1,10 +1,10 @@
-"""What skipping empty space gives: training with half the time, and pictures of a trained scene.
+"""The gain of skipping empty space: training in half the time, and pictures of a trained scene.
 
     python benchmarks/occupancy.py --budget 60 --json benchmarks/results/occupancy.json
-    python benchmarks/occupancy.py --trained RUN      pictures of a run that is there, trained without a grid
+    python benchmarks/occupancy.py --trained RUN      pictures of a finished run that was trained without a grid
 
 Two runs of one scene take turns in one process: one without a grid, one with, which gets `--share` of the time. Then
-test views of the first run are rendered at `--size`, alternately asking the field for every sample and through a grid
+test views of the first run are rendered at `--size`, alternately with every sample and through a grid
 made from the field; the time to make the grid is given apart. The same for the run trained with the grid, by its own.
 """
 

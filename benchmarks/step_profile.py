@@ -3,9 +3,9 @@
     python benchmarks/step_profile.py --data DIR --downscale 4
     python benchmarks/step_profile.py --data builtin --json profile.json
 
-Trains a scene until its cells are there, then times whole steps, and profiles as many: the profiler's own time of every
+Trains a scene until it has cells, then times whole steps, and profiles as many: the profiler's time of every
 operator is added up by what the operator is for. What the operators do not account for is Python and the dispatcher.
-The profiler makes small operators look dearer than they are, so the two times of a step stand side by side.
+The profiler makes small operators look slower than they are, so both times of a step are shown.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def show(result: dict[str, Any], top: int) -> None:
-    """Prints the parts of a step and its dearest operators."""
+    """Prints the parts of a step and its slowest operators."""
     about = result["metadata"]
     print(
         f"{about['data']}, {about['field']}, {about['sampling']}, {about['cells']} cells of width {about['width']}, "

@@ -2,7 +2,7 @@
 
 python benchmarks/table.py benchmarks/results/throughput.json                    the rows that docs/performance.md shows
 python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   any others
-python benchmarks/table.py benchmarks/results/throughput.json --targets          what was to be shown, and is
+python benchmarks/table.py benchmarks/results/throughput.json --targets          the targets, and what is reached
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def markdown(rows: list[Row]) -> list[str]:
 
 
 def target_markdown(rows: list[Row]) -> list[str]:
-    """What was to be shown and what the rows reach, then what kernels and architecture save."""
+    """The targets and what the rows reach, then what kernels and architecture save."""
     found = ["| | wanted | reached | |", "|---|---|---|---|"]
     for target, value in reached(rows):
         figure = "-" if value is None else f"{value:.2f}" if value < 10 else f"{value:.1f}"
@@ -127,7 +127,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--rows", action="append", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in"
     )
-    parser.add_argument("--targets", action="store_true", help="the table of what was to be shown")
+    parser.add_argument("--targets", action="store_true", help="the table of targets")
     options = parser.parse_args(arguments)
     try:
         patterns = [re.compile(text) for text in options.rows or SHOWN]

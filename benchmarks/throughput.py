@@ -1,4 +1,4 @@
-"""What every operation and the whole route cost, beside what one would otherwise run and beside the machine's limit.
+"""The cost of every operation and of the whole route, beside alternatives and the limit of the machine.
 
     python benchmarks/throughput.py                                   everything, about twelve minutes on two cores
     python benchmarks/throughput.py --quick                           every operation once, under a minute
@@ -92,7 +92,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
-    """The cases that the options leave."""
+    """The cases that the options select."""
     every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases(), *cases_marching.cases()]
     if options.foreign:
         every = cases_foreign.cases()
@@ -110,7 +110,7 @@ def chosen_cases(options: argparse.Namespace) -> list[Case]:
 
 
 def installed() -> tuple[dict[str, str], list[str]]:
-    """Versions of the optional packages that are there, and what to install for the others."""
+    """Versions of the installed optional packages, and what to install for the others."""
     found, missing = {}, []
     for module, package in OPTIONAL.items():
         try:
@@ -136,7 +136,7 @@ class Bench:
         self.rows: list[dict[str, Any]] = []
 
     def run(self, case: Case) -> list[dict[str, Any]]:
-        """The rows of a case, one for each backend that can run it; none where none can."""
+        """The rows of a case, one for each backend that can run it."""
         names = [
             name
             for name in case.backends
@@ -197,7 +197,7 @@ class Bench:
             error, warm[name] = self._check(contender, work)
         except NotApplicable:
             raise
-        except Exception as failure:  # an alternative may fail in its own ways, which is a result too
+        except Exception as failure:  # an alternative may fail in any way, which is a result too
             first = (str(failure).strip().splitlines() or [""])[0]
             raise NotApplicable(f"{type(failure).__name__}: {first}"[:300]) from failure
         if not error <= work.tolerance:
@@ -293,7 +293,7 @@ def main(arguments: list[str] | None = None) -> None:
         except OSError as error:
             fail(f"--json: {error}")
     if not options.quick:
-        # Compilation is part of what a first call costs; a cache that is there would hide it.
+        # Compilation is part of the cost of a first call; an old cache would hide it.
         folder = tempfile.mkdtemp(prefix="voronerf-warp-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         os.environ["WARP_CACHE_PATH"] = folder

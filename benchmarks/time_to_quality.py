@@ -3,7 +3,7 @@
     python benchmarks/time_to_quality.py --data builtin --budget 120
     python benchmarks/time_to_quality.py --data DIR --downscale 4 --budget 480 --variants w64 voronoi-16
 
-All variants train the same scene for the same training time with the same settings but for the networks. They take
+All variants train the same scene for the same time with the same settings except for the networks. They take
 turns of a few seconds in one process, so that the noise of a shared machine falls on all of them alike. The JSON holds
 every evaluation; the plot shows them.
 """

@@ -1,4 +1,4 @@
-"""Several trainings in one process, a few seconds each in turns: a machine's noise falls on all of them alike."""
+"""Several trainings in one process, in turns of a few seconds, so that the noise of the machine affects all alike."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from voronerf.training.trainer import TrainingError
 
 
 class Training(Protocol):
-    """What can take turns: ``voronerf.training.trainer.Trainer``, or what counts its seconds as it does."""
+    """A training that can take turns, such as ``voronerf.training.trainer.Trainer``."""
 
     seconds: float
 
@@ -32,13 +32,13 @@ def take_turns(
     after_turn: Callable[[T], None] = lambda training: None,
     on_failure: Callable[[T, TrainingError], None] | None = None,
 ) -> None:
-    """Trains all of them for the same time; what the callbacks take is nobody's training time.
+    """Trains all of them for the same time; the time of the callbacks does not count.
 
     Args:
-        trainings: at any point of their run; those that have come further than others wait for them.
+        trainings: at any point of their run; the ones that are ahead wait for the others.
         budget: training seconds of each.
         turn: seconds until the next one has its turn.
-        stops: for each the training seconds at which somebody wants to look at it, rising.
+        stops: for each the training seconds at which ``on_stop`` is called, rising.
         on_stop: called with a training and the stop that it has reached.
         after_turn: called with a training after each of its turns.
         on_failure: called with a training that failed and its error; the others go on. None: the error ends all.

@@ -1,10 +1,10 @@
 """NVIDIA Warp kernels, installed as ``voronerf.kernels``: one file per op, one source for CPU and CUDA.
 
-On the CPU Warp runs on one thread, so there it is a path for checking. Importing this package raises
+On the CPU Warp runs on one thread, so there it serves as a check. Importing this package raises
 ``BackendUnavailable`` where Warp is missing or too old; ``import voronerf`` never imports it.
 
-Kernels are compiled when they are first used, a file at a time, or all of them by `preload` (`voronerf preload`). What
-is compiled stays in Warp's cache, whose place is the environment variable WARP_CACHE_PATH or Warp's default.
+Kernels are compiled when they are first used, a file at a time, or all at once by `preload` (`voronerf preload`).
+Compiled kernels stay in Warp's cache, in the folder WARP_CACHE_PATH or Warp's default.
 """
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ from torch import Tensor
 
 
 def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float32) -> Any:
-    """A view of a tensor with its strides, nothing copied; for None an empty one of a dtype, on the device of `like`.
+    """A view of a tensor with its strides, without a copy; for None an empty array of a dtype, on the device of `like`.
 
-    Kernels do not look at an array that is not there, but Warp wants one.
+    Kernels do not read an absent array, but Warp needs one.
     """
     if tensor is None:
         tensor = like.new_empty(0, dtype=dtype)
@@ -24,7 +24,7 @@ def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float3
 
 
 def on_stream(tensor: Tensor) -> AbstractContextManager[Any]:
-    """Makes torch's current stream Warp's, for what takes no stream as an argument."""
+    """Makes torch's current stream Warp's, for calls without a stream argument."""
     if not tensor.is_cuda:
         return nullcontext()
     context: AbstractContextManager[Any] = wp.ScopedStream(wp.stream_from_torch(tensor.device), sync_enter=False)

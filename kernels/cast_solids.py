@@ -1,6 +1,6 @@
 """First hits of rays on solids as a Warp kernel. r rays, s solids.
 
-A thread takes a ray and asks a tree of the solids' boxes (wp.Bvh) which of them it meets; their distances are the
+A thread takes a ray and finds the solids that it may meet in a tree of their boxes (wp.Bvh); distances are by the
 reference's formulas. Building the tree of some hundred solids costs less than a thousand rays.
 """
 
@@ -131,7 +131,7 @@ def _cast_solids_kernel(
             found = _cylinder(o, d, size)
         else:
             found = _torus(o, d, size)
-        # The tree gives the solids in any order: of equally near ones the first counts.
+        # The tree gives the solids in any order: of equally near ones, the one with the lowest index counts.
         if found < best or (found == best and which >= 0 and number < which):
             best = found
             which = number

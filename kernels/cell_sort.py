@@ -19,7 +19,7 @@ def _keys_kernel(
     order: wp.array(dtype=wp.int32),
 ) -> None:
     i = wp.tid()
-    # What is out of range (where values are not read) is kept apart: before cell 0, whose key is 1, or behind the last.
+    # Cells out of range (possible where values are not read) go before cell 0, whose key is 1, or behind the last.
     keys[i] = wp.clamp(cells[i], -1, k) + 1
     order[i] = i
 
@@ -52,7 +52,7 @@ def _cell_sort(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:
         low, high = (int(bound) for bound in cells.aminmax())
         if low < 0 or high >= k:
             raise ValueError(f"cell_sort: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
-    # The sort wants room for twice the pairs, and leaves them in the first half.
+    # The sort needs room for twice the pairs, and leaves them in the first half.
     keys, order = cells.new_empty(2 * n), cells.new_empty(2 * n)
     offsets = cells.new_empty(k + 1)
     launch(_keys_kernel, n, [array(cells, cells), k, array(keys, cells), array(order, cells)], cells)

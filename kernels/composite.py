@@ -35,7 +35,7 @@ _OPAQUE = wp.constant(wp.float32(1.0e30))
 
 @wp.func
 def _density(sigma: wp.float32) -> wp.float32:
-    # A NaN stays one.
+    # NaN stays NaN.
     density = sigma
     if sigma > _OPAQUE:
         density = _OPAQUE
@@ -178,7 +178,7 @@ def _forward(
     sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     colour, opacity, depth, weights = results = _allocate(sigma, rgb, ray_offsets)
-    # Samples of no ray.
+    # Samples that belong to no ray.
     weights.zero_()
     outputs = [array(tensor, sigma) for tensor in (colour, opacity, depth, weights.view(-1))]
     inputs = _inputs(sigma, rgb, depths, deltas, ray_offsets, background)
@@ -229,7 +229,7 @@ def _backward(
 def _inputs(
     sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
 ) -> list[Any]:
-    """What both kernels read, in their order. Samples are numbered through all rays."""
+    """The inputs of both kernels, in their order. Samples are numbered through all rays."""
     rays, c = _rays(sigma, ray_offsets), rgb.shape[-1]
     flat = [sigma.reshape(-1), rgb.reshape(sigma.numel(), c), depths.reshape(-1), deltas.reshape(-1)]
     behind = rgb.new_empty(0, c) if background is None else background.expand(rays, c)

@@ -35,7 +35,7 @@ def _squared(
 @wp.func
 def _mass(nearest: wp.float32, squared: wp.float32, temperature: wp.float32) -> wp.float32:
     mass = wp.exp((nearest - wp.sqrt(squared)) / temperature)
-    # A number, unlike that of a point that is not finite; above 1 it is by rounding.
+    # Finite, unlike the mass of a point that is not finite; above 1 only by rounding.
     if mass >= 0.0:
         return wp.min(mass, wp.float32(1.0))
     return wp.float32(0.0)
@@ -76,7 +76,7 @@ def _draw_cell_kernel(
             for j in range(first, last):
                 total += _mass(nearest, _squared(x, centres, weights, weighted, heaviest, j), temperature)
             wanted = wp.float32(1.0) - uniforms[i, level]
-            if not (wanted <= 1.0):  # a number above 1, or none
+            if not (wanted <= 1.0):  # above 1, or NaN
                 wanted = wp.float32(1.0)
             wanted = wp.max(wanted, wp.float32(5.9604645e-8)) * total
             drawn = first

@@ -47,7 +47,7 @@ def _sample(
     last: wp.float32,
 ) -> wp.float32:
     at = _depth(near, far, (wp.float32(stratum) + inside) / wp.float32(samples), disparity)
-    # Not min and max, which would make a number of what is none.
+    # Not min and max, which would turn NaN into a number.
     if at < first:
         at = first
     if at > last:
@@ -119,7 +119,7 @@ def _march_kernel(
             taken = occupied[x, y, z] != wp.uint8(0)
         if taken and not counting:
             if found == room:
-                # Cut: it goes on here.
+                # The ray is cut; the next call starts here.
                 going = wp.bool(False)
             else:
                 ray_index[row + found] = ray
@@ -184,7 +184,7 @@ def _count(
     none, no_index = array(near[:0], near), array(offsets[:0], near)
     results = [array(counts, near), no_index, none, none, array(origins[:0], near), no_index]
     launch(_march_kernel, near.shape[0], [*inputs, True, no_index, *results], near)
-    # In int64: the sum of what all rays want may not fit, what there is room for does.
+    # In int64: the number of samples of all rays may not fit int32; the capacity does.
     return offsets.cumsum(dim=0).clamp(max=capacity).to(torch.int32)
 
 
@@ -229,7 +229,7 @@ def _inputs(
     disparity: bool,
     most: int,
 ) -> list[object]:
-    """What both launches read, in the kernel's order."""
+    """The inputs of both launches, in the order of the kernel."""
     places = near.new_empty(0, 0) if uniforms is None else uniforms
     views = [array(tensor, near) for tensor in (origins, directions, near, far, occupied, box, places)]
     first = [array(start, near, torch.int32), start is not None]

@@ -69,7 +69,7 @@ def _nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None) -> 
     cells = points.new_empty(points.shape[0], dtype=torch.int32)
     if points.shape[0] == 0:
         return cells
-    # Strides are passed along: nothing is copied but what has another dtype.
+    # Strides are passed on: only tensors of another dtype are copied.
     arrays = [wp.from_torch(tensor.to(dtype)) for tensor in given]
     arrays += [wp.empty(0, dtype=arrays[0].dtype, device=arrays[0].device)] if weights is None else []
     stream = wp.stream_from_torch(points.device) if points.is_cuda else None

@@ -63,7 +63,7 @@ def select_heaviest(points: Tensor, importance: Tensor, count: int) -> tuple[Ten
 @torch.library.custom_op("voronerf::select_heaviest_warp", mutates_args=())
 def _select(points: Tensor, importance: Tensor, count: int) -> tuple[Tensor, Tensor]:
     n = points.shape[0]
-    # The sort wants room for twice the pairs, and leaves them in the first half.
+    # The sort needs room for twice the pairs, and leaves them in the first half.
     keys, order = (points.new_empty(2 * n, dtype=torch.int32) for _ in range(2))
     results = _allocate(points, count)
     given = [array(points, points), array(importance, points)]

@@ -1,4 +1,4 @@
-"""The memory of an occupancy grid as Warp kernels. n cells, q of them looked at."""
+"""Updating an occupancy grid as Warp kernels. n cells, q of them updated."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _fade_kernel(
     result: wp.array(dtype=wp.float32),
 ) -> None:
     i = wp.tid()
-    # From what was: a cell that is named twice fades once, whoever is first.
+    # From the old density: a cell that occurs twice decays once, in any order.
     result[cells[i]] = density[cells[i]] * decay
 
 
@@ -42,7 +42,7 @@ def _compare_kernel(
 def update_occupancy(
     density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
 ) -> tuple[Tensor, Tensor]:
-    """The larger of what was found and what is remembered; see ``voronerf.ops.update_occupancy``."""
+    """The larger of the density found and the decayed old one; see ``voronerf.ops.update_occupancy``."""
     remembered, occupied = _update(density, cells, values, decay, threshold)
     return remembered, occupied
 

@@ -1,6 +1,6 @@
-"""What a user would otherwise run in place of grouped_mlp and grouped_linear, each at its best setting.
+"""Alternatives to grouped_mlp and grouped_linear, each at its best setting.
 
-Samples are sorted by cell, and encoded inputs are given to the alternatives for nothing, while grouped_mlp encodes
+Samples are sorted by cell, and the alternatives get encoded inputs for free, while grouped_mlp encodes
 inside. Every call of each returns its output as one new tensor, through which training goes. n samples, k cells, i
 inputs and o outputs of a layer.
 """
@@ -54,7 +54,7 @@ def evaluate(net: MLP, x: Any, d: Any, weights: Sequence[Any], biases: Sequence[
 
 
 def torch_linear(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
-    """addmm and ReLU in place, which is what the gradient needs as well."""
+    """addmm and ReLU in place; the gradient needs no more."""
     y = F.linear(x, weight, bias)
     return y.relu_() if activation == "relu" else y
 

@@ -1,6 +1,6 @@
-"""One row of the throughput table before it is measured: what runs, against what, and how its answer is checked.
+"""One row of the throughput table before it is measured: what runs, against what, and how results are checked.
 
-n samples, k cells. A case is cheap to make; its inputs and contenders come into being when it is built.
+n samples, k cells. A case is cheap to make; its inputs and contenders are made when it is built.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Contender:
 
     Attributes:
         run: call number -> result.
-        adapt: result -> what ``Work.error`` compares, where that is not the result itself.
+        adapt: result -> what ``Work.error`` compares, if that is not the result itself.
     """
 
     run: Run
@@ -45,7 +45,7 @@ class Work:
         alternatives: name -> what sets it up, which may raise ``NotApplicable``.
         error: result of call 0 -> largest error against float64: relative to the largest entry for floats, the number
             of wrong ones for integers.
-        tolerance: largest error with which an alternative still counts as having done the work.
+        tolerance: largest error of an alternative that counts as correct.
         amount: operations, or bytes read and written, of a call at the least; samples where there is no bound.
         bound: which limit of the machine the amount is compared with: "float32", "bfloat16" or "copy"; "" for none.
         executed: operations of a call with what is computed again, where that is more than ``amount``.
@@ -113,7 +113,7 @@ def optional(name: str) -> Any:
 
 
 def rotation(tensor_bytes: int) -> int:
-    """How many sets of inputs of this size calls go through, 64 at most: smaller ones are in a cache in use as well."""
+    """Number of input sets of this size, at most 64; small inputs are in a cache in real use as well."""
     return min(max(ROTATED_BYTES // max(tensor_bytes, 1), 2), 64)
 
 

@@ -64,7 +64,7 @@ def cases() -> list[Case]:
 
 
 def frozen_lookup() -> Callable[..., Any] | None:
-    """What prepares frozen centres for faster queries, where this version has it."""
+    """Prepares frozen centres for faster queries, if this version can."""
     return getattr(ops, "centre_grid", None)
 
 
@@ -113,7 +113,7 @@ def _nearest_work(n: int, k: int, dtype: torch.dtype, frozen: bool, device: torc
 
 
 def _wrong_cells(points: Tensor, centres: Tensor, cells: Tensor) -> float:
-    """Of ``CHECKED`` points, those with a centre that is farther than another, in float64."""
+    """The number of ``CHECKED`` points whose centre is farther than another, in float64."""
     step = max(1, points.shape[0] // CHECKED)
     points, chosen = points[::step].double().cpu(), cells[::step].long().cpu()
     if int(chosen.min()) < 0 or int(chosen.max()) >= centres.shape[0]:
@@ -304,7 +304,7 @@ def _draw_work(n: int, k: int, device: torch.device, temperature: float = 0.05) 
         return (logits - torch.empty_like(logits).exponential_().log()).argmax(1)
 
     def error(cells: Tensor) -> float:
-        """How far the number of points in a cell is from the law's, in standard deviations, at the worst."""
+        """Largest deviation of the number of points in a cell from its expectation, in standard deviations."""
         mean, variance = torch.zeros(k, dtype=torch.float64), torch.zeros(k, dtype=torch.float64)
         for piece in points[0].double().cpu().split(max(1, (1 << 20) // k)):
             law = (torch.cdist(piece, centres.double().cpu()) / -temperature).softmax(1)
@@ -355,7 +355,7 @@ def _sort_work(n: int, k: int, device: torch.device) -> Work:
         return Contender(run)
 
     def error(result: tuple[Any, Any]) -> float:
-        """Entries that differ from numpy's stable sort; the number of samples, which offsets may leave out, is not."""
+        """Number of entries that differ from numpy's stable sort."""
         expected = cells[0].cpu().numpy().argsort(kind="stable")
         order, offsets = (torch.as_tensor(part).cpu().numpy() for part in result)
         first = cells[0].cpu().numpy()[expected].searchsorted(np.arange(k))

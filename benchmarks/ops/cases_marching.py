@@ -88,10 +88,10 @@ def _march_work(n: int, jitter: bool, device: torch.device) -> Work:
         return Contender(run)
 
     def error(found: Any) -> float:
-        """Of the depths against float64; where other strata are kept, the share of the rays with another number."""
+        """Error of the depths against float64; if other strata are kept, the share of rays with a different number."""
         others = float((found[0].diff() != exact.ray_offsets.diff()).double().mean())
         if found[1].shape != exact.ray_index.shape or not torch.equal(found[1], exact.ray_index):
-            return others or float("inf")  # the numbers are right, but not whose samples they are
+            return others or float("inf")  # the numbers are right, but the samples belong to other rays
         return relative_error(found[2], _exact_depths(*sets[0], exact))
 
     # Read the rays (and the places in the strata), look up a byte for each stratum, write what is kept.
@@ -100,7 +100,7 @@ def _march_work(n: int, jitter: bool, device: torch.device) -> Work:
         lambda backend: contender(functools.partial(ops.march_rays, backend=backend)),
         {"torch, all strata and a mask": lambda: contender(_march_masked)},
         error,
-        0.01,  # rounded otherwise, a sample at a cell's border falls on its other side
+        0.01,  # with another rounding, a sample at the border of a cell falls on the other side
         amount,
         "copy",
     )
@@ -134,7 +134,7 @@ def _march_masked(
     *,
     uniforms: Tensor | None,
 ) -> tuple[Tensor, ...]:
-    """Every sample's place, its cell, and the rows that are occupied: what one writes without an op."""
+    """The place and cell of every sample, and the occupied rows: the code that one writes without the op."""
     r, size = origins.shape[0], occupied.shape[0]
     stratum = torch.arange(samples, device=near.device)
     at = (stratum + (0.5 if uniforms is None else uniforms)) / samples
@@ -285,7 +285,7 @@ def _balance_work(n: int, k: int, device: torch.device) -> Work:
         return Contender(lambda call: function(*sets[call % len(sets)]))
 
     def error(found: Any) -> float:
-        """What is left of the imbalance, std(W / max W) of what was before: 500 steps amplify every rounding."""
+        """The remaining imbalance, relative to the one before; values differ because 500 steps amplify rounding."""
         return _spread_of_masses(sets[0], found[0]) / before
 
     def tree() -> Contender:
@@ -351,7 +351,7 @@ def _heaviest_work(n: int, device: torch.device) -> Work:
     expected = sets[0][1].double().sort(descending=True).values[:KEPT]
 
     def error(found: Any) -> float:
-        """Of the weights; infinite where a point is not the one of its weight."""
+        """Error of the weights; infinite if a point does not belong to its weight."""
         points, kept = found
         rows = (sets[0][0][None] == points[:, None]).all(-1).float().argmax(1)
         same = torch.equal(sets[0][0][rows], points) and torch.equal(sets[0][1][rows], kept)

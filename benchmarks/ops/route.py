@@ -1,6 +1,6 @@
-"""Cases of routed_mlp, the whole route: positions in any order to outputs in that order. n samples, k cells.
+"""Cases of routed_mlp, the whole route: positions in any order to outputs in the same order. n samples, k cells.
 
-A case named "separate" composes the operations instead. The alternatives are what one writes in torch: look up the cell
+A case named "separate" composes the operations instead. The alternatives are written in torch: look up the cell
 by the fastest way that is installed, then either sort and loop over the cells, or loop over boolean masks, as Mega-NeRF
 does. All of them encode the positions themselves.
 """
@@ -114,7 +114,7 @@ def fastest_lookup(centres: Tensor, points: Tensor) -> tuple[str, Callable[[Tens
         try:
             find = make(centres)
             find(points[: max(1, points.shape[0] // 8)])
-        except Exception:  # one that is not there, or that fails, is no pipeline's
+        except Exception:  # a lookup that is not installed or that fails is left out
             continue
         synchronise(points)
         start = time.perf_counter()
@@ -207,7 +207,7 @@ def masked_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Co
 def _contender(
     batch: Batch, parts: Callable[[int], Iterator[tuple[Tensor, Tensor]]], own: Parameters, dtype: torch.dtype
 ) -> Contender:
-    """Puts the parts where they belong; with gradients, the whole output is there before they are taken."""
+    """Puts the parts in their places; with gradients, the whole output is made before they are computed."""
 
     def empty() -> Tensor:
         return torch.empty(batch.n, batch.net.out_features, dtype=dtype, device=batch.positions[0].device)

@@ -1,4 +1,4 @@
-"""What the project set out to show, and what the rows of a run reach of it.
+"""The targets of the project, and what the rows of a run reach.
 
 Every target reads rows of the native backend; a row that was not measured leaves its target open.
 """

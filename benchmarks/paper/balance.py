@@ -38,7 +38,7 @@ def samples_path(run: Run) -> Path:
 
 
 def without_samples(settings: Settings) -> list[str]:
-    """The trainings whose samples are not there."""
+    """The trainings without kept samples."""
     absent = [run for run in runs(settings) if not samples_path(run).is_file()]
     return [f"samples of {Path(run.scene).name}, seed {run.seed}" for run in absent]
 
@@ -113,7 +113,7 @@ def claims(results: Sequence[dict[str, Any]]) -> list[Claim]:
 
 
 def balance_verdict(before: float | None, after: float | None) -> str:
-    """Whether balancing reaches the published figure, or at least its factor, or nothing of it."""
+    """Whether balancing reaches the published figure, at least its factor, or neither."""
     if before is None or after is None:
         return NOT_MEASURED
     if after >= before:

@@ -1,4 +1,4 @@
-"""What the paper claims, and whether the figures of a run say the same: every verdict is computed from them."""
+"""The claims of the paper, and whether the figures of a run agree: every verdict is computed from them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Rows:
     def gains(
         self, better: str, worse: str, scene: str | None = None, value: Callable[[Row], float | None] | None = None
     ) -> list[float]:
-        """Value of one variant less that of another, for each scene and seed that both have; PSNR by default.
+        """Difference between two variants, for each scene and seed that both have; PSNR by default.
 
         Trainings of different machines are not a pair: the same seconds are not the same number of steps there.
         """
@@ -74,7 +74,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim, what was published, what came out here and whether the two agree."""
+    """A claim, the published figure, the figure here, and whether they agree."""
 
     claim: str
     published: str
@@ -146,7 +146,7 @@ def at_look(row: dict[str, Any], look: str, value: str) -> float | None:
 def fewer_seams(rows: Rows, scene: str, usual: str, other: str, looks: Sequence[str]) -> list[float]:
     """By how many per cent of the usual variant's mean the other's seams are lower, for each seed.
 
-    Of each seed those looks count that both variants have.
+    For each seed, only looks that both variants have count.
     """
     others = {row["seed"]: row for row in rows.of(other, scene)}
     means = []

@@ -1,4 +1,4 @@
-"""What a training looks like on the way: a held-out view, a slice through its density, its cells, its seams.
+"""Snapshots of a training: a held-out view, a slice through its density, its cells, its seams.
 
 A look is a file of a run directory, looks/NAME.npz; NAME says when: "before" and "after" the first split, at quarters
 of the run, "end".
@@ -42,12 +42,12 @@ def stops(trainer: Trainer) -> list[tuple[str, float]]:
 
 
 def held_out_view(scene: Scene) -> int:
-    """The test view that is looked at."""
+    """The test view of the snapshots."""
     return len(scene.test) // 3
 
 
 def reached(trainer: Trainer, second: float) -> None:
-    """Looks at a trainer that has come to one of its stops, unless that was done before an interruption."""
+    """Writes the look of a trainer at one of its stops, unless that was done before an interruption."""
     names = [name for name, at in stops(trainer) if at == second]
     if all((trainer.out / "looks" / f"{name}.npz").is_file() for name in names):
         return
@@ -66,7 +66,7 @@ def forget_later(trainer: Trainer) -> None:
 
 
 def missed(trainer: Trainer) -> list[str]:
-    """The looks that a finished run has not: their time had passed when it was resumed."""
+    """The looks that a finished run lacks, because their time had passed when it was resumed."""
     return [name for name, _ in stops(trainer) if not (trainer.out / "looks" / f"{name}.npz").is_file()]
 
 
@@ -106,7 +106,7 @@ def picture(trainer: Trainer) -> dict[str, Any]:
 def seams(trainer: Trainer) -> dict[str, float]:
     """The step in colour across the borders of cells, {} where none is visible.
 
-    Of trainings with one field of points; others are not asked.
+    Only for trainings with one field of points.
     """
     if len(trainer.routers) > 1 or trainer.renderer.fine_samples or trainer.renderer.cones:
         return {}
@@ -125,7 +125,7 @@ def load(folder: Path, name: str) -> dict[str, Any] | None:
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
-    """What is a number in the looks of a run, in the order of time."""
+    """The numbers in the looks of a run, in the order of time."""
     found = []
     for path in (folder / "looks").glob("*.npz"):
         with np.load(path) as file:

@@ -6,8 +6,8 @@
     python benchmarks/paper.py report                               # docs/paper.md again, from what is in --out
 
 All variants of an experiment train for the same time. Each experiment writes NAME.json ({metadata, results, claims}),
-NAME.md and pictures into --out. A training that is there already, made with the same settings, is not made again, and
-an interrupted one goes on. Trainings made in one go take turns of a few seconds in one process.
+NAME.md and pictures into --out. A training that was made before with the same settings is not made again, and
+an interrupted one is continued. Trainings that are started together take turns of a few seconds in one process.
 
 A long table is made in parts, over several sittings, with a file that can be committed:
 
@@ -16,7 +16,7 @@ A long table is made in parts, over several sittings, with a file that can be co
     python benchmarks/paper.py table sampling --record RECORD.json --no-train    # the table as far as it goes
     python benchmarks/paper.py export RECORD.json --out runs/paper               # all trainings of a folder
 
-Tables and pages show what is there and name what is missing. Gains are taken between trainings of one machine only.
+Tables and pages show the results so far and name what is missing. Gains compare trainings of one machine only.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def trainings(name: str, settings: Settings) -> list[Run]:
 
 
 def experiment(name: str, settings: Settings) -> dict[str, Any]:
-    """Runs what is missing of an experiment and writes its files; returns {metadata, results, claims}."""
+    """Runs the missing trainings of an experiment and writes its files; returns {metadata, results, claims}."""
     if name == "nested-2d":
         paper_nested.refuse_trainings(settings)
     runs = trainings(name, settings)
@@ -138,7 +138,7 @@ def figure(name: tyro.conf.Positional[Figure], settings: Settings) -> None:
 
 
 def show(name: str, outcome: dict[str, Any], settings: Settings) -> None:
-    """Prints what came out."""
+    """Prints the results."""
     print((settings.out / f"{name}.md").read_text())
     print(f"wrote {settings.out}: {name}.json, {name}.md, {name}*.png")
 

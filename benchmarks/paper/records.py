@@ -2,8 +2,8 @@
 
     {"metadata": {...}, "results": {"SCENE-SEED-HASH": what a training's result.json holds}}
 
-No checkpoints, samples or pictures: of a training's looks the numbers only. A training that the file knows counts as
-made wherever the file is named (``--record``), so a later sitting on another machine goes on where the last one ended.
+No checkpoints, samples or pictures: of a training's looks the numbers only. A training in the file counts as made
+wherever the file is named (``--record``), so a later session on another machine continues where the last one ended.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _processor_numbers() -> str | None:
 
 
 def comparable(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
-    """Whether two trainings had as much of a machine in a second; those that do not say where they were made had."""
+    """Whether two trainings were made on equal machines; results without a machine count as equal."""
     one, other = (row.get("made_on") for row in (first, second))
     same = ("machine", "processor", "threads", "instruction set")
     return one is None or other is None or all(one.get(name) == other.get(name) for name in same)
@@ -64,7 +64,7 @@ def machine_name(made: Mapping[str, Any]) -> str:
 
 
 def changed_settings(config: Mapping[str, Any]) -> Row:
-    """Of a configuration as JSON holds it the settings that differ from their defaults."""
+    """The settings of a configuration, as in its JSON, that differ from their defaults."""
     usual = json.loads(TrainConfig().to_json())
     return {name: value for name, value in config.items() if name not in NOT_TOLD and value != usual.get(name)}
 
@@ -128,7 +128,7 @@ def keep(folders: Iterable[Path], record: Path) -> tuple[int, int]:
 
 
 def restore(folders: Iterable[Path], record: Path) -> int:
-    """Writes result.json of those trainings that a file knows and the run directories have not; returns how many."""
+    """Writes result.json of the trainings that are in a file and not in the run directories; returns how many."""
     results, count = read_record(record), 0
     for folder in folders:
         if folder.name in results and not (folder / "result.json").is_file():
@@ -138,7 +138,7 @@ def restore(folders: Iterable[Path], record: Path) -> int:
 
 
 def forget(folders: Iterable[Path], record: Path) -> None:
-    """Takes the results of trainings out of a file: they will be made again."""
+    """Removes the results of trainings from a file: they will be made again."""
     results = read_record(record)
     names = {folder.name for folder in folders}
     if results.keys() & names:

@@ -1,8 +1,8 @@
-"""The trainings behind the paper's tables and figures: made once, kept by what they are, looked at on the way.
+"""The trainings behind the paper's tables and figures: made once, named by their settings, with snapshots on the way.
 
-A training is known by its whole configuration, so two experiments that need the same one share it, and one that is in
-the output folder already is not made again. All trainings of a scene and a seed that are missing take turns of a few
-seconds in one process. An interrupted one goes on from its last turn. One that fails leaves its group, and its
+A training is identified by its whole configuration, so two experiments that need the same one share it, and one in
+the output folder is not made again. All missing trainings of a scene and a seed take turns of a few
+seconds in one process. An interrupted one continues from its last turn. One that fails leaves its group, and its
 result.json says why. A long table is made in parts: settings say which of its trainings are made now, and a file keeps
 the results of all sittings.
 
