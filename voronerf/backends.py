@@ -1,4 +1,4 @@
-"""Which implementation of an op runs: one table, of which each op declares its own row (``voronerf/ops``), and one
+"""Which implementation of an op runs: one table, in which each op declares its own row (``voronerf/ops``), and one
 predicate that both selects and explains.
 
 An op has up to three implementations with one signature, that of its reference function:
@@ -8,8 +8,8 @@ An op has up to three implementations with one signature, that of its reference 
     warp        kernels/, NVIDIA Warp, one source for CPU and CUDA
 
 ``backend="auto"`` takes the first entry of the device's order that is available and supports the call. The choice never
-depends on timing. On CUDA the reference comes last, rather than being left out, so that every op runs on every device
-while not every op has a CUDA kernel. A backend asked for by name never falls back: what is missing raises
+depends on timing. The reference is the last entry on CUDA too, so that every op runs on every device, although not
+every op has a CUDA kernel. A backend that is given by name never falls back to another: if it cannot run, it raises
 :class:`BackendUnavailable` with the reason and the remedy.
 """
 
@@ -33,7 +33,7 @@ ORDER = {"cpu": ("native", "reference"), "cuda": ("native", "warp", "reference")
 
 
 class BackendUnavailable(RuntimeError):
-    """A backend asked for by name cannot run here; the message says why and what to do."""
+    """A backend that was given by name cannot run here; the message says why, and what to do."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Row:
         backend: name of the backend.
         devices: device types on which this pair can run here and now.
         dtypes: names of the dtypes it takes, ``("any",)`` for all, empty where there is no implementation.
-        reason: why it cannot run, or cannot run on some device, in one line; empty where nothing is missing.
+        reason: why it cannot run, or cannot run on some device, in one line; empty if it can.
     """
 
     op: str
@@ -125,19 +125,19 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
 
     Raises:
         ValueError: unknown op or backend.
-        BackendUnavailable: the backend asked for by name is not available, or does not take this device or dtype.
+        BackendUnavailable: the named backend is not available, or does not support this device or dtype.
     """
     return _FUNCTIONS[op, _choose(op, backend, device.type, device.index, dtype)]
 
 
 def why_not(op: str, backend: str, device: torch.device, dtype: torch.dtype | None = None) -> str | None:
-    """Reason, with the remedy where there is one, why a backend cannot run an op; None if it can.
+    """Why a backend cannot run an op, with the remedy if there is one; None if it can.
 
     Args:
         op: name of the op.
         backend: a name from ``BACKENDS``.
         device: device of the op's tensors.
-        dtype: dtype of the op's first tensor argument; None leaves it out of the question.
+        dtype: dtype of the op's first tensor argument; None to ignore it.
     """
     implementation = _TABLE.get((op, backend))
     if implementation is None:
@@ -194,7 +194,7 @@ def table() -> list[Row]:
 
 
 def describe() -> dict[str, Any]:
-    """What this installation is made of: versions, threads, and how the compiled module was built."""
+    """Describes this installation: versions, threads, and how the compiled module was built."""
     from voronerf import __version__
 
     return {

@@ -1,6 +1,6 @@
 """Marks for ``torch.compile`` that do not import it.
 
-The decorators of ``torch.compiler`` import all of torch's compiler, which takes as long as importing torch itself.
+The decorators of ``torch.compiler`` import the whole compiler of torch, which takes as long as importing torch.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The layer table of a per-cell network: what ``grouped_mlp`` runs, and what a field or a router describes.
+"""The layer table of a per-cell network, which ``grouped_mlp`` runs.
 
-A network is a list of linear layers with elementwise activations. Each layer names where its inputs come from, so that
+A network is a list of linear layers with elementwise activations. Each layer names the sources of its inputs, so that
 skip connections and a branch that sees the view direction are entries of a table rather than code, and one kernel runs
 them all. The original NeRF (Mildenhall et al. 2020, figure 7) and the networks of KiloNeRF are both such tables.
 

@@ -1,4 +1,4 @@
-// One template binds every function. A file of an op says no more than the functions and the structs they take:
+// One template binds every function. The binding file of an op only lists its functions and the structs they take:
 //
 //   VN_BINDINGS(module) {
 //     module.cpu("nearest_centre", VN_CPU(nearest_centre_cpu<float>));

@@ -29,7 +29,7 @@
   } while (false)
 #endif
 
-// Internal invariants: what Python has validated is not validated again.
+// Internal invariants: arguments that Python has validated are not validated again.
 #define VN_CHECK(condition, message)                     \
   do {                                                   \
     if (!(condition)) throw std::runtime_error(message); \

@@ -34,7 +34,7 @@ namespace voronerf {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-// threadIdx.x, read where it is wanted: the compiler would keep what is made of it in registers that others need.
+// threadIdx.x, read where it is used: the compiler would otherwise keep values derived from it in scarce registers.
 __device__ __forceinline__ int thread_again() {
 #ifdef VN_EMULATE
   return static_cast<int>(threadIdx.x);

@@ -9,7 +9,7 @@ enum class Isa : int { portable = 0, avx2 = 1, avx512 = 2 };
 // Whether this processor and its operating system can run it.
 bool isa_supported(Isa isa);
 
-// Whether it multiplies pairs of bfloat16, and the build has the code for it.
+// Whether the processor multiplies pairs of bfloat16, and the build has code for it.
 bool isa_multiplies_bfloat16(Isa isa);
 
 }  // namespace voronerf

@@ -1,4 +1,4 @@
-// What this machine's cores and memory can do, as the yardstick of benchmarks/: operands that never leave registers,
+// The limits of this machine's cores and memory, for benchmarks/: operands that never leave registers,
 // and a copy of memory that fits no cache.
 #pragma once
 

@@ -39,12 +39,12 @@ void parallel(int threads, const Body& body) {
 #endif
 }
 
-// Items 0 to count - 1 in runs of `run`, for whichever thread of a team asks next.
+// Items 0 to count - 1 in runs of `run`; each goes to the next thread of a team that is free.
 class Items {
  public:
   explicit Items(int64_t count, int64_t run = 1) : count_(count), run_(run) {}
 
-  // Whether there was a run left: items [begin, end).
+  // Takes the next run, items [begin, end); false if none is left.
   bool take(int64_t& begin, int64_t& end) {
     begin = next_.fetch_add(run_, std::memory_order_relaxed);
     end = std::min(begin + run_, count_);

@@ -59,12 +59,12 @@ VN_HD float turns_of_large(float x) {
   return x < 0.0f ? -fraction : fraction;
 }
 
-// 2^octave, of which products are exact.
+// 2^octave; products with it are exact.
 VN_HD float octave_scale(int octave) {
   return ldexpf(1.0f, octave);
 }
 
-// How much of an octave a Gaussian of this variance leaves.
+// The factor on an octave for a Gaussian of this variance.
 VN_HD float octave_blur(float scale, float variance) {
   return expf(-0.5f * scale * scale * variance);
 }

@@ -63,7 +63,7 @@ void encode_row_exactly(const float* x, const float* table, int64_t stride, cons
   }
 }
 
-// What the lanes of a vector of columns compute. `raw`: those that hold x itself.
+// The work of the lanes of a vector of columns. `raw`: the lanes that hold x itself.
 struct Lanes {
   Bits index, raw;
   F32 scale, phase;
@@ -175,7 +175,8 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 #endif
 }
 
-// What the variances leave of encoded rows: d <= kLanes, no input among the columns, rows as in `encode`.
+// Multiplies encoded rows by the factors of the variances: d <= kLanes, no input among the columns, rows as in
+// `encode`.
 void blur(const float* variances, int64_t x_stride, const float* table, int64_t rows, float* out, int64_t stride) {
   for (int64_t row = 0; row < rows; ++row, variances += x_stride, out += stride) {
     const F32 features = load(variances);

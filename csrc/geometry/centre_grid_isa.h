@@ -14,11 +14,11 @@ struct CentreGrid {
   int bits;
 };
 
-// Rows on the calling thread; -1 for those beyond the reach of the grid.
+// Rows on the calling thread; -1 for points beyond the reach of the grid.
 VN_DECLARE_FOR_ISA(void nearest_centre_grid(const float* points, const float* centres, const float* weights,
                                             float weight_bound, const CentreGrid& grid, int32_t* cells, int64_t n))
 
-// Strikes out of `count` candidates those that another beats in the box (lowest, highest corner), and returns how many
+// Removes from `count` candidates those that another beats in the box (lowest, highest corner), and returns how many
 // stay. centres [k,4] with weights; workspace of kPruneWorkspace doubles a candidate.
 constexpr int64_t kPruneWorkspace = 16;
 VN_DECLARE_FOR_ISA(int32_t centre_grid_prune(const double* box, const double* centres, const int32_t* in, int32_t count,

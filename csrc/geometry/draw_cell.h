@@ -4,8 +4,8 @@
 //     exp(-d / temperature),    d = |x - c|, with power weights sqrt(|x - c|^2 + max w - w)
 //
 // by the inverse of the distribution: with u = uniforms[point, level] in 0 to 1 it is the first centre up to which the
-// probabilities sum to at least 1 - u. Float32 throughout; what is less likely than the nearest centre by a factor of
-// e^20 counts as impossible. A point that is not finite takes the first centre at every level.
+// probabilities sum to at least 1 - u. Float32 throughout; a centre less likely than the nearest by a factor of
+// e^20 is never drawn. A point that is not finite takes the first centre at every level.
 #pragma once
 
 #include <cstdint>
@@ -26,7 +26,7 @@ bool draw_cell_cpu(const float* points, const float* centres, const float* weigh
                    const int32_t* child, const float* uniforms, int32_t* leaves, int32_t* places, float* sums,
                    int64_t n, int64_t m, int depth, double temperature, Isa isa, int threads);
 
-// g diagrams. Of unsound tables what locate_cell_cuda says.
+// g diagrams. For unsound tables see locate_cell_cuda.
 void draw_cell_cuda(const float* points, const float* centres, const float* weights, const int32_t* child_offsets,
                     const int32_t* child, const float* uniforms, int32_t* leaves, int64_t n, int64_t m, int64_t g,
                     int depth, double temperature, void* stream);

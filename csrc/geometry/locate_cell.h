@@ -11,7 +11,7 @@
 
 namespace voronerf {
 
-// Null if the tables are sound, else what is wrong with them, to follow "locate_cell: ". g diagrams.
+// Null if the tables are sound, else the rule that they break, for an error after "locate_cell: ". g diagrams.
 const char* locate_cell_fault(const int32_t* child_offsets, const int32_t* child, int64_t g, int64_t m);
 
 // int32 elements of workspace for a number of threads and m centres.

@@ -30,7 +30,7 @@ VN_HD float nearest_margin(int index_bits) {
   return kMargin + 2.5f * static_cast<float>(1 << index_bits) / 8388608.0f;
 }
 
-// Whether float32 has decided: `second` is the smallest computed value but that of the best index.
+// Whether float32 decides: `second` is the smallest computed value except that of the best index.
 VN_HD bool nearest_is_certain(float best, float second, float weight_bound) {
   const float magnitude = best < 0.0f ? -best : best;
   return best + (kMargin * (magnitude + weight_bound) + kFloor) < second;

@@ -4,7 +4,8 @@
 // is read and written inside of the tiles. Sums are float32; with bfloat16 storage the operands of products are
 // bfloat16 where the processor multiplies them faster, float32 elsewhere.
 //   x [n,i], offsets [k+1], weight [k,o,i], bias [k,o] or null, out [n,o]
-// Rows of no cell (before offsets[0], from offsets[k] on) give 0. Results do not depend on the number of threads.
+// Rows outside all cells (before offsets[0], from offsets[k] on) give 0. Results do not depend on the number of
+// threads.
 #pragma once
 
 #include <cstdint>
@@ -23,7 +24,7 @@ struct LinearInputs {
   bool bfloat16;  // storage of every tensor
 };
 
-// Where gradients go; every element is written. Null: not wanted. That of the bias comes with that of the weight.
+// Where gradients go; every element is written; null if not wanted. The gradient of the bias comes with the weight's.
 struct LinearGradients {
   const void* out;  // [n,o], the incoming one
   void* x;
@@ -34,7 +35,7 @@ struct LinearGradients {
 // Both throw std::invalid_argument for offsets that fall or exceed n.
 void grouped_linear_cpu(const LinearInputs& inputs, void* out, Isa isa, int threads);
 
-// The activation's derivative is taken from outputs that are computed again.
+// The derivative of the activation uses recomputed outputs.
 void grouped_linear_backward_cpu(const LinearInputs& inputs, const LinearGradients& gradients, Isa isa, int threads);
 
 }  // namespace voronerf

@@ -4,7 +4,8 @@
 // n samples, r rays, k cells, p and q features of a raw position and direction. All tensors are float32 and contiguous.
 //   positions [n,p], directions [n,q] or [r,q] with direction_index [n], offsets [k+1], weights[l] [k,o,i], biases[l]
 //   [k,o] or null
-// Rows of no cell (before offsets[0], from offsets[k] on) give 0. Results do not depend on the number of threads.
+// Rows outside all cells (before offsets[0], from offsets[k] on) give 0. Results do not depend on the number of
+// threads.
 //
 // With `order` [n] the samples lie anywhere: the row i that the offsets speak of is row order[i] of positions,
 // directions, direction_index, output and gradients. Rows are gathered and scattered by the tiles, so that nothing is
@@ -20,7 +21,7 @@ namespace voronerf {
 
 enum class Activation : int { none = 0, relu, softplus, sigmoid, sine };
 
-// The operation that errors name.
+// The operation named in errors.
 enum class MlpCaller : int { grouped_mlp = 0, grouped_linear, routed_mlp };
 
 constexpr int kFromPositions = -1;
@@ -66,7 +67,7 @@ struct MlpGradients {
 // Throws std::invalid_argument for offsets that fall or exceed n and for a direction_index out of range.
 void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& inputs, float* out, Isa isa, int threads);
 
-// Activations are computed again, tile by tile, rather than kept since the forward pass.
+// Activations are recomputed tile by tile instead of kept since the forward pass.
 void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& inputs, const MlpGradients& gradients, Isa isa,
                               int threads);
 

@@ -1,4 +1,4 @@
-// What the plans of grouped_mlp for the CPU and for CUDA share.
+// Shared by the plans of grouped_mlp for the CPU and for CUDA.
 #pragma once
 
 #include <algorithm>

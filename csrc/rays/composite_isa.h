@@ -1,5 +1,5 @@
 // The kernels of composite, once for each instruction set: one ray with samples [begin, end). The gradient of the
-// background is left to the caller, who finds in `left` what each ray lets through.
+// background is left to the caller; `left` is the transmittance of each ray.
 #pragma once
 
 #include "rays/composite.h"

@@ -1,4 +1,4 @@
-// The memory of an occupancy grid: n cells, q of them looked at. What it computes is said in
+// Updates an occupancy grid: n cells, q updates. The formula is in
 // voronerf/ops/update_occupancy.py.
 #pragma once
 
@@ -7,7 +7,7 @@
 namespace voronerf {
 
 // density: [n], rows: [q] numbers of cells, values: [q] -> result: [n], occupied: [n], 0 or 1. Returns false, with
-// nothing of use written, if a number is not that of a cell.
+// undefined results, if a number is not that of a cell.
 bool update_occupancy_cpu(const float* density, const int32_t* rows, const float* values, float* result,
                           uint8_t* occupied, int64_t n, int64_t q, float decay, float threshold, int threads);
 

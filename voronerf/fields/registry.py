@@ -1,8 +1,8 @@
-"""The table of fields: which networks can be trained by name, and what each of them says about itself.
+"""The table of fields: the networks that can be trained by name, and their properties.
 
 A field is any ``nn.Module`` that maps positions [n, 3] and unit directions [n, 3] to a colour [n, 3] in 0..1 and a
 density [n] >= 0 per scene unit. Its class, or a function that makes it, is entered by :func:`register_field`. It may
-say more about itself by attributes, all of which can be left out:
+have these attributes, all of which are optional:
 
     inputs                   "points" (the default), or "gaussians": positions are [n, 6], means and variances
     training_defaults        options that differ in training from the defaults of the constructor
@@ -26,7 +26,7 @@ from torch import nn
 Inputs = Literal["points", "gaussians"]
 Network = TypeVar("Network", bound=Callable[..., nn.Module])
 
-#: Adam's rate at the start for a field that says none: the optimiser's own default.
+#: Adam's learning rate at the start for a field without one: the optimiser's own default.
 LEARNING_RATE = 1e-3
 
 
@@ -35,7 +35,7 @@ class FieldType:
     """A row of the table.
 
     Attributes:
-        name: What ``--field`` calls it.
+        name: The value of ``--field``.
         network: The class, or the function, that makes the module.
         inputs: "points", positions [n, 3], or "gaussians", means and variances [n, 6].
         options: Its options and their defaults in training; ``inspect.Parameter.empty`` for one that must be given.

@@ -1,4 +1,4 @@
-// What the operations over rows sorted by cell share: their tasks, and the memory of a call. A task is a cell and a
+// Shared by the operations over rows sorted by cell: their tasks, and the memory of a call. A task is a cell and a
 // range of its rows. Which tasks there are depends on the sizes alone, and partial weight gradients are summed in the
 // order of the rows, so results do not depend on the number of threads or on which thread took what.
 #pragma once

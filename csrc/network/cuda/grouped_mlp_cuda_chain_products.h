@@ -7,7 +7,7 @@
 
 namespace voronerf {
 
-// Sums are there at once.
+// Sums are available at once.
 template <bool kHalf>
 struct ChainWarps {
   static constexpr bool kBfloat16 = kHalf, kGroups = false;
@@ -20,7 +20,7 @@ struct ChainWarps {
   }
   static __device__ __forceinline__ void advance(Weights& weights, int bytes) { weights += bytes; }
 
-  // What this thread copied to shared memory is about to be multiplied by others.
+  // Other threads are about to multiply what this thread copied to shared memory.
   static __device__ __forceinline__ void publish() {}
 
   // sums += held weights^T for the first `steps` steps, all where kAll says so.

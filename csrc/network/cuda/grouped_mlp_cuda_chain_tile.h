@@ -254,7 +254,7 @@ __device__ __forceinline__ const float* chain_raw(const float* first, int row, i
   return first + static_cast<uint64_t>(static_cast<unsigned>(row)) * static_cast<unsigned>(raw);
 }
 
-// A lane's unit of an input in its four rows of that input; those that are none (-1) are 0.
+// A lane's unit of an input in its four rows of that input; missing rows (-1) are 0.
 //
 // One reduction and one sine and cosine serve two octaves, the second by the double angle, whose error of about 2e-6
 // is below what 16 bits keep; blurs likewise, by the fourth power.

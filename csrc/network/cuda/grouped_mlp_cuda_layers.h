@@ -65,7 +65,7 @@ struct MlpLayersPlan {
   const MlpLayersInput& input(int from) const { return from == kFromPositions ? positions : directions; }
 };
 
-// Null where the table fits, else the rule that it breaks.
+// Null if the table fits, else the rule that it breaks.
 const char* mlp_layers_plan(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
                             const MlpCudaDevice& device, MlpLayersPlan& plan);
 
