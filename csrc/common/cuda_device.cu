@@ -1,5 +1,5 @@
-#include "common/cuda_device.h"
 #include "common/common.h"
+#include "common/cuda_device.h"
 
 namespace voronerf {
 

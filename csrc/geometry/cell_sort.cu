@@ -15,9 +15,9 @@
 // for it, and cell_sort_offsets finds each cell's first row in what comes out.
 //
 // Either way every row has one possible place: the result is that of the CPU, bit for bit.
-#include "geometry/cell_sort.h"
 #include "common/cuda_wrappers.h"
 #include "common/index_maps.h"
+#include "geometry/cell_sort.h"
 #include "geometry/radix_sort.h"
 
 namespace voronerf {

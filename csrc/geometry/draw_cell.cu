@@ -2,8 +2,8 @@
 // times over the centres: for the nearest, for the sum of the masses, and for the first centre up to which they sum to
 // enough, in the same order and with the same roundings. Neighbouring samples of a ray share their diagrams, so that
 // the centres come from the first-level cache; nothing but a few numbers is kept, whatever the number of centres.
-#include "geometry/draw_cell.h"
 #include "common/cuda_wrappers.h"
+#include "geometry/draw_cell.h"
 
 namespace voronerf {
 

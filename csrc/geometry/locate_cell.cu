@@ -1,8 +1,8 @@
 // The nested query on CUDA: a thread a point walks down the tree. Each level is nearest_centre of one diagram, screened
 // in float32 and decided in float64 where float32 cannot (nearest_centre_math.h). Neighbouring samples of a ray share
 // their diagrams, so that the centres come from the first-level cache.
-#include "geometry/locate_cell.h"
 #include "common/cuda_wrappers.h"
+#include "geometry/locate_cell.h"
 #include "geometry/nearest_centre_math.h"
 
 namespace voronerf {

@@ -1,8 +1,8 @@
 // Nearest centre on CUDA: a thread a point, centres through shared memory in tiles that every thread of the block reads
 // at the same address (a broadcast). Float32 input is screened and, rarely, decided again in float64 by
 // nearest_centre_math.h, with the same answer as on the CPU to the last index.
-#include "geometry/nearest_centre.h"
 #include "common/cuda_wrappers.h"
+#include "geometry/nearest_centre.h"
 #include "geometry/nearest_centre_math.h"
 
 namespace voronerf {

@@ -3,8 +3,8 @@
 // which most GPUs have little of. The formulas are those of composite_isa.cpp; like there, the backward pass goes along
 // the ray once, leaving the optical depth in front of each sample where the gradient of sigma is to be, and comes back
 // with the sum of what is behind.
-#include "rays/composite.h"
 #include "common/cuda_wrappers.h"
+#include "rays/composite.h"
 
 namespace voronerf {
 

@@ -2,8 +2,8 @@
 // workspace [r,s]; then every lane looks its targets up by bisection. Uniforms in any order: a depth's place is its
 // uniform's rank, counted by walking over the ray's uniforms (count^2 / 32 steps a lane, from cache), which needs no
 // scratch memory and leaves equal ones in their order.
-#include "rays/resample.h"
 #include "common/cuda_wrappers.h"
+#include "rays/resample.h"
 
 namespace voronerf {
 

@@ -37,11 +37,11 @@ unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements);
 MlpCudaDevice mlp_cuda_device();
 
 void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
-                      unsigned char* workspace, void* stream);
+                    unsigned char* workspace, void* stream);
 
 // gradients: null without those of parameters.
 void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
-                               const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream);
+                             const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream);
 
 // Steps around the kernel of rows: weights packed and tasks mapped before it, rows of no cell cleared, partials summed.
 void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t tasks, void* stream);

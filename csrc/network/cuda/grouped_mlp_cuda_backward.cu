@@ -257,7 +257,7 @@ void launch(const MlpCudaPlan& plan, const MlpCudaData& data, void* stream) {
 }  // namespace
 
 void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
-                               const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream) {
+                             const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream) {
   const MlpCudaWorkspace parts = mlp_cuda_workspace(plan, data.k, gradients != nullptr);
   data.packed = workspace + parts.packed;
   data.first_task = reinterpret_cast<int32_t*>(workspace + parts.first_task);

@@ -62,7 +62,7 @@ void launch(const MlpCudaPlan& plan, const MlpCudaData& data, void* stream) {
 }  // namespace
 
 void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
-                      unsigned char* workspace, void* stream) {
+                    unsigned char* workspace, void* stream) {
   if (data.n == 0) return;
   const MlpCudaWorkspace parts = mlp_cuda_workspace(plan, data.k, false);
   data.packed = workspace + parts.packed;
