@@ -145,3 +145,64 @@ def _cell_numbers(cells: str | Sequence[int], num_cells: int) -> list[int]:
     if any(not 0 <= cell < num_cells for cell in numbers) or len(set(numbers)) < len(numbers):
         raise ValueError(f"split_diagram: cells must name cells 0..{num_cells - 1}, each once, got {list(cells)}")
     return numbers
+
+
+def finer_diagram(
+    present: VoronoiDiagram,
+    finer: VoronoiDiagram | int,
+    parents: Tensor | None,
+    points: Tensor | None,
+    weights: Tensor | None,
+    split: dict[str, Any],
+) -> tuple[VoronoiDiagram, Tensor]:
+    """The diagram that ``VoronoiRouter.subdivide`` was asked for, and the parents of its cells.
+
+    Args:
+        present: The router's diagram.
+        finer: A finer one, or a number of children.
+        parents: int64 [new cells], or None for those that hold the new centres.
+        points: [m, 3], with a number of children.
+        weights: [m], with a number of children.
+        split: Options of :func:`split_diagram`, ``backend`` and ``generator`` among them.
+
+    Raises:
+        ValueError: For parents that do not fit, or points and weights that are missing or too many.
+        TypeError: When ``finer`` is neither a diagram nor a number, or ``parents`` are not int64.
+    """
+    if not isinstance(finer, VoronoiDiagram):
+        if isinstance(finer, bool) or not isinstance(finer, int):
+            raise TypeError(
+                "VoronoiRouter.subdivide: diagram must be a VoronoiDiagram or a number of children, got "
+                f"{type(finer).__name__}"
+            )
+        if points is None or weights is None or parents is not None:
+            raise ValueError(
+                "VoronoiRouter.subdivide: a number of children needs points and weights, the samples and their "
+                "importance, and no parents"
+            )
+        generator = split["generator"]
+        if generator is not None and generator.device.type != "cpu":
+            seed = torch.randint(2**62, (), generator=generator, device=generator.device)
+            split = {**split, "generator": torch.Generator().manual_seed(int(seed))}
+        result = split_diagram(present, points, weights, finer, **split)
+        finer, parents = result.diagram, result.parents
+    elif points is not None or weights is not None or split.keys() - {"generator", "backend"}:
+        given = [n for n, v in (("points", points), ("weights", weights)) if v is not None]
+        given += [name for name in split if name not in ("generator", "backend")]
+        raise ValueError(
+            f"VoronoiRouter.subdivide: {given[0]} must come with a number of children, got a VoronoiDiagram"
+        )
+    if parents is None:
+        parents = present.locate(finer.leaf_centres.to(present.centres.device)).long()
+    if parents.ndim != 1 or parents.shape[0] != finer.num_cells:
+        raise ValueError(
+            f"VoronoiRouter.subdivide: parents must have shape [{finer.num_cells}], got {list(parents.shape)}"
+        )
+    if parents.dtype != torch.int64:
+        raise TypeError(f"VoronoiRouter.subdivide: parents must be int64, got {parents.dtype}")
+    if int(parents.min()) < 0 or int(parents.max()) >= present.num_cells:
+        raise ValueError(
+            f"VoronoiRouter.subdivide: parents must lie in 0..{present.num_cells - 1}, got "
+            f"{int(parents.min())}..{int(parents.max())}"
+        )
+    return finer, parents

@@ -14,13 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.backends import BackendUnavailable
-from voronerf.router.fused import Program, trace
+from voronerf.router.fused import Program
 from voronerf.router.grouped import Ungroupable, run_part
 from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import RAY, SHARED, Call, Layout, map_tree, tensors_of
+from voronerf.router.layout import RAY, SHARED, Call, Layout
 from voronerf.router.loop import Given, NoRandomness, Results, check_rows, run_cells
 from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
-from voronerf.router.tracing import Unfusable
+from voronerf.router.tracing import ROWS, Unfusable, trace_call
+from voronerf.router.trees import map_tree, tensors_of
 from voronerf.tolerances import agree, agree_gradients
 
 _OP = "VoronoiRouter"
@@ -181,8 +182,10 @@ class Trial:
 
     def traced(self) -> Program:
         """The network as a layer table."""
+        if self.layout.axis:
+            raise Unfusable("the module sees one ray, [1, samples, f]; layout='flat' gives it [samples, f]")
         with NoRandomness():
-            return trace(self.original, self.module, self.call, self.given, self.layout)
+            return Program(trace_call(self.original, self.module, self.call, self.given().part(0, ROWS, 0)))
 
     def is_fusable(self, expected: tuple[Results, list[Tensor]]) -> bool:
         """Whether ``fuse=True`` would serve."""

@@ -23,8 +23,9 @@ from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.admission import Choice, Trial, admitted, flattened
 from voronerf.router.grouped import Ungroupable, is_inside, run_grouped
 from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import Call, Layout, rebuild, tensors_of
+from voronerf.router.layout import Call, Layout
 from voronerf.router.loop import Given, Results, restored, run_cells
+from voronerf.router.trees import rebuild, tensors_of
 
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs

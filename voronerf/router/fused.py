@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,17 +24,20 @@ from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
 from voronerf.router.grouped import PerCell, for_all_cells, name_of
 from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import Call, Layout, tensors_of
-from voronerf.router.loop import Given, Results
+from voronerf.router.layout import Layout
+from voronerf.router.loop import Results
 from voronerf.router.parameters import is_shared, owned_parameters
-from voronerf.router.tracing import ROWS, Ref, Step, Trace, Unfusable, map_arguments, trace_call
+from voronerf.router.tracing import (
+    Ref,
+    Step,
+    Trace,
+    Unfusable,
+    activation_of,
+    map_arguments,
+    with_scales,
+)
+from voronerf.router.trees import tensors_of
 
-_ACTIVATIONS: dict[str, set[Any]] = {
-    "relu": {F.relu, torch.relu, torch.relu_, torch.Tensor.relu, torch.Tensor.relu_, F.relu_},
-    "sigmoid": {torch.sigmoid, torch.Tensor.sigmoid, F.sigmoid, torch.sigmoid_, torch.Tensor.sigmoid_},
-    "sine": {torch.sin, torch.Tensor.sin, torch.sin_, torch.Tensor.sin_},
-    "softplus": {F.softplus},
-}
 _MOVES = """
     cat concat concatenate hstack dstack stack split chunk tensor_split unbind __getitem__ narrow select index_select
     permute transpose swapaxes swapdims movedim moveaxis reshape view view_as reshape_as flatten unflatten unsqueeze
@@ -44,7 +47,6 @@ _MOVERS = frozenset(
     getattr(place, name) for place in (torch, torch.Tensor) for name in _MOVES.split() if hasattr(place, name)
 )
 """What may move columns without changing them."""
-_PRODUCTS = (torch.mul, torch.multiply, torch.Tensor.mul, torch.Tensor.__mul__, torch.Tensor.__rmul__)
 
 
 @dataclass(frozen=True)
@@ -76,24 +78,6 @@ class _Linear:
     scale: float = 1.0
 
 
-def trace(original: nn.Module, module: nn.Module, call: Call, given: Callable[[], Given], layout: Layout) -> Program:
-    """The fused form of a method.
-
-    Args:
-        original: The routed module.
-        module: A copy of it, with stacked parameters.
-        call: Of the method.
-        given: Gives arguments for more than ``ROWS`` samples.
-        layout: Of the arguments.
-
-    Raises:
-        Unfusable: Where a layer table does not describe the network.
-    """
-    if layout.axis:
-        raise Unfusable("the module sees one ray, [1, samples, f]; layout='flat' gives it [samples, f]")
-    return Program(trace_call(original, module, call, given().part(0, ROWS, 0)))
-
-
 class Program:
     """A layer table with the steps before and behind it.
 
@@ -113,7 +97,7 @@ class Program:
         self._behind: list[Step] = []
         self._weights: list[Step] = []
         late: set[int] = set()
-        for step in _with_scales(trace):
+        for step in with_scales(trace):
             self._place(step, late)
         if not self._layers:
             raise Unfusable("there is no linear layer")
@@ -157,7 +141,7 @@ class Program:
             self._columns.update({value: self._whole(value) for value in step.values})
             return
         if not any(r in late for r in rows):
-            name = _activation_of(step)
+            name = activation_of(step)
             if name is not None and self._activate(step, rows, name):
                 return
             moved = None if step.inplace else self._moved(step)
@@ -415,40 +399,3 @@ def _join_segments(segments: Sequence[Segment]) -> Columns:
             segment = replace(merged.pop(), stop=segment.stop)
         merged.append(segment)
     return tuple(merged)
-
-
-def _activation_of(step: Step) -> str | None:
-    """The name that a layer table has for a step's function, or None."""
-    rest = (step.args[1:], {key: value for key, value in step.kwargs.items() if key != "inplace"})
-    for name, functions in _ACTIVATIONS.items():
-        if step.function in functions:
-            plain = rest in (((), {}), ((1, 20), {}), ((1.0, 20.0), {}), ((), {"beta": 1}))
-            return name if name != "softplus" or plain else None
-    return None
-
-
-def _with_scales(trace: Trace) -> list[Step]:
-    """The steps of a trace, with the factor of ``sin(factor * layer(x))`` in the layer."""
-    steps = list(trace.steps)
-    uses: dict[int, int] = {}
-    for step in steps:
-        for ref in step.refs():
-            uses[ref] = uses.get(ref, 0) + 1
-    for item in trace.outputs:
-        if isinstance(item, Ref):
-            uses[item.value] = uses.get(item.value, 0) + 1
-    made = {value: step for step in steps for value in step.values}
-    for step in list(steps):
-        refs = step.refs()
-        factors = [item for item in step.args if isinstance(item, (int, float)) and not isinstance(item, bool)]
-        source = made.get(refs[0]) if len(refs) == 1 else None
-        if step.function not in _PRODUCTS or len(factors) != 1 or len(step.args) != 2 or source is None:
-            continue
-        wave = next((s for s in steps if refs and step.values[0] in s.refs()), None)
-        once = uses.get(refs[0]) == 1 and uses.get(step.values[0]) == 1
-        if source.function is F.linear and once and wave is not None and _activation_of(wave) == "sine":
-            linear = replace(source, values=step.values, kwargs={**source.kwargs, "scale": factors[0]})
-            steps[steps.index(source)] = linear
-            steps.remove(step)
-            made[step.values[0]] = linear
-    return steps

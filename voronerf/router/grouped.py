@@ -23,10 +23,11 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.grouping import Grouping, Part
-from voronerf.router.layout import Call, Layout, map_tree, tensors_of
+from voronerf.router.layout import Call, Layout
 from voronerf.router.loop import Given, Results
 from voronerf.router.parameters import cell_parameters, in_place_of_parameters
 from voronerf.router.tables import Tables
+from voronerf.router.trees import map_tree, tensors_of
 
 _MARK = "_voronerf_rows"
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))

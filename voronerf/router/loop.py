@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.grouping import Grouping
-from voronerf.router.layout import Call, Layout, map_tree, rebuild, tensors_of
+from voronerf.router.layout import Call, Layout
 from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
+from voronerf.router.trees import map_tree, rebuild, tensors_of
 from voronerf.tolerances import agree
 
 _DRAWS = """

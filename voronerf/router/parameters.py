@@ -9,8 +9,6 @@ import contextlib
 import copy
 import fnmatch
 import itertools
-import warnings
-import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -18,27 +16,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import UninitializedParameter
 from torch.nn.utils import parametrizations
-from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from voronerf.router.layout import map_tree, tensors_of
+from voronerf.backends import BACKENDS
+from voronerf.router.layout import accepted_names
+from voronerf.router.trees import map_tree, tensors_of
 
 _OP = "VoronoiRouter"
 _SHARED, _ALIASES = "_voronerf_shared", "_voronerf_aliases"  # names that parts of a routed module carry
 _OWN = frozenset(vars(nn.Module())) | {_SHARED, _ALIASES}
-_ELEMENTWISE_OPTIMIZERS = (
-    torch.optim.Adam,
-    torch.optim.AdamW,
-    torch.optim.RAdam,
-    torch.optim.NAdam,
-    torch.optim.Adamax,
-    torch.optim.SGD,
-    torch.optim.RMSprop,
-    torch.optim.Adagrad,
-    torch.optim.Adadelta,
-    torch.optim.Rprop,
-    torch.optim.ASGD,
-)
-"""Optimisers whose state is of the parameter's shape, entry by entry, or a number."""
 
 
 def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parameter]]:
@@ -115,6 +100,44 @@ def _containers(part: nn.Module) -> list[tuple[str, Any]]:
         for name, value in vars(part).items()
         if isinstance(value, (list, tuple, dict)) and not name.endswith("_hooks") and name not in _OWN
     ]
+
+
+def check_options(
+    module: nn.Module,
+    coords: Any,
+    lists: dict[str, Any],
+    layout: str,
+    assignment: str,
+    temperature: float,
+    backend: str,
+    blend: float,
+) -> None:
+    """Raises ValueError or TypeError for an option of the router that is wrong; ``lists`` are per_ray and the like."""
+    if assignment not in ("nearest", "stochastic"):
+        raise ValueError(f"{_OP}: assignment must be 'nearest' or 'stochastic', got {assignment!r}")
+    if not temperature > 0:
+        raise ValueError(f"{_OP}: temperature must be positive, got {temperature}")
+    if not 0 <= blend < float("inf"):
+        raise ValueError(f"{_OP}: blend must be finite and at least 0, got {blend}")
+    if layout not in ("rays", "flat"):
+        raise ValueError(f"{_OP}: layout must be 'rays' or 'flat', got {layout!r}")
+    if backend not in ("auto", *BACKENDS):
+        raise ValueError(f"{_OP}: backend must be auto, {', '.join(BACKENDS)}, got {backend!r}")
+    if not (coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords)):
+        raise ValueError(f"{_OP}: coords must be 'first3', a slice or a function, got {coords!r}")
+    for name, value in lists.items():
+        if isinstance(value, (str, int)):
+            raise TypeError(f"{_OP}: {name} must be a list, got {value!r}")
+    kind = type(module).__name__
+    for name in lists["methods"]:
+        if not callable(getattr(module, name, None)):
+            raise ValueError(f"{_OP}: methods must name methods of {kind}, got {name!r}")
+    known = accepted_names([module.forward, *(getattr(module, name) for name in lists["methods"])])
+    for item in (*(lists["per_ray"] or ()), *lists["shared"]):
+        if isinstance(item, str) and known is not None and item.split(".")[0] not in known:
+            raise ValueError(
+                f"{_OP}: per_ray and shared must name arguments of {kind}, one of {', '.join(known)}, got {item!r}"
+            )
 
 
 def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
@@ -254,92 +277,6 @@ def inherit_parameters(module: nn.Module, parents: Tensor, fresh: Sequence[Tenso
                 other = torch.float32 if values.dtype == torch.float64 else torch.float64
                 parameter.data = values.new_empty(0, dtype=other)
             parameter.data, parameter.grad = values, None
-
-
-def check_optimizer(optimizer: torch.optim.Optimizer, module: nn.Module, method: str = "subdivide") -> None:
-    """Raises ValueError for an optimiser that holds none of a module's parameters."""
-    ours = {id(parameter) for parameter in module.parameters()}
-    if ours and not any(id(parameter) in ours for group in optimizer.param_groups for parameter in group["params"]):
-        raise ValueError(f"{_OP}.{method}: optimizer must hold the router's parameters, got one of others")
-
-
-def move_state(
-    optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
-) -> None:
-    """Gives every cell the state that an optimiser has for its parent; other optimisers begin anew, which is said.
-
-    Args:
-        optimizer: Of a module whose parameters are those of the new cells already.
-        module: With stacked parameters.
-        parents: int64 [new cells].
-        k: Cells before.
-        fresh: bool [new cells], whose state is zero instead, or None.
-    """
-    known, lost = isinstance(optimizer, _ELEMENTWISE_OPTIMIZERS), False
-    for parameter in {id(p): p for _, _, p in cell_parameters(module)}.values():
-        old, state = (k, *parameter.shape[1:]), optimizer.state.get(parameter, {})
-        lost = lost or (bool(state) and not known)
-        for key, value in state.items():
-            if isinstance(value, Tensor) and value.shape == old and known:
-                state[key] = value[parents.to(value.device)]
-                if fresh is not None:
-                    state[key][fresh.to(value.device)] = 0
-    if not known:
-        # Some keep what is not a parameter's own, such as the last flattened gradient; nothing of it fits any more.
-        optimizer.state.clear()
-        if isinstance(optimizer, torch.optim.LBFGS):
-            optimizer._numel_cache = None  # the number of entries of all parameters together
-    if lost:
-        name = type(optimizer).__name__
-        warnings.warn(
-            f"{_OP}.subdivide: the state of {name} cannot be inherited by cells and begins anew", stacklevel=4
-        )
-
-
-def drop_state(optimizer: torch.optim.Optimizer) -> None:
-    """Lets an optimiser begin anew where its state has the shapes of other cells than the parameters have."""
-    for group in optimizer.param_groups:
-        for parameter in group["params"]:
-            if _is_stale(optimizer, parameter):
-                optimizer.state.pop(parameter)
-                if isinstance(optimizer, torch.optim.Adagrad):  # which makes its state when it is made
-                    total = torch.full_like(parameter, group["initial_accumulator_value"])
-                    optimizer.state[parameter].update(step=torch.tensor(0.0), sum=total)
-    if isinstance(optimizer, torch.optim.LBFGS):
-        optimizer.state.clear()
-        optimizer._numel_cache = None
-
-
-def _is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
-    state = optimizer.state.get(parameter, {})
-    return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())
-
-
-def watch_optimizers(module: nn.Module, line: str) -> Any:
-    """Raises at the next step of an optimiser that holds state of other cells than a module's parameters have.
-
-    Args:
-        module: Whose parameters have got other cells.
-        line: What to write, so that the optimiser follows.
-
-    Returns:
-        A handle whose ``remove()`` ends the watch.
-    """
-    watched = {id(parameter): weakref.ref(parameter) for _, _, parameter in cell_parameters(module)}
-
-    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched] if watched else []
-        if any(watched[id(parameter)]() is parameter and _is_stale(optimizer, parameter) for parameter in held):
-            raise ValueError(
-                f"{_OP}: optimizer, a {type(optimizer).__name__}, holds the state of other cells than the router has; "
-                f"write {line}, or make the optimizer afterwards"
-            )
-        if held:
-            watched.clear()  # torch does not let a hook remove itself
-
-    handle = register_optimizer_step_pre_hook(check)
-    weakref.finalize(module, handle.remove)
-    return handle
 
 
 def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | None) -> list[Tensor]:

@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
 
-from voronerf.backends import BACKENDS
 from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.blending import Mixture
-from voronerf.diagram.subdivision import split_diagram
+from voronerf.router.cells import CellModules
 from voronerf.router.evaluate import Choices, evaluate, mixed
 from voronerf.router.grouping import Assignments, Grouping
 from voronerf.router.layered import (
@@ -29,19 +28,7 @@ from voronerf.router.layered import (
     told_by_table,
 )
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
-from voronerf.router.parameters import (
-    check_module,
-    check_optimizer,
-    clone_module,
-    draw_parameters,
-    drop_state,
-    fill_cell,
-    inherit_parameters,
-    move_state,
-    stack_parameters,
-    take_cell,
-    watch_optimizers,
-)
+from voronerf.router.parameters import check_module, check_options, fill_cell
 
 Assignment = Literal["nearest", "stochastic"]
 
@@ -50,7 +37,7 @@ _MANY = 256
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
 
-class VoronoiRouter(nn.Module):
+class VoronoiRouter(CellModules):
     """k copies of a module, one for each cell of a Voronoi diagram; the copy of its cell evaluates each sample.
 
     ``router(...)`` takes the arguments of the module's ``forward`` and returns what it returns, in the same order and
@@ -91,7 +78,9 @@ class VoronoiRouter(nn.Module):
             of them, with ordinary gradients; the others are per cell.
         fuse: Promises that ``forward`` does the same in every call. Its network is traced once and runs as one
             operation, or is refused with the line that stands in the way.
-        layout: How the module sees samples ``[rays, samples, f]``: "rays" as ``[n, 1, f]``, "flat" as ``[n, f]``.
+        layout: How the module sees samples ``[rays, samples, f]``: "rays" as ``[n, 1, f]``, with what is per ray as
+            ``[n, f]``; "flat" as ``[n, f]``, for modules that squeeze or flatten. One ray, ``[1, samples, f]``, stays
+            ``[1, n, f]`` with "rays".
         assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell by the distances
             while training (:meth:`VoronoiDiagram.sample_cell`), and is "nearest" in eval mode.
         temperature: Of the stochastic assignment, in scene units.
@@ -139,46 +128,17 @@ class VoronoiRouter(nn.Module):
         backend: str = "auto",
         blend: float = 0.0,
     ) -> None:
-        super().__init__()
         module = getattr(module, "_orig_mod", module)  # of torch.compile, which would not see the parameters of cells
         check_module(module)
-        if assignment not in ("nearest", "stochastic"):
-            raise ValueError(f"VoronoiRouter: assignment must be 'nearest' or 'stochastic', got {assignment!r}")
-        if not temperature > 0:
-            raise ValueError(f"VoronoiRouter: temperature must be positive, got {temperature}")
-        if not 0 <= blend < float("inf"):
-            raise ValueError(f"VoronoiRouter: blend must be finite and at least 0, got {blend}")
-        if layout not in ("rays", "flat"):
-            raise ValueError(f"VoronoiRouter: layout must be 'rays' or 'flat', got {layout!r}")
-        if backend not in ("auto", *BACKENDS):
-            raise ValueError(f"VoronoiRouter: backend must be auto, {', '.join(BACKENDS)}, got {backend!r}")
-        if not (coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords)):
-            raise ValueError(f"VoronoiRouter: coords must be 'first3', a slice or a function, got {coords!r}")
-        for name, value in (("per_ray", per_ray), ("shared", shared), ("methods", methods), ("share", share)):
-            if isinstance(value, (str, int)):
-                raise TypeError(f"VoronoiRouter: {name} must be a list, got {value!r}")
+        given = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
+        check_options(module, coords, given, layout, assignment, temperature, backend, blend)
         for name in methods:
-            if not callable(getattr(module, name, None)):
-                raise ValueError(f"VoronoiRouter: methods must name methods of {type(module).__name__}, got {name!r}")
             if hasattr(VoronoiRouter, name) or name in ("module", "diagram"):
                 raise ValueError(f"VoronoiRouter: methods must not name what a router has itself, got {name!r}")
-        known = accepted_names([module.forward, *(getattr(module, name) for name in methods)])
-        for item in (*(per_ray or ()), *shared):
-            if isinstance(item, str) and known is not None and item.split(".")[0] not in known:
-                raise ValueError(
-                    f"VoronoiRouter: per_ray and shared must name arguments of {type(module).__name__}, one of "
-                    f"{', '.join(known)}, got {item!r}"
-                )
-        self.diagram = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
-        first = next(module.parameters(), None)
-        if first is not None and not first.is_meta:
-            self.diagram.to(first.device)
-        self.assignment = assignment
-        self.temperature = temperature
-        self.backend = backend
-        self.blend = blend
-        self.generator: torch.Generator | None = None
-        self.coords = coords
+        own = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
+        super().__init__(module, own, share)
+        self.assignment, self.temperature = assignment, temperature
+        self.backend, self.blend, self.coords = backend, blend, coords
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared = tuple(shared)
         self.methods = tuple(methods)
@@ -186,13 +146,9 @@ class VoronoiRouter(nn.Module):
         self._own_coords = frozenset(
             name for name in ("forward", *methods) if "coords" in (accepted_names([getattr(module, name)]) or ())
         )
-        self.share, self.fuse, self.layout = tuple(share), fuse, layout
+        self.fuse, self.layout = fuse, layout
         self._choices, self._assignments = Choices(), Assignments()
         self._argument_names: dict[tuple[str, int], list[str]] = {}
-        self._watch: Any = None  # of optimisers that hold the state of other cells
-
-        self.module: nn.Module = clone_module(module)
-        stack_parameters(self.module, self.diagram.num_cells, self.share)
         self._told = self._layered and told_by_table(self.module) and not self.share
 
     @classmethod
@@ -226,11 +182,6 @@ class VoronoiRouter(nn.Module):
     def field(self) -> LayeredField:
         """The field with stacked parameters; its own ``forward`` cannot be called any more."""
         return cast(LayeredField, self.module)
-
-    @property
-    def num_cells(self) -> int:
-        """Cells of the diagram, networks of the router."""
-        return self.diagram.num_cells
 
     def assign(self, positions: Tensor) -> Tensor:
         """The cell that evaluates each position: positions [n, 3] -> int32 [n]."""
@@ -349,14 +300,11 @@ class VoronoiRouter(nn.Module):
 
     def _group(self, positions: Tensor, n: int) -> Grouping:
         flat, k = positions.detach().reshape(-1, 3), self.num_cells
-        cells: Tensor | Callable[[], Tensor] | None = None
-        tables: dict[str, Any] | None = None
         if not n:  # the module runs on placeholders, since it may not take an empty batch
             return Grouping(torch.zeros(2, dtype=torch.int32, device=flat.device), 2, k, flat.device, self.backend)
-        if k > 1:
-            where = self._where(flat, flat)
-            cells = where.get("cells", functools.partial(self.assign, flat))
-            tables = None if "cells" in where else where
+        where = self._where(flat, flat)
+        cells = where.get("cells", functools.partial(self.assign, flat)) if k > 1 else None
+        tables = None if k == 1 or "cells" in where else where
         return Grouping(cells, n, k, positions.device, self.backend, tables)
 
     def _assignment_key(self) -> tuple[Any, ...]:
@@ -379,198 +327,16 @@ class VoronoiRouter(nn.Module):
             return tables
         return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
 
-    def cell(self, index: int) -> nn.Module:
-        """A plain copy of one cell's module, with parameters of its own.
-
-        Raises:
-            IndexError: If there is no such cell.
-        """
-        return take_cell(self.module, self._check_index("cell", index))
-
-    def load_cell(self, index: int, module: nn.Module) -> None:
-        """Copies the parameters of a plain module into one cell. Parameter objects and optimisers stay the same.
-
-        Raises:
-            IndexError: If there is no such cell.
-            ValueError: For parameters of other names or shapes, or buffers that differ from those shared by the cells.
-        """
-        fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
-
-    def _check_index(self, method: str, index: int) -> int:
-        if not -self.num_cells <= index < self.num_cells:
-            raise IndexError(f"VoronoiRouter.{method}: index must be below {self.num_cells}, got {index}")
-        return index
-
-    @torch.no_grad()
-    def subdivide(
-        self,
-        diagram: VoronoiDiagram | int,
-        parents: Tensor | None = None,
-        *,
-        optimizer: torch.optim.Optimizer | None = None,
-        inherit: bool = True,
-        points: Tensor | None = None,
-        weights: Tensor | None = None,
-        **split: Any,
-    ) -> Tensor:
-        """Replaces the diagram by a finer one; every new cell starts as a copy of its parent.
-
-        Parameters are copied from the parent and, with ``optimizer``, so is the state of Adam, AdamW, RAdam, SGD and
-        similar optimisers; others start afresh, with a warning. The parameter objects stay the same, so groups,
-        learning rates and schedules continue. A wrapper with parameters of its own, such as
-        ``DistributedDataParallel``, has to be made again.
-
-        Args:
-            diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children that
-                :func:`voronerf.split_diagram` gives each cell that has enough samples.
-            parents: int64 [new cells], the present cell that each new cell lies in; None for the cell that holds the
-                new centre.
-            optimizer: The optimiser that holds this router's parameters.
-            inherit: False draws new parameters for the children of every cell that is split, with moments of zero: the
-                ablation that shows ghosting.
-            points: [m, 3], samples in scene units, if ``diagram`` is a number of children.
-            weights: [m], the importance of the samples, by which the new cells are balanced.
-            **split: Further options of ``split_diagram``, such as cells, centres, min_samples.
-
-        Returns:
-            int64 [new cells], the parents.
-
-        Raises:
-            ValueError: If ``parents`` does not fit, ``points`` or ``weights`` are missing, or the module cannot draw
-                new parameters.
-            TypeError: If ``diagram`` is neither a diagram nor a number, or ``parents`` are not int64.
-
-        Examples:
-            >>> import torch
-            >>> from voronerf import VoronoiRouter
-            >>> router = VoronoiRouter(torch.nn.Linear(3, 1), torch.zeros(1, 3), coords="first3")
-            >>> optimizer = torch.optim.Adam(router.parameters())
-            >>> points, weights = torch.rand(500, 3), torch.rand(500)  # see SampleReservoir
-            >>> parents = router.subdivide(8, optimizer=optimizer, points=points, weights=weights)
-            >>> router.num_cells, router.module.weight.shape
-            (8, torch.Size([8, 1, 3]))
-        """
-        if not isinstance(diagram, VoronoiDiagram):
-            if isinstance(diagram, bool) or not isinstance(diagram, int):
-                raise TypeError(
-                    "VoronoiRouter.subdivide: diagram must be a VoronoiDiagram or a number of children, got "
-                    f"{type(diagram).__name__}"
-                )
-            if points is None or weights is None or parents is not None:
-                raise ValueError(
-                    "VoronoiRouter.subdivide: a number of children needs points and weights, the samples and their "
-                    "importance, and no parents"
-                )
-            generator = self.generator
-            if generator is not None and generator.device.type != "cpu":
-                seed = torch.randint(2**62, (), generator=generator, device=generator.device)
-                generator = torch.Generator().manual_seed(int(seed))
-            result = split_diagram(
-                self.diagram,
-                points,
-                weights,
-                diagram,
-                **{"generator": generator, "backend": self.backend, **split},
-            )
-            diagram, parents = result.diagram, result.parents
-        elif points is not None or weights is not None or split:
-            given = [n for n, v in (("points", points), ("weights", weights)) if v is not None] + list(split)
-            raise ValueError(
-                f"VoronoiRouter.subdivide: {given[0]} must come with a number of children, got a VoronoiDiagram"
-            )
-        if parents is None:
-            parents = self.diagram.locate(diagram.leaf_centres.to(self.diagram.centres.device)).long()
-        if parents.ndim != 1 or parents.shape[0] != diagram.num_cells:
-            raise ValueError(
-                f"VoronoiRouter.subdivide: parents must have shape [{diagram.num_cells}], got {list(parents.shape)}"
-            )
-        if parents.dtype != torch.int64:
-            raise TypeError(f"VoronoiRouter.subdivide: parents must be int64, got {parents.dtype}")
-        if int(parents.min()) < 0 or int(parents.max()) >= self.num_cells:
-            raise ValueError(
-                f"VoronoiRouter.subdivide: parents must lie in 0..{self.num_cells - 1}, got "
-                f"{int(parents.min())}..{int(parents.max())}"
-            )
-        # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
-        new = torch.bincount(parents, minlength=self.num_cells)[parents] > 1
-        fresh = None if inherit else draw_parameters(self.cell(0), diagram.num_cells, self.generator)
-        if optimizer is not None:
-            check_optimizer(optimizer, self.module)
-        before = self.num_cells
-        inherit_parameters(self.module, parents, fresh, new)
-        self.diagram = copy.deepcopy(diagram).to(self.diagram.centres.device)
+    def _forget_assignments(self) -> None:
         self._assignments = Assignments()
-        if optimizer is not None:
-            move_state(optimizer, self.module, parents, before, None if inherit else new)
-        else:
-            self._watch_optimizers("router.subdivide(..., optimizer=optimizer)")
-        return parents
 
-    def _watch_optimizers(self, line: str) -> None:
-        if self._watch is not None:
-            self._watch.remove()
-        self._watch = watch_optimizers(self.module, line)
-
-    def load_state_dict(
-        self,
-        state_dict: Mapping[str, Any],
-        strict: bool = True,
-        assign: bool = False,
-        *,
-        optimizer: torch.optim.Optimizer | None = None,
-    ) -> Any:
-        """Loads a state of any number of cells; the parameter objects stay, so an optimiser goes on with them.
-
-        Args:
-            state_dict: What ``state_dict()`` of a router around the same module gave.
-            strict: As of ``nn.Module``.
-            assign: As of ``nn.Module``; parameters are new objects then.
-            optimizer: The optimiser that holds this router's parameters. Where the number of cells changes, its state
-                begins anew, if its own ``load_state_dict`` does not follow. Without it an optimiser that has state of
-                the cells before raises at its next step.
-
-        Returns:
-            Missing and unexpected keys.
-
-        Raises:
-            ValueError: When the optimiser holds none of the router's parameters.
-        """
-        if optimizer is not None:
-            check_optimizer(optimizer, self.module, "load_state_dict")
-        result = super().load_state_dict(state_dict, strict, assign)
-        if optimizer is not None:
-            drop_state(optimizer)
-        return result
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Takes over the stored diagram first, so that parameters of any number of cells fit."""
-        self._assignments = Assignments()
-        if f"{prefix}diagram.centres" in state_dict:
-            diagram = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram.")
-            if diagram.num_cells == self.num_cells:
-                self.diagram = diagram.to(self.diagram.centres.device)
-            else:
-                self.subdivide(diagram, torch.zeros(diagram.num_cells, dtype=torch.int64))
-                self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_assignments": Assignments()}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
         self._choices.forget()
         self._assignments = Assignments()
         return super()._apply(fn, recurse)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_watch": None, "_assignments": Assignments()}
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
-        for part in self.modules():
-            for value in vars(part).values():
-                if isinstance(value, Tensor) and not value.is_leaf:
-                    memo[id(value)] = value.detach().clone()
-        copied = type(self).__new__(type(self))
-        memo[id(self)] = copied
-        copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
-        return copied
 
     def extra_repr(self) -> str:
         """What ``print(router)`` shows beside the field's modules."""

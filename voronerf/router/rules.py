@@ -17,7 +17,7 @@ from torch import Tensor
 from voronerf.ops import grouped_linear
 from voronerf.router import tables
 from voronerf.router.grouped import GroupedRun, PerCell, register
-from voronerf.router.layout import map_tree, tensors_of
+from voronerf.router.trees import map_tree, tensors_of
 
 _ELEMENTWISE = """
     add sub subtract rsub mul multiply div divide true_divide remainder fmod pow maximum minimum atan2 hypot lerp where

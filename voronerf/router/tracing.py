@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -16,13 +16,21 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.grouped import METADATA, name_of, user_line
-from voronerf.router.layout import Call, rebuild, tensors_of
+from voronerf.router.layout import Call
 from voronerf.router.loop import RANDOM, Given
 from voronerf.router.parameters import cell_parameters, in_place_of_parameters, owned_parameters
+from voronerf.router.trees import rebuild, tensors_of
 
 ROWS = 37  # in a trace
 _INPLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "div", "floordiv", "mod", "pow", "and", "or")}
 _APPLY = torch.autograd.Function.apply.__func__.__code__  # type: ignore[attr-defined]
+_ACTIVATIONS: dict[str, set[Any]] = {
+    "relu": {F.relu, torch.relu, torch.relu_, torch.Tensor.relu, torch.Tensor.relu_, F.relu_},
+    "sigmoid": {torch.sigmoid, torch.Tensor.sigmoid, F.sigmoid, torch.sigmoid_, torch.Tensor.sigmoid_},
+    "sine": {torch.sin, torch.Tensor.sin, torch.sin_, torch.Tensor.sin_},
+    "softplus": {F.softplus},
+}
+_PRODUCTS = (torch.mul, torch.multiply, torch.Tensor.mul, torch.Tensor.__mul__, torch.Tensor.__rmul__)
 
 
 class Unfusable(Exception):
@@ -266,3 +274,40 @@ def _is_idle(func: Any, args: Any, kwargs: dict[str, Any]) -> bool:
         return False
     given = {**dict(zip(("input", "p", "training"), args, strict=False)), **kwargs}
     return not given.get("training", True) or given.get("p", 0.5) == 0
+
+
+def activation_of(step: Step) -> str | None:
+    """The name that a layer table has for a step's function, or None."""
+    rest = (step.args[1:], {key: value for key, value in step.kwargs.items() if key != "inplace"})
+    for name, functions in _ACTIVATIONS.items():
+        if step.function in functions:
+            plain = rest in (((), {}), ((1, 20), {}), ((1.0, 20.0), {}), ((), {"beta": 1}))
+            return name if name != "softplus" or plain else None
+    return None
+
+
+def with_scales(trace: Trace) -> list[Step]:
+    """The steps of a trace, with the factor of ``sin(factor * layer(x))`` in the layer."""
+    steps = list(trace.steps)
+    uses: dict[int, int] = {}
+    for step in steps:
+        for ref in step.refs():
+            uses[ref] = uses.get(ref, 0) + 1
+    for item in trace.outputs:
+        if isinstance(item, Ref):
+            uses[item.value] = uses.get(item.value, 0) + 1
+    made = {value: step for step in steps for value in step.values}
+    for step in list(steps):
+        refs = step.refs()
+        factors = [item for item in step.args if isinstance(item, (int, float)) and not isinstance(item, bool)]
+        source = made.get(refs[0]) if len(refs) == 1 else None
+        if step.function not in _PRODUCTS or len(factors) != 1 or len(step.args) != 2 or source is None:
+            continue
+        wave = next((s for s in steps if refs and step.values[0] in s.refs()), None)
+        once = uses.get(refs[0]) == 1 and uses.get(step.values[0]) == 1
+        if source.function is F.linear and once and wave is not None and activation_of(wave) == "sine":
+            linear = replace(source, values=step.values, kwargs={**source.kwargs, "scale": factors[0]})
+            steps[steps.index(source)] = linear
+            steps.remove(step)
+            made[step.values[0]] = linear
+    return steps
