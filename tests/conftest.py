@@ -20,11 +20,9 @@ is a skip with its reason; ``--require native,cuda,warp`` turns those skips into
 from __future__ import annotations
 
 import contextlib
-import importlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -32,7 +30,6 @@ import torch
 from voronerf import backends
 
 PARTS = ("native", "cuda", "warp")
-BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 
 pytest_plugins = ("pytester",)
 
@@ -105,18 +102,6 @@ def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
     for guard in guards:
         whole = guard.isnan() if guard.is_floating_point() else guard == (0 if guard.dtype == torch.bool else 121)
         assert whole.all(), "something was written outside of a tensor"
-
-
-@pytest.fixture(scope="module")
-def load() -> Iterator[Callable[[str], Any]]:
-    """Imports a module of benchmarks/ as a script there does; each test file has modules of its own."""
-    sys.path.insert(0, str(BENCHMARKS))
-    before = set(sys.modules)
-    yield importlib.import_module
-    sys.path.remove(str(BENCHMARKS))
-    for name in set(sys.modules) - before:
-        if str(BENCHMARKS) in str(getattr(sys.modules[name], "__file__", None)):
-            del sys.modules[name]
 
 
 @pytest.fixture(autouse=True)

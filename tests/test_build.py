@@ -78,19 +78,15 @@ def test_clang_on_linux_is_refused_before_it_builds(build, monkeypatch):
 
 
 def test_nvcc_is_found_where_cuda_home_has_none(build, monkeypatch, tmp_path):
-    for name in ("home/bin", "path"):
-        (tmp_path / name).mkdir(parents=True)
-    nvcc = tmp_path / "path" / "nvcc"
-    nvcc.write_text("#!/bin/sh\n")
-    nvcc.chmod(0o755)
-    for name, value in (("VORONERF_CUDA", "auto"), ("VORONERF_CUDA_ARCHITECTURES", "80"), ("CUDA_HOME", "home")):
-        monkeypatch.setenv(name, str(tmp_path / value) if name == "CUDA_HOME" else value)
-    monkeypatch.setenv("PATH", str(tmp_path / "path"))
-    assert build["find_cuda"]().nvcc == nvcc
-    own = tmp_path / "home" / "bin" / "nvcc"
-    own.write_bytes(nvcc.read_bytes())
-    own.chmod(0o755)
-    assert build["find_cuda"]().nvcc == own
+    nvcc, own = tmp_path / "path" / "nvcc", tmp_path / "home" / "bin" / "nvcc"
+    for path in (nvcc, own):
+        path.parent.mkdir(parents=True)
+    settings = {"VORONERF_CUDA": "auto", "VORONERF_CUDA_ARCHITECTURES": "80", "PATH": str(nvcc.parent)}
+    for name, value in (settings | {"CUDA_HOME": str(tmp_path / "home")}).items():
+        monkeypatch.setenv(name, value)
+    for path in (nvcc, own):
+        program(path)
+        assert build["find_cuda"]().nvcc == path
 
 
 def test_one_word_and_none(build, monkeypatch):
@@ -111,15 +107,35 @@ ptxas info    : Used 8 registers, used 0 barriers
 """
 
 
-def cuda_check():
+@pytest.fixture
+def check(monkeypatch, tmp_path):
+    """The script, which says into the folder of the test."""
     path = ROOT / ".ci" / "cuda_check.py"
     if not path.is_file():
         pytest.skip(".ci/cuda_check.py is not there: the tests are not in the source tree")
     spec = importlib.util.spec_from_file_location("cuda_check", path)
-    assert spec is not None and spec.loader is not None
     check = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(check)
+    monkeypatch.setattr(check, "OUT", tmp_path / "out")
     return check
+
+
+def program(path, text="") -> None:
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+
+
+@pytest.fixture
+def reporting(check, monkeypatch, capsys, tmp_path):
+    """Status and words of a check with an nvcc that compiles nothing and reports what it is told to."""
+
+    def run(report, *architectures):
+        (tmp_path / "report").write_text(report)
+        program(tmp_path / "nvcc", f"cat '{tmp_path}/report' >&2")
+        monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+        return check.main(list(architectures)), capsys.readouterr().out.rstrip()
+
+    return run
 
 
 @pytest.mark.parametrize(
@@ -130,68 +146,34 @@ def cuda_check():
         ([], 1, "failed: no kernel was reported."),
     ],
 )
-def test_cuda_check_fails_where_nothing_was_checked(
-    monkeypatch,
-    capsys,
-    tmp_path,
-    reported,
-    status,
-    outcome,
-):
-    check = cuda_check()
-    # An nvcc that compiles nothing and reports what it is told to.
-    (tmp_path / "report").write_text("".join(REPORT.format(arch) for arch in reported))
-    nvcc = tmp_path / "nvcc"
-    nvcc.write_text(f"#!/bin/sh\ncat '{tmp_path}/report' >&2\n")
-    nvcc.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr(check, "OUT", tmp_path / "out")
-    assert check.main(["80", "90a"]) == status
-    assert capsys.readouterr().out.rstrip().endswith(outcome)
+def test_cuda_check_fails_where_nothing_was_checked(reporting, reported, status, outcome):
+    found, said = reporting("".join(REPORT.format(arch) for arch in reported), "80", "90a")
+    assert found == status and said.endswith(outcome)
 
 
-def test_cuda_check_leaves_the_toolkits_own_kernels_alone(monkeypatch, capsys, tmp_path):
-    check = cuda_check()
-    theirs = REPORT.replace("_Z6kernelv", "_ZN3cub18CUB_300001_SM_8000EmptyKernelIvEEvv").replace(
-        "0 bytes spill", "8 bytes spill"
-    )
-    (tmp_path / "report").write_text(REPORT.format("80") + theirs.format("80"))
-    nvcc = tmp_path / "nvcc"
-    nvcc.write_text(f"#!/bin/sh\ncat '{tmp_path}/report' >&2\n")
-    nvcc.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr(check, "OUT", tmp_path / "out")
-    assert check.main(["80"]) == 0
-    said = capsys.readouterr().out
-    assert "cub" not in said and "kernels and 1 of the toolkit's compiled for sm_80" in said
+def test_cuda_check_leaves_the_toolkits_own_kernels_alone(reporting):
+    theirs = REPORT.replace("_Z6kernelv", "_ZN3cub18CUB_300001_SM_8000EmptyKernelIvEEvv")
+    theirs = theirs.replace("0 bytes spill", "8 bytes spill")
+    status, said = reporting(REPORT.format("80") + theirs.format("80"), "80")
+    assert status == 0 and "cub" not in said and "kernels and 1 of the toolkit's compiled for sm_80" in said
 
 
-def test_cuda_check_takes_no_serialized_products(monkeypatch, capsys, tmp_path):
+def test_cuda_check_takes_no_serialized_products(reporting, check, monkeypatch, tmp_path):
     """ptxas's word for it, which -Werror does not reach."""
-    check = cuda_check()
     told = (
         "ptxas info    : (C7510) Potential Performance Loss: wgmma.mma_async instructions are serialized due to "
         "insufficient register resources for the wgmma pipeline in the function '_Z6kernelv'\n"
     )
-    (tmp_path / "report").write_text(told + REPORT.format("90a"))
-    nvcc = tmp_path / "nvcc"
-    nvcc.write_text(f"#!/bin/sh\ncat '{tmp_path}/report' >&2\n")
-    nvcc.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr(check, "OUT", tmp_path / "out")
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
-    assert check.main(["90a"]) == 1
-    said = capsys.readouterr().out
-    assert "(C7510)" in said and "failed: ptxas serializes wgmma in " in said
+    status, said = reporting(told + REPORT.format("90a"), "90a")
+    assert status == 1 and "(C7510)" in said and "failed: ptxas serializes wgmma in " in said
 
 
-def test_cuda_check_compares_with_the_table(monkeypatch, tmp_path):
-    check = cuda_check()
+def test_cuda_check_compares_with_the_table(check, monkeypatch, tmp_path):
     row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
-    assert (
-        len(check.regressions("V13", {"kernel": {"sm_80": row}})) == 1
-    )  # not in the table, which is not there: no spills
+    # Not in the table, which is not there: no spills.
+    assert len(check.regressions("V13", {"kernel": {"sm_80": row}})) == 1
     check.TABLE.write_text(check.as_text("V13", {"kernel": {"sm_80": row}}))
     assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []
     more = {"kernel": {"sm_80": {**row, "registers": 41, "spilled_bytes": 12}}}

@@ -1,11 +1,11 @@
 """Kernels under what programs do to them: several Python threads, forked children, thread counts, odd numbers."""
 
-import subprocess
 import sys
 import threading
 
 import pytest
 import torch
+from helpers import python, same, seeded
 
 import voronerf as v
 
@@ -20,15 +20,14 @@ def network(points, weight):
 
 
 def calls(seed):
-    generator = torch.Generator().manual_seed(seed)
-    points = torch.rand(5000, 3, generator=generator)
-    centres = torch.rand(400, 3, generator=generator)
-    weight = torch.rand(2, 7, 3, generator=generator)
-    grid = v.centre_grid(centres)
-    cells = v.nearest_centre(points, centres)
-    ray = [torch.rand(100, 50, generator=generator) for _ in range(3)]
-    rgb = torch.rand(100, 50, 3, generator=generator)
-    edges = torch.rand(100, 51, generator=generator).sort(dim=1).values
+    generator = seeded(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    points, centres, weight = rand(5000, 3), rand(400, 3), rand(2, 7, 3)
+    ray, rgb, edges = [rand(100, 50) for _ in range(3)], rand(100, 50, 3), rand(100, 51).sort(dim=1).values
+    grid, cells = v.centre_grid(centres), v.nearest_centre(points, centres)
 
     def gradient():
         own = weight.clone().requires_grad_()
@@ -57,7 +56,7 @@ def test_calls_from_several_python_threads_at_once():
             torch.set_num_threads(1 + which % 2)
             for _ in range(5):
                 for i, call in enumerate(everything[which]):
-                    if not all(torch.equal(a, b) for a, b in zip(call(), expected[which][i], strict=True)):
+                    if not same(call(), expected[which][i]):
                         wrong.append((which, i))
         except Exception as error:  # a thread's exception would be lost
             wrong.append(error)
@@ -89,10 +88,10 @@ if child == 0:
     os._exit(0 if torch.equal(cells, expected) and out.isfinite().all() else 1)
 raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
-    assert result.returncode == 0, result.stderr
+    python("-c", code)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
 def test_set_num_threads_is_honoured():
     """A team of the asked size and no larger: threads of the process before and after."""
     code = """
@@ -107,15 +106,14 @@ torch.set_num_threads(3)
 voronerf.nearest_centre(points, centres)
 assert len(os.listdir("/proc/self/task")) == before + 2
 """
-    if sys.platform != "linux":
-        pytest.skip("counts threads in /proc")
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
-    assert result.returncode == 0, result.stderr
+    python("-c", code)
 
 
-def agree(native, reference):
-    """NaN where the reference has NaN, the same infinities, close elsewhere."""
+def agree(op, *args):
+    """The native result, which has NaN where the reference has, the same infinities, and is close elsewhere."""
+    native, reference = (op(*args, backend=backend) for backend in ("native", "reference"))
     torch.testing.assert_close(native, reference, equal_nan=True, rtol=1e-4, atol=1e-5)
+    return native
 
 
 @pytest.mark.parametrize("bad", BAD)
@@ -123,20 +121,16 @@ def test_odd_numbers_propagate_as_in_the_reference(bad):
     points = torch.rand(70, 3)
     points[::9, 1] = bad
     centres, weight = torch.rand(5, 3), torch.rand(5, 6, 3) - 0.5
-    cells = v.nearest_centre(points, centres)
-    assert torch.equal(cells, v.nearest_centre(points, centres, backend="reference"))
+    cells = agree(v.nearest_centre, points, centres)
     assert cells[::9].eq(0).all()
     order, offsets = v.cell_sort(cells, 5)
-    rows = points[order.long()]
     for broken in (weight, weight.masked_fill(torch.rand(weight.shape) < 0.05, bad)):
-        both = [v.grouped_linear(rows, offsets, broken, backend=backend) for backend in ("native", "reference")]
-        agree(*both)
+        agree(v.grouped_linear, points[order.long()], offsets, broken)
     for octaves in (0, 4):
-        agree(*[v.frequency_encode(points, octaves, backend=backend) for backend in ("native", "reference")])
+        agree(v.frequency_encode, points, octaves)
     variances = torch.rand(70, 3)
     variances[::7, 2] = bad
-    finite = torch.rand(70, 3)
-    agree(*[v.integrated_encode(finite, variances.abs(), 4, backend=backend) for backend in ("native", "reference")])
+    agree(v.integrated_encode, torch.rand(70, 3), variances.abs(), 4)
 
 
 # A density is at least 0: minus infinity is outside of the contract.
@@ -147,14 +141,8 @@ def test_odd_numbers_propagate_as_in_the_reference(bad):
 def test_odd_numbers_along_rays(where, bad):
     values = {"sigma": torch.rand(8, 20), "rgb": torch.rand(8, 20, 3), "depths": torch.rand(8, 20)}
     values[where][3, 7] = bad
-    deltas = torch.rand(8, 20)
-    both = [
-        v.composite(values["sigma"], values["rgb"], values["depths"], deltas, backend=backend)
-        for backend in ("native", "reference")
-    ]
-    for native, reference in zip(*both):
-        agree(native, reference)
-        assert native[[0, 1, 2, 4, 5, 6, 7]].isfinite().all()
+    for part in agree(v.composite, *values.values(), torch.rand(8, 20)):
+        assert part[[0, 1, 2, 4, 5, 6, 7]].isfinite().all()
     weights, edges = torch.rand(8, 20), torch.rand(8, 21).sort(dim=1).values
     weights[3, 7] = bad
-    agree(*[v.resample(weights, edges, 9, backend=backend) for backend in ("native", "reference")])
+    agree(v.resample, weights, edges, 9)

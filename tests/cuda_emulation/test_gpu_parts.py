@@ -79,10 +79,8 @@ def test_a_wrong_result_is_told(parts, monkeypatch, capsys, tmp_path):
     assert "right  fine" in said and "WRONG  bad: ValueError: not what it should be" in said
     assert said.endswith("1 of 2 cases are right\n")
     kept = read_json(tmp_path / "small.json")["cases"]
-    assert [(row["name"], row["right"], row["said"]) for row in kept] == [
-        ("fine", True, ""),
-        ("bad", False, "ValueError: not what it should be"),
-    ]
+    expected = [("fine", True, ""), ("bad", False, "ValueError: not what it should be")]
+    assert [(row["name"], row["right"], row["said"]) for row in kept] == expected
 
 
 AFTER_FAULTS = """
@@ -152,11 +150,9 @@ def fake_cuda(monkeypatch):
 
     called.append(call)
     stream = SimpleNamespace(wait_stream=lambda other: None)
-    monkeypatch.setattr("torch.cuda.CUDAGraph", Graph)
-    monkeypatch.setattr("torch.cuda.graph", graph)
-    monkeypatch.setattr("torch.cuda.Stream", lambda: stream)
-    monkeypatch.setattr("torch.cuda.current_stream", lambda: stream)
-    monkeypatch.setattr("torch.cuda.stream", lambda stream: contextlib.nullcontext())
+    fakes = {"CUDAGraph": Graph, "graph": graph, "Stream": lambda: stream, "current_stream": lambda: stream}
+    for name, fake in {**fakes, "stream": lambda stream: contextlib.nullcontext()}.items():
+        monkeypatch.setattr(f"torch.cuda.{name}", fake)
     return called
 
 
