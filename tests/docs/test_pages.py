@@ -57,3 +57,16 @@ def test_options_on_a_page_exist(name: str) -> None:
     for line in re.findall(r"voronerf train( [^`\n|]*)", (ROOT / name).read_text()):
         for option in re.findall(r"(?<!\w)--[a-z-]+", line):
             assert option in known, f"{name}: voronerf train has no {option}"
+
+
+def sources() -> set[str]:
+    names = ("voronerf", "csrc", "kernels", "benchmarks", "tests", "docs", "examples", ".ci")
+    files = [path for name in names for path in (ROOT / name).rglob("*.*")] + list(ROOT.glob("*.*"))
+    return {f"/{path.relative_to(ROOT).as_posix()}" for path in files}
+
+
+@pytest.mark.parametrize("name", [*PAGES, "CONTRIBUTING.md", "CHANGELOG.md"])
+def test_files_that_a_page_names_exist(name: str) -> None:
+    files = sources()
+    for path in re.findall(r"(?<![*>\w./-])[\w./-]+\.(?:py|cpp|cu|h|toml)\b", (ROOT / name).read_text()):
+        assert any(file.endswith(f"/{path}") for file in files), f"{name} names {path}"
