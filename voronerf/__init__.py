@@ -1,9 +1,6 @@
 """Many small networks, one per Voronoi cell of space, as cheap to run and to train as one."""
 
-from __future__ import annotations
-
-import importlib
-from typing import TYPE_CHECKING, Any
+__version__ = "0.1.0"
 
 from voronerf.backends import BackendUnavailable
 from voronerf.diagram import (
@@ -38,11 +35,7 @@ from voronerf.ops import (
 )
 from voronerf.rendering import OccupancyGrid
 from voronerf.router import VoronoiRouter
-
-if TYPE_CHECKING:
-    from voronerf.run import Run, open_run
-
-__version__ = "0.1.0"
+from voronerf.run import Run, open_run
 
 __all__ = [
     "MLP",
@@ -78,10 +71,3 @@ __all__ = [
     "uniform_centres",
     "update_occupancy",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """``Run`` and ``open_run``, whose module needs what reads images and draws plots: imported when it is asked for."""
-    if name in ("Run", "open_run"):
-        return getattr(importlib.import_module("voronerf.run"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
