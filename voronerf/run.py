@@ -11,7 +11,7 @@ from typing import Any
 from voronerf.data import Scene, load_scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.lpips import Lpips, find_lpips
-from voronerf.evaluation.scores import score_views
+from voronerf.evaluation.scores import render_camera, score_views
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import RenderedImage, Renderer
@@ -75,19 +75,10 @@ class Run:
         Raises:
             IndexError: When there is no such camera.
         """
-        scene, device = self.scene, self.renderer.device
-        cameras, index = (scene.test.cameras, camera) if isinstance(camera, int) else (camera, index)
-        if not 0 <= index < len(cameras.poses):
-            raise IndexError(f"render: there are {len(cameras.poses)} cameras, got number {index}")
-        return self.renderer.train(False).image(
-            cameras.to(device),
-            index,
-            near=scene.near,
-            far=scene.far,
-            box=None if scene.box is None else scene.box.to(device),
-            background=scene.background_colour(device),
-            heaviest=heaviest,
-        )
+        cameras, index = (self.scene.test.cameras, camera) if isinstance(camera, int) else (camera, index)
+        if not 0 <= index < len(cameras):
+            raise IndexError(f"render: there are {len(cameras)} cameras, got number {index}")
+        return render_camera(self.renderer, self.scene, cameras, index, heaviest=heaviest)
 
     def find_lpips(self, weights: Path | str | None = None) -> tuple[Lpips | None, str]:
         """The LPIPS network for this run's images, or None; and where it was found, or why it was not.

@@ -9,6 +9,7 @@ from typing import Any
 from voronerf.data import Scene
 from voronerf.evaluation.lpips import Lpips
 from voronerf.evaluation.metrics import psnr, ssim
+from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.renderer import RenderedImage, Renderer
 
 
@@ -36,11 +37,18 @@ def view_numbers(count: int, views: int | None) -> list[int]:
 
 
 def render_view(renderer: Renderer, scene: Scene, view: int, *, heaviest: bool = True) -> RenderedImage:
-    """One test view as the renderer sees it, samples at the middle of their strata, those in empty cells left out."""
+    """A test view of a scene, see :func:`render_camera`."""
+    return render_camera(renderer, scene, scene.test.cameras, view, heaviest=heaviest)
+
+
+def render_camera(
+    renderer: Renderer, scene: Scene, cameras: Cameras, index: int, *, heaviest: bool = True
+) -> RenderedImage:
+    """What one of several cameras sees of a scene, on its background, without randomness; on the renderer's device."""
     device = renderer.device
     return renderer.train(False).image(
-        scene.test.cameras.to(device),
-        view,
+        cameras.to(device),
+        index,
         near=scene.near,
         far=scene.far,
         box=None if scene.box is None else scene.box.to(device),
