@@ -78,7 +78,7 @@ def _choose_isa() -> str:
     wanted = os.environ.get("VORONERF_ISA") or SUPPORTED_ISAS[-1]
     if wanted not in SUPPORTED_ISAS:
         here = ", ".join(SUPPORTED_ISAS)
-        # No BackendUnavailable, which backend="auto" would pass over in silence.
+        # Not BackendUnavailable, which backend="auto" would skip silently.
         raise ValueError(f"VORONERF_ISA must be one this processor supports ({here}), got {wanted!r}")
     return wanted
 

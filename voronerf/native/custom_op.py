@@ -13,7 +13,7 @@ from torch.library import CustomOpDef
 
 from voronerf import native
 
-# Bytes from which a result is asked to lie on huge pages; below, the allocator has warm memory as a rule.
+# Results of at least this many bytes are put on huge pages; for smaller ones the allocator usually has warm memory.
 _LARGE = 1 << 22
 
 

@@ -1,4 +1,4 @@
-"""``update_occupancy`` of the compiled module. n cells of a grid, q of them looked at."""
+"""``update_occupancy`` of the compiled module. n cells of a grid, q updates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from voronerf.native.custom_op import custom_op
 def update_occupancy(
     density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
 ) -> tuple[Tensor, Tensor]:
-    """The larger of what was found and what is remembered; see ``voronerf.ops.update_occupancy``."""
+    """The larger of the density found and the decayed old one; see ``voronerf.ops.update_occupancy``."""
     remembered, occupied = _update(density, cells, values, decay, threshold)
     return remembered, occupied
 

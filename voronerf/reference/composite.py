@@ -12,13 +12,13 @@ _OPAQUE = 1e30
 
 
 class Composite(NamedTuple):
-    """What a batch of rays sees.
+    """The result of `composite`.
 
     Attributes:
         colour: [r, c], background included.
         opacity: [r], the sum of the weights.
         depth: [r], the sum of weight times depth: not divided by the opacity.
-        weights: like sigma, each sample's contribution.
+        weights: like sigma, the contribution of each sample.
 
     Examples:
         >>> import torch
@@ -58,7 +58,7 @@ def composite(
     else:
         rays = ray_offsets.shape[0] - 1
         row = torch.arange(sigma.shape[0], device=sigma.device)
-        # One more than the ray of each sample: 0 and rays + 1 are for samples of no ray.
+        # One more than the ray of each sample: 0 and rays + 1 are for samples that belong to no ray.
         ray = torch.searchsorted(ray_offsets.long(), row, right=True)
         inside = (ray > 0) & (ray <= rays)
         first = torch.where(inside, ray_offsets[(ray - 1).clamp(0, rays)], row)
@@ -77,7 +77,7 @@ def composite(
 def _in_front(optical: Tensor) -> Tensor:
     """Transmittance in front of each sample [r, s]: exp of minus the optical depth up to there.
 
-    The sum is shifted rather than having its last term taken off again, which for an opaque sample would be inf - inf.
+    The sum is shifted. Subtracting its last term instead would be inf - inf for an opaque sample.
     """
     before = torch.nn.functional.pad(optical[:, :-1], (1, 0))
     return torch.exp(-before.cumsum(dim=1))

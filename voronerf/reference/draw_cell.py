@@ -64,7 +64,7 @@ def _draw(
     for level in range(depth):
         elsewhere = owner[None, :] != state[:, None]
         nearest = distance.masked_fill(elsewhere, torch.inf).amin(1, keepdim=True)
-        # What is infinite or no number has no mass.
+        # Infinity and NaN have no mass.
         mass = ((nearest - distance) / temperature).exp().masked_fill(elsewhere, 0).nan_to_num(0.0)
         # A device sums as a tree, each place with roundings of its own: a sum may be below the one before it, and the
         # last above that at the last centre with mass. Of those with mass the first counts that has enough.

@@ -19,9 +19,9 @@ class March(NamedTuple):
         ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
         ray_index: int32 [m], the ray of each sample.
         depths: [m], distance along the ray, rising along each ray.
-        deltas: [m], length of the sample's stratum.
+        deltas: [m], length of the stratum of each sample.
         positions: [m, 3], where the samples are.
-        stop: int32 [r], the stratum with which each ray would go on: s where the whole ray has been walked.
+        stop: int32 [r], the stratum at which each ray continues: s if the whole ray was walked.
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""The memory of an occupancy grid. x, y, z cells along each axis, q cells looked at."""
+"""Updating an occupancy grid. x, y, z cells along each axis, q updates."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 def update_occupancy(
     density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
 ) -> tuple[Tensor, Tensor]:
-    """The larger of what was found and what is remembered; see ``voronerf.ops.update_occupancy``."""
+    """The larger of the density found and the decayed old one; see ``voronerf.ops.update_occupancy``."""
     if cells.device.type == "cpu" and cells.shape[0] > 0 and not torch.compiler.is_compiling():
         low, high = (int(bound) for bound in cells.aminmax())
         if low < 0 or high >= density.numel():
@@ -19,7 +19,7 @@ def update_occupancy(
             )
     flat = density.reshape(-1)
     row = cells.long()
-    # Every cell looked at fades once, however often it is named.
+    # A cell decays once, however often it occurs.
     faded = flat.scatter(0, row, flat[row] * decay)
     result = faded.scatter_reduce(0, row, values, "amax").reshape(density.shape)
     return result, result >= threshold
