@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from voronerf.reference import specification
+from voronerf.reference import grouped_linear as specification
 
 native = pytest.importorskip("voronerf.native.grouped_linear")
 

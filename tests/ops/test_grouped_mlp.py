@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import loops
 import pytest
 import torch
 from op_cases import COUNTS, FLOATS, need, offsets_of, refused, strided
@@ -11,7 +12,6 @@ from torch import Tensor
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import frequency_encode, grouped_mlp, integrated_encode
-from voronerf.reference import specification
 
 pytestmark = pytest.mark.op("grouped_mlp")
 
@@ -113,8 +113,8 @@ def test_output_and_gradients_match_the_specification(
     device: torch.device, backend: str, name: str, counts: list[int]
 ) -> None:
     case = Case.make(name, counts)
-    exact = case.results(specification.grouped_mlp, torch.float64)
-    plain = case.results(specification.grouped_mlp, torch.float32)
+    exact = case.results(loops.grouped_mlp, torch.float64)
+    plain = case.results(loops.grouped_mlp, torch.float32)
     found = case.results(grouped_mlp, torch.float32, device, backend=backend)
     for part, same, right in zip(found, plain, exact):
         assert_as_exact(part, same, right)
@@ -125,8 +125,8 @@ def test_output_and_gradients_match_the_specification(
 def test_dtypes(device: torch.device, backend: str, name: str, dtype: torch.dtype) -> None:
     need("grouped_mlp", backend, device, dtype)
     case = Case.make(name, COUNTS["odd"], dtype)
-    exact = case.results(specification.grouped_mlp, torch.float64)
-    plain = case.results(specification.grouped_mlp, dtype)
+    exact = case.results(loops.grouped_mlp, torch.float64)
+    plain = case.results(loops.grouped_mlp, dtype)
     found = case.results(grouped_mlp, dtype, device, backend=backend)
     for part, same, right in zip(found, plain, exact):
         assert_as_exact(part, same, right)
@@ -202,7 +202,7 @@ def test_wide_positions_with_half_weights_keep_their_octaves(device: torch.devic
     case.table = MLP(case.table.layers, case.table.outputs, position_octaves=10)
     case.inputs[2] = torch.randn(len(COUNTS["odd"]), 9, 63) / 8
     halves = [case.inputs[0], case.inputs[1], *(tensor.bfloat16() for tensor in case.inputs[2:])]
-    exact = case.run(specification.grouped_mlp, [tensor.double() for tensor in halves])
+    exact = case.run(loops.grouped_mlp, [tensor.double() for tensor in halves])
     found = case.run(grouped_mlp, [tensor.to(device) for tensor in halves], backend=backend)
     assert found.dtype == torch.bfloat16
     # Rounded to bfloat16 before they are encoded, positions would be wrong by 512 / 256 radians.
@@ -275,8 +275,8 @@ def test_second_derivatives(device: torch.device, backend: str) -> None:
         (slope,) = torch.autograd.grad(case.run(mlp, leaves, **options).sum(), leaves[0], create_graph=True)
         return list(torch.autograd.grad(slope.square().sum(), leaves, allow_unused=True, materialize_grads=True))
 
-    exact = penalty(specification.grouped_mlp, torch.float64, CPU)
-    plain = penalty(specification.grouped_mlp, torch.float32, CPU)
+    exact = penalty(loops.grouped_mlp, torch.float64, CPU)
+    plain = penalty(loops.grouped_mlp, torch.float32, CPU)
     for part, same, right in zip(penalty(grouped_mlp, torch.float32, device, backend=backend), plain, exact):
         assert_as_exact(part, same, right)
 
@@ -290,24 +290,7 @@ def test_second_derivatives_where_one_input_is_computed_from_another() -> None:
         (slope,) = torch.autograd.grad(y.sum(), positions, create_graph=True)
         return torch.cat([slope, *torch.autograd.grad(slope.square().sum(), positions)])
 
-    torch.testing.assert_close(penalty(grouped_mlp), penalty(specification.grouped_mlp))
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
-@pytest.mark.parametrize("keep", [True, False])
-def test_opcheck(keep: bool, dtype: torch.dtype) -> None:
-    case = Case.make("nerf", [2, 0, 3], dtype)
-    positions, directions, *parameters = case.leaves(dtype)
-    network = (positions, directions, case.direction_index, case.offsets, parameters, case.bias, case.table.text)
-    torch.library.opcheck(torch.ops.voronerf.grouped_mlp, (*network, keep))
-    with torch.no_grad():
-        out, hidden = torch.ops.voronerf.grouped_mlp(*network, True)
-        arguments = [[tensor.detach() for tensor in each] if each is parameters else each for each in network]
-        arguments[:2] = positions.detach(), directions.detach()
-        needs = [True] * (2 + len(parameters))
-        torch.library.opcheck(
-            torch.ops.voronerf.grouped_mlp_backward, (torch.randn(out.shape).to(dtype), *arguments, hidden, needs)
-        )
+    torch.testing.assert_close(penalty(grouped_mlp), penalty(loops.grouped_mlp))
 
 
 def test_autocast(device: torch.device, backend: str) -> None:

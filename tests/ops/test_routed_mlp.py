@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import loops
 import pytest
 import torch
 from op_cases import need, refused, strided
@@ -13,7 +14,6 @@ from torch import Tensor
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import cell_sort, frequency_encode, grouped_mlp, locate_cell, nearest_centre, routed_mlp
-from voronerf.reference import specification
 
 pytestmark = pytest.mark.op("routed_mlp")
 
@@ -118,7 +118,7 @@ class Case:
         order = self.expected_cells.argsort(stable=True)
         k = parameters[0].shape[0]
         biases = iter(parameters[len(self.bias) :])
-        out = specification.grouped_mlp(
+        out = loops.grouped_mlp(
             positions[order],
             torch.tensor([0, *self.expected_cells.bincount(minlength=k)]).cumsum(0).int(),
             parameters[: len(self.bias)],

@@ -19,7 +19,7 @@ from torch import Tensor
 from voronerf import native
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.reference.frequency_encode import frequency_encode
-from voronerf.reference.specification import encode_positions
+from voronerf.reference.grouped_mlp import encode_positions
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
 

@@ -17,7 +17,7 @@ from voronerf.layers import MLP
 from voronerf.native.grouped_linear import _forward as linear
 from voronerf.reference.activation import activate
 from voronerf.reference.grouped_linear import grouped_linear as _reference
-from voronerf.reference.specification import grouped_mlp as compose
+from voronerf.reference.grouped_mlp import grouped_mlp as compose
 
 # Rows that go through the layers together: their values stay in the cache.
 _PIECE = 8192
