@@ -50,7 +50,16 @@ def main(architectures: list[str]) -> int:
     generate.append(f"-gencode=arch=compute_{architectures[-1]},code=compute_{architectures[-1]}")
 
     def compile_one(source: Path) -> subprocess.CompletedProcess[str]:
-        command = [nvcc, *FLAGS, *generate, "-c", str(source), "-o", str(OUT / f"{source.name}.o")]
+        command = [
+            nvcc,
+            *FLAGS,
+            f"-I{ROOT / 'csrc'}",
+            *generate,
+            "-c",
+            str(source),
+            "-o",
+            str(OUT / f"{source.name}.o"),
+        ]
         return subprocess.run(command, capture_output=True, text=True)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:

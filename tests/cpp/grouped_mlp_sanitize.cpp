@@ -56,7 +56,7 @@ MlpTable random_table() {
   if (table.integrated) table.positions = 6;
   const int64_t layers = 1 + below(5);
   for (int64_t l = 0; l < layers; ++l) {
-    MlpLayer layer;
+    voronerf::MlpLayer layer;
     layer.width = widths[below(13)];
     layer.activation = static_cast<Activation>(below(5));
     const int64_t sources = 1 + below(10) / 3 + (below(20) == 0 ? 9 : 0);
@@ -126,7 +126,7 @@ struct Case {
     positions = uniform(n * table.positions);
     directions = uniform(rays * table.directions);
     std::vector<int64_t> depths;
-    for (const MlpLayer& layer : table.layers) {
+    for (const voronerf::MlpLayer& layer : table.layers) {
       int64_t depth = 0;
       for (const int from : layer.inputs) {
         depth += from >= 0                          ? table.layers[from].width
