@@ -51,6 +51,13 @@ def test_nvcc_gets_one_program_and_the_arguments(build, monkeypatch):
         assert "ccache" not in rules[rule]
 
 
+def test_files_of_one_name_in_two_rooms_make_two_objects(build):
+    lines = build["ninja_file"](Path("_C.so"), build["Cuda"]("built without CUDA")).splitlines()
+    objects = [line.split(":")[0] for line in lines if line.startswith("build ")]
+    assert "build geometry/cell_sort.cpp.o" in objects and "build bindings/cell_sort.cpp.o" in objects
+    assert len(objects) == len(set(objects))
+
+
 @pytest.mark.parametrize("given", ["", "-Ofast -march=native", "-ffast-math -ffp-contract=fast"])
 def test_arithmetic_is_exact_whatever_flags_are_given(build, monkeypatch, given):
     monkeypatch.setenv("CXXFLAGS", given)
@@ -149,6 +156,14 @@ def reporting(check, monkeypatch, capsys, tmp_path):
 def test_cuda_check_fails_where_nothing_was_checked(reporting, reported, status, outcome):
     found, said = reporting("".join(REPORT.format(arch) for arch in reported), "80", "90a")
     assert found == status and said.endswith(outcome)
+
+
+def test_cuda_check_compiles_with_the_folder_that_includes_start_from(check, reporting, tmp_path):
+    reporting(REPORT.format("80"), "80")
+    program(tmp_path / "nvcc", f"echo \"$@\" >> '{tmp_path}/commands'")
+    check.main(["80"])
+    compiled = [line for line in (tmp_path / "commands").read_text().splitlines() if " -c " in line]
+    assert compiled and all(f" -I{ROOT / 'csrc'} " in line for line in compiled)
 
 
 def test_cuda_check_leaves_the_toolkits_own_kernels_alone(reporting):
