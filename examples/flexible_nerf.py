@@ -60,7 +60,7 @@ def main() -> None:
     radiance_field = model(x)
 
     # after
-    model = VoronoiRouter(model, torch.rand(16, 3) * 2 - 1, coords="first3")
+    model = VoronoiRouter(model, torch.rand(16, 3) * 2 - 1, coords="first3", fuse=True)
     routed = model(x)
 
     torch.testing.assert_close(routed, radiance_field)

@@ -66,7 +66,7 @@ def main() -> None:
     raw_rgb, raw_density = mlp(samples_enc, viewdirs_enc)
 
     # after
-    mlp = VoronoiRouter(mlp, torch.rand(16, 3) * 2 - 1, per_ray=["view_direction"])
+    mlp = VoronoiRouter(mlp, torch.rand(16, 3) * 2 - 1, per_ray=["view_direction"], fuse=True)
     routed_rgb, routed_density = mlp(samples_enc, viewdirs_enc, coords=means)
 
     torch.testing.assert_close(routed_rgb, raw_rgb)

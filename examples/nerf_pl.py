@@ -58,7 +58,7 @@ def main() -> None:
     out, sigma = nerf(x), nerf(xyz, sigma_only=True)
 
     # after
-    nerf = VoronoiRouter(nerf, torch.rand(16, 3) * 2 - 1, coords="first3")
+    nerf = VoronoiRouter(nerf, torch.rand(16, 3) * 2 - 1, coords="first3", fuse=True)
     routed, routed_sigma = nerf(x), nerf(xyz, sigma_only=True)
 
     torch.testing.assert_close(routed, out)

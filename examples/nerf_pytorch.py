@@ -69,7 +69,7 @@ def main() -> None:
     raw = run_network(points, viewdirs, model)
 
     # after: 16 copies of the model, one a cell; all that calls `model` stays as it is
-    router = VoronoiRouter(model, centres, coords="first3")
+    router = VoronoiRouter(model, centres, coords="first3", fuse=True)
     routed = run_network(points, viewdirs, router)
     torch.testing.assert_close(routed, raw)
 
@@ -79,6 +79,15 @@ def main() -> None:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+
+    # a split, and a run that resumes after it: build, make the optimiser, load both states
+    flat = points.reshape(-1, 3)
+    router.subdivide(4, optimizer=optimizer, points=flat, weights=torch.ones(len(flat)), min_samples=100)
+    resumed = VoronoiRouter(model, centres[:1], coords="first3", fuse=True)
+    again = torch.optim.Adam(resumed.parameters(), lr=5e-4)
+    again.load_state_dict(optimizer.state_dict())
+    resumed.load_state_dict(router.state_dict())
+    torch.testing.assert_close(run_network(points, viewdirs, resumed), run_network(points, viewdirs, router))
     print(f"nerf-pytorch: {router.num_cells} cells, loss {loss.item():.4f} after three steps")
 
 

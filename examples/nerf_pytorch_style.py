@@ -59,7 +59,7 @@ def main() -> None:
     pixels = torch.cat([view(scene.train, i) for i in range(len(scene.train))])
     model = NeRF(options.depth, options.width, input_ch=63, input_ch_views=27, use_viewdirs=True)
     if options.voronoi:
-        model, kept = VoronoiRouter(model, torch.zeros(1, 3), coords="first3"), SampleReservoir()  # changed
+        model, kept = VoronoiRouter(model, torch.zeros(1, 3), coords="first3", fuse=True), SampleReservoir()  # changed
     optimizer = torch.optim.Adam(model.parameters(), lr=options.lr)
 
     began, step, spent = time.perf_counter(), 0, 0.0

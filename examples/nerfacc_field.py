@@ -88,7 +88,9 @@ def main() -> None:
 
     # after
     centres = torch.rand(16, 3) * 2 - 1
-    radiance_field = VoronoiRouter(radiance_field, centres, coords="first3", methods=["query_density", "query_opacity"])
+    radiance_field = VoronoiRouter(
+        radiance_field, centres, coords="first3", methods=["query_density", "query_opacity"], fuse=True
+    )
     routed_rgb, routed_sigma = radiance_field(positions, directions)
     routed_density = radiance_field.query_density(positions)
 

@@ -84,7 +84,7 @@ def main() -> None:
     density = model.density(x)
 
     # after
-    model = VoronoiRouter(model, torch.rand(16, 3) * 2 - 1, coords="first3", methods=["density"])
+    model = VoronoiRouter(model, torch.rand(16, 3) * 2 - 1, coords="first3", methods=["density"], fuse=True)
     routed_sigma, routed_rgb = model(x, d)
     routed_density = model.density(x)
 

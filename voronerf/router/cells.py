@@ -306,7 +306,7 @@ def watch_optimizers(module: nn.Module, line: str) -> Any:
         held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched] if watched else []
         if any(watched[id(parameter)]() is parameter and _is_stale(optimizer, parameter) for parameter in held):
             raise ValueError(
-                f"{_OP}: optimizer, a {type(optimizer).__name__}, holds the state of other cells than the router has; "
+                f"{_OP}: optimizer ({type(optimizer).__name__}) holds the state of other cells than the router has; "
                 f"write {line}, or make the optimizer afterwards"
             )
         if held:

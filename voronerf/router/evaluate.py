@@ -79,6 +79,10 @@ class Choices:
             self._kinds, self._values = {}, {}
         self._kinds[kind] = choice
 
+    def all_fusable(self) -> bool:
+        """Whether ``fuse=True`` would serve for every kind of call so far."""
+        return all(choice.fusable for choice in self._kinds.values())
+
     def note(self, call: Call, choice: Choice) -> None:
         """For :meth:`explain`: how a method was carried out."""
         self._latest.setdefault(call.method, {})[choice.way] = choice.why
@@ -234,7 +238,7 @@ def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, c
             return choice
         found = replace(admitted(trial, fuse), flat=flat)
     choices.keep(kind, found)
-    if found.fusable:
+    if found.fusable and choices.all_fusable():
         name = f"{type(module).__name__}.{call.method}"
         choices.say_once(
             f"fuse {call.method}",
