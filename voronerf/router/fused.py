@@ -22,11 +22,11 @@ from torch import Tensor, nn
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
-from voronerf.router.grouped import PerCell, for_all_cells, name_of
 from voronerf.router.grouping import Entries, Grouping
 from voronerf.router.layout import Layout
 from voronerf.router.loop import Results
 from voronerf.router.parameters import is_shared, owned_parameters
+from voronerf.router.percell import PerCell, for_all_cells, name_of
 from voronerf.router.tracing import (
     Ref,
     Step,
@@ -162,10 +162,8 @@ class Program:
             raise Unfusable(f"a layer has weights or inputs that are neither parameters nor samples{step.line}")
         if source in late:
             earlier = next(s for s in self._behind if source in s.values)
-            raise Unfusable(
-                f"a layer reads the result of {name_of(earlier.function)}{earlier.line}, which is no activation or "
-                f"arrangement that a table has{step.line if not earlier.line else ''}"
-            )
+            name = f"{name_of(earlier.function)}{earlier.line}"
+            raise Unfusable(f"a layer reads the result of {name}, which is no activation or arrangement of a table")
         own = sizes[source]
         assert own is not None
         if own[:1] != (1,) or any(size != 1 for size in own[1:-1]):
@@ -344,7 +342,7 @@ class Program:
             args, kwargs = map_arguments(
                 (step.args, step.kwargs), lambda v: PerCell(stacked(v.value)) if isinstance(v, Ref) else v
             )
-            results = tensors_of(for_all_cells(None, step.function, args, kwargs))
+            results = tensors_of(for_all_cells(step.function, args, kwargs))
             known.update(zip(step.values, [r.stacked for r in results if isinstance(r, PerCell)], strict=True))
         weights, biases = [], []
         for linear, start, stop in self._parts:
