@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -11,15 +13,15 @@ _PIECE = 1 << 17
 
 def nearest_centre(points: Tensor, centres: Tensor, *, weights: Tensor | None = None) -> Tensor:
     """Index of the centre with the smallest ``|x - c|^2 - w`` for every point; see ``voronerf.ops.nearest_centre``."""
-    rows = max(1, _PIECE // centres.shape[0])
-    if torch.compiler.is_compiling() or points.shape[0] <= rows:
-        # A compiler fuses distance and argmin, and would unroll the loop.
-        return distances(points, centres, weights).argmin(dim=1).to(torch.int32)
-    cells = torch.empty(points.shape[0], dtype=torch.int32, device=points.device)
-    for start in range(0, points.shape[0], rows):
-        piece = slice(start, start + rows)
-        cells[piece] = distances(points[piece], centres, weights).argmin(dim=1)
-    return cells
+    run = lambda points: distances(points, centres, weights).argmin(dim=1).to(torch.int32)  # noqa: E731
+    return in_pieces(run, _PIECE // centres.shape[0], points)
+
+
+def in_pieces(run: Callable[..., Tensor], rows: int, *tensors: Tensor) -> Tensor:
+    """``run`` on so many rows of the tensors at a time; a compiler, which would unroll the loop, gets them whole."""
+    if torch.compiler.is_compiling() or tensors[0].shape[0] <= rows:
+        return run(*tensors)
+    return torch.cat([run(*piece) for piece in zip(*(tensor.split(max(1, rows)) for tensor in tensors))])
 
 
 def distances(points: Tensor, centres: Tensor, weights: Tensor | None) -> Tensor:
