@@ -107,8 +107,9 @@ def tensors_of(value: Any) -> list[Tensor]:
 def _collect(value: Any, found: list[Tensor], depth: int) -> None:
     if isinstance(value, Tensor):
         found.append(value)
-    elif depth <= _DEEPEST and (items := _items(value)):
-        for item in items.values():
+    elif depth <= _DEEPEST:
+        # Every function of a grouped module comes here with its arguments: lists are not made dicts for it.
+        for item in value if type(value) in (list, tuple) else (_items(value) or {}).values():
             _collect(item, found, depth + 1)
 
 
