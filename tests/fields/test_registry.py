@@ -50,6 +50,21 @@ class OwnEncoding(NeRF):
         return super().forward(torch.sin(positions * self.frequencies))
 
 
+class Fourier(nn.Module):
+    """Linear layers behind random waves, an encoding of its own that all cells share."""
+
+    router_options: ClassVar[dict[str, Any]] = {"fuse": True}
+
+    def __init__(self, width: int = 8) -> None:
+        super().__init__()
+        self.register_buffer("waves", torch.linspace(-4, 4, 18).reshape(3, 6))
+        self.hidden, self.out = nn.Linear(6, width), nn.Linear(width, 4)
+
+    def forward(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        raw = self.out(F.relu(self.hidden(torch.sin(positions @ self.waves))))
+        return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3])
+
+
 class Foreign(nn.Module):
     """Any module of positions and directions, with a learning rate and an option of its own."""
 
@@ -86,6 +101,7 @@ class Balls(nn.Module):
 KINDS: dict[str, tuple[type[nn.Module], dict[str, Any]]] = {
     "table": (Table, {"field_options": ("omega=5.0",)}),
     "own-encoding": (OwnEncoding, {}),
+    "fourier": (Fourier, {}),
     "foreign": (Foreign, {"field_options": ("hidden=8", "kind=tanh")}),
     "balls": (Balls, {}),
 }
@@ -134,7 +150,7 @@ def test_every_kind_of_field_is_trained_split_resumed_and_scored(tmp_path: Path,
     run = open_run(tmp_path / "whole", scene=scene)
     assert run.evaluate()["psnr"] == summary["psnr"]
     assert run.render(1).colour.shape == (16, 16, 3)
-    if name in ("table", "balls"):  # a layer table, and a class whose router has fuse=True
+    if name in ("table", "fourier", "balls"):  # a layer table, or a class whose router has fuse=True
         assert "fused" in run.router.explain()
 
 
@@ -156,7 +172,7 @@ def test_options_reach_the_field(scene: Scene) -> None:
     [
         (
             {"field": "siren"},
-            "--field must be nerf, mipnerf, kilonerf, table, own-encoding, fo",
+            "--field must be nerf, mipnerf, kilonerf, table, own-encoding, fourier, fo",
         ),
         ({"field": "table", "depth": 3}, "--depth must not come with --field table, got 3"),
         ({"field": "table", "view_directions": False}, "--view-directions must not come with --field table, got False"),

@@ -22,10 +22,10 @@ from voronerf.evaluation.scores import render_view, view_numbers
 from voronerf.files import write_bytes
 from voronerf.rendering.renderer import Renderer
 
-# steps of hue, saturation and value: sequences that fill their range evenly however many are drawn (Roberts 2018)
+# Steps of hue, saturation and value; their multiples modulo 1 fill the range evenly for any count (Roberts 2018).
 HUE_STEP, SATURATION_STEP, VALUE_STEP = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
-ERROR_SCALE = 0.3  # mean absolute error over the channels that has the map's last colour
-SOLID = 0.5  # opacity above which a pixel has a depth worth a place in the scale
+ERROR_SCALE = 0.3  # mean absolute error over the channels that gets the last colour of the map
+SOLID = 0.5  # opacity above which the depth of a pixel counts for the scale
 PICTURE_HEIGHT = 240
 CAPTION, GAP = 18, 6
 
@@ -57,7 +57,7 @@ def picture_of_error(colour: Tensor, truth: Tensor) -> Tensor:
 
 
 def picture_of_depth(depth: Tensor, opacity: Tensor) -> Tensor:
-    """Depth [h, w], near (yellow) to far (dark blue) over the range of what is opaque, white where nothing is."""
+    """Depth [h, w] from near (yellow) to far (dark blue), fading to white with the opacity."""
     solid = depth[opacity > SOLID]
     solid = solid[:: 1 + solid.numel() // 2**20]  # torch takes no quantile of more than 2^24
     low, high = (solid.quantile(0.01), solid.quantile(0.99)) if solid.numel() else (depth.min(), depth.max())
@@ -71,7 +71,7 @@ def picture_of_cells(cells: Tensor, opacity: Tensor, colour: Tensor | None = Non
     Args:
         cells: integer [h, w].
         opacity: [h, w].
-        colour: [h, w, 3]; where given its lightness shades the cells, so that shapes stay visible.
+        colour: [h, w, 3], or None; its lightness shades the cells, so that shapes stay visible.
     """
     picture = palette(int(cells.max()) + 1 if cells.numel() else 0)[cells.long()]
     if colour is not None:
@@ -107,7 +107,7 @@ def contact_sheet(pictures: Mapping[str, Tensor]) -> Tensor:
 
 
 def save_picture(path: Path, picture: Tensor) -> None:
-    """Writes a picture as PNG, whole or not at all; makes its folder.
+    """Writes a picture as PNG, atomically; makes its folder.
 
     Raises:
         OSError: it cannot be written.

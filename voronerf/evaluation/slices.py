@@ -8,15 +8,14 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from voronerf.data import Scene
 from voronerf.rendering.contraction import Contraction
-from voronerf.router import VoronoiRouter
 
 #: Half the side of a slice through a scene without a box, in scene units.
 EXTENT = 1.5
-#: Density that has the map's last colour: a wall a hundredth of a scene unit thick then lets a third of the light pass.
+#: Density of the last colour of the map; a wall of this density and a thickness of 0.01 passes a third of the light.
 DENSEST = 100.0
 
 
@@ -26,9 +25,9 @@ def slice_points(scene: Scene, *, axis: int = 2, at: float = 1 / 3, size: int = 
     The picture's right is the lower of the other two axes, its top the higher.
 
     Args:
-        scene: the plane fills its box, or a cube of 3 units where it has none.
-        axis: that the plane is perpendicular to, 0 to 2.
-        at: where the plane cuts it, as a fraction of the box.
+        scene: the plane fills its box, or a cube of 3 units for a scene without a box.
+        axis: the axis that the plane is perpendicular to, 0 to 2.
+        at: position of the plane on this axis, as a fraction of the box.
         size: points along a side.
 
     Raises:
@@ -49,20 +48,21 @@ def slice_points(scene: Scene, *, axis: int = 2, at: float = 1 / 3, size: int = 
 
 @torch.no_grad()
 def slice_density(
-    router: VoronoiRouter, points: Tensor, *, cones: bool = False, contraction: Contraction | None = None
+    field: nn.Module, points: Tensor, *, cones: bool = False, contraction: Contraction | None = None
 ) -> Tensor:
-    """Density [h, w] of a router's field, blended where the router's `blend` says so.
+    """Density [h, w] of a field in evaluation mode, so that a router with a `blend` blends.
 
     Args:
-        router: around a field of positions, directions and ray indices; it is left in the mode it is in.
+        field: takes positions, directions and ray indices, as `Renderer.field` does; its mode is restored.
         points: [h, w, 3].
-        cones: ask about Gaussians [n, 6], means and variances, as mip-NeRF wants: cubes that fill the slice.
+        cones: evaluate the field on Gaussians [n, 6], means and variances of cubes that fill the slice, as mip-NeRF
+            needs them.
         contraction: of the space that the field lives in, see `Renderer.contraction`.
     """
-    device = next(router.parameters()).device
+    device = next(field.parameters()).device
     flat = points.reshape(-1, 3).to(device)
     if cones:
-        # a cube's side is the distance between neighbours, its variance a twelfth of the square
+        # The side of a cube is the distance between neighbours; its variance along each axis is side^2 / 12.
         side = (points[-1, -1] - points[0, 0]).abs().amax() / max(max(points.shape[:2]) - 1, 1)
         variance = (side.square() / 12).to(flat).expand(len(flat), 1)
         spread = variance.expand(-1, 3)
@@ -74,19 +74,19 @@ def slice_density(
         flat = contraction.points(flat)
     down = torch.tensor([[0.0, 0.0, -1.0]], device=device)
     index = torch.zeros(len(flat), dtype=torch.int32, device=device)
-    was = router.training
-    router.eval()
+    was = field.training
+    field.eval()
     try:
-        _, density = router(flat, down, index)
+        _, density = field(flat, down, index)
     finally:
-        router.train(was)
+        field.train(was)
     return density.float().cpu().reshape(points.shape[:-1])
 
 
 def picture_of_density(density: Tensor, densest: float = DENSEST) -> Tensor:
-    """Densities [h, w] as uint8 [h, w, 3]: nothing is black, `densest` and above pale yellow, on a logarithmic scale.
+    """Densities [h, w] as uint8 [h, w, 3]: 0 is black, `densest` and above pale yellow, on a logarithmic scale.
 
-    The scale shows both the walls and the faint fog before and behind them: log(1 + density) / log(1 + densest).
+    The scale log(1 + density) / log(1 + densest) shows both walls and the faint fog before and behind them.
     """
     if not densest > 0:
         raise ValueError(f"picture_of_density: densest must be positive, got {densest}")

@@ -12,6 +12,11 @@ have these attributes, all of which are optional:
 
 Its options are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is called with
 the directions [r, 3] of the rays, and with the row of them that belongs to each sample.
+
+A class with ``layers``, ``linears()`` and ``activate()`` is a layer table, as :class:`voronerf.fields.NeRF` is: a
+router evaluates the table for all cells in one operation and does not call ``forward``. A module with an encoding of
+its own before its linear layers becomes such a table by ``router_options = {"fuse": True}``, if the encoding has no
+parameters. Any other module runs its own ``forward``.
 """
 
 from __future__ import annotations
