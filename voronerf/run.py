@@ -61,19 +61,19 @@ class Run:
         return self.router.diagram
 
     def render(self, camera: int | Cameras, index: int = 0, *, heaviest: bool = True) -> RenderedImage:
-        """A picture, without gradients and without randomness.
+        """Renders a picture, without gradients and without randomness.
 
         Args:
             camera: The number of a test view, or cameras of any kind.
             index: Which of several cameras.
-            heaviest: Whether the place that each pixel shows is wanted as well, which takes a little longer.
+            heaviest: Also find the place that each pixel shows, which takes a little longer.
 
         Returns:
             Colour [h, w, 3] over the scene's background, opacity [h, w], depth [h, w] in scene units, and the heaviest
             sample [h, w, 3] of each pixel's ray.
 
         Raises:
-            IndexError: When there is no such camera.
+            IndexError: If there is no such camera.
         """
         cameras, index = (self.scene.test.cameras, camera) if isinstance(camera, int) else (camera, index)
         if not 0 <= index < len(cameras):
@@ -81,21 +81,21 @@ class Run:
         return render_camera(self.renderer, self.scene, cameras, index, heaviest=heaviest)
 
     def find_lpips(self, weights: Path | str | None = None) -> tuple[Lpips | None, str]:
-        """The LPIPS network for this run's images, or None; and where it was found, or why it was not.
+        """The LPIPS network for the images of this run, or None; and where it was found, or why it was not.
 
         Args:
-            weights: A file or folder, or "off"; None looks where the training looked, see ``TrainConfig.lpips``.
+            weights: A file or folder, or "off"; None searches as in training, see ``TrainConfig.lpips``.
         """
         weights = self.config.lpips if weights is None else Path(weights)
         cameras = self.scene.test.cameras
         return find_lpips(weights, self.config.data, (cameras.height, cameras.width))
 
     def evaluate(self, *, views: int | None = None, lpips: Lpips | Path | str | None = None) -> dict[str, Any]:
-        """Scores on the test views, each and in the mean.
+        """Scores of the test views, and their means.
 
         Args:
-            views: So many test views, evenly spread; None for all.
-            lpips: The network, or what :meth:`find_lpips` takes.
+            views: Number of test views, evenly spread; None for all.
+            lpips: The network, or the weights for :meth:`find_lpips`.
 
         Returns:
             "psnr" in dB, "ssim", "lpips" (None without its weights) and "psnr_of_mean_error" over all views, and
@@ -123,21 +123,21 @@ def open_run(
 
     Args:
         path: The run directory.
-        scene: The scene, where it is loaded already.
-        data: Scene folder, where it has moved since training.
+        scene: The scene, if it is loaded already.
+        data: Scene folder, if it has moved since training.
         downscale: Factor on the images; None for that of the training.
-        samples: Samples per ray, of the first pass where there are two; None for those of the training.
-        fine_samples: Samples per ray of the second pass; None for those of the training.
-        occupancy: Skip empty space, which the field is evaluated for once. A run trained with occupancy always uses its
-            own grid, since its field has learnt nothing about empty space.
+        samples: Samples per ray in the first pass; None for those of the training.
+        fine_samples: Samples per ray in the second pass; None for those of the training.
+        occupancy: Skip empty space, found by evaluating the field once. A run trained with occupancy always uses its
+            own grid, because its field has learnt nothing about empty space.
         blend: Margin in scene units within which neighbouring cells are blended; None for that of the training.
         device: Torch device.
         backend: Backend of the operations.
 
     Raises:
-        CheckpointError: When there is no usable checkpoint.
-        ConfigError: For an argument that cannot be used, or a grid that is asked for where the run has no use for it.
-        SceneError: When the scene cannot be read.
+        CheckpointError: If there is no usable checkpoint.
+        ConfigError: For an argument that cannot be used, or occupancy for a run that cannot use a grid.
+        SceneError: If the scene cannot be read.
 
     Examples:
         >>> import tempfile, voronerf  # a tiny run of the built-in scene, trained and opened again

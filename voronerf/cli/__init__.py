@@ -1,4 +1,4 @@
-"""The command line: ``voronerf train | eval | render | info | demo``."""
+"""The command line: ``voronerf train | eval | render | info | preload | demo``."""
 
 from voronerf.cli.main import main
 
