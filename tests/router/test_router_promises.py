@@ -13,7 +13,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from convention_harness import randomised
-from convention_listed import LISTED, example, ngp, uniform
+from convention_listed import LISTED, ngp, uniform
 from router_fields import SkipNet, gradients, masked_loop, perturb, tensors
 from torch import Tensor, nn
 
@@ -355,6 +355,9 @@ def test_explain_names_each_method_and_the_step_in_the_way() -> None:
         def forward(self, x: Tensor) -> Tensor:
             return self.mix(x, x)
 
+    alone = VoronoiRouter(Both(), centres(1), coords="first3", methods=["density"])
+    alone.density(uniform((40,)))
+    assert alone.explain().endswith("density: the module itself: there is one cell")
     router = VoronoiRouter(Both(), centres(), coords="first3", methods=["density"])
     assert router.explain() == "forward: not called yet\ndensity: not called yet"
     router.density(uniform((40,)))
@@ -454,29 +457,34 @@ def test_lists_may_hold_parameters_that_are_registered(generator: torch.Generato
 # Resuming -------------------------------------------------------------------------------------------------------------
 
 
-def step(router: VoronoiRouter, optimizer: torch.optim.Optimizer, x: Tensor) -> None:
-    optimizer.zero_grad()
-    router(x).square().mean().backward()
-    optimizer.step()
-
-
-def test_resuming_after_a_split_in_the_order_of_nerf_pytorch(generator: torch.Generator) -> None:
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+@pytest.mark.parametrize("case", [case for case in LISTED if case.method == "forward"], ids=str)
+def test_resuming_after_a_split_in_the_order_of_nerf_pytorch(case: Any) -> None:
     """Build, make the optimiser, load the optimiser's state, then the network's; here after a split into 4 cells."""
-    module, x = example("nerf_pytorch").NeRF(D=2, W=8, input_ch=15, input_ch_views=0), uniform((90,), 15)
-    router = VoronoiRouter(module, torch.zeros(1, 3), coords="first3", fuse=True)
-    optimizer = torch.optim.Adam(router.parameters(), lr=1e-2)
-    step(router, optimizer, x)
-    router.subdivide(4, points=x[:, :3], weights=torch.ones(90), optimizer=optimizer)
-    step(router, optimizer, x)
-    saved = copy.deepcopy({"network": router.state_dict(), "optimizer": optimizer.state_dict()})
+    module, (args, kwargs) = randomised(case.make()), case.arguments(case.lead)
+    points = case.positions(*args, **kwargs).reshape(-1, 3)
 
-    again = VoronoiRouter(module, torch.zeros(1, 3), coords="first3", fuse=True)
-    resumed = torch.optim.Adam(again.parameters(), lr=1e-2)
+    def made() -> tuple[VoronoiRouter, torch.optim.Optimizer]:
+        router = VoronoiRouter(module, torch.zeros(1, 3), **case.options)
+        return router, torch.optim.Adam(router.parameters(), lr=1e-2)
+
+    def step(router: VoronoiRouter, optimizer: torch.optim.Optimizer) -> None:
+        optimizer.zero_grad()
+        sum(t.square().mean() for t in tensors(case.call(router, args, kwargs))).backward()
+        optimizer.step()
+
+    router, optimizer = made()
+    step(router, optimizer)
+    router.subdivide(4, points=points, weights=torch.ones(len(points)), optimizer=optimizer, min_samples=1)
+    step(router, optimizer)
+    saved = copy.deepcopy({"network": router.state_dict(), "optimizer": optimizer.state_dict()})
+    again, resumed = made()
     resumed.load_state_dict(saved["optimizer"])
     again.load_state_dict(saved["network"])
     for _ in range(2):
-        step(router, optimizer, x)
-        step(again, resumed, x)
+        step(router, optimizer)
+        step(again, resumed)
+    assert again.num_cells == 4
     for a, b in zip(again.parameters(), router.parameters(), strict=True):
         assert torch.equal(a, b)
 

@@ -215,7 +215,8 @@ def _evaluate_sorted(
         if failure is not None:
             raise error from failure
         raise
-    choices.note(call, choice)
+    one = Choice("the module itself", "there is one cell")
+    choices.note(call, choice if grouping.k > 1 or choice.way != "grouped" else one)
     if grouping.k > 1 and choice.why and layout.n >= _FEWEST:
         name = f"{type(module).__name__}.{call.method}"
         choices.say_once(f"cells {call.method}", f"{name} runs cell by cell: {choice.why}")
