@@ -208,8 +208,7 @@ def test_routes_compute_the_same(direction):
 
 
 def test_what_is_compared_is_right_in_every_small_case():
-    lookup, sampling = cases_lookup, cases_sampling
-    marching = cases_marching
+    lookup, sampling, marching = cases_lookup, cases_sampling, cases_marching
     works = {
         "nearest_centre": lookup._nearest_work(500, 7, torch.float32, False, CPU),
         "locate_cell": lookup._locate_work(500, (4, 3), CPU),
@@ -245,32 +244,27 @@ def test_what_is_compared_is_right_in_every_small_case():
 
 
 def test_wrong_answers_are_found():
-    lookup = cases_lookup
-    work = lookup._nearest_work(500, 7, torch.float32, False, CPU)
-    right = work.ours("reference").run(0)
-    assert work.error(right) == 0 and work.error((right + 1) % 7) == 500 and work.error(right + 7) == float("inf")
-    work = lookup._sort_work(500, 7, CPU)
-    order, offsets = work.ours("reference").run(0)
-    assert work.error((order, offsets)) == 0 and work.error((order.flip(0), offsets)) > 0
-    marching = cases_marching
-    work = marching._march_work(1 << 13, True, CPU)
-    right = work.ours("reference").run(0)
-    assert work.error(right) < 1e-6 and work.error(right._replace(depths=right.depths * 1.1)) > 0.05
-    assert work.error(work.ours("reference").run(1)) > 0.1, "other rays"
-    work = marching._update_work(250, CPU)
-    density, occupied = work.ours("reference").run(0)
-    assert work.error((density, occupied)) < 1e-6 and work.error((density, ~occupied)) == float("inf")
+    lookup, marching, infinite = cases_lookup, cases_marching, float("inf")
+    nearest, marched = lookup._nearest_work(500, 7, torch.float32, False, CPU), marching._march_work(1 << 13, True, CPU)
+    for work, spoilt, least in (
+        (nearest, lambda right: (right + 1) % 7, 500),
+        (nearest, lambda right: right + 7, infinite),
+        (lookup._sort_work(500, 7, CPU), lambda right: (right[0].flip(0), right[1]), 1e-6),
+        (marched, lambda right: right._replace(depths=right.depths * 1.1), 0.05),
+        (marched, lambda right: marched.ours("reference").run(1), 0.1),  # other rays
+        (marching._update_work(250, CPU), lambda right: (right[0], ~right[1]), infinite),
+        (marching._heaviest_work(2000, CPU), lambda right: (right[0].flip(0), right[1]), infinite),
+    ):
+        right = work.ours("reference").run(0)
+        assert work.error(right) < 1e-6 and work.error(spoilt(right)) >= least
     work = marching._balance_work(600, 5, CPU)
     assert work.error((marching._balance_work(600, 5, CPU).ours("reference").run(1)[0], None)) > work.tolerance
-    work = marching._heaviest_work(2000, CPU)
-    points, kept = work.ours("reference").run(0)
-    assert work.error((points, kept)) == 0 and work.error((points.flip(0), kept)) == float("inf")
     batch = networks.make_batch(networks.NETS["mlp32"], 200, 3, torch.float32, "forward+backward", CPU)
     error = networks.network_error(batch)
     out, gradients = alternatives.ours(batch, "reference").run(0)
     assert error((out, gradients)) < 1e-5
     assert error((out, (*gradients[:-1], gradients[-1] * 1.5))) > 0.1
-    assert error((out * torch.nan, None)) == float("inf")
+    assert error((out * torch.nan, None)) == infinite
 
 
 def test_rows_report_failures_losses_and_caps():

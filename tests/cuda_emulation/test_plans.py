@@ -1,4 +1,4 @@
-"""How grouped_mlp runs on the GPUs there are, as a pure function: every launch can be made, and fits its workspace."""
+"""How cell_sort and grouped_mlp run on the GPUs there are: every launch can be made, and fits its workspace."""
 
 import itertools
 
@@ -130,3 +130,46 @@ def test_memory_of_layers_is_bounded(shared):
             assert found["slab"] % 64 == 0 and found["slab"] * found["slabs"] >= n
             assert found["slab"] * found["bytes_of_row"] <= max(4 * 64 * KIB, 8 * 64 * found["bytes_of_row"])
             assert found["tiles"] >= found["slab"] // 64 + k and 1 <= found["splits"] <= 64
+
+
+AUTOMATIC, COUNTING, RADIX = range(3)
+MOST = 2**31 - 1
+SORTED_ROWS = (0, 1, 2047, 2048, 2049, 4_000_000, MOST)
+CELLS = (1, 2, 254, 255, 510, 511, 1022, 1023, 4096, 65_534, 65_535, 1 << 20, MOST - 2)
+
+
+@pytest.mark.parametrize("k", CELLS)
+def test_few_cells_are_counted_and_many_sorted_by_radix(k):
+    for n in SORTED_ROWS:
+        assert module().cell_sort_plan(n, k, AUTOMATIC, 0)["radix"] == (k > 1022)
+        assert module().cell_sort_plan(n, k, RADIX, 0)["radix"]
+    if k > 1022:
+        with pytest.raises(RuntimeError, match="too many cells to be counted"):
+            module().cell_sort_plan(1, k, COUNTING, 0)
+
+
+@pytest.mark.parametrize("k", CELLS)
+def test_keys_have_exactly_the_bits_of_the_buckets(k):
+    plan = module().cell_sort_plan(100, k, RADIX, 0)
+    assert plan["bits"] == (k + 1).bit_length(), "the largest bucket is k + 1"
+    assert plan["key_bytes"] == (2 if plan["bits"] <= 16 else 4)
+
+
+@pytest.mark.parametrize(("way", "k"), [(AUTOMATIC, k) for k in CELLS] + [(RADIX, k) for k in CELLS])
+def test_parts_of_the_workspace_lie_side_by_side(way, k):
+    for n, temporary in itertools.product(SORTED_ROWS, (0, 12_345)):
+        plan = module().cell_sort_plan(n, k, way, temporary)
+        if plan["radix"]:
+            sizes = [n * plan["key_bytes"], n * plan["key_bytes"], 4 * n, temporary]
+        else:
+            # Whole blocks of eight chunks, and none of no rows.
+            assert plan["chunks"] % 8 == 0 and plan["chunks"] * plan["chunk_rows"] >= n
+            assert n > (plan["chunks"] - 8) * plan["chunk_rows"]
+            counts = plan["chunks"] * (k + 2)
+            assert 4096 * plan["tiles"] >= counts
+            sizes = [4 * counts, 4 * plan["tiles"]]
+            assert 2 * counts <= n + 16 * max(k + 2, 512), "histograms stay a fraction of the rows"
+        ends = [*plan["parts"][1:], plan["bytes"]]
+        for start, size, end in zip(plan["parts"], sizes, ends):
+            assert start % 256 == 0 and start + size <= end < start + size + 256
+        assert plan["bytes"] == ends[-2] + sizes[-1]
