@@ -109,9 +109,9 @@ def evaluate_run(
         downscale: Factor on the images; default as in training.
         views: Number of test views, evenly spread; default all.
         panels: Number of views drawn.
-        samples: Samples per ray, of the first pass where there are two; default as in training.
-        fine_samples: Samples per ray of the second pass; default as in training.
-        occupancy: Skip empty space, which the field is evaluated for once; a run trained with --occupancy always uses
+        samples: Samples per ray in the first pass; default as in training.
+        fine_samples: Samples per ray in the second pass; default as in training.
+        occupancy: Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses
             its own grid.
         blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
         lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
@@ -175,9 +175,9 @@ def render(
         fps: Frames per second.
         data: Scene folder, if it has moved since training.
         downscale: Factor on the images, which decides the video's size; default as in training.
-        samples: Samples per ray, of the first pass where there are two; default as in training.
-        fine_samples: Samples per ray of the second pass; default as in training.
-        occupancy: Skip empty space, which the field is evaluated for once; a run trained with --occupancy always uses
+        samples: Samples per ray in the first pass; default as in training.
+        fine_samples: Samples per ray in the second pass; default as in training.
+        occupancy: Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses
             its own grid.
         blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
         device: Torch device.
