@@ -109,7 +109,8 @@ def ops() -> tuple[str, ...]:
 
 def implemented(op: str) -> tuple[str, ...]:
     """Backends that have an implementation of an op, whether or not it can run here."""
-    return tuple(backend for backend in BACKENDS if op in ops() and (op, backend) in _TABLE)
+    ops()  # puts them into the table
+    return tuple(backend for backend in BACKENDS if (op, backend) in _TABLE)
 
 
 def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
