@@ -31,12 +31,16 @@ def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
 def _runs(node: Any) -> bool:
     # torch has no public name for this question; without the answer every gradient is computed.
     ask = getattr(torch._C, "_will_engine_execute_node", None)
-    if node is None or ask is None or type(node).__name__ == "AccumulateGrad":
-        return node is not None  # a leaf: under torch.autograd.grad the engine refuses to answer, which takes 30 us
+    if node is None or ask is None:
+        return node is not None
+    # For leaves that torch.autograd.grad was asked for the engine refuses to answer, which takes 30 us: too long to ask
+    # unless a whole graph is being made.
+    if type(node).__name__ == "AccumulateGrad" and not torch.is_grad_enabled():
+        return True
     try:
         return bool(ask(node))
     except RuntimeError:
-        return True  # the engine refuses to answer for leaves that torch.autograd.grad was asked for
+        return True
 
 
 def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:

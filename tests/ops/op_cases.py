@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
 import torch
-from torch import Tensor
 
 from voronerf import backends
 
@@ -23,19 +21,19 @@ COUNTS = {
 """Samples of each cell: no samples, one, odd numbers with empty cells, more than two pieces, a plain network."""
 
 
-def need(op: str, backend: str, device: torch.device, dtype: torch.dtype) -> None:
+def need(op, backend, device, dtype):
     """Skips, with the reason, where a backend does not take a device or dtype."""
     reason = backends.why_not(op, backend, device, dtype)
     if reason is not None:
         pytest.skip(reason)
 
 
-def offsets_of(counts: list[int], device: torch.device | str = "cpu") -> Tensor:
+def offsets_of(counts, device="cpu"):
     """Cell offsets from the number of samples of each cell."""
     return torch.tensor([0, *counts]).cumsum(0).to(torch.int32).to(device)
 
 
-def strided(tensor: Tensor) -> Tensor:
+def strided(tensor):
     """The same values with no two of them next to each other in memory."""
     wide = tensor.new_full((*tensor.shape[:-1], 2 * tensor.shape[-1]), torch.nan if tensor.is_floating_point() else -7)
     wide[..., ::2] = tensor
@@ -43,7 +41,7 @@ def strided(tensor: Tensor) -> Tensor:
 
 
 @contextmanager
-def refused(kind: type[Exception], message: str) -> Iterator[None]:
+def refused(kind, message):
     """Passes if the block raises just this message; "..." stands for anything."""
     with pytest.raises(kind) as caught:
         yield

@@ -5,22 +5,21 @@ import math
 import pytest
 import torch
 from op_cases import refused, strided
-from torch import Tensor
 
 from voronerf.ops import balance_centres
 
 pytestmark = pytest.mark.op("balance_centres")
 
 
-def samples(m: int) -> tuple[Tensor, Tensor]:
+def samples(m):
     points = torch.nn.functional.normalize(torch.randn(m, 3), dim=1) * (1 + 0.05 * torch.randn(m, 1))
     return points, torch.randn(m, dtype=torch.float64).exp() * (1 + 3 * points[:, 0].clamp(min=0))
 
 
-def slow(points: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, nearby: int, norm: bool):
+def slow(points, masses, centres, steps, alpha, nearby, norm):
     """Sample by sample and neighbour by neighbour; centres are float32 between the steps."""
 
-    def weigh() -> list[float]:
+    def weigh():
         weights = [0.0] * len(places)
         for point, mass in zip(points.tolist(), masses.tolist()):
             weights[min(range(len(places)), key=lambda i: math.dist(point, places[i]))] += mass
@@ -42,7 +41,7 @@ def slow(points: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: flo
 
 @pytest.mark.parametrize("global_norm", [False, True])
 @pytest.mark.parametrize(("k", "neighbours"), [(2, 8), (5, 2), (9, 8), (20, 8), (12, 1)])
-def test_equals_slow_loops(device: torch.device, backend: str, k: int, neighbours: int, global_norm: bool) -> None:
+def test_equals_slow_loops(device, backend, k, neighbours, global_norm):
     points, masses = samples(300)
     found = balance_centres(
         points.to(device),
@@ -59,7 +58,7 @@ def test_equals_slow_loops(device: torch.device, backend: str, k: int, neighbour
     torch.testing.assert_close(found[1].cpu(), weights, rtol=1e-12, atol=1e-12)
 
 
-def test_balances_and_repeats_itself(device: torch.device, backend: str) -> None:
+def test_balances_and_repeats_itself(device, backend):
     points, masses = samples(2000)
     given = points.to(device), masses.to(device), points[:16].to(device)
     start, end = (balance_centres(*given, steps=steps, backend=backend) for steps in (0, 300))
@@ -70,7 +69,7 @@ def test_balances_and_repeats_itself(device: torch.device, backend: str) -> None
     assert torch.equal(again[0], end[0]) and torch.equal(again[1], end[1])
 
 
-def test_cells_and_samples_without_mass(device: torch.device, backend: str) -> None:
+def test_cells_and_samples_without_mass(device, backend):
     points = torch.rand(20, 3, device=device)
     nothing = torch.zeros(20, dtype=torch.float64, device=device)
     centres = torch.rand(4, 3, device=device)
@@ -82,7 +81,7 @@ def test_cells_and_samples_without_mass(device: torch.device, backend: str) -> N
 
 
 @pytest.mark.native
-def test_same_bits_for_any_number_of_threads() -> None:
+def test_same_bits_for_any_number_of_threads():
     points, masses = samples(9000)
     before = torch.get_num_threads()
     found = []
@@ -97,7 +96,7 @@ def test_same_bits_for_any_number_of_threads() -> None:
 
 @pytest.mark.native
 @pytest.mark.warp
-def test_opcheck() -> None:
+def test_opcheck():
     points, masses = samples(9)
     for backend in ("native", "warp"):
         balance_centres(points, masses, points[:3], steps=0, backend=backend)
@@ -105,7 +104,7 @@ def test_opcheck() -> None:
         torch.library.opcheck(op, (points, masses, points[:3], 2, 0.1, 8, False))
 
 
-def test_refuses_what_makes_no_sense() -> None:
+def test_refuses_what_makes_no_sense():
     points, masses = samples(5)
     with refused(ValueError, "balance_centres: masses must have shape [m] with m = 5, got [4]"):
         balance_centres(points, masses[:4], points[:2])

@@ -3,7 +3,6 @@ from __future__ import annotations
 import pytest
 import torch
 from op_cases import refused, strided
-from torch import Tensor
 
 from voronerf.ops import camera_rays
 from voronerf.rendering.cameras import Cameras, look_at
@@ -11,7 +10,7 @@ from voronerf.rendering.cameras import Cameras, look_at
 pytestmark = pytest.mark.op("camera_rays")
 
 
-def cameras(count: int, distorted: bool) -> Cameras:
+def cameras(count, distorted):
     poses = look_at(torch.randn(count, 3) * 3, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     intrinsics = torch.tensor([[80.0, 75.0, 31.0, 25.0]]) + torch.rand(count, 4)
     lens = torch.randn(count, 4) * torch.tensor([0.05, 0.02, 0.005, 0.005]) if distorted else None
@@ -20,12 +19,12 @@ def cameras(count: int, distorted: bool) -> Cameras:
 
 @pytest.mark.parametrize("distorted", [False, True])
 @pytest.mark.parametrize("b", [0, 1, 300])
-def test_rays_pass_through_their_pixels(device: torch.device, backend: str, b: int, distorted: bool) -> None:
+def test_rays_pass_through_their_pixels(device, backend, b, distorted):
     some = cameras(3, distorted)
     camera = torch.randint(0, 3, (b,), dtype=torch.int32)
     x, y = 64 * torch.rand(b), 48 * torch.rand(b)
 
-    def run(given: Cameras, index: Tensor | None) -> list[Tensor]:
+    def run(given, index):
         tensors = (strided(tensor.to(device)) for tensor in (given.poses, given.intrinsics, x, y))
         lens = None if given.distortion is None else strided(given.distortion.to(device))
         which = None if index is None else strided(index.to(device))
@@ -46,7 +45,7 @@ def test_rays_pass_through_their_pixels(device: torch.device, backend: str, b: i
 
 
 @pytest.mark.warp
-def test_opcheck() -> None:
+def test_opcheck():
     some = cameras(2, True)
     x = torch.rand(5)
     index = torch.tensor([0, 1, 1, 0, 1], dtype=torch.int32)
@@ -56,7 +55,7 @@ def test_opcheck() -> None:
         torch.library.opcheck(torch.ops.voronerf.camera_rays_warp.default, given)
 
 
-def test_refuses_what_makes_no_sense() -> None:
+def test_refuses_what_makes_no_sense():
     some, x = cameras(2, True), torch.rand(5)
     with refused(ValueError, "camera_rays: poses must have shape [c, 4, 4], got [2, 3, 4]"):
         camera_rays(some.poses[:, :3], some.intrinsics, x, x)

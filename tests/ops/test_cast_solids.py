@@ -3,14 +3,13 @@ from __future__ import annotations
 import pytest
 import torch
 from op_cases import refused, strided
-from torch import Tensor
 
 from voronerf.ops import cast_solids
 
 pytestmark = pytest.mark.op("cast_solids")
 
 
-def solids(count: int) -> list[Tensor]:
+def solids(count):
     """Kinds, frames and sizes of solids that overlap in the middle of space, every kind among them."""
     kinds = torch.arange(count, dtype=torch.int32) % 4
     turns = torch.linalg.qr(torch.randn(count, 3, 3)).Q
@@ -20,12 +19,12 @@ def solids(count: int) -> list[Tensor]:
     return [kinds, torch.cat((turns, centres), dim=1), sizes]
 
 
-def rays(count: int) -> list[Tensor]:
+def rays(count):
     origins = 4 * torch.nn.functional.normalize(torch.randn(count, 3), dim=1)
     return [origins, torch.nn.functional.normalize(torch.randn(count, 3) * 0.5 - origins, dim=1)]
 
 
-def gap(kind: int, size: Tensor, points: Tensor) -> Tensor:
+def gap(kind, size, points):
     """Signed distance, or a bound of it, of points [n, 3] in a solid's frame."""
     x, y, z = points.double().unbind(1)
     first, second, third = size.double()
@@ -40,7 +39,7 @@ def gap(kind: int, size: Tensor, points: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("count", [1, 4, 23])
 @pytest.mark.parametrize("r", [0, 1, 600])
-def test_first_hits(device: torch.device, backend: str, r: int, count: int) -> None:
+def test_first_hits(device, backend, r, count):
     """What is found lies on its solid; solids a little smaller are hit no earlier, a little larger ones no later."""
     tables, (origins, directions) = solids(count), rays(r)
     given = [tensor.to(device) for tensor in (*tables, origins, directions)]
@@ -63,7 +62,7 @@ def test_first_hits(device: torch.device, backend: str, r: int, count: int) -> N
         assert len(which.unique()) > min(count, 4)
 
 
-def test_by_hand(device: torch.device, backend: str) -> None:
+def test_by_hand(device, backend):
     kinds = torch.tensor([0, 0, 1, 2, 3], dtype=torch.int32)
     frames = torch.eye(3)[None].repeat(5, 1, 1)
     centres = torch.tensor([[0.0, 0, 0], [0.0, 0, 0], [3.0, 0, 0], [6.0, 0, 0], [9.0, 0, 0]])
@@ -85,13 +84,13 @@ def test_by_hand(device: torch.device, backend: str) -> None:
 
 
 @pytest.mark.warp
-def test_opcheck() -> None:
+def test_opcheck():
     given = [*solids(5), *rays(6)]
     cast_solids(*given, backend="warp")
     torch.library.opcheck(torch.ops.voronerf.cast_solids_warp.default, tuple(given))
 
 
-def test_refuses_what_makes_no_sense() -> None:
+def test_refuses_what_makes_no_sense():
     kinds, frames, sizes, origins, directions = [*solids(3), *rays(5)]
     with refused(ValueError, "cast_solids: frames must have shape [s, 4, 3] with s = 3, got [3, 3, 3]"):
         cast_solids(kinds, frames[:, :3], sizes, origins, directions)

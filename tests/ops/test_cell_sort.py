@@ -3,14 +3,13 @@ from __future__ import annotations
 import pytest
 import torch
 from op_cases import refused, strided
-from torch import Tensor
 
 from voronerf.ops import cell_sort
 
 pytestmark = pytest.mark.op("cell_sort")
 
 
-def check(cells: Tensor, k: int, order: Tensor, offsets: Tensor) -> None:
+def check(cells, k, order, offsets):
     expected = sorted(range(len(cells)), key=lambda row: int(cells[row]))
     assert order.dtype == offsets.dtype == torch.int32
     assert order.tolist() == expected
@@ -19,23 +18,23 @@ def check(cells: Tensor, k: int, order: Tensor, offsets: Tensor) -> None:
 
 @pytest.mark.parametrize("k", [1, 2, 7, 255, 256, 257, 40000])
 @pytest.mark.parametrize("n", [0, 1, 2, 333])
-def test_is_the_stable_sort(device: torch.device, backend: str, n: int, k: int) -> None:
+def test_is_the_stable_sort(device, backend, n, k):
     cells = torch.randint(0, k, (n,), dtype=torch.int32)
     check(cells, k, *(part.cpu() for part in cell_sort(cells.to(device), k, backend=backend)))
 
 
-def test_empty_and_very_unequal_cells(device: torch.device, backend: str) -> None:
+def test_empty_and_very_unequal_cells(device, backend):
     cells = torch.tensor([5] * 700 + [0] + [5] * 3 + [8], dtype=torch.int32)
     check(cells, 10, *(part.cpu() for part in cell_sort(cells.to(device), 10, backend=backend)))
     check(cells[:0], 3, *(part.cpu() for part in cell_sort(cells[:0].to(device), 3, backend=backend)))
 
 
-def test_strided(device: torch.device, backend: str) -> None:
+def test_strided(device, backend):
     cells = torch.randint(0, 4, (99,), dtype=torch.int32)
     check(cells, 4, *(part.cpu() for part in cell_sort(strided(cells.to(device)), 4, backend=backend)))
 
 
-def test_round_trip() -> None:
+def test_round_trip():
     cells = torch.randint(0, 9, (500,), dtype=torch.int32)
     x = torch.rand(500, 3)
     order, _ = cell_sort(cells, 9)
@@ -44,14 +43,14 @@ def test_round_trip() -> None:
     assert torch.equal(y, x)
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     cells = torch.randint(0, 6, (321,), dtype=torch.int32, device=device)
     compiled = torch.compile(lambda cells: cell_sort(cells, 6, backend=backend), fullgraph=True, backend="aot_eager")
     for found, expected in zip(compiled(cells), cell_sort(cells, 6, backend=backend)):
         assert torch.equal(found, expected)
 
 
-def test_compiled_reference_keeps_stray_cells_apart() -> None:
+def test_compiled_reference_keeps_stray_cells_apart():
     cells = torch.tensor([3, 9, 0, -5, 2, 3], dtype=torch.int32)
     compiled = torch.compile(
         lambda cells: cell_sort(cells, 4, backend="reference"), fullgraph=True, backend="aot_eager"
@@ -62,7 +61,7 @@ def test_compiled_reference_keeps_stray_cells_apart() -> None:
 
 
 @pytest.mark.parametrize("backend", ["auto", "reference"])
-def test_errors(backend: str) -> None:
+def test_errors(backend):
     cells = torch.tensor([0, 3, 1], dtype=torch.int32)
     with refused(ValueError, "cell_sort: cells must lie in 0 to 2, got values from 0 to 3"):
         cell_sort(cells, 3, backend=backend)
@@ -75,4 +74,4 @@ def test_errors(backend: str) -> None:
     with refused(TypeError, "cell_sort: cells must have dtype int32, got int64"):
         cell_sort(cells.long(), 4, backend=backend)
     with refused(TypeError, "cell_sort: k must be an integer, got float"):
-        cell_sort(cells, 4.0, backend=backend)  # type: ignore[arg-type]
+        cell_sort(cells, 4.0, backend=backend)

@@ -12,26 +12,25 @@ from torch import Tensor
 from voronerf import backends
 from voronerf.diagram import VoronoiDiagram, uniform_centres
 from voronerf.ops import CentreGrid, centre_grid, nearest_centre
-from voronerf.reference.centre_grid import GridTables
 
 native = pytest.mark.native
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 
 
-def clustered(k: int) -> Tensor:
+def clustered(k):
     return torch.cat([2 * torch.rand(k // 4, 3) - 1, 0.3 + 1e-3 * torch.rand(k - k // 4, 3)])
 
 
-def shell(k: int) -> Tensor:
+def shell(k):
     centres = torch.randn(k, 3)
     return centres / centres.norm(dim=1, keepdim=True) + 0.02 * torch.randn(k, 3)
 
 
-def flat(k: int) -> Tensor:
+def flat(k):
     return torch.cat([torch.rand(k, 2), torch.full((k, 1), 0.25)], dim=1)
 
 
-def in_line(k: int) -> Tensor:
+def in_line(k):
     return torch.linspace(-1, 1, k)[:, None] * torch.tensor([1.0, 2, 0.5])
 
 
@@ -53,7 +52,7 @@ SCENES: dict[str, Callable[[], Tensor]] = {
 }
 
 
-def points_around(centres: Tensor) -> Tensor:
+def points_around(centres):
     """Among the centres, on them, half way between two, far out along axes and diagonals, and no points at all."""
     k = len(centres)
     low, high = centres.amin(0), centres.amax(0)
@@ -70,7 +69,7 @@ def points_around(centres: Tensor) -> Tensor:
 @pytest.mark.op("nearest_centre_grid")
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_finds_what_all_centres_give(backend: str, scene: str, dtype: torch.dtype) -> None:
+def test_finds_what_all_centres_give(backend, scene, dtype):
     if backend == "reference" and scene in ("kilonerf", "lattice", "shell"):
         pytest.skip("slow, and tested with fewer centres")
     centres = SCENES[scene]().to(dtype)
@@ -87,7 +86,7 @@ def test_finds_what_all_centres_give(backend: str, scene: str, dtype: torch.dtyp
 
 @native
 @pytest.mark.parametrize("k", [512, 4096])
-def test_ties_of_a_regular_grid(k: int) -> None:
+def test_ties_of_a_regular_grid(k):
     """On the faces, edges and corners of equal cubes, where up to eight centres are equally near."""
     side = round(k ** (1 / 3))
     steps = torch.arange(side).float()
@@ -102,7 +101,7 @@ def test_ties_of_a_regular_grid(k: int) -> None:
 
 
 @native
-def test_instruction_sets_and_threads_build_the_same_grid(isa: str) -> None:
+def test_instruction_sets_and_threads_build_the_same_grid(isa):
     from voronerf import native
 
     centres, weights = clustered(700), torch.rand(700) / 100
@@ -124,7 +123,7 @@ def test_instruction_sets_and_threads_build_the_same_grid(isa: str) -> None:
 
 @native
 @pytest.mark.parametrize("scene", ["random", "clustered", "flat"])
-def test_lists_hold_every_centre_that_is_nearest_somewhere(scene: str) -> None:
+def test_lists_hold_every_centre_that_is_nearest_somewhere(scene):
     """The tables of one backend serve the other, and those of the kernel are shorter."""
     centres = SCENES[scene]()
     points = points_around(centres)
@@ -136,11 +135,11 @@ def test_lists_hold_every_centre_that_is_nearest_somewhere(scene: str) -> None:
     assert mean_length(own.tables) <= mean_length(plain.tables)
 
 
-def mean_length(tables: GridTables) -> float:
+def mean_length(tables):
     """Of the lists of the root grid, bricks of 4^3 cells averaged."""
     entries, lists = tables.entries.long(), tables.lists
 
-    def length(entry: int) -> float:
+    def length(entry):
         if entry >= 0:
             return float(lists[entry])
         return sum(length(int(entries[~entry + i])) for i in range(64)) / 64
@@ -151,7 +150,7 @@ def mean_length(tables: GridTables) -> float:
 
 @native
 @pytest.mark.parametrize("scale", [1.0, 1e160])
-def test_memory_is_bounded_where_no_centre_can_be_left_out(scale: float) -> None:
+def test_memory_is_bounded_where_no_centre_can_be_left_out(scale):
     """All centres are candidates around the middle of a sphere, and everywhere where their squares overflow."""
     centres = torch.randn(300, 3, dtype=torch.float64)
     centres /= centres.norm(dim=1, keepdim=True)
@@ -162,7 +161,7 @@ def test_memory_is_bounded_where_no_centre_can_be_left_out(scale: float) -> None
     assert torch.equal(nearest_centre(points, centres * scale, grid=grid), expected)
 
 
-def test_errors() -> None:
+def test_errors():
     points, centres, weights = torch.rand(4, 3), torch.rand(5, 3), torch.rand(5)
     grid = centre_grid(centres)
     with refused(ValueError, "nearest_centre: grid must be made from these centres and weights, got that of others"):
@@ -172,7 +171,7 @@ def test_errors() -> None:
     with refused(ValueError, "nearest_centre: grid must be made from these centres and weights, got that of others"):
         nearest_centre(points, centres, weights=weights, grid=grid)
     with refused(TypeError, "nearest_centre: grid must be a CentreGrid, got Tensor"):
-        nearest_centre(points, centres, grid=centres)  # type: ignore[arg-type]
+        nearest_centre(points, centres, grid=centres)
     with refused(ValueError, "centre_grid: centres must have shape [k, 3], got [5, 2]"):
         centre_grid(centres[:, :2])
     with refused(ValueError, "centre_grid: centres must hold at least one centre, got none"):
@@ -188,7 +187,7 @@ def test_errors() -> None:
 
 
 @native
-def test_grid_keeps_its_own_centres() -> None:
+def test_grid_keeps_its_own_centres():
     centres, points = torch.rand(50, 3), torch.rand(100, 3)
     grid = centre_grid(centres)
     half = centres.half()
@@ -202,7 +201,7 @@ def test_grid_keeps_its_own_centres() -> None:
 
 
 @native
-def test_a_grid_is_not_that_of_rounded_centres() -> None:
+def test_a_grid_is_not_that_of_rounded_centres():
     centres = torch.rand(100, 3, dtype=torch.float64) + 1e6
     weights = torch.rand(100, dtype=torch.float64) * 1e-3
     points, of_others = torch.rand(50, 3) + 1e6, "grid must be made from these centres and weights"
@@ -216,7 +215,7 @@ def test_a_grid_is_not_that_of_rounded_centres() -> None:
 
 
 @native
-def test_compiled_graphs_refuse_grids_of_another_size() -> None:
+def test_compiled_graphs_refuse_grids_of_another_size():
     # Such a grid names centres behind the end of those that are given.
     points, grid = torch.rand(5, 3), centre_grid(torch.rand(70, 3))
     for centres, weights in ((torch.rand(2, 3), None), (grid.centres, torch.rand(70))):
@@ -228,7 +227,7 @@ def test_compiled_graphs_refuse_grids_of_another_size() -> None:
 
 
 @native
-def test_ops_pass_opcheck_and_compile_whole() -> None:
+def test_ops_pass_opcheck_and_compile_whole():
     ops = torch.ops.voronerf
 
     points, centres, weights = torch.rand(50, 3), torch.rand(70, 3), torch.rand(70)
@@ -242,7 +241,7 @@ def test_ops_pass_opcheck_and_compile_whole() -> None:
 
 
 @native
-def test_diagrams_make_a_grid_where_it_pays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_diagrams_make_a_grid_where_it_pays(monkeypatch):
     monkeypatch.setattr("voronerf.diagram.voronoi._GRID_POINTS", 1500)
     points = 4 * torch.rand(1000, 3) - 2
     for weights in (None, torch.rand(512) / 100):
@@ -266,5 +265,5 @@ def test_diagrams_make_a_grid_where_it_pays(monkeypatch: pytest.MonkeyPatch) -> 
     assert small._grid is None
 
 
-def test_backends_list_the_grid() -> None:
+def test_backends_list_the_grid():
     assert {"centre_grid", "nearest_centre_grid"} <= set(backends.ops())

@@ -6,7 +6,6 @@ import pytest
 import torch
 from op_cases import FLOATS, need, offsets_of, refused, strided
 from tolerances import assert_as_exact
-from torch import Tensor
 
 from voronerf.ops import Composite, composite
 
@@ -15,7 +14,7 @@ pytestmark = pytest.mark.op("composite")
 INF, NAN = math.inf, math.nan
 
 
-def slow(sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, background: Tensor | None = None) -> Composite:
+def slow(sigma, rgb, depths, deltas, background=None):
     """One sample at a time, in float64."""
     rays = []
     for ray in range(sigma.shape[0]):
@@ -39,23 +38,21 @@ def slow(sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, background:
     )
 
 
-def rays(r: int, s: int, c: int = 3, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def rays(r, s, c=3, dtype=torch.float32):
     sigma = 5 * torch.rand(r, s) * (torch.rand(r, s) > 0.3)
-    return tuple(  # type: ignore[return-value]
+    return tuple(
         tensor.to(dtype) for tensor in (sigma, torch.rand(r, s, c), torch.rand(r, s).cumsum(1), torch.rand(r, s) / 2)
     )
 
 
-def pack(tensors: tuple[Tensor, ...], counts: list[int]) -> tuple[Tensor, ...]:
+def pack(tensors, counts):
     return tuple(torch.cat([tensor[ray, :count] for ray, count in enumerate(counts)]) for tensor in tensors)
 
 
 @pytest.mark.parametrize(("r", "s", "c"), [(1, 1, 3), (5, 33, 3), (3, 64, 1), (2, 7, 5)])
 @pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("form", ["dense", "packed"])
-def test_matches_a_slow_loop(
-    device: torch.device, backend: str, form: str, dtype: torch.dtype, r: int, s: int, c: int
-) -> None:
+def test_matches_a_slow_loop(device, backend, form, dtype, r, s, c):
     need("composite", backend, device, dtype)
     inputs = rays(r, s, c, dtype)
     background = torch.rand(r, c).to(dtype)
@@ -74,9 +71,7 @@ def test_matches_a_slow_loop(
 
 @pytest.mark.parametrize("counts", [[], [0], [0, 0, 0], [1], [3, 0, 17, 1, 0], [0, 200, 1]])
 @pytest.mark.parametrize("with_background", [False, True])
-def test_packed_rays_of_any_length_equal_each_ray_alone(
-    device: torch.device, backend: str, counts: list[int], with_background: bool
-) -> None:
+def test_packed_rays_of_any_length_equal_each_ray_alone(device, backend, counts, with_background):
     inputs = rays(len(counts), max(counts, default=0))
     background = torch.tensor([0.2, 0.5, 1.0]) if with_background else None
     packed = pack(inputs, counts) if counts else tuple(tensor.flatten(0, 1) for tensor in inputs)
@@ -96,7 +91,7 @@ def test_packed_rays_of_any_length_equal_each_ray_alone(
         torch.testing.assert_close(found.depth[ray].double().cpu(), exact.depth[0], rtol=1e-6, atol=1e-6)
 
 
-def test_rays_without_samples_show_the_background(device: torch.device, backend: str) -> None:
+def test_rays_without_samples_show_the_background(device, backend):
     inputs = tuple(tensor.to(device) for tensor in rays(4, 0))
     background = torch.rand(4, 3, device=device)
     found = composite(*inputs, background=background, backend=backend)
@@ -105,7 +100,7 @@ def test_rays_without_samples_show_the_background(device: torch.device, backend:
     assert composite(*(tensor[:0] for tensor in inputs), backend=backend).colour.shape == (0, 3)
 
 
-def test_samples_outside_all_rays_count_for_nothing(device: torch.device, backend: str) -> None:
+def test_samples_outside_all_rays_count_for_nothing(device, backend):
     inputs = tuple(tensor.to(device) for tensor in pack(rays(1, 9), [9]))
     offsets = torch.tensor([2, 5, 7], dtype=torch.int32, device=device)
     found = composite(*inputs, ray_offsets=offsets, backend=backend)
@@ -115,7 +110,7 @@ def test_samples_outside_all_rays_count_for_nothing(device: torch.device, backen
 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
-def test_infinite_density_is_opaque_and_hides_what_follows(device: torch.device, backend: str, form: str) -> None:
+def test_infinite_density_is_opaque_and_hides_what_follows(device, backend, form):
     sigma = torch.tensor([[1.0, INF, INF, 2.0], [INF, INF, 0.0, 1.0]])
     deltas = torch.tensor([[0.5, 0.5, 0.5, 0.5], [0.0, 1e30, 1.0, 1.0]])
     rgb, depths = torch.rand(2, 4, 3), torch.arange(8.0).reshape(2, 4)
@@ -132,7 +127,7 @@ def test_infinite_density_is_opaque_and_hides_what_follows(device: torch.device,
 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
-def test_an_opaque_ray_costs_the_rays_behind_it_no_digits(device: torch.device, backend: str, form: str) -> None:
+def test_an_opaque_ray_costs_the_rays_behind_it_no_digits(device, backend, form):
     inputs = rays(40, 30)
     inputs[0][::2] = 1e30
     exact = slow(*inputs)
@@ -144,9 +139,7 @@ def test_an_opaque_ray_costs_the_rays_behind_it_no_digits(device: torch.device, 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
 @pytest.mark.parametrize("where", [0, 1, 2, 3])
-def test_what_is_not_a_number_spoils_its_own_ray_alone(
-    device: torch.device, backend: str, form: str, where: int
-) -> None:
+def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend, form, where):
     clean = rays(5, 6)
     spoiled = tuple(tensor.clone() for tensor in clean)
     spoiled[0][2, 3] = spoiled[3][2, 3] = 1
@@ -166,7 +159,7 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(
 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
-def test_a_spoiled_density_spoils_the_weights_from_there_on(device: torch.device, backend: str, form: str) -> None:
+def test_a_spoiled_density_spoils_the_weights_from_there_on(device, backend, form):
     sigma, rgb, depths, deltas = rays(1, 5)
     sigma[0, 2] = NAN
     inputs = (sigma, rgb, depths, deltas) if form == "dense" else (sigma[0], rgb[0], depths[0], deltas[0])
@@ -175,7 +168,7 @@ def test_a_spoiled_density_spoils_the_weights_from_there_on(device: torch.device
     assert weights.flatten().isnan().tolist() == [False, False, True, True, True]
 
 
-def test_sums_are_float32_under_autocast(device: torch.device, backend: str) -> None:
+def test_sums_are_float32_under_autocast(device, backend):
     need("composite", backend, device, torch.float32)
     inputs = [tensor.to(device) for tensor in rays(4, 9)]
     expected = composite(*inputs, backend=backend)
@@ -185,7 +178,7 @@ def test_sums_are_float32_under_autocast(device: torch.device, backend: str) -> 
         assert torch.equal(one, other)
 
 
-def test_gradcheck() -> None:
+def test_gradcheck():
     inputs = [tensor.requires_grad_() for tensor in rays(2, 4, 2, torch.float64)]
     background = torch.rand(2, 2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda *a: composite(*a[:4], background=a[4]), (*inputs, background))
@@ -198,11 +191,11 @@ def test_gradcheck() -> None:
 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
-def test_gradients_of_the_backend(device: torch.device, backend: str, form: str) -> None:
+def test_gradients_of_the_backend(device, backend, form):
     inputs = [*rays(7, 19), torch.rand(7, 3)]
     cotangents = [torch.randn(7, 3), torch.randn(7), torch.randn(7), torch.randn(7, 19)]
 
-    def gradients(dtype: torch.dtype, device: torch.device, backend: str) -> list[Tensor]:
+    def gradients(dtype, device, backend):
         leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
         given = leaves[:4] if form == "dense" else [leaf.flatten(0, 1) for leaf in leaves[:4]]
         ray_offsets = None if form == "dense" else offsets_of([19] * 7, device)
@@ -216,7 +209,7 @@ def test_gradients_of_the_backend(device: torch.device, backend: str, form: str)
         assert_as_exact(found, same, right)
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     inputs = [tensor.to(device).requires_grad_() for tensor in rays(4, 9)]
     packed = [tensor.detach().flatten(0, 1).requires_grad_() for tensor in inputs]
     ray_offsets = offsets_of([9, 0, 20, 7], device)
@@ -232,7 +225,7 @@ def test_compiles(device: torch.device, backend: str) -> None:
         )
 
 
-def test_errors() -> None:
+def test_errors():
     sigma, rgb, depths, deltas = rays(4, 5)
     with refused(ValueError, "composite: sigma must have shape [r, s], got [20]"):
         composite(sigma.flatten(), rgb, depths, deltas)

@@ -22,7 +22,7 @@ DEPTH = 3
 Tables = tuple[Tensor, Tensor]
 
 
-def flat(k: int, device: torch.device | str = "cpu") -> Tables:
+def flat(k, device="cpu"):
     """The tables of one diagram."""
     return (
         torch.tensor([0, k], dtype=torch.int32, device=device),
@@ -30,21 +30,13 @@ def flat(k: int, device: torch.device | str = "cpu") -> Tables:
     )
 
 
-def draw(points: Tensor, centres: Tensor, uniforms: Tensor, temperature: float, **options: object) -> Tensor:
+def draw(points, centres, uniforms, temperature, **options):
     """In one diagram, by a number for each point."""
     tables = flat(centres.shape[0], centres.device)
-    return draw_cell(points, centres, *tables, uniforms[:, None], temperature=temperature, depth=1, **options)  # type: ignore[arg-type]
+    return draw_cell(points, centres, *tables, uniforms[:, None], temperature=temperature, depth=1, **options)
 
 
-def slow(
-    points: Tensor,
-    centres: Tensor,
-    tables: Tables,
-    uniforms: Tensor,
-    temperature: float,
-    depth: int,
-    weights: Tensor | None = None,
-) -> tuple[list[int], list[float]]:
+def slow(points, centres, tables, uniforms, temperature, depth, weights=None):
     """Leaves by the formula in float64, a point at a time, and how far each number is from where another is drawn."""
     offsets, child = tables
     leaves, margins = [], []
@@ -66,7 +58,7 @@ def slow(
     return leaves, margins
 
 
-def agree(leaves: Tensor, expected: list[int], margins: list[float], tolerance: float) -> None:
+def agree(leaves, expected, margins, tolerance):
     """Equal wherever the numbers are not within rounding of a border; nearly all are not."""
     assert leaves.dtype == torch.int32
     clear = [i for i, margin in enumerate(margins) if margin > tolerance]
@@ -75,7 +67,7 @@ def agree(leaves: Tensor, expected: list[int], margins: list[float], tolerance: 
     assert [found[i] for i in clear] == [expected[i] for i in clear]
 
 
-def chi_square(counts: Tensor, probabilities: Tensor) -> float:
+def chi_square(counts, probabilities):
     """Of classes that are expected at least five times; the others are one class."""
     expected = probabilities.double() * counts.sum()
     rare = expected < 5
@@ -87,7 +79,7 @@ def chi_square(counts: Tensor, probabilities: Tensor) -> float:
 
 @pytest.mark.parametrize("n", [0, 1, 257])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_uneven_tree_is_the_formula(device: torch.device, backend: str, n: int, weighted: bool) -> None:
+def test_uneven_tree_is_the_formula(device, backend, n, weighted):
     points, centres, uniforms = torch.randn(n, 3), torch.randn(10, 3), torch.rand(n, DEPTH)
     weights = torch.rand(10) if weighted else None
     leaves = draw_cell(
@@ -103,14 +95,14 @@ def test_uneven_tree_is_the_formula(device: torch.device, backend: str, n: int, 
 
 @pytest.mark.parametrize("k", [1, 2, 15, 17, 1000])
 @pytest.mark.parametrize("temperature", [0.05, 2.0])
-def test_many_cells(device: torch.device, backend: str, k: int, temperature: float) -> None:
+def test_many_cells(device, backend, k, temperature):
     points, centres, uniforms = strided(torch.rand(301, 3)), torch.rand(k, 3), torch.rand(301)
     leaves = draw(points.to(device), centres.to(device), uniforms.to(device), temperature, backend=backend)
     expected = slow(points, centres, flat(k), uniforms[:, None], temperature, 1)
     agree(leaves.cpu(), *expected, tolerance=1e-5)
 
 
-def test_frequencies_are_those_of_the_law(device: torch.device, backend: str) -> None:
+def test_frequencies_are_those_of_the_law(device, backend):
     """Chi square by degree of freedom, at each of some places: its mean is 1, and 3 is far beyond its spread."""
     n, k, temperature = 20_000, 12, 0.3
     centres, places = torch.rand(k, 3), torch.rand(4, 3)
@@ -124,7 +116,7 @@ def test_frequencies_are_those_of_the_law(device: torch.device, backend: str) ->
         assert chi_square(torch.bincount(leaves.cpu(), minlength=k), wrong) > 3.0
 
 
-def test_along_the_path_frequencies_multiply(device: torch.device, backend: str) -> None:
+def test_along_the_path_frequencies_multiply(device, backend):
     n, temperature = 30_000, 0.7
     centres, place = torch.randn(10, 3), torch.randn(3)
     tables = tuple(table.to(device) for table in (CHILD_OFFSETS, CHILD))
@@ -146,7 +138,7 @@ def test_along_the_path_frequencies_multiply(device: torch.device, backend: str)
     assert chi_square(torch.bincount(leaves.cpu(), minlength=7), law) < 3.0
 
 
-def test_numbers_at_and_beyond_the_ends(device: torch.device, backend: str) -> None:
+def test_numbers_at_and_beyond_the_ends(device, backend):
     """0 is the last centre with any mass, what is nearly 1 the first; never one without mass."""
     centres = torch.tensor([[50.0, 0, 0], [0, 0, 0], [1, 0, 0], [60, 0, 0]], device=device)
     uniforms = torch.tensor([0.0, -3.0, math.nan, 1 - 2**-24, 1.0, 7.0], device=device)
@@ -154,10 +146,10 @@ def test_numbers_at_and_beyond_the_ends(device: torch.device, backend: str) -> N
     assert leaves.tolist() == [2, 2, 2, 1, 1, 1]
 
 
-def test_the_reference_where_sums_do_not_rise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reference_where_sums_do_not_rise(monkeypatch):
     """Sums as a GPU takes them, in a tree: the last of all columns is above that of the last centre by rounding."""
 
-    def tree(values: Tensor, dim: int) -> Tensor:
+    def tree(values, dim):
         step = 1
         while step < values.shape[dim]:
             values = values + torch.nn.functional.pad(values[:, :-step], (step, 0))
@@ -179,7 +171,7 @@ def test_the_reference_where_sums_do_not_rise(monkeypatch: pytest.MonkeyPatch) -
     assert int(leaves.min()) >= 5 and int(leaves.max()) == 6
 
 
-def test_the_coldest_is_the_nearest_and_the_hottest_is_even(device: torch.device, backend: str) -> None:
+def test_the_coldest_is_the_nearest_and_the_hottest_is_even(device, backend):
     points, centres = 8 * torch.rand(500, 3, device=device), 8 * torch.rand(20, 3, device=device)
     uniforms = torch.rand(500, device=device)
     for temperature in (1e-300, 1e-44, 1e-30, 1e-6):
@@ -193,7 +185,7 @@ def test_the_coldest_is_the_nearest_and_the_hottest_is_even(device: torch.device
     assert bool(((far >= 0) & (far < 20)).all())
 
 
-def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device: torch.device, backend: str) -> None:
+def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device, backend):
     points = torch.tensor([[math.nan, 0, 0], [0, math.inf, 0], [1e30, 0, 0]], device=device)
     centres, uniforms = torch.rand(10, 3, device=device), torch.tensor([0.0, 0.5, 0.9], device=device)
     # Here the first centre of the root is refined too.
@@ -211,12 +203,12 @@ def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device:
     assert leaves.tolist() == [5, 5, 5]
 
 
-def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(device: torch.device, backend: str) -> None:
+def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(device, backend):
     centres, n = torch.rand(10, 3, device=device), 30_000
     points, uniforms = torch.rand(n, 3, device=device), torch.rand(n, DEPTH, device=device)
     tables = (CHILD_OFFSETS.to(device), CHILD.to(device))
 
-    def run(rows: slice) -> Tensor:
+    def run(rows):
         return draw_cell(points[rows], centres, *tables, uniforms[rows], temperature=0.2, depth=DEPTH, backend=backend)
 
     leaves = run(slice(None))
@@ -226,17 +218,17 @@ def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(devi
         assert torch.equal(run(slice(5, 4242)), leaves[5:4242])
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     points, centres = torch.rand(501, 3, device=device), torch.rand(10, 3, device=device)
     offsets, child, uniforms = CHILD_OFFSETS.to(device), CHILD.to(device), torch.rand(501, DEPTH, device=device)
 
-    def run(points: Tensor) -> Tensor:
+    def run(points):
         return draw_cell(points, centres, offsets, child, uniforms, temperature=0.3, depth=DEPTH, backend=backend)
 
     assert torch.equal(torch.compile(run, fullgraph=True, backend="aot_eager")(points), run(points))
 
 
-def test_half_types_and_float64() -> None:
+def test_half_types_and_float64():
     points, centres, uniforms = torch.rand(40, 3).half(), torch.rand(6, 3), torch.rand(40)
     assert torch.equal(draw(points, centres, uniforms, 0.2), draw(points.float(), centres, uniforms, 0.2))
     expected = slow(points, centres, flat(6), uniforms[:, None], 0.2, 1)
@@ -248,7 +240,7 @@ def test_half_types_and_float64() -> None:
 @pytest.mark.native
 @pytest.mark.parametrize("shape", [(12,), (1000,), (4, 5)])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_every_instruction_set_and_number_of_threads(isa: str, shape: tuple[int, ...], weighted: bool) -> None:
+def test_every_instruction_set_and_number_of_threads(isa, shape, weighted):
     diagram = VoronoiDiagram(torch.rand(shape[0], 3), weights=0.1 * torch.rand(shape[0]) if weighted else None)
     for k in shape[1:]:
         diagram, _ = diagram.refine(
@@ -258,25 +250,25 @@ def test_every_instruction_set_and_number_of_threads(isa: str, shape: tuple[int,
     points, uniforms = torch.rand(n, 3), torch.rand(n, diagram.depth)
     tables = (diagram.centres, diagram.child_offsets, diagram.child)
     options = {"temperature": 0.1, "depth": diagram.depth, "weights": diagram.power}
-    leaves = draw_cell(points, *tables, uniforms, backend="native", **options)  # type: ignore[arg-type]
+    leaves = draw_cell(points, *tables, uniforms, backend="native", **options)
     expected = slow(points[::5], tables[0], tables[1:], uniforms[::5], 0.1, diagram.depth, diagram.power)
     agree(leaves[::5], *expected, tolerance=1e-5)
     rows = torch.arange(n) % 7 != 0
-    thinned = draw_cell(points[rows], *tables, uniforms[rows], backend="native", **options)  # type: ignore[arg-type]
+    thinned = draw_cell(points[rows], *tables, uniforms[rows], backend="native", **options)
     assert torch.equal(thinned, leaves[rows])
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(3)
-        assert torch.equal(draw_cell(points, *tables, uniforms, backend="native", **options), leaves)  # type: ignore[arg-type]
+        assert torch.equal(draw_cell(points, *tables, uniforms, backend="native", **options), leaves)
     finally:
         torch.set_num_threads(before)
 
 
 @pytest.mark.native
-def test_native_refuses_unsound_tables_and_passes_opcheck() -> None:
+def test_native_refuses_unsound_tables_and_passes_opcheck():
     points, centres, uniforms = torch.rand(40, 3), torch.rand(10, 3), torch.rand(40, DEPTH)
 
-    def run(offsets: Tensor, child: Tensor, depth: int) -> Tensor:
+    def run(offsets, child, depth):
         return draw_cell(
             points, centres, offsets, child, uniforms[:, :depth], temperature=0.3, depth=depth, backend="native"
         )
@@ -294,7 +286,7 @@ def test_native_refuses_unsound_tables_and_passes_opcheck() -> None:
 
 
 @pytest.mark.warp
-def test_warp_passes_opcheck_and_stays_inside_unsound_tables() -> None:
+def test_warp_passes_opcheck_and_stays_inside_unsound_tables():
     points, centres = torch.rand(7, 3), torch.rand(3, 3)
     draw(points, centres, torch.rand(7), 0.3, backend="warp")
     op = torch.ops.voronerf.draw_cell_warp.default
@@ -308,28 +300,28 @@ def test_warp_passes_opcheck_and_stays_inside_unsound_tables() -> None:
         assert bool((op(points, centres, *tables, torch.rand(7, depth), 0.3, depth, None) < 0).all())
 
 
-def test_errors() -> None:
+def test_errors():
     points, centres, uniforms = torch.rand(4, 3), torch.rand(10, 3), torch.rand(4, 3)
     tables = (CHILD_OFFSETS, CHILD)
     good = {"temperature": 0.1, "depth": 3}
     with refused(ValueError, "draw_cell: points must have shape [n, 3], got [3]"):
-        draw_cell(points[0], centres, *tables, uniforms, **good)  # type: ignore[arg-type]
+        draw_cell(points[0], centres, *tables, uniforms, **good)
     with refused(ValueError, "draw_cell: centres must have shape [m, 3], got [10, 2]"):
-        draw_cell(points, centres[:, :2], *tables, uniforms, **good)  # type: ignore[arg-type]
+        draw_cell(points, centres[:, :2], *tables, uniforms, **good)
     with refused(ValueError, "draw_cell: uniforms must have shape [n, depth] with n = 4, depth = 3, got [4, 2]"):
-        draw_cell(points, centres, *tables, uniforms[:, :2], **good)  # type: ignore[arg-type]
+        draw_cell(points, centres, *tables, uniforms[:, :2], **good)
     with refused(ValueError, "draw_cell: child must have shape [m] with m = 9, got [10]"):
-        draw_cell(points, centres[:9], *tables, uniforms, **good)  # type: ignore[arg-type]
+        draw_cell(points, centres[:9], *tables, uniforms, **good)
     with refused(ValueError, "draw_cell: weights must have shape [m] with m = 10, got [1]"):
-        draw_cell(points, centres, *tables, uniforms, weights=torch.zeros(1), **good)  # type: ignore[arg-type]
+        draw_cell(points, centres, *tables, uniforms, weights=torch.zeros(1), **good)
     with refused(ValueError, "draw_cell: depth must be at least 1, got 0"):
         draw_cell(points, centres, *tables, uniforms[:, :0], temperature=0.1, depth=0)
     for temperature in (0.0, -1.0, math.inf, math.nan):
         with refused(ValueError, f"draw_cell: temperature must be positive and finite, got {temperature}"):
             draw_cell(points, centres, *tables, uniforms, temperature=temperature, depth=3)
     with refused(ValueError, "draw_cell: centres must hold ... got 0 centres in 4 diagrams"):
-        draw_cell(points, centres[:0], CHILD_OFFSETS, CHILD[:0], uniforms, **good)  # type: ignore[arg-type]
+        draw_cell(points, centres[:0], CHILD_OFFSETS, CHILD[:0], uniforms, **good)
     with refused(TypeError, "draw_cell: child must have dtype int32, got int64"):
-        draw_cell(points, centres, CHILD_OFFSETS, CHILD.long(), uniforms, **good)  # type: ignore[arg-type]
+        draw_cell(points, centres, CHILD_OFFSETS, CHILD.long(), uniforms, **good)
     with refused(ValueError, "draw_cell: uniforms must be on the device of points, cpu, got meta"):
-        draw_cell(points, centres, *tables, uniforms.to("meta"), **good)  # type: ignore[arg-type]
+        draw_cell(points, centres, *tables, uniforms.to("meta"), **good)

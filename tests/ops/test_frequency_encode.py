@@ -6,14 +6,13 @@ import pytest
 import torch
 from op_cases import FLOATS, need, refused, strided
 from tolerances import assert_as_exact
-from torch import Tensor
 
 from voronerf.ops import frequency_encode
 
 pytestmark = pytest.mark.op("frequency_encode")
 
 
-def slow(x: Tensor, octaves: int, include_input: bool = True) -> Tensor:
+def slow(x, octaves, include_input=True):
     """One number at a time, in float64."""
     rows = []
     for point in x.double().tolist():
@@ -26,16 +25,14 @@ def slow(x: Tensor, octaves: int, include_input: bool = True) -> Tensor:
 
 @pytest.mark.parametrize(("n", "d", "octaves"), [(1, 3, 10), (17, 3, 4), (65, 1, 3), (9, 5, 1), (7, 3, 0)])
 @pytest.mark.parametrize("include_input", [True, False])
-def test_matches_a_slow_loop(
-    device: torch.device, backend: str, n: int, d: int, octaves: int, include_input: bool
-) -> None:
+def test_matches_a_slow_loop(device, backend, n, d, octaves, include_input):
     x = 4 * torch.rand(n, d) - 2
     encoded = frequency_encode(x.to(device), octaves, include_input=include_input, backend=backend)
     assert encoded.shape == (n, d * (include_input + 2 * octaves))
     torch.testing.assert_close(encoded.double().cpu(), slow(x, octaves, include_input), rtol=0, atol=3e-7)
 
 
-def test_empty(device: torch.device, backend: str) -> None:
+def test_empty(device, backend):
     x = torch.empty(0, 3, device=device, requires_grad=True)
     encoded = frequency_encode(x, 10, backend=backend)
     assert encoded.shape == (0, 63)
@@ -45,7 +42,7 @@ def test_empty(device: torch.device, backend: str) -> None:
 
 
 @pytest.mark.parametrize("dtype", FLOATS)
-def test_dtypes(device: torch.device, backend: str, dtype: torch.dtype) -> None:
+def test_dtypes(device, backend, dtype):
     need("frequency_encode", backend, device, dtype)
     x = (2 * torch.rand(300, 3) - 1).to(dtype)
     exact = slow(x, 10)
@@ -53,13 +50,13 @@ def test_dtypes(device: torch.device, backend: str, dtype: torch.dtype) -> None:
     assert_as_exact(frequency_encode(x.to(device), 10, backend=backend), exact.to(dtype), exact)
 
 
-def test_strided(device: torch.device, backend: str) -> None:
+def test_strided(device, backend):
     x = torch.rand(33, 3, device=device)
     found, expected = (frequency_encode(each, 5, backend=backend) for each in (strided(x), x))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
 
 
-def test_gradient_matches_the_formula(device: torch.device, backend: str) -> None:
+def test_gradient_matches_the_formula(device, backend):
     x = torch.rand(31, 3, device=device, requires_grad=True)
     g = torch.randn(31, 3 + 6 * 6, device=device)
     frequency_encode(x, 6, backend=backend).backward(g)
@@ -71,27 +68,27 @@ def test_gradient_matches_the_formula(device: torch.device, backend: str) -> Non
 
 
 @pytest.mark.parametrize("include_input", [True, False])
-def test_gradcheck(include_input: bool) -> None:
+def test_gradcheck(include_input):
     x = torch.rand(3, 2, dtype=torch.float64, requires_grad=True)
     run = lambda x: frequency_encode(x, 3, include_input=include_input)  # noqa: E731
     assert torch.autograd.gradcheck(run, x)
     assert torch.autograd.gradgradcheck(run, x)
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     compiled = torch.compile(lambda x: frequency_encode(x, 4, backend=backend), fullgraph=True, backend="aot_eager")
     for n in (5, 8):
         x = torch.rand(n, 3, device=device)
         torch.testing.assert_close(compiled(x), frequency_encode(x, 4, backend=backend), rtol=0, atol=1e-6)
 
 
-def test_errors() -> None:
+def test_errors():
     x = torch.rand(4, 3)
     with refused(ValueError, "frequency_encode: x must have shape [n, d], got [3]"):
         frequency_encode(x[0], 2)
     with refused(ValueError, "frequency_encode: octaves must be at least 0, got -1"):
         frequency_encode(x, -1)
     with refused(TypeError, "frequency_encode: octaves must be an integer, got float"):
-        frequency_encode(x, 2.0)  # type: ignore[arg-type]
+        frequency_encode(x, 2.0)
     with refused(TypeError, "frequency_encode: x must have dtype ... or float64, got int32"):
         frequency_encode(x.int(), 2)

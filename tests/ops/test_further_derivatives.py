@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -18,36 +17,36 @@ N, K = sum(COUNTS), len(COUNTS)
 Call = Callable[..., Tensor]
 
 
-def draw(*shape: int, seed: int) -> Tensor:
+def draw(*shape, seed):
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
 
 
-def linear(backend: str, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def linear(backend, x, weight, bias):
     return ops.grouped_linear(x, offsets_of(COUNTS, x.device), weight, bias, activation="sine", backend=backend)
 
 
 NETWORK = MLP((Layer((POSITIONS,), 6, "sine"), Layer((0,), 2, "sigmoid")), (1,), position_octaves=2)
 
 
-def network(backend: str, x: Tensor, first: Tensor, second: Tensor) -> Tensor:
+def network(backend, x, first, second):
     offsets = offsets_of(COUNTS, x.device)
     return ops.grouped_mlp(x, offsets, [first, second], [None, None], layers=NETWORK, backend=backend)
 
 
-def routed(backend: str, x: Tensor, first: Tensor, second: Tensor) -> Tensor:
+def routed(backend, x, first, second):
     cells = torch.tensor([0, 2, 2, 0, 2, 0, 2, 0, 2], dtype=torch.int32, device=x.device)
     return ops.routed_mlp(x, [first, second], [None, None], layers=NETWORK, cells=cells, backend=backend)[0]
 
 
-def frequencies(backend: str, x: Tensor) -> Tensor:
+def frequencies(backend, x):
     return ops.frequency_encode(x, 2, backend=backend)
 
 
-def gaussians(backend: str, x: Tensor, variances: Tensor) -> Tensor:
+def gaussians(backend, x, variances):
     return ops.integrated_encode(x, variances.square(), 2, backend=backend)
 
 
-def rays(backend: str, x: Tensor, sigma: Tensor) -> Tensor:
+def rays(backend, x, sigma):
     depths = torch.linspace(1, 2, N).to(x)
     deltas = torch.full((N,), 0.3).to(x)
     offsets = torch.tensor([0, 4, N], dtype=torch.int32, device=x.device)
@@ -65,7 +64,7 @@ CASES: dict[str, tuple[Call, list[Tensor]]] = {
 }
 
 
-def gradients(call: Call, backend: str, values: list[Tensor], device: torch.device, dtype: torch.dtype) -> list[Tensor]:
+def gradients(call, backend, values, device, dtype):
     """Of a loss on values, slopes and curvatures, the latter beside a slope in which they are not linear."""
     leaves = [value.to(device, dtype).requires_grad_() for value in values]
     y = call(backend, *leaves)
@@ -78,7 +77,7 @@ def gradients(call: Call, backend: str, values: list[Tensor], device: torch.devi
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_loss_on_second_derivatives(name: str, device: torch.device, backend: str) -> None:
+def test_a_loss_on_second_derivatives(name, device, backend):
     need(name, backend, device, torch.float32)
     call, values = CASES[name]
     expected = gradients(call, "reference", values, torch.device("cpu"), torch.float64)
@@ -88,11 +87,11 @@ def test_a_loss_on_second_derivatives(name: str, device: torch.device, backend: 
 
 
 @pytest.mark.op("grouped_mlp")
-def test_slopes_of_no_samples_by_frozen_networks(device: torch.device, backend: str) -> None:
+def test_slopes_of_no_samples_by_frozen_networks(device, backend):
     """As where a march through empty space has found nothing, and normals are trained on."""
     need("grouped_mlp", backend, device, torch.float32)
     x = torch.zeros(0, 3, device=device, requires_grad=True)
-    weights: list[Any] = [draw(K, 6, 15, seed=2).to(device), draw(K, 2, 6, seed=3).to(device)]
+    weights = [draw(K, 6, 15, seed=2).to(device), draw(K, 2, 6, seed=3).to(device)]
     offsets = offsets_of([0] * K, device)
     y = ops.grouped_mlp(x, offsets, weights, [None, None], layers=NETWORK, backend=backend)
     (slope,) = torch.autograd.grad(y.sum(), x, create_graph=True)

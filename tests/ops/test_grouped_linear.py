@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import loops
 import pytest
 import torch
 from op_cases import COUNTS, FLOATS, HALVES, need, offsets_of, refused, strided
 from tolerances import assert_as_exact
-from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from voronerf.layers import ACTIVATIONS
 from voronerf.ops import grouped_linear
@@ -17,22 +15,14 @@ pytestmark = pytest.mark.op("grouped_linear")
 WIDTHS = [(1, 1), (63, 64), (90, 3), (3, 90)]
 
 
-def layer(counts: list[int], i: int, o: int, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+def layer(counts, i, o, dtype=torch.float32):
     """Samples, weight and bias of one layer."""
     k = len(counts)
     tensors = torch.randn(sum(counts), i), torch.randn(k, o, i) / i**0.5, torch.randn(k, o)
     return [tensor.to(dtype) for tensor in tensors]
 
 
-def results(
-    linear: Callable[..., Tensor],
-    inputs: list[Tensor],
-    offsets: Tensor,
-    dtype: torch.dtype,
-    device: torch.device,
-    g: Tensor,
-    **options: str,
-) -> list[Tensor]:
+def results(linear, inputs, offsets, dtype, device, g, **options):
     """Output and gradients in a dtype, on a device."""
     leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
     x, weight, bias = leaves
@@ -42,9 +32,7 @@ def results(
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("counts", COUNTS.values(), ids=COUNTS)
-def test_output_and_gradients_match_a_plain_loop(
-    device: torch.device, backend: str, counts: list[int], activation: str
-) -> None:
+def test_output_and_gradients_match_a_plain_loop(device, backend, counts, activation):
     inputs, offsets = layer(counts, 17, 9), offsets_of(counts)
     g = torch.randn(sum(counts), 9)
     exact = results(loops.grouped_linear, inputs, offsets, torch.float64, torch.device("cpu"), g, activation=activation)
@@ -61,7 +49,7 @@ def test_output_and_gradients_match_a_plain_loop(
 
 @pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize(("i", "o"), WIDTHS)
-def test_dtypes_and_widths(device: torch.device, backend: str, i: int, o: int, dtype: torch.dtype) -> None:
+def test_dtypes_and_widths(device, backend, i, o, dtype):
     need("grouped_linear", backend, device, dtype)
     counts = COUNTS["odd"]
     inputs, offsets, g = layer(counts, i, o, dtype), offsets_of(counts), torch.randn(sum(counts), o).to(dtype)
@@ -74,7 +62,7 @@ def test_dtypes_and_widths(device: torch.device, backend: str, i: int, o: int, d
 
 
 @pytest.mark.parametrize("dtype", HALVES)
-def test_sums_over_many_samples_are_wide(device: torch.device, backend: str, dtype: torch.dtype) -> None:
+def test_sums_over_many_samples_are_wide(device, backend, dtype):
     need("grouped_linear", backend, device, dtype)
     n = 9000
     weight = torch.zeros(1, 1, 1, dtype=dtype, device=device, requires_grad=True)
@@ -86,7 +74,7 @@ def test_sums_over_many_samples_are_wide(device: torch.device, backend: str, dty
     assert weight.grad.item() == bias.grad.item() == torch.tensor(float(n), dtype=dtype).item()
 
 
-def test_without_bias(device: torch.device, backend: str) -> None:
+def test_without_bias(device, backend):
     counts = COUNTS["odd"]
     x, weight, _ = (tensor.to(device) for tensor in layer(counts, 5, 4))
     offsets = offsets_of(counts, device)
@@ -95,7 +83,7 @@ def test_without_bias(device: torch.device, backend: str) -> None:
     torch.testing.assert_close(found, expected)
 
 
-def test_identical_cells_are_one_layer(device: torch.device, backend: str) -> None:
+def test_identical_cells_are_one_layer(device, backend):
     counts = COUNTS["unequal"]
     x, weight, bias = (tensor.to(device) for tensor in layer(counts, 31, 8))
     weight, bias = weight[:1].expand(4, -1, -1), bias[:1].expand(4, -1)
@@ -103,7 +91,7 @@ def test_identical_cells_are_one_layer(device: torch.device, backend: str) -> No
     torch.testing.assert_close(found, torch.nn.functional.linear(x, weight[0], bias[0]), rtol=1e-5, atol=1e-5)
 
 
-def test_layouts(device: torch.device, backend: str) -> None:
+def test_layouts(device, backend):
     counts = COUNTS["odd"]
     x, weight, bias = (tensor.to(device) for tensor in layer(counts, 6, 5))
     offsets = offsets_of(counts, device)
@@ -119,7 +107,7 @@ def test_layouts(device: torch.device, backend: str) -> None:
     assert all(tensor.grad is not None and tensor.grad.isfinite().all() for tensor in wide)
 
 
-def test_rows_of_no_cell_are_zero(device: torch.device, backend: str) -> None:
+def test_rows_of_no_cell_are_zero(device, backend):
     x, weight, bias = (tensor.to(device).requires_grad_() for tensor in layer([3, 4, 5], 4, 2))
     offsets = torch.tensor([2, 5, 9], dtype=torch.int32, device=device)
     y = grouped_linear(x, offsets, weight[:2], bias[:2], activation="sigmoid", backend=backend)
@@ -128,7 +116,7 @@ def test_rows_of_no_cell_are_zero(device: torch.device, backend: str) -> None:
     assert (x.grad[:2] == 0).all() and (x.grad[9:] == 0).all() and (x.grad[2:9] != 0).any()
 
 
-def test_what_is_not_a_number_stays_in_its_cell(device: torch.device, backend: str) -> None:
+def test_what_is_not_a_number_stays_in_its_cell(device, backend):
     counts = [4, 5, 6]
     x, weight, bias = (tensor.to(device) for tensor in layer(counts, 4, 3))
     x[6, 2], weight[1, 0, 1] = torch.nan, torch.inf
@@ -141,7 +129,7 @@ def test_what_is_not_a_number_stays_in_its_cell(device: torch.device, backend: s
     assert not y[6].isfinite().any()
 
 
-def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> None:
+def test_gradients_only_where_asked_for(device, backend):
     counts = COUNTS["odd"]
     offsets = offsets_of(counts, device)
     for wanted in range(3):
@@ -152,7 +140,7 @@ def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> N
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_gradcheck(activation: str) -> None:
+def test_gradcheck(activation):
     counts = [2, 0, 1, 3]
     inputs = [tensor.requires_grad_() for tensor in layer(counts, 2, 3, torch.float64)]
     offsets = offsets_of(counts)
@@ -161,18 +149,19 @@ def test_gradcheck(activation: str) -> None:
     assert torch.autograd.gradgradcheck(run, inputs)
 
 
-def test_second_derivatives_match_the_specification(device: torch.device, backend: str) -> None:
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_second_derivatives_match_a_plain_loop(device, backend, activation):
     counts = COUNTS["odd"]
     offsets = offsets_of(counts)
     inputs = layer(counts, 4, 3)
 
-    def penalty(
-        linear: Callable[..., Tensor], device: torch.device, dtype: torch.dtype, **options: str
-    ) -> list[Tensor]:
+    def penalty(linear, device, dtype, **options):
         leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
-        y = linear(leaves[0], offsets.to(device), *leaves[1:], activation="softplus", **options)
-        (slope,) = torch.autograd.grad(y.sum(), leaves[0], create_graph=True)
-        return list(torch.autograd.grad(slope.square().sum(), leaves))
+        y = linear(leaves[0], offsets.to(device), *leaves[1:], activation=activation, **options)
+        slopes = torch.autograd.grad(y.square().sum(), leaves, create_graph=True)
+        return [
+            grad for slope in slopes for grad in torch.autograd.grad(slope.square().sum(), leaves, retain_graph=True)
+        ]
 
     exact = penalty(loops.grouped_linear, torch.device("cpu"), torch.float64)
     plain = penalty(loops.grouped_linear, torch.device("cpu"), torch.float32)
@@ -180,14 +169,31 @@ def test_second_derivatives_match_the_specification(device: torch.device, backen
         assert_as_exact(part, same, right)
 
 
-def test_opcheck() -> None:
+@pytest.mark.native
+def test_gradients_that_nobody_asked_for_are_not_computed():
+    class Watch(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, arguments=(), options=None):
+            if function is torch.ops.voronerf.grouped_linear_native_backward.default:
+                wanted.append(list(arguments[-1]))
+            return function(*arguments, **(options or {}))
+
+    wanted = []
+    x, weight, bias = (tensor.requires_grad_() for tensor in layer([3, 4], 4, 3))
+    y = grouped_linear(x, offsets_of([3, 4]), weight, bias, backend="native")
+    with Watch():
+        (slope,) = torch.autograd.grad(y.sum(), x, create_graph=True)
+        torch.autograd.grad(slope.square().sum(), weight, retain_graph=True)
+        assert wanted == [[True, False], [False, True]]
+
+
+def test_opcheck():
     x, weight, _ = (tensor.requires_grad_() for tensor in layer([2, 0, 1, 3], 2, 3))
     offsets, g, ops = offsets_of([2, 0, 1, 3]), torch.randn(6, 3, requires_grad=True), torch.ops.voronerf
     torch.library.opcheck(ops.grouped_product, (x, offsets, weight))
     torch.library.opcheck(ops.grouped_outer, (g, x, offsets))
 
 
-def test_autocast(device: torch.device, backend: str) -> None:
+def test_autocast(device, backend):
     counts = COUNTS["odd"]
     x, weight, bias = (tensor.to(device).requires_grad_() for tensor in layer(counts, 7, 5))
     offsets = offsets_of(counts, device)
@@ -201,12 +207,12 @@ def test_autocast(device: torch.device, backend: str) -> None:
     assert weight.grad.dtype == bias.grad.dtype == x.grad.dtype == torch.float32
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     counts = COUNTS["odd"]
     leaves = [tensor.to(device).requires_grad_() for tensor in layer(counts, 7, 5)]
     offsets = offsets_of(counts, device)
 
-    def run(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    def run(x, weight, bias):
         return grouped_linear(x, offsets, weight, bias, activation="sigmoid", backend=backend).square()
 
     compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
@@ -216,7 +222,7 @@ def test_compiles(device: torch.device, backend: str) -> None:
         torch.testing.assert_close(part, other)
 
 
-def test_errors() -> None:
+def test_errors():
     x, weight, bias = layer([2, 3], 4, 5)
     offsets = offsets_of([2, 3])
     with refused(ValueError, "grouped_linear: x must have shape [n, i], got [5]"):
@@ -244,7 +250,7 @@ def test_errors() -> None:
 
 
 @pytest.mark.parametrize("bad", [[0, 2, 6], [0, 4, 3], [-1, 2, 5]])
-def test_offsets_that_are_no_offsets_are_refused(backend: str, bad: list[int]) -> None:
+def test_offsets_that_are_no_offsets_are_refused(backend, bad):
     need("grouped_linear", backend, torch.device("cpu"), torch.float32)
     x, weight, bias = layer([2, 3], 4, 5)
     with pytest.raises(ValueError, match=r"^grouped_linear: offsets must rise from 0 or more to at most .* 5, got"):

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import loops
@@ -67,7 +66,7 @@ class Case:
     bias: list[bool]
 
     @classmethod
-    def make(cls, name: str, counts: list[int], dtype: torch.dtype = torch.float32, rays: int | None = 5) -> Case:
+    def make(cls, name, counts, dtype=torch.float32, rays=5):
         table, n, k = TABLES[name], sum(counts), len(counts)
         positions = 2 * torch.rand(n, 3) - 1
         if table.integrated:
@@ -80,7 +79,7 @@ class Case:
         inputs = [tensor.to(dtype) for tensor in (positions, directions, *weights, *biases)]
         return cls(table, offsets_of(counts), inputs, index, bias)
 
-    def run(self, mlp: Callable[..., Tensor], leaves: list[Tensor], **options: str) -> Tensor:
+    def run(self, mlp, leaves, **options):
         positions, directions, *parameters = leaves
         biases = iter(parameters[len(self.bias) :])
         index = self.direction_index
@@ -95,12 +94,10 @@ class Case:
             **options,
         )
 
-    def leaves(self, dtype: torch.dtype, device: torch.device = CPU) -> list[Tensor]:
+    def leaves(self, dtype, device=CPU):
         return [tensor.to(device, dtype).requires_grad_() for tensor in self.inputs]
 
-    def results(
-        self, mlp: Callable[..., Tensor], dtype: torch.dtype, device: torch.device = CPU, **options: str
-    ) -> list[Tensor]:
+    def results(self, mlp, dtype, device=CPU, **options):
         leaves = self.leaves(dtype, device)
         y = self.run(mlp, leaves, **options)
         g = torch.randn(y.shape, generator=torch.Generator().manual_seed(1)).to(device, dtype)
@@ -109,9 +106,7 @@ class Case:
 
 @pytest.mark.parametrize("counts", COUNTS.values(), ids=COUNTS)
 @pytest.mark.parametrize("name", TABLES)
-def test_output_and_gradients_match_the_specification(
-    device: torch.device, backend: str, name: str, counts: list[int]
-) -> None:
+def test_output_and_gradients_match_the_specification(device, backend, name, counts):
     case = Case.make(name, counts)
     exact = case.results(loops.grouped_mlp, torch.float64)
     plain = case.results(loops.grouped_mlp, torch.float32)
@@ -122,7 +117,7 @@ def test_output_and_gradients_match_the_specification(
 
 @pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("name", TABLES)
-def test_dtypes(device: torch.device, backend: str, name: str, dtype: torch.dtype) -> None:
+def test_dtypes(device, backend, name, dtype):
     need("grouped_mlp", backend, device, dtype)
     case = Case.make(name, COUNTS["odd"], dtype)
     exact = case.results(loops.grouped_mlp, torch.float64)
@@ -132,7 +127,7 @@ def test_dtypes(device: torch.device, backend: str, name: str, dtype: torch.dtyp
         assert_as_exact(part, same, right)
 
 
-def test_directions_of_each_sample_and_of_each_ray_agree(device: torch.device, backend: str) -> None:
+def test_directions_of_each_sample_and_of_each_ray_agree(device, backend):
     case = Case.make("nerf", COUNTS["odd"])
     leaves = case.leaves(torch.float32, device)
     by_ray = case.run(grouped_mlp, leaves, backend=backend)
@@ -145,7 +140,7 @@ def test_directions_of_each_sample_and_of_each_ray_agree(device: torch.device, b
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_encoded_and_raw_positions_agree(device: torch.device, backend: str) -> None:
+def test_encoded_and_raw_positions_agree(device, backend):
     case = Case.make("plain", COUNTS["odd"])
     leaves = case.leaves(torch.float32, device)
     raw = case.run(grouped_mlp, leaves, backend=backend)
@@ -155,7 +150,7 @@ def test_encoded_and_raw_positions_agree(device: torch.device, backend: str) -> 
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6])
-def test_integrated_inside_and_before(device: torch.device, backend: str, scale: float) -> None:
+def test_integrated_inside_and_before(device, backend, scale):
     case = Case.make("integrated", COUNTS["odd"])
     leaves = [tensor.to(device) for tensor in case.inputs]
     leaves[0] *= scale  # beyond the angles of the vector sine
@@ -168,9 +163,7 @@ def test_integrated_inside_and_before(device: torch.device, backend: str, scale:
 
 
 @pytest.mark.parametrize("width", [15, 30, 31, 32, 63])
-def test_infinity_in_bfloat16_stays_what_it_is(
-    device: torch.device, backend: str, width: int, request: pytest.FixtureRequest
-) -> None:
+def test_infinity_in_bfloat16_stays_what_it_is(device, backend, width, request):
     """Rows of pairs end in padding, whose product with infinity is no number. CUDA's kernels leave that to the row."""
     cuda = backend == "native" and (device.type == "cuda" or request.config.getoption("--emulate-cuda") is not None)
     weights = [torch.ones(1, width, 2, device=device), torch.ones(1, 5, width, device=device)]
@@ -185,7 +178,7 @@ def test_infinity_in_bfloat16_stays_what_it_is(
     assert found[0].nan_to_num(0.0).tolist() == [0.0] * 5 and (cuda or not bool(found.isnan().any()))
 
 
-def test_identical_cells_are_one_chain_of_layers(device: torch.device, backend: str) -> None:
+def test_identical_cells_are_one_chain_of_layers(device, backend):
     case = Case.make("plain", COUNTS["unequal"])
     leaves = [tensor.to(device) for tensor in case.inputs]
     leaves[2:] = [tensor[:1].expand_as(tensor) for tensor in leaves[2:]]
@@ -196,7 +189,7 @@ def test_identical_cells_are_one_chain_of_layers(device: torch.device, backend: 
     )
 
 
-def test_wide_positions_with_half_weights_keep_their_octaves(device: torch.device, backend: str) -> None:
+def test_wide_positions_with_half_weights_keep_their_octaves(device, backend):
     need("grouped_mlp", backend, device, torch.bfloat16)
     case = Case.make("plain", COUNTS["odd"])
     case.table = MLP(case.table.layers, case.table.outputs, position_octaves=10)
@@ -209,7 +202,7 @@ def test_wide_positions_with_half_weights_keep_their_octaves(device: torch.devic
     assert error(found, exact) < 0.02
 
 
-def test_layouts(device: torch.device, backend: str) -> None:
+def test_layouts(device, backend):
     case = Case.make("nerf", COUNTS["odd"])
     leaves = [tensor.to(device) for tensor in case.inputs]
     expected = case.run(grouped_mlp, leaves, backend=backend)
@@ -219,7 +212,7 @@ def test_layouts(device: torch.device, backend: str) -> None:
     found.sum().backward()
 
 
-def test_rows_of_no_cell_are_zero(device: torch.device, backend: str) -> None:
+def test_rows_of_no_cell_are_zero(device, backend):
     case = Case.make("nerf", [4, 4, 4])
     case.offsets = torch.tensor([2, 5, 5, 9], dtype=torch.int32)
     leaves = case.leaves(torch.float32, device)
@@ -230,7 +223,7 @@ def test_rows_of_no_cell_are_zero(device: torch.device, backend: str) -> None:
     assert all((leaf.grad[1] == 0).all() for leaf in leaves[2:])
 
 
-def test_what_is_not_a_number_stays_in_its_cell(device: torch.device, backend: str) -> None:
+def test_what_is_not_a_number_stays_in_its_cell(device, backend):
     case = Case.make("nerf", [4, 5, 6], rays=None)
     case.inputs[0][6, 1] = torch.nan
     leaves = case.leaves(torch.float32, device)
@@ -242,7 +235,7 @@ def test_what_is_not_a_number_stays_in_its_cell(device: torch.device, backend: s
     assert all(leaf.grad[[0, 2]].isfinite().all() for leaf in leaves[2:])
 
 
-def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> None:
+def test_gradients_only_where_asked_for(device, backend):
     case = Case.make("nerf", COUNTS["odd"])
     every = [tensor.to(device) for tensor in case.inputs]
     for wanted in range(len(every)):
@@ -254,7 +247,7 @@ def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> N
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_gradcheck(name: str) -> None:
+def test_gradcheck(name):
     case = Case.make(name, [2, 0, 1], torch.float64, rays=2)
     if name == "tangled":
         # Off the kink of its ReLU.
@@ -267,10 +260,10 @@ def test_gradcheck(name: str) -> None:
     assert torch.autograd.gradcheck(call, used, fast_mode=name != "one layer")
 
 
-def test_second_derivatives(device: torch.device, backend: str) -> None:
+def test_second_derivatives(device, backend):
     case = Case.make("nerf", [3, 0, 2])
 
-    def penalty(mlp: Callable[..., Tensor], dtype: torch.dtype, device: torch.device, **options: str) -> list[Tensor]:
+    def penalty(mlp, dtype, device, **options):
         leaves = case.leaves(dtype, device)
         (slope,) = torch.autograd.grad(case.run(mlp, leaves, **options).sum(), leaves[0], create_graph=True)
         return list(torch.autograd.grad(slope.square().sum(), leaves, allow_unused=True, materialize_grads=True))
@@ -281,10 +274,10 @@ def test_second_derivatives(device: torch.device, backend: str) -> None:
         assert_as_exact(part, same, right)
 
 
-def test_second_derivatives_where_one_input_is_computed_from_another() -> None:
+def test_second_derivatives_where_one_input_is_computed_from_another():
     case = Case.make("nerf", [3, 0, 2], torch.float64, rays=None)
 
-    def penalty(mlp: Callable[..., Tensor]) -> Tensor:
+    def penalty(mlp):
         positions, _, *parameters = case.leaves(torch.float64)
         y = case.run(mlp, [positions, positions.square(), *parameters])
         (slope,) = torch.autograd.grad(y.sum(), positions, create_graph=True)
@@ -293,7 +286,7 @@ def test_second_derivatives_where_one_input_is_computed_from_another() -> None:
     torch.testing.assert_close(penalty(grouped_mlp), penalty(loops.grouped_mlp))
 
 
-def test_autocast(device: torch.device, backend: str) -> None:
+def test_autocast(device, backend):
     case = Case.make("nerf", COUNTS["odd"])
     leaves = case.leaves(torch.float32, device)
     with torch.autocast(device.type, torch.bfloat16):
@@ -304,7 +297,7 @@ def test_autocast(device: torch.device, backend: str) -> None:
     assert all(leaf.grad.dtype == torch.float32 for leaf in leaves)
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     case = Case.make("nerf", COUNTS["odd"])
     leaves = case.leaves(torch.float32, device)
     run = lambda *leaves: case.run(grouped_mlp, list(leaves), backend=backend).square()  # noqa: E731
@@ -316,12 +309,12 @@ def test_compiles(device: torch.device, backend: str) -> None:
         torch.testing.assert_close(compiled(*leaves), run(*leaves))
 
 
-def test_inputs_without_features_are_refused(device: torch.device, backend: str) -> None:
+def test_inputs_without_features_are_refused(device, backend):
     positions, offsets, index = torch.rand(5, 3, device=device), offsets_of([2, 3], device), torch.zeros(5).int()
     table = MLP((Layer((POSITIONS, DIRECTIONS), 4, "relu"), Layer((0,), 2)), (1,), 2, 1)
     message = "grouped_mlp: ... must have at least one feature where a layer reads them, got 0"
 
-    def call(layers: MLP, p: int, q: int, **changed: Tensor) -> Tensor:
+    def call(layers, p, q, **changed):
         weights = [torch.rand(2, o, i, device=device) for o, i in layers.weight_shapes(p, q)]
         biases = [None] * len(weights)
         return grouped_mlp(positions[:, :p], offsets, weights, biases, layers=layers, backend=backend, **changed)
@@ -341,7 +334,7 @@ def test_inputs_without_features_are_refused(device: torch.device, backend: str)
 
 
 @pytest.mark.parametrize("bad", [[0, 2, 6], [0, 4, 3], [-1, 2, 5]])
-def test_offsets_that_are_no_offsets_are_refused(backend: str, bad: list[int]) -> None:
+def test_offsets_that_are_no_offsets_are_refused(backend, bad):
     need("grouped_mlp", backend, CPU, torch.float32)
     case = Case.make("nerf", [2, 3])
     case.offsets = torch.tensor(bad, dtype=torch.int32)
@@ -349,7 +342,7 @@ def test_offsets_that_are_no_offsets_are_refused(backend: str, bad: list[int]) -
         case.run(grouped_mlp, case.inputs, backend=backend)
 
 
-def test_errors() -> None:
+def test_errors():
     case = Case.make("nerf", [2, 3])
     positions, directions, *parameters = case.inputs
     count = len(case.bias)
@@ -363,7 +356,7 @@ def test_errors() -> None:
         "direction_index": case.direction_index,
     }
 
-    def call(**changed: object) -> Tensor:
+    def call(**changed):
         return grouped_mlp(**{**good, **changed})
 
     assert call().shape == (5, 4)

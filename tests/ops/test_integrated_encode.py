@@ -4,14 +4,13 @@ import pytest
 import torch
 from op_cases import FLOATS, need, refused, strided
 from tolerances import assert_as_exact
-from torch import Tensor
 
 from voronerf.ops import frequency_encode, integrated_encode
 
 pytestmark = pytest.mark.op("integrated_encode")
 
 
-def exact_of(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
+def exact_of(means, variances, octaves):
     parts = []
     for octave in range(octaves):
         blur = (-(4.0**octave) * variances.double() / 2).exp()
@@ -20,7 +19,7 @@ def exact_of(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
     return torch.cat(parts, dim=1)
 
 
-def test_is_the_mean_of_the_encoding_over_the_gaussian(device: torch.device, backend: str) -> None:
+def test_is_the_mean_of_the_encoding_over_the_gaussian(device, backend):
     mean, deviation = torch.tensor([[0.3, -1.0, 2.0]]), torch.tensor([[0.05, 0.2, 0.6]])
     normal = torch.randn(200_000, 3, dtype=torch.float64)
     drawn = frequency_encode(mean + deviation * torch.cat([normal, -normal]), 3, include_input=False).mean(dim=0)
@@ -29,13 +28,13 @@ def test_is_the_mean_of_the_encoding_over_the_gaussian(device: torch.device, bac
     torch.testing.assert_close(encoded[0].double().cpu(), drawn, rtol=0, atol=5 / 400_000**0.5)
 
 
-def test_without_variance_is_the_frequency_encoding(device: torch.device, backend: str) -> None:
+def test_without_variance_is_the_frequency_encoding(device, backend):
     means = torch.rand(33, 3, device=device)
     found = integrated_encode(means, torch.zeros_like(means), 5, backend=backend)
     torch.testing.assert_close(found, frequency_encode(means, 5, include_input=False), rtol=0, atol=1e-6)
 
 
-def test_large_variances_fade_to_zero(device: torch.device, backend: str) -> None:
+def test_large_variances_fade_to_zero(device, backend):
     means = torch.ones(1, 3, device=device)
     found = integrated_encode(means, torch.tensor([[1e30, float("inf"), 3e38]], device=device), 16, backend=backend)
     assert (found == 0).all()
@@ -43,7 +42,7 @@ def test_large_variances_fade_to_zero(device: torch.device, backend: str) -> Non
 
 @pytest.mark.parametrize("n", [0, 1, 65])
 @pytest.mark.parametrize("dtype", FLOATS)
-def test_dtypes_and_sizes(device: torch.device, backend: str, dtype: torch.dtype, n: int) -> None:
+def test_dtypes_and_sizes(device, backend, dtype, n):
     need("integrated_encode", backend, device, dtype)
     means, variances = torch.rand(n, 3).to(dtype), (torch.rand(n, 3) / 100).to(dtype)
     exact = exact_of(means, variances, 6)
@@ -51,25 +50,25 @@ def test_dtypes_and_sizes(device: torch.device, backend: str, dtype: torch.dtype
     assert_as_exact(found, exact.to(dtype), exact)
 
 
-def test_no_octaves(device: torch.device, backend: str) -> None:
+def test_no_octaves(device, backend):
     means = torch.rand(5, 3, device=device)
     assert integrated_encode(means, means, 0, backend=backend).shape == (5, 0)
 
 
-def test_gradcheck() -> None:
+def test_gradcheck():
     means = torch.rand(3, 3, dtype=torch.float64, requires_grad=True)
     variances = torch.rand(3, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda m, v: integrated_encode(m, v, 3), (means, variances))
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     means, variances = torch.rand(9, 3, device=device), torch.rand(9, 3, device=device)
     run = lambda m, v: integrated_encode(m, v, 4, backend=backend)  # noqa: E731
     compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(means, variances), run(means, variances), rtol=0, atol=1e-6)
 
 
-def test_errors() -> None:
+def test_errors():
     means = torch.rand(4, 3)
     with refused(ValueError, "integrated_encode: means must have shape [n, 3], got [4, 2]"):
         integrated_encode(means[:, :2], means, 2)

@@ -20,7 +20,7 @@ NERF = MLP(
 )
 
 
-def test_widths() -> None:
+def test_widths():
     assert NERF.out_features == 4
     assert NERF.uses_directions
     assert NERF.weight_shapes(3, 3) == [(64, 63), (64, 127), (1, 64), (32, 91), (3, 32)]
@@ -31,7 +31,7 @@ def test_widths() -> None:
     assert not plain.uses_directions
 
 
-def test_text_round_trip() -> None:
+def test_text_round_trip():
     assert MLP.parse(NERF.text) == NERF
     assert MLP.parse(NERF.text) is MLP.parse(NERF.text)
     assert hash(MLP.parse(NERF.text)) == hash(NERF)
@@ -39,7 +39,7 @@ def test_text_round_trip() -> None:
     assert MLP.parse(encoded.text) == encoded
 
 
-def test_text_of_integrated_positions() -> None:
+def test_text_of_integrated_positions():
     layers = (Layer((POSITIONS,), 4, "relu"), Layer((0, POSITIONS), 2))
     gaussians = MLP(layers, (1,), 16, position_encoding="integrated")
     assert gaussians.weight_shapes(6) == [(4, 96), (2, 100)]
@@ -75,7 +75,7 @@ def test_text_of_integrated_positions() -> None:
         ),
     ],
 )
-def test_errors(layers: tuple[Layer, ...], outputs: tuple[int, ...], octaves: int | None, message: str) -> None:
+def test_errors(layers, outputs, octaves, message):
     with pytest.raises(ValueError) as caught:
         MLP(layers, outputs, octaves)
     assert str(caught.value) == message

@@ -3,7 +3,6 @@ from __future__ import annotations
 import pytest
 import torch
 from op_cases import refused, strided
-from torch import Tensor
 
 from voronerf.ops import locate_cell, nearest_centre
 
@@ -16,7 +15,7 @@ CHILD = torch.tensor([-1, 1, 2, -2, -3, -4, 3, -5, -6, -7], dtype=torch.int32)
 DEPTH = 3
 
 
-def slow(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
+def slow(points, centres, weights=None):
     """Down the tree, one point at a time."""
     leaves = []
     for point in points:
@@ -33,7 +32,7 @@ def slow(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tens
 
 @pytest.mark.parametrize("n", [0, 1, 257])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_uneven_tree_matches_a_slow_descent(device: torch.device, backend: str, n: int, weighted: bool) -> None:
+def test_uneven_tree_matches_a_slow_descent(device, backend, n, weighted):
     points, centres = torch.randint(-3, 4, (n, 3)).float(), torch.randint(-3, 4, (10, 3)).float()
     weights = torch.randint(0, 3, (10,)).float() if weighted else None
     leaf = locate_cell(
@@ -49,7 +48,7 @@ def test_uneven_tree_matches_a_slow_descent(device: torch.device, backend: str, 
     assert torch.equal(leaf.cpu(), slow(points, centres, weights))
 
 
-def test_flat_tree_is_nearest_centre(device: torch.device, backend: str) -> None:
+def test_flat_tree_is_nearest_centre(device, backend):
     points, centres = strided(torch.rand(1001, 3, device=device)), torch.rand(9, 3, device=device)
     offsets = torch.tensor([0, 9], dtype=torch.int32, device=device)
     child = -torch.arange(9, dtype=torch.int32, device=device) - 1
@@ -57,7 +56,7 @@ def test_flat_tree_is_nearest_centre(device: torch.device, backend: str) -> None
     assert torch.equal(leaf, nearest_centre(points, centres))
 
 
-def test_many_points_cross_the_pieces(device: torch.device, backend: str) -> None:
+def test_many_points_cross_the_pieces(device, backend):
     centres = torch.rand(10, 3)
     points = centres[torch.randint(0, 10, (30000,))] + 0.2 * torch.rand(30000, 3)
     tables = (CHILD_OFFSETS.to(device), CHILD.to(device))
@@ -65,7 +64,7 @@ def test_many_points_cross_the_pieces(device: torch.device, backend: str) -> Non
     assert torch.equal(leaf[::97].cpu(), slow(points[::97], centres))
 
 
-def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device: torch.device, backend: str) -> None:
+def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device, backend):
     points = torch.tensor([[float("nan"), 0, 0], [0, float("inf"), 0]], device=device)
     centres = torch.rand(10, 3, device=device)
     # Here the first centre of the root is refined too.
@@ -74,17 +73,17 @@ def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device:
     assert leaf.tolist() == [5, 5]
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     points, centres = torch.rand(501, 3, device=device), torch.rand(10, 3, device=device)
     offsets, child = CHILD_OFFSETS.to(device), CHILD.to(device)
 
-    def run(points: Tensor) -> Tensor:
+    def run(points):
         return locate_cell(points, centres, offsets, child, depth=DEPTH, backend=backend)
 
     assert torch.equal(torch.compile(run, fullgraph=True, backend="aot_eager")(points), run(points))
 
 
-def test_errors() -> None:
+def test_errors():
     points, centres = torch.rand(4, 3), torch.rand(10, 3)
     tables = (CHILD_OFFSETS, CHILD)
     with refused(ValueError, "locate_cell: points must have shape [n, 3], got [3]"):
@@ -106,6 +105,6 @@ def test_errors() -> None:
     with refused(TypeError, "locate_cell: child_offsets must have dtype int32, got int64"):
         locate_cell(points, centres, CHILD_OFFSETS.long(), CHILD, depth=3)
     with refused(TypeError, "locate_cell: depth must be an integer, got float"):
-        locate_cell(points, centres, *tables, depth=1.0)  # type: ignore[arg-type]
+        locate_cell(points, centres, *tables, depth=1.0)
     with refused(ValueError, "locate_cell: child must be on the device of points, cpu, got meta"):
         locate_cell(points, centres, CHILD_OFFSETS, CHILD.to("meta"), depth=3)

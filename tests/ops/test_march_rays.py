@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from op_cases import need, refused, strided
@@ -15,7 +13,7 @@ from voronerf.rendering.sampling import stratified_depths
 pytestmark = pytest.mark.op("march_rays")
 
 
-def case(r: int, shape: tuple[int, ...] = (5, 4, 7), share: float = 0.4) -> dict[str, Tensor]:
+def case(r, shape=(5, 4, 7), share=0.4):
     """Rays from outside through a box, some of which begin in it, end in it, or miss it."""
     directions = torch.nn.functional.normalize(0.4 * torch.randn(r, 3) + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
     near = 0.2 + torch.rand(r)
@@ -29,19 +27,19 @@ def case(r: int, shape: tuple[int, ...] = (5, 4, 7), share: float = 0.4) -> dict
     }
 
 
-def march(given: dict[str, Tensor], samples: int, device: torch.device, backend: str, **options: Any) -> Any:
+def march(given, samples, device, backend, **options):
     moved = {name: value.to(device) if isinstance(value, Tensor) else value for name, value in options.items()}
     result = march_rays(*(tensor.to(device) for tensor in given.values()), samples, **moved, backend=backend)
     assert all(part.device.type == device.type for part in result)
     return type(result)(*(part.cpu() for part in result))
 
 
-def same(found: Any, expected: Any) -> None:
+def same(found, expected):
     for name, a, b in zip(found._fields, found, expected):
         assert a.dtype == b.dtype and torch.equal(a, b), name
 
 
-def test_a_full_grid_gives_stratified_samples(device: torch.device, backend: str) -> None:
+def test_a_full_grid_gives_stratified_samples(device, backend):
     given = case(9) | {"occupied": torch.ones(3, 2, 4, dtype=torch.bool), "box": torch.tensor([[-9.0] * 3, [9.0] * 3])}
     for spacing in ("linear", "disparity"):
         found = march(given, 33, device, backend, spacing=spacing)
@@ -56,7 +54,7 @@ def test_a_full_grid_gives_stratified_samples(device: torch.device, backend: str
         torch.testing.assert_close(found.positions, places)
 
 
-def test_samples_are_those_in_occupied_cells(device: torch.device, backend: str) -> None:
+def test_samples_are_those_in_occupied_cells(device, backend):
     given = case(40)
     found = march(given, 50, device, backend)
     everywhere = march(given | {"occupied": torch.ones(1, 1, 1, dtype=torch.bool)}, 50, device, backend)
@@ -73,13 +71,11 @@ def test_samples_are_those_in_occupied_cells(device: torch.device, backend: str)
 
 @pytest.mark.parametrize(("r", "samples"), [(0, 4), (1, 1), (65, 31), (130, 32), (63, 65)])
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])
-def test_equals_the_reference_to_the_last_bit(
-    device: torch.device, backend: str, spacing: str, r: int, samples: int
-) -> None:
+def test_equals_the_reference_to_the_last_bit(device, backend, spacing, r, samples):
     need("march_rays", backend, device, torch.float32)
     for shape in ((1, 1, 1), (16, 3, 33)):
         given = case(r, shape)
-        rest: dict[str, Any] = {"spacing": spacing}
+        rest = {"spacing": spacing}
         for more in (
             {},
             {"uniforms": torch.rand(r, samples)},
@@ -92,11 +88,11 @@ def test_equals_the_reference_to_the_last_bit(
             same(march(given, samples, device, backend, **rest, **more), expected)
 
 
-def test_waves_give_together_what_one_call_gives(device: torch.device, backend: str) -> None:
+def test_waves_give_together_what_one_call_gives(device, backend):
     given, uniforms = case(30), torch.rand(30, 40)
     whole = march(given, 40, device, backend, uniforms=uniforms)
     for options in ({"most": 1}, {"most": 7}, {"capacity": 100}, {"capacity": 60, "most": 4}):
-        found: list[list[float]] = [[] for _ in range(30)]
+        found = [[] for _ in range(30)]
         start = torch.zeros(30, dtype=torch.int32)
         for _ in range(41):
             wave = march(given, 40, device, backend, uniforms=uniforms, start=start, **options)
@@ -109,7 +105,7 @@ def test_waves_give_together_what_one_call_gives(device: torch.device, backend: 
         assert [depth for own in found for depth in own] == whole.depths.tolist()
 
 
-def test_rays_of_no_length_and_of_no_numbers_have_no_samples(device: torch.device, backend: str) -> None:
+def test_rays_of_no_length_and_of_no_numbers_have_no_samples(device, backend):
     given = case(6) | {"occupied": torch.ones(2, 2, 2, dtype=torch.bool)}
     given["origins"][:] = 0
     given["near"][:], given["far"][:] = 0.1, 0.5
@@ -123,7 +119,7 @@ def test_rays_of_no_length_and_of_no_numbers_have_no_samples(device: torch.devic
     assert found.stop.tolist() == [8] * 6
 
 
-def test_strided_inputs(device: torch.device, backend: str) -> None:
+def test_strided_inputs(device, backend):
     given = case(20)
     expected = march(given, 12, device, backend, uniforms=torch.full((20, 12), 0.25))
     scattered = {
@@ -132,7 +128,7 @@ def test_strided_inputs(device: torch.device, backend: str) -> None:
     same(march(scattered, 12, device, backend, uniforms=strided(torch.full((20, 12), 0.25))), expected)
 
 
-def test_compiles_whole_with_a_capacity(device: torch.device, backend: str) -> None:
+def test_compiles_whole_with_a_capacity(device, backend):
     given = case(5)
     compiled = torch.compile(
         lambda *tensors: march_rays(*tensors, 9, capacity=50, backend=backend), fullgraph=True, backend="aot_eager"
@@ -145,7 +141,7 @@ def test_compiles_whole_with_a_capacity(device: torch.device, backend: str) -> N
 
 
 @pytest.mark.native
-def test_native_ops_pass_opcheck() -> None:
+def test_native_ops_pass_opcheck():
     ops = torch.ops.voronerf
 
     given = [*case(5).values(), None, None]
@@ -159,7 +155,7 @@ def test_native_ops_pass_opcheck() -> None:
 
 @pytest.mark.native
 @pytest.mark.parametrize("threads", [1, 3])
-def test_instruction_sets_and_threads_agree(isa: str, threads: int) -> None:
+def test_instruction_sets_and_threads_agree(isa, threads):
     given, uniforms = case(300, (9, 8, 7)), torch.rand(300, 70)
     expected = march(given, 70, torch.device("cpu"), "reference", uniforms=uniforms, most=9)
     before = torch.get_num_threads()
@@ -170,10 +166,10 @@ def test_instruction_sets_and_threads_agree(isa: str, threads: int) -> None:
         torch.set_num_threads(before)
 
 
-def test_refuses_what_makes_no_sense() -> None:
+def test_refuses_what_makes_no_sense():
     given = case(4)
 
-    def run(samples: Any = 8, **changes: Any) -> None:
+    def run(samples=8, **changes):
         options = {name: changes.pop(name) for name in list(changes) if name not in given}
         march_rays(*(given | changes).values(), samples, **options)
 

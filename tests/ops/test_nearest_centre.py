@@ -3,7 +3,6 @@ from __future__ import annotations
 import pytest
 import torch
 from op_cases import FLOATS, HALVES, need, refused, strided
-from torch import Tensor
 
 from voronerf.backends import BackendUnavailable
 from voronerf.ops import nearest_centre
@@ -11,7 +10,7 @@ from voronerf.ops import nearest_centre
 pytestmark = pytest.mark.op("nearest_centre")
 
 
-def slow(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
+def slow(points, centres, weights=None):
     """One point and one centre at a time, in float64."""
     cells = []
     for point in points.double().tolist():
@@ -24,7 +23,7 @@ def slow(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tens
 
 @pytest.mark.parametrize("k", [1, 2, 17])
 @pytest.mark.parametrize("n", [0, 1, 63, 130])
-def test_matches_a_slow_loop_on_integers_ties_included(device: torch.device, backend: str, n: int, k: int) -> None:
+def test_matches_a_slow_loop_on_integers_ties_included(device, backend, n, k):
     points = torch.randint(-2, 3, (n, 3)).float()
     centres = torch.randint(-2, 3, (k, 3)).float()
     weights = torch.randint(0, 3, (k,)).float()
@@ -38,9 +37,7 @@ def test_matches_a_slow_loop_on_integers_ties_included(device: torch.device, bac
 
 @pytest.mark.parametrize("shift", [0.0, 10.0, 1000.0])
 @pytest.mark.parametrize("k", [16, 300])
-def test_chosen_centre_is_nearest_in_float64_wherever_the_scene_is(
-    device: torch.device, backend: str, k: int, shift: float
-) -> None:
+def test_chosen_centre_is_nearest_in_float64_wherever_the_scene_is(device, backend, k, shift):
     points, centres = torch.rand(3001, 3) + shift, torch.rand(k, 3) + shift
     cells = nearest_centre(points.to(device), centres.to(device), backend=backend).cpu().long()
     distances = (points.double()[:, None] - centres.double()[None]).square().sum(-1)
@@ -50,7 +47,7 @@ def test_chosen_centre_is_nearest_in_float64_wherever_the_scene_is(
     assert (chosen <= distances.min(dim=1).values + bound).all()
 
 
-def test_weights_make_a_power_diagram(device: torch.device, backend: str) -> None:
+def test_weights_make_a_power_diagram(device, backend):
     points = torch.tensor([[0.4, 0, 0], [0.6, 0, 0]], device=device)
     centres = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]], device=device)
     assert nearest_centre(points, centres, backend=backend).tolist() == [0, 1]
@@ -59,7 +56,7 @@ def test_weights_make_a_power_diagram(device: torch.device, backend: str) -> Non
     assert nearest_centre(points, centres, weights=weights, backend=backend).tolist() == [1, 1]
 
 
-def test_points_that_are_not_finite_go_to_cell_0(device: torch.device, backend: str) -> None:
+def test_points_that_are_not_finite_go_to_cell_0(device, backend):
     nan, inf = float("nan"), float("inf")
     points = torch.tensor([[nan, 1, 1], [inf, 1, 1], [1, -inf, 1], [inf, -inf, nan], [1, 1, 1]], device=device)
     centres = torch.tensor([[9.0, 9, 9], [5, 5, 5], [1, 1, 1]], device=device)
@@ -69,7 +66,7 @@ def test_points_that_are_not_finite_go_to_cell_0(device: torch.device, backend: 
 
 
 @pytest.mark.parametrize("dtype", FLOATS)
-def test_dtypes(device: torch.device, backend: str, dtype: torch.dtype) -> None:
+def test_dtypes(device, backend, dtype):
     need("nearest_centre", backend, device, dtype)
     points, centres = torch.rand(257, 3).to(dtype), torch.rand(9, 3).to(dtype)
     cells = nearest_centre(points.to(device), centres.to(device), backend=backend)
@@ -79,7 +76,7 @@ def test_dtypes(device: torch.device, backend: str, dtype: torch.dtype) -> None:
     assert torch.equal(mixed.cpu(), slow(points, centres))
 
 
-def test_layouts(device: torch.device, backend: str) -> None:
+def test_layouts(device, backend):
     points, centres, weights = torch.rand(101, 3), torch.rand(7, 3), torch.rand(7) / 10
     expected = slow(points, centres, weights)
     points, centres, weights = (strided(tensor.to(device)) for tensor in (points, centres, weights))
@@ -88,13 +85,13 @@ def test_layouts(device: torch.device, backend: str) -> None:
     assert torch.equal(nearest_centre(columns, centres, weights=weights, backend=backend).cpu(), expected)
 
 
-def test_is_not_differentiable(device: torch.device, backend: str) -> None:
+def test_is_not_differentiable(device, backend):
     points = torch.rand(5, 3, device=device, requires_grad=True)
     centres = torch.rand(2, 3, device=device, requires_grad=True)
     assert not nearest_centre(points, centres, backend=backend).requires_grad
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     points, centres = torch.rand(20000, 3, device=device), torch.rand(16, 3, device=device)
     compiled = torch.compile(
         lambda p, c: nearest_centre(p, c, backend=backend) + 1, fullgraph=True, backend="aot_eager"
@@ -102,7 +99,7 @@ def test_compiles(device: torch.device, backend: str) -> None:
     assert torch.equal(compiled(points, centres), nearest_centre(points, centres, backend=backend) + 1)
 
 
-def test_errors() -> None:
+def test_errors():
     points, centres = torch.rand(4, 3), torch.rand(2, 3)
     with refused(ValueError, "nearest_centre: points must have shape [n, 3], got [4, 2]"):
         nearest_centre(points[:, :2], centres)

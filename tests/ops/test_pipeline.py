@@ -6,7 +6,6 @@ import shutil
 
 import pytest
 import torch
-from torch import Tensor
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import cell_sort, composite, grouped_mlp, nearest_centre, resample
@@ -25,13 +24,13 @@ TABLE = MLP(
 RAYS, SAMPLES, CELLS = 12, 8, 5
 
 
-def inputs(device: torch.device) -> list[Tensor]:
+def inputs(device):
     weights = [torch.randn(CELLS, o, i) / i**0.5 for o, i in TABLE.weight_shapes(3, 3)]
     tensors = [torch.randn(RAYS, 3), torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1), torch.randn(CELLS, 3)]
     return [tensor.to(device).requires_grad_(index > 2) for index, tensor in enumerate([*tensors, *weights])]
 
 
-def render(origins: Tensor, directions: Tensor, centres: Tensor, *weights: Tensor) -> Tensor:
+def render(origins, directions, centres, *weights):
     edges = torch.linspace(0, 2, SAMPLES + 1, device=origins.device).expand(RAYS, -1)
     depths = resample(torch.ones_like(edges[:, 1:]), edges, SAMPLES)
     points = (origins[:, None] + depths[..., None] * directions[:, None]).flatten(0, 1)
@@ -52,7 +51,7 @@ def render(origins: Tensor, directions: Tensor, centres: Tensor, *weights: Tenso
 
 
 @pytest.mark.parametrize("compiler", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
-def test_compiles_as_one_graph(device: torch.device, compiler: str) -> None:
+def test_compiles_as_one_graph(device, compiler):
     if compiler == "inductor" and not any(shutil.which(name) for name in ("c++", "g++", "clang++")):
         pytest.skip("torch.compile finds no C++ compiler")
     leaves = inputs(device)

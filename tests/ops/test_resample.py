@@ -5,14 +5,13 @@ import math
 import pytest
 import torch
 from op_cases import FLOATS, need, refused, strided
-from torch import Tensor
 
 from voronerf.ops import resample
 
 pytestmark = pytest.mark.op("resample")
 
 
-def slow(weights: list[float], edges: list[float], targets: list[float]) -> list[float]:
+def slow(weights, edges, targets):
     """Walks along one ray until the mass in front exceeds each target."""
     if sum(weights) == 0:
         weights = [1.0] * len(weights)
@@ -26,14 +25,14 @@ def slow(weights: list[float], edges: list[float], targets: list[float]) -> list
     return depths
 
 
-def rays(r: int, s: int) -> tuple[Tensor, Tensor]:
+def rays(r, s):
     weights = torch.rand(r, s) * (torch.rand(r, s) > 0.4)
     return weights, (0.1 + torch.rand(r, s + 1)).cumsum(dim=1)
 
 
 @pytest.mark.parametrize(("r", "s", "count"), [(1, 1, 1), (9, 2, 3), (5, 63, 17), (3, 64, 128)])
 @pytest.mark.parametrize("given", [False, True])
-def test_matches_a_slow_walk(device: torch.device, backend: str, r: int, s: int, count: int, given: bool) -> None:
+def test_matches_a_slow_walk(device, backend, r, s, count, given):
     weights, edges = rays(r, s)
     uniforms = torch.rand(r, count)
     depths = resample(
@@ -51,7 +50,7 @@ def test_matches_a_slow_walk(device: torch.device, backend: str, r: int, s: int,
 
 
 @pytest.mark.parametrize("dtype", FLOATS)
-def test_depths_rise_and_stay_in_bins_that_have_mass(device: torch.device, backend: str, dtype: torch.dtype) -> None:
+def test_depths_rise_and_stay_in_bins_that_have_mass(device, backend, dtype):
     need("resample", backend, device, dtype)
     weights, edges = (tensor.to(device, dtype) for tensor in rays(50, 20))
     weights[:, 7] = 0
@@ -65,7 +64,7 @@ def test_depths_rise_and_stay_in_bins_that_have_mass(device: torch.device, backe
     assert not inside[weights.sum(dim=1) > 0].any()
 
 
-def test_converges_to_the_density(device: torch.device, backend: str) -> None:
+def test_converges_to_the_density(device, backend):
     weights = torch.tensor([[1.0, 0.0, 3.0]], device=device)
     edges = torch.tensor([[0.0, 1.0, 2.0, 4.0]], device=device)
     depths = resample(weights, edges, 4000, backend=backend)
@@ -76,38 +75,38 @@ def test_converges_to_the_density(device: torch.device, backend: str) -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_rays_without_weight_are_drawn_evenly_over_the_bins(device: torch.device, backend: str, value: float) -> None:
+def test_rays_without_weight_are_drawn_evenly_over_the_bins(device, backend, value):
     weights = torch.full((1, 4), value, device=device)
     edges = torch.tensor([[0.0, 1.0, 2.0, 4.0, 8.0]], device=device)
     depths = resample(weights, edges, 4, backend=backend)
     torch.testing.assert_close(depths.cpu(), torch.tensor([[0.5, 1.5, 3.0, 6.0]]))
 
 
-def test_weights_that_are_no_weights_count_as_zero(device: torch.device, backend: str) -> None:
+def test_weights_that_are_no_weights_count_as_zero(device, backend):
     weights = torch.tensor([[math.nan, 1.0, -3.0, math.inf]], device=device)
     edges = torch.arange(5.0, device=device)[None]
     depths = resample(weights, edges, 2, backend=backend)
     torch.testing.assert_close(depths.cpu(), torch.tensor([[1.25, 1.75]]))
 
 
-def test_no_rays(device: torch.device, backend: str) -> None:
+def test_no_rays(device, backend):
     weights, edges = (tensor.to(device) for tensor in rays(0, 5))
     assert resample(weights, edges, 7, backend=backend).shape == (0, 7)
 
 
-def test_carries_no_gradient(device: torch.device, backend: str) -> None:
+def test_carries_no_gradient(device, backend):
     weights, edges = (tensor.to(device).requires_grad_() for tensor in rays(2, 5))
     assert not resample(weights, edges, 3, backend=backend).requires_grad
 
 
-def test_compiles(device: torch.device, backend: str) -> None:
+def test_compiles(device, backend):
     weights, edges = (tensor.to(device) for tensor in rays(6, 5))
     run = lambda w, e: resample(w, e, 8, backend=backend)  # noqa: E731
     compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(weights, edges), run(weights, edges))
 
 
-def test_errors() -> None:
+def test_errors():
     weights, edges = rays(4, 5)
     with refused(ValueError, "resample: weights must have shape [r, s], got [5]"):
         resample(weights[0], edges, 3)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -58,19 +57,12 @@ class Case:
     extra: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def make(
-        cls,
-        name: str = "nerf",
-        source: str = "flat",
-        n: int = 61,
-        rays: int | None = 5,
-        dtype: torch.dtype = torch.float32,
-    ) -> Case:
+    def make(cls, name="nerf", source="flat", n=61, rays=5, dtype=torch.float32):
         table = TABLES[name]
         k = {"flat": 6, "tree": 6, "cells": 6, "one": 1}[source]
         positions = 2 * torch.rand(n, 3) - 1
         centres = torch.rand(8 if source == "tree" else k, 3) - 0.5
-        options: dict[str, Any] = {"centres": centres}
+        options = {"centres": centres}
         if source == "tree":
             options |= {**TREE, "depth": 2}
             cells = locate_cell(positions, centres, **TREE, depth=2, backend="reference")
@@ -91,7 +83,7 @@ class Case:
         leaves = [tensor.to(dtype) for tensor in (positions, directions, *weights, *biases)]
         return cls(table, leaves, options, bias, cells)
 
-    def run(self, leaves: list[Tensor], **changed: Any) -> tuple[Tensor, Tensor]:
+    def run(self, leaves, **changed):
         positions, directions, *parameters = leaves
         biases = iter(parameters[len(self.bias) :])
         device = positions.device
@@ -107,10 +99,10 @@ class Case:
         }
         return routed_mlp(**arguments)
 
-    def given(self, dtype: torch.dtype = torch.float32, device: torch.device = CPU) -> list[Tensor]:
+    def given(self, dtype=torch.float32, device=CPU):
         return [tensor.detach().to(device, dtype).requires_grad_() for tensor in self.leaves]
 
-    def specified(self, leaves: list[Tensor]) -> Tensor:
+    def specified(self, leaves):
         """One cell after another, by its definition."""
         positions, directions, *parameters = leaves
         index = self.options.get("direction_index")
@@ -128,15 +120,13 @@ class Case:
         )
         return out[order.argsort()]
 
-    def results(
-        self, run: Callable[[list[Tensor]], Tensor], dtype: torch.dtype, device: torch.device = CPU
-    ) -> list[Tensor]:
+    def results(self, run, dtype, device=CPU):
         leaves = self.given(dtype, device)
         y = run(leaves)
         g = torch.randn(y.shape, generator=torch.Generator().manual_seed(1)).to(device, dtype)
         return [y, *torch.autograd.grad(y, leaves, g, allow_unused=True, materialize_grads=True)]
 
-    def check(self, device: torch.device, backend: str, dtype: torch.dtype = torch.float32) -> None:
+    def check(self, device, backend, dtype=torch.float32):
         exact = self.results(self.specified, torch.float64)
         plain = self.results(self.specified, dtype)
         found = self.results(lambda leaves: self.run(leaves, backend=backend)[0], dtype, device)
@@ -146,7 +136,7 @@ class Case:
 
 @pytest.mark.parametrize("source", ["flat", "tree", "cells", "one"])
 @pytest.mark.parametrize("name", TABLES)
-def test_output_cells_and_gradients(device: torch.device, backend: str, name: str, source: str) -> None:
+def test_output_cells_and_gradients(device, backend, name, source):
     case = Case.make(name, source)
     case.check(device, backend)
     out, cells = case.run([tensor.to(device) for tensor in case.leaves], backend=backend)
@@ -155,23 +145,23 @@ def test_output_cells_and_gradients(device: torch.device, backend: str, name: st
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 95, 97, 2500])
-def test_any_number_of_samples(device: torch.device, backend: str, n: int) -> None:
+def test_any_number_of_samples(device, backend, n):
     Case.make(n=n).check(device, backend)
 
 
-def test_directions_of_each_sample(device: torch.device, backend: str) -> None:
+def test_directions_of_each_sample(device, backend):
     Case.make(rays=None).check(device, backend)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("name", ["nerf", "integrated"])
-def test_half_types(device: torch.device, backend: str, name: str, dtype: torch.dtype) -> None:
+def test_half_types(device, backend, name, dtype):
     need("routed_mlp", backend, device, dtype)
     case = Case.make(name, "cells", dtype=dtype)
     case.check(device, backend, dtype)
 
 
-def test_float64_positions_and_half_coordinates(device: torch.device, backend: str) -> None:
+def test_float64_positions_and_half_coordinates(device, backend):
     case = Case.make()
     leaves = [tensor.to(device) for tensor in case.leaves]
     expected, _ = case.run(leaves, backend=backend)
@@ -183,7 +173,7 @@ def test_float64_positions_and_half_coordinates(device: torch.device, backend: s
     assert torch.equal(cells, nearest_centre(halves, case.options["centres"].to(device)))
 
 
-def test_coordinates_beside_encoded_positions(device: torch.device, backend: str) -> None:
+def test_coordinates_beside_encoded_positions(device, backend):
     case = Case.make("plain", "tree")
     leaves = [tensor.to(device) for tensor in case.leaves]
     raw, _ = case.run(leaves, backend=backend)
@@ -198,7 +188,7 @@ def test_coordinates_beside_encoded_positions(device: torch.device, backend: str
 
 
 @pytest.mark.parametrize("name", ["raw", "integrated"])
-def test_layouts(device: torch.device, backend: str, name: str) -> None:
+def test_layouts(device, backend, name):
     case = Case.make(name, "tree")
     leaves = [tensor.to(device) for tensor in case.leaves]
     expected, _ = case.run(leaves, backend=backend)
@@ -211,7 +201,7 @@ def test_layouts(device: torch.device, backend: str, name: str) -> None:
     assert all(leaf.grad is not None for leaf in used)
 
 
-def test_power_diagram(device: torch.device, backend: str) -> None:
+def test_power_diagram(device, backend):
     case = Case.make()
     weights = torch.tensor([5.0, 0, 0, 0, 0, 0])
     _, cells = case.run(
@@ -220,7 +210,7 @@ def test_power_diagram(device: torch.device, backend: str) -> None:
     assert (cells == 0).all()
 
 
-def test_samples_nowhere_go_to_the_first_cell(device: torch.device, backend: str) -> None:
+def test_samples_nowhere_go_to_the_first_cell(device, backend):
     for source in ("flat", "tree"):
         case = Case.make("nerf", source)
         plain, cells = case.run([tensor.to(device) for tensor in case.leaves], backend=backend)
@@ -236,7 +226,7 @@ def test_samples_nowhere_go_to_the_first_cell(device: torch.device, backend: str
         assert leaves[0].grad[others].isfinite().all() and leaves[2].grad[1:].isfinite().all()
 
 
-def test_autocast(device: torch.device, backend: str) -> None:
+def test_autocast(device, backend):
     case = Case.make()
     leaves = case.given(torch.float32, device)
     with torch.autocast(device.type, torch.bfloat16):
@@ -247,7 +237,7 @@ def test_autocast(device: torch.device, backend: str) -> None:
     assert all(leaf.grad.dtype == torch.float32 for leaf in leaves)
 
 
-def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> None:
+def test_gradients_only_where_asked_for(device, backend):
     case = Case.make()
     full = case.given(torch.float32, device)
     case.run(full, backend=backend)[0].sum().backward()
@@ -261,10 +251,10 @@ def test_gradients_only_where_asked_for(device: torch.device, backend: str) -> N
 
 
 @pytest.mark.parametrize("rays", [3, None])
-def test_second_derivatives(device: torch.device, backend: str, rays: int | None) -> None:
+def test_second_derivatives(device, backend, rays):
     case = Case.make("integrated", "flat", n=9, rays=rays)
 
-    def penalty(run: Callable[[list[Tensor]], Tensor], dtype: torch.dtype, device: torch.device) -> list[Tensor]:
+    def penalty(run, dtype, device):
         leaves = case.given(dtype, device)
         (slope,) = torch.autograd.grad(run(leaves).square().sum(), leaves[0], create_graph=True)
         return list(torch.autograd.grad(slope.square().sum(), leaves, allow_unused=True, materialize_grads=True))
@@ -277,11 +267,11 @@ def test_second_derivatives(device: torch.device, backend: str, rays: int | None
 
 
 @pytest.mark.parametrize("source", ["tree", "cells", "one"])
-def test_compiles(device: torch.device, backend: str, source: str) -> None:
+def test_compiles(device, backend, source):
     case = Case.make("nerf", source)
     leaves = case.given(torch.float32, device)
 
-    def run(*leaves: Tensor) -> tuple[Tensor, Tensor]:
+    def run(*leaves):
         out, cells = case.run(list(leaves), backend=backend)
         return out.square(), cells
 
@@ -293,13 +283,13 @@ def test_compiles(device: torch.device, backend: str, source: str) -> None:
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
 
 
-def test_auto_composes_where_nothing_is_fused() -> None:
+def test_auto_composes_where_nothing_is_fused():
     case = Case.make("nerf", "tree", dtype=torch.float64)
     assert case.run(case.leaves)[0].dtype == torch.float64
     case.check(CPU, "auto", torch.float64)
 
 
-def test_cells_outside_are_refused(backend: str) -> None:
+def test_cells_outside_are_refused(backend):
     case = Case.make("nerf", "cells")
     for value in (-1, 6):
         case.options["cells"][5] = value
@@ -307,7 +297,7 @@ def test_cells_outside_are_refused(backend: str) -> None:
             case.run(case.leaves, backend=backend)
 
 
-def test_errors() -> None:
+def test_errors():
     case, op = Case.make("nerf", "flat"), "routed_mlp"
     centres, cells = case.options["centres"], case.expected_cells
     call = functools.partial(case.run, case.leaves)
@@ -364,7 +354,7 @@ def test_errors() -> None:
 
 
 @pytest.mark.native
-def test_errors_of_the_kernel() -> None:
+def test_errors_of_the_kernel():
     tree, op = Case.make("nerf", "tree"), "routed_mlp"
     call = functools.partial(tree.run, tree.leaves, backend="native")
     with refused(ValueError, f"{op}: child must name a diagram (below the number of diagrams) or a leaf (negative)"):
@@ -378,7 +368,7 @@ def test_errors_of_the_kernel() -> None:
         call(direction_index=tree.options["direction_index"] + 1 + (tree.options["direction_index"] == 3).int())
 
 
-def test_an_index_of_no_ray_is_refused_where_the_operations_are_separate() -> None:
+def test_an_index_of_no_ray_is_refused_where_the_operations_are_separate():
     case = Case.make("nerf", "tree")
     for bad in (-1, 5):
         index = case.options["direction_index"].clone()
@@ -390,7 +380,7 @@ def test_an_index_of_no_ray_is_refused_where_the_operations_are_separate() -> No
 @pytest.mark.native
 @pytest.mark.parametrize("name", ["wide", "nerf", "integrated", "raw"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name: str, dtype: torch.dtype) -> None:
+def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name, dtype):
     wide = MLP((Layer((POSITIONS,), 64, "relu"), Layer((0,), 64, "relu"), Layer((1,), 4)), (2,), position_octaves=10)
     case = Case.make("nerf" if name == "wide" else name, n=3001)
     if name == "wide":
@@ -401,7 +391,7 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name: str
     uses = case.table.uses_directions
     index = case.options.get("direction_index")
 
-    def separate(leaves: list[Tensor]) -> Tensor:
+    def separate(leaves):
         positions, directions, *parameters = leaves
         order, offsets = cell_sort(nearest_centre(positions[:, :3], case.options["centres"]), 6)
         biases = iter(parameters[len(case.bias) :])
@@ -416,7 +406,7 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name: str
         )
         return torch.zeros_like(out).index_copy(0, order.long(), out)
 
-    def results(run: Callable[[list[Tensor]], Tensor]) -> list[Tensor]:
+    def results(run):
         leaves = [tensor.detach().requires_grad_() for tensor in case.leaves]
         y = run(leaves)
         g = torch.linspace(-1, 2, y.numel()).view_as(y).to(y.dtype)
@@ -436,7 +426,7 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name: str
 
 @pytest.mark.native
 @pytest.mark.parametrize("source", ["flat", "tree", "cells", "one"])
-def test_opcheck(source: str) -> None:
+def test_opcheck(source):
     layer_table = pytest.importorskip("voronerf.native.layer_table")
     case = Case.make("integrated", source, n=7)
     given = case.given()

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.op("select_heaviest")
 
 
 @pytest.mark.parametrize(("n", "count"), [(0, 3), (1, 1), (5, 9), (1000, 37), (1000, 1000)])
-def test_keeps_the_heaviest(device: torch.device, backend: str, n: int, count: int) -> None:
+def test_keeps_the_heaviest(device, backend, n, count):
     points = torch.rand(n, 3)
     importance = (torch.randperm(n) + 1).float() ** 5 * 1e-9
     found = select_heaviest(strided(points.to(device)), strided(importance.to(device)), count, backend=backend)
@@ -18,7 +18,7 @@ def test_keeps_the_heaviest(device: torch.device, backend: str, n: int, count: i
     assert torch.equal(found[0].cpu(), points[order]) and torch.equal(found[1].cpu(), importance[order])
 
 
-def test_what_does_not_count_is_left_out(device: torch.device, backend: str) -> None:
+def test_what_does_not_count_is_left_out(device, backend):
     points = torch.rand(8, 3)
     points[1, 2], points[2, 0] = torch.nan, torch.inf
     importance = torch.tensor([1.0, 9.0, 9.0, 0.0, torch.inf, torch.nan, -3.0, 2.0])
@@ -28,13 +28,13 @@ def test_what_does_not_count_is_left_out(device: torch.device, backend: str) -> 
 
 
 @pytest.mark.warp
-def test_opcheck() -> None:
+def test_opcheck():
     given = torch.rand(9, 3), torch.rand(9)
     select_heaviest(*given, 4, backend="warp")
     torch.library.opcheck(torch.ops.voronerf.select_heaviest_warp.default, (*given, 4))
 
 
-def test_refuses_what_makes_no_sense() -> None:
+def test_refuses_what_makes_no_sense():
     points = torch.rand(4, 3)
     with refused(ValueError, "select_heaviest: importance must have shape [n] with n = 4, got [3]"):
         select_heaviest(points, torch.rand(3), 2)

@@ -21,7 +21,7 @@ def slow(density, cells, values, decay, threshold):
 
 @pytest.mark.parametrize(("shape", "q"), [((3, 4, 5), 37), ((1, 1, 1), 5), ((2, 1, 3), 0), ((40, 40, 50), 9000)])
 @pytest.mark.parametrize("decay", [0.0, 0.75, 1.0])
-def test_equals_a_slow_loop(device: torch.device, backend: str, decay: float, shape, q: int) -> None:
+def test_equals_a_slow_loop(device, backend, decay, shape, q):
     density, values = 2 * torch.rand(shape), torch.rand(q)
     cells = torch.randint(0, density.numel(), (q,), dtype=torch.int32)
     if q > 1000:
@@ -39,7 +39,7 @@ def test_equals_a_slow_loop(device: torch.device, backend: str, decay: float, sh
         assert a.dtype == b.dtype and torch.equal(a.cpu(), b)
 
 
-def test_infinite_values_strides_and_compile(device: torch.device, backend: str) -> None:
+def test_infinite_values_strides_and_compile(device, backend):
     density = torch.tensor([[[1.0, torch.inf, 3.0]]], device=device)
     cells, values = (
         torch.tensor([0, 2], dtype=torch.int32, device=device),
@@ -59,13 +59,13 @@ def test_infinite_values_strides_and_compile(device: torch.device, backend: str)
 
 
 @pytest.mark.native
-def test_native_op_passes_opcheck() -> None:
+def test_native_op_passes_opcheck():
     cells = torch.tensor([3, 0], dtype=torch.int32)
     arguments = (torch.rand(2, 2, 2), cells, torch.rand(2), 0.5, 0.1)
     torch.library.opcheck(torch.ops.voronerf.update_occupancy_native.default, arguments)
 
 
-def test_refuses_what_makes_no_sense(device: torch.device) -> None:
+def test_refuses_what_makes_no_sense(device):
     density, cells, values = torch.rand(2, 2, 2), torch.zeros(3, dtype=torch.int32), torch.rand(3)
     for backend in ("reference", "native") if device.type == "cpu" else ():
         with refused(ValueError, "update_occupancy: cells must lie in 0 to 7, got values from 0 to 8"):
