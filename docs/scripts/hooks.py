@@ -1,7 +1,8 @@
-"""Fills the pages of the site that come from the code: every option of the command line."""
+"""Fills the pages of the site that come from the code, and cleans what docstrings leave in them."""
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,3 +20,8 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
         assert MARKER in markdown, f"docs/options.md must hold {MARKER}"
         return markdown.replace(MARKER, options.markdown())
     return markdown
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Drops the roles of cross-references in docstrings, such as :class:, which only Sphinx reads."""
+    return re.sub(r":(?:class|meth|func|mod|attr|data):<code>~?", "<code>", html)
