@@ -152,6 +152,9 @@ def test_every_kind_of_field_is_trained_split_resumed_and_scored(tmp_path: Path,
     assert run.render(1).colour.shape == (16, 16, 3)
     if name in ("table", "fourier", "balls"):  # a layer table, or a class whose router has fuse=True
         assert "fused" in run.router.explain()
+    del FIELDS[name]
+    with pytest.raises(ConfigError, match=f"got '{name}'; voronerf.fields.register_field adds others"):
+        open_run(tmp_path / "whole", scene=scene)
 
 
 def test_options_reach_the_field(scene: Scene) -> None:

@@ -31,7 +31,8 @@ class ConfigError(Exception):
 def check_field(config: TrainConfig) -> None:
     """Raises ConfigError for a field that is not in the table, or a setting that it has no option for."""
     if config.field not in FIELDS:
-        raise ConfigError(f"--field must be {either(list(FIELDS))}, got {config.field!r}")
+        known = either(list(FIELDS))
+        raise ConfigError(f"--field must be {known}, got {config.field!r}; voronerf.fields.register_field adds others")
     options = config.field_type.options
     for name in NETWORK_SETTINGS:
         given = getattr(config, name)
