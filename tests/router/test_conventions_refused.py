@@ -19,124 +19,68 @@ def centres() -> Tensor:
     return torch.rand(4, 3) * 2 - 1
 
 
-class TransformerLayer(nn.Module):
-    def __init__(self) -> None:
+class Mixes(nn.Module):
+    """A linear layer, a step that brings samples together, and another layer."""
+
+    def __init__(self, step: Callable[[Any, Tensor], Any], **parts: nn.Module) -> None:
         super().__init__()
-        self.fc, self.layer = nn.Linear(3, 8), nn.TransformerEncoderLayer(8, 2, 16, batch_first=True)
+        self.fc, self.out, self.step = nn.Linear(3, 4), nn.Linear(4, 4), [step]
+        for name, part in parts.items():
+            self.add_module(name, part)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.layer(self.fc(x)[None])[0]
-
-
-class Attention(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.attention = nn.MultiheadAttention(3, 1, batch_first=True)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.attention(x[None], x[None], x[None])[0][0]
+    def forward(self, x: Tensor) -> Any:
+        result = self.step[0](self, self.fc(x))
+        return result if isinstance(result, tuple) else self.out(result)
 
 
-class OwnAttention(nn.Module):
-    """Attention across samples from Linear layers and products alone."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.q, self.k, self.v = nn.Linear(3, 4), nn.Linear(3, 4), nn.Linear(3, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.softmax(self.q(x) @ self.k(x).t(), -1) @ self.v(x)
-
-
-class Centred(nn.Module):
-    """The mean over all samples is taken off."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc = nn.Linear(3, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        h = self.fc(x)
-        return h - h.mean(0)
-
-
-class Neighbour(nn.Module):
-    """Every sample sees the one before it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc = nn.Linear(3, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc(x + x.roll(1, 0))
-
-
-class AlongRays(nn.Module):
-    """Each sample sees those before it on its ray, in one of three ways."""
-
-    def __init__(self, way: str) -> None:
-        super().__init__()
-        self.way, self.fc = way, nn.Linear(3, 4)
-        self.conv, self.attention = nn.Conv1d(4, 4, 3, padding=1), nn.MultiheadAttention(4, 1, batch_first=True)
-
-    def forward(self, x: Tensor) -> Tensor:
-        h = self.fc(x)
-        if self.way == "convolution":
-            return self.conv(h.transpose(1, 2)).transpose(1, 2)
-        if self.way == "attention":
-            return h + self.attention(h, h, h)[0]
-        return torch.cumsum(h, 1)
-
-
-class FromFirst(nn.Module):
-    """Every sample sees the first of the batch."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc = nn.Linear(3, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc(x) + self.fc(x[:1])
-
-
-class ReadsValues(nn.Module):
-    """Scaled by the largest number of the batch, read on the host."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc = nn.Linear(3, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        h = self.fc(x)
-        return h / h.abs().max().item()
-
-
-class Regularised(nn.Module):
-    """Returns a number for the whole batch beside the samples' outputs."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc = nn.Linear(3, 4)
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        h = self.fc(x)
-        return h, h.square().mean()
+def attention() -> nn.Module:
+    return nn.MultiheadAttention(4, 1, batch_first=True)
 
 
 MIXING: list[tuple[Callable[[], nn.Module], tuple[int, ...], str]] = [
     (lambda: nn.Sequential(nn.Linear(3, 8), nn.BatchNorm1d(8), nn.Linear(8, 2)), (40,), "BatchNorm1d"),
     (lambda: nn.Sequential(nn.Linear(3, 8), nn.SyncBatchNorm(8), nn.Linear(8, 2)), (40,), "SyncBatchNorm"),
-    (TransformerLayer, (40,), "sample"),
-    (Attention, (40,), "sample"),
-    (OwnAttention, (40,), "sample"),
-    (Centred, (40,), "sample"),
-    (Neighbour, (40,), "sample"),
-    (lambda: AlongRays("convolution"), RAYS, "sample"),
-    (lambda: AlongRays("attention"), RAYS, "sample"),
-    (lambda: AlongRays("sum"), RAYS, "sample"),
-    (FromFirst, (40,), "sample"),
-    (ReadsValues, (40,), "sample"),
-    (Regularised, (40,), "sample"),
+    *(
+        (step, lead, "sample")
+        for lead, steps in (
+            (
+                (40,),
+                (
+                    lambda: Mixes(
+                        lambda net, h: net.layer(h[None])[0],
+                        layer=nn.TransformerEncoderLayer(4, 2, 16, batch_first=True),
+                    ),
+                    lambda: Mixes(lambda net, h: net.layer(h[None], h[None], h[None])[0][0], layer=attention()),
+                    lambda: Mixes(lambda net, h: torch.softmax(h @ net.out(h).t(), -1) @ h),
+                    lambda: Mixes(lambda net, h: h - h.mean(0)),
+                    lambda: Mixes(lambda net, h: h + h.roll(1, 0)),
+                    lambda: Mixes(lambda net, h: h + h[:1]),
+                    lambda: Mixes(lambda net, h: h.cumsum(0)),
+                    lambda: Mixes(lambda net, h: h.flip(0)),
+                    lambda: Mixes(lambda net, h: torch.cat([h[1:], h[:1]])),
+                    lambda: Mixes(lambda net, h: h / h.norm()),
+                    lambda: Mixes(lambda net, h: h[torch.argsort(h[:, 0])]),
+                    lambda: Mixes(lambda net, h: h / h.abs().max().item()),
+                    lambda: Mixes(lambda net, h: h * (1.0 if h.max() > 0.3 else -1.0) * float(h.sum())),
+                    lambda: Mixes(
+                        lambda net, h: torch.autograd.grad(h.square().sum() / h.shape[0], h, create_graph=True)[0]
+                    ),
+                    lambda: Mixes(lambda net, h: (h, h.square().mean())),  # a number for the whole batch
+                ),
+            ),
+            (
+                RAYS,  # each sample sees those before it on its ray, or all of it
+                (
+                    lambda: Mixes(
+                        lambda net, h: net.layer(h.transpose(1, 2)).transpose(1, 2), layer=nn.Conv1d(4, 4, 3, padding=1)
+                    ),
+                    lambda: Mixes(lambda net, h: h + net.layer(h, h, h)[0], layer=attention()),
+                    lambda: Mixes(lambda net, h: torch.cumsum(h, 1)),
+                ),
+            ),
+        )
+        for step in steps
+    ),
 ]
 
 

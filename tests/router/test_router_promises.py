@@ -518,3 +518,64 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
     assert not torch.equal(before, router.module.weight)
     with pytest.raises(ValueError, match="load_state_dict: optimizer must hold the router's parameters"):
         router.load_state_dict(state, optimizer=torch.optim.SGD([nn.Parameter(torch.zeros(2))]))
+
+
+# Arguments that a rule does not serve ---------------------------------------------------------------------------------
+
+
+class Odd(nn.Module):
+    """Parameters of many shapes, and a step with some of them."""
+
+    def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.fc, self.step = nn.Linear(3, 4), [step]
+        self.vector, self.square, self.one = (nn.Parameter(torch.randn(s)) for s in ((4,), (4, 4), (1, 4)))
+        self.cube, self.table = nn.Parameter(torch.randn(1, 2, 4)), nn.Embedding(5, 4, padding_idx=0)
+        self.norm = nn.GroupNorm(2, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.step[0](self, self.fc(x))
+
+
+def index(h: Tensor) -> Tensor:
+    return (h[:, 0] > 0).long()
+
+
+ODD: list[Callable[[Any, Tensor], Tensor]] = [
+    lambda net, h: h @ net.vector,
+    lambda net, h: (net.square @ h[..., None])[..., 0],
+    lambda net, h: (net.square @ h.t()).t(),
+    lambda net, h: torch.addmm(net.one, h, net.square),
+    lambda net, h: torch.addmm(net.vector, h, net.square, alpha=2),
+    lambda net, h: torch.einsum("ni,oi", h, net.square),
+    lambda net, h: torch.einsum("in,oi->no", h.t(), net.square),
+    lambda net, h: torch.einsum("ni,oi,o->no", [h, net.square, net.vector]),
+    lambda net, h: torch.einsum("nci,oi->nco", h[:, None], net.square)[:, 0],
+    lambda net, h: (h[:, None] * net.cube).sum(1),
+    lambda net, h: (h[:, None].expand(-1, 2, -1) * net.cube[0]).sum(1),
+    lambda net, h: h * net.square.sum(),
+    lambda net, h: torch.where(h > 0, h, net.vector),
+    lambda net, h: h.add(net.vector).clamp(net.one - 1, net.vector + 1),
+    lambda net, h: F.layer_norm(h, (4,), net.vector, torch.ones(4)),
+    lambda net, h: F.rms_norm(h, (4,), net.vector),
+    lambda net, h: net.norm(h[..., None])[..., 0],
+    lambda net, h: F.prelu(h, net.vector),
+    lambda net, h: F.prelu(h[..., None], net.vector)[..., 0],
+    lambda net, h: net.table(index(h)),
+    lambda net, h: net.square[index(h) - 1],
+    lambda net, h: net.square[:, index(h)].t(),
+    lambda net, h: net.cube[0].repeat(len(h), 1, 1).sum(1),
+    lambda net, h: net.vector.type_as(h).expand_as(h) + h,
+    lambda net, h: net.one.expand(len(h), 4) + net.vector.data,
+    lambda net, h: h * max(net.vector.tolist()),
+    lambda net, h: h * torch.stack(torch.unbind(net.square)).norm(),
+    lambda net, h: F.linear(h, net.square, torch.ones(4)) + F.linear(h, torch.eye(4), net.vector),
+    lambda net, h: h + torch.autograd.grad(net.vector.square().sum(), net.vector, create_graph=True)[0],
+]
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+@pytest.mark.parametrize("number", range(len(ODD)))
+def test_whatever_a_rule_does_not_serve_is_right(number: int, generator: torch.Generator) -> None:
+    router = perturb(VoronoiRouter(Odd(ODD[number]), centres(), coords="first3"), generator)
+    equal_to_loop(router, [torch.rand(50, 3, generator=generator) * 2 - 1], generator)

@@ -390,49 +390,7 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
         torch.distributed.destroy_process_group()
 
 
-def test_hooks_of_layers_run(generator: torch.Generator) -> None:
-    router = router_of(SkipNet(), generator)
-    x = uniform(generator, 40, 15)
-    for _ in range(3):
-        before = router(x)
-    seen = []
-    handle = router.module.alpha.register_forward_hook(lambda module, args, out: seen.append(out.shape) or out + 1)
-    torch.testing.assert_close(router(x)[:, 3], before[:, 3] + 1)
-    handle.remove()
-    torch.testing.assert_close(router(x), before)
-    assert seen == [(40, 1)]
-
-
 # Errors ---------------------------------------------------------------------------------------------------------------
-
-
-class Mixes(nn.Module):
-    def __init__(self, how: Callable[[Tensor], Tensor]) -> None:
-        super().__init__()
-        self.lin, self.out, self.how = nn.Linear(3, 4), nn.Linear(4, 2), [how]
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.out(self.how[0](self.lin(x)))
-
-
-@pytest.mark.parametrize(
-    "how",
-    [
-        lambda h: torch.softmax(h @ h.T, -1) @ h,
-        lambda h: h - h.mean(0),
-        lambda h: h.cumsum(0),
-        lambda h: h.flip(0),
-        lambda h: torch.cat([h[1:], h[:1]]),
-        lambda h: h / h.norm(),
-        lambda h: h[torch.argsort(h[:, 0])],
-        lambda h: torch.autograd.grad(h.square().sum() / h.shape[0], h, create_graph=True)[0],
-        lambda h: h * (1.0 if h.max() > 0.3 else -1.0) * float(h.sum()),
-    ],
-)
-def test_what_mixes_samples_is_refused(generator: torch.Generator, how: Callable[[Tensor], Tensor]) -> None:
-    router = router_of(Mixes(how), generator, k=3)
-    with pytest.raises(TypeError, match="must treat samples one by one, but Mixes gives other results"):
-        router(uniform(generator, 60, 3))
 
 
 class Decides(nn.Module):
