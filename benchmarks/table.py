@@ -3,6 +3,7 @@
 python benchmarks/table.py benchmarks/results/throughput.json                    the rows that docs/performance.md shows
 python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   any others
 python benchmarks/table.py benchmarks/results/throughput.json --targets          the targets, and what is reached
+python benchmarks/table.py benchmarks/results/foreign_fields.json --foreign      times faster than the loop over masks
 """
 
 from __future__ import annotations
@@ -120,6 +121,21 @@ def target_markdown(rows: list[Row]) -> list[str]:
     return found
 
 
+def foreign_markdown(rows: list[Row]) -> list[str]:
+    """Rows of fields of other codebases: how many times faster than the loop over masks each way is."""
+    ways = ("fused", "torch.compile of masks", "one module")
+    found = [f"| {' | '.join(('', 'n', 'k', '', 'masks, ms', 'grouped', *ways))} |", "|---" * 9 + "|"]
+    for row in rows:
+        times = row["alternatives"]
+        masks = times["masks"]
+        name = row["case"].split(" n=")[0] + (f", {row['threads']} threads" if row["threads"] > 1 else "")
+        cells = [name, f"{row['n']:,}", str(row["k"]), row["direction"].replace("+", " + "), milliseconds(masks)]
+        cells += [f"**{masks / row['median_ms']:.2f}**"]
+        cells += ["-" if times.get(way) is None else f"{masks / times[way]:.2f}" for way in ways]
+        found.append(f"| {' | '.join(cells)} |")
+    return found
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Prints what was asked for."""
     parser = Parser(description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
@@ -128,6 +144,7 @@ def main(arguments: list[str] | None = None) -> None:
         "--rows", action="append", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in"
     )
     parser.add_argument("--targets", action="store_true", help="the table of targets")
+    parser.add_argument("--foreign", action="store_true", help="the table of fields of other codebases")
     options = parser.parse_args(arguments)
     try:
         patterns = [re.compile(text) for text in options.rows or SHOWN]
@@ -137,6 +154,9 @@ def main(arguments: list[str] | None = None) -> None:
     native = [row for row in outcome["results"] if row["backend"] == "native"]
     if options.targets:
         print("\n".join(target_markdown(native)))
+        return
+    if options.foreign:
+        print("\n".join(foreign_markdown([row for row in native if row["op"] == "foreign"])))
         return
     rows = [row for row in native if any(pattern.search(key(row)) for pattern in patterns)]
     if not rows:

@@ -132,7 +132,7 @@ class Bench:
     def __init__(self, device: torch.device, *, quick: bool, wanted: list[str]) -> None:
         self.device, self.quick, self.wanted = device, quick, wanted
         self.limits = QUICK_LIMITS if quick else LIMITS
-        self.stopwatch, self.peaks = Stopwatch(device), Peaks(device)
+        self.clock, self.peaks = time.perf_counter, Peaks(device)
         self.rows: list[dict[str, Any]] = []
 
     def run(self, case: Case) -> list[dict[str, Any]]:
@@ -144,6 +144,7 @@ class Bench:
         ]
         if not names:
             return []
+        self.clock = time.process_time if case.threads == 1 else time.perf_counter
         with instruction_set(case.isa), threads(case.threads):
             rows = self._measure(case, names, case.build(self.device))
         self.rows += rows
@@ -169,8 +170,7 @@ class Bench:
         limits = {name: self.limits["ours" if name in names else "alternative"] for name in contenders}
         runs = {name: contender.run for name, contender in contenders.items()}
         others = Others()
-        stopwatch = Stopwatch(self.device, time.process_time) if case.threads == 1 else self.stopwatch
-        timings = measure(runs, limits, stopwatch, warm)
+        timings = measure(runs, limits, Stopwatch(self.device, self.clock), warm)
         disturbed = others.cores()
         after = before if self.quick or not work.bound else self.peaks(work.bound)
         peak = max((found for found in (before, after) if found), key=lambda found: found[1], default=None)
@@ -183,11 +183,11 @@ class Bench:
 
     def _check(self, contender: Contender, work: Work) -> tuple[float, float]:
         """Calls a contender for the first time: error, seconds."""
-        start = time.perf_counter()
+        start = self.clock()
         result = contender.run(0)
         if torch.cuda.is_available():
             torch.cuda.synchronize()
-        seconds = time.perf_counter() - start
+        seconds = self.clock() - start
         return work.error(contender.adapt(result)), seconds
 
     def _set_up(self, set_up: Callable[[], Contender], work: Work, warm: dict[str, float], name: str) -> Contender:
