@@ -215,15 +215,15 @@ class Mixture:
         rows, cells, weights = (part[~own] for part in blend)
         if rows.numel() == 0:
             return None
-        if rows.shape[0] == 1:  # one row leaves open what is a row: the second counts for nothing
+        if rows.shape[0] == 1:  # a single row is ambiguous: add one of weight 0
             rows, cells, weights = rows.repeat(2), cells.repeat(2), torch.cat([weights, torch.zeros_like(weights)])
         return cls(rows, cells, weights, kept)
 
     def mix(self, own: Tensor, others: Tensor) -> Tensor:
-        """Weighted means; what is not floating stays that of a sample's own cell.
+        """Weighted means; results that are not floating-point are those of a sample's own cell.
 
         Args:
-            own: [n, ...] in whatever leading dimensions, the results in the samples' own cells.
+            own: [n, ...], the results in the samples' own cells.
             others: [m, ...], those of the entries.
         """
         if not own.is_floating_point():

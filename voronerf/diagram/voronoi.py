@@ -11,7 +11,7 @@ With power weights the nearest centre is the one with the smallest `|x - v_i|^2 
 constant to the weights of one diagram changes nothing. A heavy weight can leave a sibling without any points, and a
 centre may then lie outside of its own cell.
 
-Coordinates are in scene units, in the world frame of the points that are asked about.
+Coordinates are in scene units, in the world frame of the query points.
 """
 
 import operator

@@ -202,13 +202,13 @@ class Renderer:
             depths, _, edges = stratified_depths(
                 near, far, self.samples, jitter=jitter, spacing=self.spacing, generator=generator
             )
-        asked = self.fields.get("coarse", self.fields.get("proposal", self.field))
-        passes = [self._ask(asked, rays, depths, edges, background)]
+        first_field = self.fields.get("coarse", self.fields.get("proposal", self.field))
+        passes = [self._render_samples(first_field, rays, depths, edges, background)]
         if not self.fine_samples:
             return tuple(passes)
         for _ in range(self.rounds - 1):
             depths, edges = self._intervals(passes[-1], self.samples, jitter, generator)
-            passes.append(self._ask(asked, rays, depths, edges, background))
+            passes.append(self._render_samples(first_field, rays, depths, edges, background))
         if self.cones or "proposal" in self.fields:
             depths, edges = self._intervals(passes[-1], self.fine_samples, jitter, generator)
         else:
@@ -216,9 +216,11 @@ class Renderer:
             depths, edges = union_depths(
                 depths, edges, weights, count, jitter=jitter, generator=generator, backend=self.backend
             )
-        return (*passes, self._ask(self.field, rays, depths, edges, background))
+        return (*passes, self._render_samples(self.field, rays, depths, edges, background))
 
-    def _ask(self, field: Field, rays: Rays, depths: Tensor, edges: Tensor, background: Tensor | None) -> Rendered:
+    def _render_samples(
+        self, field: Field, rays: Rays, depths: Tensor, edges: Tensor, background: Tensor | None
+    ) -> Rendered:
         return render_samples(
             field,
             rays,
@@ -353,7 +355,7 @@ def render_image(
         samples: s, per ray, inside the box.
         background: [3], None is black.
         spacing: of the strata.
-        occupancy: which cells of the box are empty; the field is asked about the others alone, up to where a ray is
+        occupancy: which cells of the box are empty; the field is evaluated in the others alone, up to where a ray is
             opaque. None asks about every sample.
         heaviest: whether to look for each ray's heaviest sample; without it the result has every ray's far end instead.
         chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples of

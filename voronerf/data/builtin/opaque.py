@@ -149,7 +149,7 @@ def render_views(cameras: Cameras, name: str, see: See, *, box: Array, supersamp
         cameras: their poses, all with one focal length and the principal point in the middle.
         name: of the split, which its images are named after.
         see: from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity [r, 4] in 0..1.
-        box: [2, 3] that holds everything; ``see`` is asked about the rays that meet it.
+        box: [2, 3] that holds everything; ``see`` gets the rays that meet it.
         supersamples: rays on each side of a pixel, which is their average.
     """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
