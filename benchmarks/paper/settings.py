@@ -39,7 +39,7 @@ class Settings:
     """Make trainings again that are in --out already: their results are deleted before the first one starts. What is
     interrupted goes on without --again; with it, all begins anew."""
     turn: float = 5.0
-    """Seconds that a variant trains before the next one has its turn, of those that are trained in one go."""
+    """Seconds that a variant trains before the next one has its turn."""
     rays: int = 1024
     """Rays per step."""
     samples: int = 64

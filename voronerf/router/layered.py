@@ -33,11 +33,11 @@ class LayeredField(Protocol):
         ...
 
 
-def told_by_table(field: nn.Module) -> bool:
-    """Whether a field's table, weights and ``activate`` say all of it.
+def described_by_table(field: nn.Module) -> bool:
+    """Whether the table, the weights and ``activate`` of a field describe all that it computes.
 
-    They do not where a class has a ``forward`` of its own and not both the others, or where hooks or
-    parametrisations, such as weight normalisation, change what layers take, give or are.
+    They do not if a class has its own ``forward`` without its own ``linears`` and ``activate``, or if hooks or
+    parametrisations, such as weight normalisation, change inputs, outputs or weights of layers.
     """
     first = {}
     for name in ("forward", "linears", "activate"):

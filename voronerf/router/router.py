@@ -22,10 +22,10 @@ from voronerf.router.grouping import Assignments, Grouping
 from voronerf.router.layered import (
     LayeredField,
     coords_by_rule,
+    described_by_table,
     each_direction,
     evaluate_blended,
     evaluate_table,
-    told_by_table,
 )
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.parameters import check_module, check_options, fill_cell
@@ -149,7 +149,7 @@ class VoronoiRouter(CellModules):
         self.fuse, self.layout = fuse, layout
         self._choices, self._assignments = Choices(), Assignments()
         self._argument_names: dict[tuple[str, int], list[str]] = {}
-        self._told = self._layered and told_by_table(self.module) and not self.share
+        self._by_table = self._layered and described_by_table(self.module) and not self.share
 
     @classmethod
     def from_modules(
@@ -211,8 +211,8 @@ class VoronoiRouter(CellModules):
             TypeError: For a module that mixes samples.
         """
         if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
-            self._told = told_by_table(self.module) and not self.share
-        if self._told:
+            self._by_table = described_by_table(self.module) and not self.share
+        if self._by_table:
             coords = coords_by_rule(self.coords, args, kwargs) if coords is None else coords
             if self._blends:
                 at = self._mixture
@@ -232,7 +232,7 @@ class VoronoiRouter(CellModules):
             >>> router.explain()
             'forward: not called yet'
         """
-        if self._told:
+        if self._by_table:
             return "forward: fused, by the layer table of the field"
         return self._choices.explain(("forward", *self.methods))
 
