@@ -136,6 +136,30 @@ def test_the_codebases_of_examples_fuse(case: Any) -> None:
     assert f"{case.method}: fused" in router.explain()
 
 
+class Rough(nn.Module):
+    """Fast sines of layers that are not initialised for them: float32 rounds the results away."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Linear(3 if i == 0 else 64, 64) for i in range(5))
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.layers:
+            x = torch.sin(30 * layer(x))
+        return x
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+@pytest.mark.parametrize("fuse", [False, True])
+def test_rounding_is_no_reason_for_a_loop(fuse: bool) -> None:
+    router = VoronoiRouter(Rough(), centres(), coords="first3", fuse=fuse)
+    router(uniform((200,)))
+    assert router.explain() == f"forward: {'fused' if fuse else 'grouped'}"
+    exact = copy.deepcopy(router).double()
+    x = uniform((200,)).double()
+    torch.testing.assert_close(exact(x), exact.cell(0)(x), rtol=1e-4, atol=1e-5)
+
+
 class Forward(nn.Module):
     """Linear layers around a step."""
 
