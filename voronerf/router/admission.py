@@ -190,7 +190,7 @@ class Trial:
     def fused(self, program: Program) -> Run:
         """As one operation, with the parameters of the copy."""
         here = program.with_parameters_of(self.original, self.module)
-        return lambda given: here.run(given.rows, self.layout, self.entries)
+        return lambda given: here.run(given.rows, self.entries)
 
     def is_groupable(self) -> bool:
         """Whether the module runs for all cells at once on this batch, right or wrong."""
@@ -291,8 +291,7 @@ def _as_samples(module: nn.Module, call: Call, layout: Layout, lead: tuple[int, 
     _, samples = _picked(layout, lead)
     device = tensors_of((call.args, call.kwargs))[0].device
     cells = torch.zeros(samples.shape[0], dtype=torch.int32, device=device)
-    args, kwargs, _ = call.arranged(layout, Entries(samples.to(device), cells, 1, "auto"))
-    return _run_first(module, call, args, kwargs)
+    return _run_first(module, call, *call.arranged(layout, Entries(samples.to(device), cells, 1, "auto"))[:2])
 
 
 def _on_rays(

@@ -31,7 +31,7 @@ from voronerf.router.trees import rebuild, tensors_of
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs
 _GAIN = "about 1.4 times as fast at width 64 and 65,536 samples"
-_KINDS, _VALUES = 256, 16  # kinds of calls that are remembered; numbers and words of an argument that tell kinds apart
+_KINDS = 256  # kinds of calls that are remembered
 
 
 class Choices:
@@ -48,27 +48,18 @@ class Choices:
     def forget(self) -> None:
         """Begins anew, after a change of dtype, device or parameters' names."""
         self._kinds: dict[Any, Choice] = {}
-        self._values: dict[Any, set[Any]] = {}
         self._said: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
-    def kind(self, module: nn.Module, call: Call, layout: Layout, device: torch.device) -> Any:
+    def kind(self, module: nn.Module, call: Call, layout: Layout, device: torch.device, fuse: bool) -> Any:
         """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
 
-        Numbers and words count by what they are while an argument has had few of them.
+        Numbers count by what they are only where they would go into a fused network.
         """
         autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
         modes = (call.method, module.training, torch.is_grad_enabled(), autocast, layout.one_ray, tuple(call.kwargs))
         d = len(layout.lead)
-        values = (*call.args, *call.kwargs.values())
-        alike = (*modes, d, *[_description(value, d, False) for value in values])
-        if not any(type(value) in (int, str) for value in values):
-            return alike
-        kind = (*modes, d, *[_description(value, d, True) for value in values])
-        known = self._values.setdefault(alike, set())
-        if len(known) < _VALUES:
-            known.add(kind)
-        return kind if kind in known else alike
+        return (*modes, d, *[_description(value, d, fuse) for value in (*call.args, *call.kwargs.values())])
 
     def find(self, kind: Any) -> Choice | None:
         """What is known of a kind of call."""
@@ -77,7 +68,7 @@ class Choices:
     def keep(self, kind: Any, choice: Choice) -> None:
         """Remembers a choice."""
         if len(self._kinds) >= _KINDS:
-            self._kinds, self._values = {}, {}
+            self._kinds = {}
         self._kinds[kind] = choice
 
     def all_fusable(self) -> bool:
@@ -113,11 +104,11 @@ class Choices:
         return Choices, ()
 
 
-def _description(value: Any, d: int, by_value: bool) -> Any:
+def _description(value: Any, d: int, fuse: bool) -> Any:
     if isinstance(value, Tensor):
         ones = tuple(size == 1 for size in value.shape[:d])
         return tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad, ones
-    if value is None or isinstance(value, bool) or (by_value and isinstance(value, (int, str))):
+    if value is None or isinstance(value, (bool, str)) or (fuse and isinstance(value, (int, float))):
         return value
     return type(value)
 
@@ -128,28 +119,13 @@ def _description(value: Any, d: int, by_value: bool) -> Any:
 def evaluate(
     module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, *, fuse: bool
 ) -> tuple[Any, Choice]:
-    """Runs a method of a module for the samples of all cells.
+    """What a method of a module returns for the samples of all cells, and how that was found.
 
-    Args:
-        module: With stacked parameters.
-        call: Of a method of it.
-        layout: Of the arguments.
-        grouping: Of the samples; of two placeholders where there are none.
-        choices: Of the router.
-        fuse: Whether the user says that the module's ``forward`` is fixed.
-
-    Returns:
-        What the module returns, and how that was found.
+    Where there are no samples, ``grouping`` is of two placeholders.
     """
     choice = _choose(module, call, layout, grouping, choices, fuse)
-    if choice.way == "fused":
-        assert choice.program is not None
-        given = Given(*call.arranged(layout, None))
-        results = choice.program.run(given.rows, layout, grouping)
-        choices.note(call, choice)
-        return restored(results, layout, None, choice.flat), choice
-    results, choice = _evaluate_sorted(module, call, layout, grouping, choices, choice)
-    return restored(results, layout, grouping, choice.flat), choice
+    results, choice = _carry_out(module, call, layout, grouping, choices, choice)
+    return restored(results, layout, grouping if choice.program is None else None, choice.flat), choice
 
 
 def mixed(
@@ -162,25 +138,9 @@ def mixed(
     choices: Choices,
     choice: Choice,
 ) -> Any:
-    """The blended results of a call.
-
-    Args:
-        own: What the call returned for all samples in their own cells.
-        module: With stacked parameters.
-        call: Of a method of it.
-        layout: Of its arguments.
-        mixture: Of its samples.
-        grouping: Of its samples.
-        choices: Of the router.
-        choice: How the call was carried out.
-    """
+    """The blended results of a call that returned ``own`` for all samples in their own cells."""
     entries = Entries(mixture.rows, mixture.cells, grouping.k, grouping.backend)
-    if choice.way == "fused":
-        assert choice.program is not None
-        given = Given(*call.arranged(layout, entries))
-        results = choice.program.run(given.rows, layout, entries)
-    else:
-        results, _ = _evaluate_sorted(module, call, layout, entries, choices, choice)
+    results, _ = _carry_out(module, call, layout, entries, choices, choice)
     tensors = tensors_of(own)
     for i, tensor in enumerate(results.tensors):
         if results.rows[i]:
@@ -188,10 +148,14 @@ def mixed(
     return rebuild(own, tensors)
 
 
-def _evaluate_sorted(
+def _carry_out(
     module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, choice: Choice
 ) -> tuple[Results, Choice]:
-    failure: Exception | None = None
+    """Results sorted by cell; of a fused network in the original order, but for entries."""
+    if choice.program is not None:
+        choices.note(call, choice)
+        given = Given(*call.arranged(layout, grouping if isinstance(grouping, Entries) else None))
+        return choice.program.run(given.rows, grouping), choice
     if choice.way == "grouped" and grouping.k > 1:
         try:
             results = run_grouped(module, call, layout, grouping, choice.piece)
@@ -204,16 +168,13 @@ def _evaluate_sorted(
         except Exception as error:
             if isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error):
                 raise
-            failure = error
             choice = replace(choice, way="cell by cell", why=f"for some batches, since its forward fails ({error})")
     try:
         given = Given(*call.arranged(layout, grouping))
         results = run_cells(module, call, layout, given, grouping, again=choice.again)
     except Exception as error:
-        if hasattr(error, "add_note") and len(layout.lead) > 1 and not layout.flat:
+        if hasattr(error, "add_note") and len(layout.lead) > 1 and not layout.flat:  # since Python 3.11
             error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
-        if failure is not None:
-            raise error from failure
         raise
     one = Choice("the module itself", "there is one cell")
     choices.note(call, choice if grouping.k > 1 or choice.way != "grouped" else one)
@@ -224,7 +185,7 @@ def _evaluate_sorted(
 
 
 def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
-    kind = choices.kind(module, call, layout, grouping.device)
+    kind = choices.kind(module, call, layout, grouping.device, fuse)
     choice = choices.find(kind)
     if choice is not None and not choice.open:
         return choice

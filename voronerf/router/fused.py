@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
 from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import Layout
 from voronerf.router.loop import Results
 from voronerf.router.parameters import is_shared, owned_parameters
 from voronerf.router.percell import PerCell, for_all_cells, name_of
@@ -293,13 +292,10 @@ class Program:
 
     # Running ----------------------------------------------------------------------------------------------------------
 
-    def run(self, inputs: Sequence[Tensor], layout: Layout, grouping: Grouping) -> Results:
-        """The method's results.
+    def run(self, inputs: Sequence[Tensor], grouping: Grouping) -> Results:
+        """The method's results for arguments in the original order, or sorted for ``Entries``.
 
-        Args:
-            inputs: The tensors of rows among the arguments, in the original order, or sorted for ``Entries``.
-            layout: Of the call.
-            grouping: Of the samples, which need not have been located yet.
+        The samples need not have been located yet.
         """
         n, chosen = inputs[0].shape[0], isinstance(grouping, Entries)
         values: dict[int, Any] = dict(enumerate(inputs))
@@ -357,29 +353,24 @@ class Program:
 
     def _block(self, values: dict[int, Any], block: Columns, n: int) -> Tensor:
         parts = [values[s.value].reshape(n, -1)[:, s.start : s.stop] for s in block]
-        return parts[0].contiguous() if len(parts) == 1 else torch.cat(parts, 1)
+        return torch.cat(parts, 1) if len(parts) > 1 else parts[0].contiguous()
 
     def _from_raw(self, values: dict[int, Any], raw: Tensor, value: int, n: int) -> Tensor:
-        ranges: list[tuple[int, int]] = []
-        parts: list[Tensor] = []
+        ranges: list[tuple[Tensor, int, int]] = []
 
-        def flush() -> None:
-            parts.extend(raw if one == (0, self._raw_width) else raw[:, one[0] : one[1]] for one in ranges)
-            ranges.clear()
+        def add(source: Tensor, start: int, stop: int) -> None:
+            if ranges and ranges[-1][0] is source and ranges[-1][2] == start:
+                start = ranges.pop()[1]
+            ranges.append((source, start, stop))
 
         for segment in self._columns[value]:
             if segment.layer < 0:
-                flush()
-                parts.append(values[segment.value].reshape(n, -1)[:, segment.start : segment.stop])
-                continue
-            for start, stop, _ in self._pieces[segment.layer]:
+                add(values[segment.value].reshape(n, -1), segment.start, segment.stop)
+            for start, stop, _ in self._pieces.get(segment.layer, ()):
                 if segment.start <= start < segment.stop:
                     at = self._raw[segment.layer, start]
-                    if ranges and ranges[-1][1] == at:
-                        ranges[-1] = (ranges[-1][0], at + stop - start)
-                    else:
-                        ranges.append((at, at + stop - start))
-        flush()
+                    add(raw, at, at + stop - start)
+        parts = [tensor if b - a == tensor.shape[1] else tensor[:, a:b] for tensor, a, b in ranges]
         rows = parts[0] if len(parts) == 1 else torch.cat(parts, 1)
         m, *sizes = self.trace.sizes[value] or ()
         return rows if sizes == [rows.shape[1]] and m == 1 else rows.reshape(n * m, *sizes)
