@@ -15,12 +15,11 @@ from torch import Tensor, nn
 
 from voronerf.backends import BackendUnavailable
 from voronerf.router.fused import Program
-from voronerf.router.grouped import run_part
+from voronerf.router.grouped import Ungroupable
 from voronerf.router.grouping import Entries, Grouping
 from voronerf.router.layout import RAY, SHARED, Call, Layout
-from voronerf.router.loop import Given, NoRandomness, Results, check_rows, run_cells
+from voronerf.router.loop import Given, NoRandomness, Results, check_rows, run_cells, run_part
 from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
-from voronerf.router.percell import Ungroupable
 from voronerf.router.tracing import ROWS, Unfusable, trace_call
 from voronerf.router.trees import map_tree, tensors_of
 from voronerf.tolerances import agree, agree_gradients

@@ -21,6 +21,7 @@ from voronerf.diagram.subdivision import finer_diagram
 from voronerf.router.parameters import (
     cell_parameters,
     clone_module,
+    detach_results,
     draw_parameters,
     fill_cell,
     inherit_parameters,
@@ -221,10 +222,7 @@ class CellModules(nn.Module):
         return {**self.__dict__, "_watch": None}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
-        for part in self.modules():
-            for value in vars(part).values():
-                if isinstance(value, Tensor) and not value.is_leaf:
-                    memo[id(value)] = value.detach().clone()
+        detach_results(self, memo)
         copied = type(self).__new__(type(self))
         memo[id(self)] = copied
         copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})

@@ -21,11 +21,10 @@ from voronerf.backends import BackendUnavailable
 from voronerf.diagram.blending import Mixture
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.admission import Choice, Trial, admitted, flattened
-from voronerf.router.grouped import run_grouped
+from voronerf.router.grouped import Ungroupable, is_inside
 from voronerf.router.grouping import Entries, Grouping
 from voronerf.router.layout import Call, Layout
-from voronerf.router.loop import Given, Results, restored, run_cells
-from voronerf.router.percell import Ungroupable, is_inside
+from voronerf.router.loop import Given, Results, restored, run_cells, run_grouped
 from voronerf.router.trees import rebuild, tensors_of
 
 _OP = "VoronoiRouter"

@@ -22,10 +22,10 @@ from torch import Tensor, nn
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
+from voronerf.router.grouped import PerCell, for_all_cells, name_of
 from voronerf.router.grouping import Entries, Grouping
 from voronerf.router.loop import Results
 from voronerf.router.parameters import is_shared, owned_parameters
-from voronerf.router.percell import PerCell, for_all_cells, name_of
 from voronerf.router.tracing import (
     Ref,
     Step,

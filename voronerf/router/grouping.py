@@ -5,6 +5,7 @@ n samples, k cells. A sorted tensor may have m entries a sample: its first dimen
 
 from __future__ import annotations
 
+import functools
 import itertools
 import weakref
 from collections.abc import Callable
@@ -38,13 +39,8 @@ class Grouping:
     ) -> None:
         self.n, self.k, self.backend, self.tables, self._cells = n, k, backend, tables, cells
         self.device = device
-        self._sorted: tuple[Tensor | None, Tensor] | None = None
-        self._inverse: Tensor | None = None
-        self._sorted_cells: Tensor | None = None
-        self._offsets: dict[int, Tensor] = {}
+        self.start = self._first = 0  # of the cells and rows of a part
         self._entry_offsets: dict[tuple[int, int], Tensor] = {}
-        self._slots: Tensor | None = None
-        self._bounds: list[int] | None = None
 
     @property
     def cells(self) -> Tensor | None:
@@ -58,56 +54,46 @@ class Grouping:
         """Takes over cells that ``tables`` gave."""
         self._cells, self.tables = cells, None
 
-    def _sort(self) -> tuple[Tensor | None, Tensor]:
-        if self._sorted is None:
-            if self.cells is None:
-                self._sorted = None, torch.tensor([0, self.n], dtype=torch.int32, device=self.device)
-            else:
-                self._sorted = ops.cell_sort(self.cells, self.k, backend=self.backend)
-        return self._sorted
+    @functools.cached_property
+    def _sorted(self) -> tuple[Tensor | None, Tensor]:
+        if self.cells is None:
+            return None, torch.tensor([0, self.n], dtype=torch.int32, device=self.device)
+        return ops.cell_sort(self.cells, self.k, backend=self.backend)
 
     @property
     def order(self) -> Tensor | None:
         """int32 [n], the original row of each sorted row; None where there is one cell."""
-        return self._sort()[0]
+        return self._sorted[0]
 
     @property
     def offsets(self) -> Tensor:
         """int32 [k + 1]; cell c owns sorted rows ``offsets[c]`` to ``offsets[c + 1]``."""
-        return self._sort()[1]
+        return self._sorted[1]
 
-    @property
+    @functools.cached_property
     def inverse(self) -> Tensor | None:
         """int32 [n], the sorted row of each original row."""
-        if self._inverse is None and self.order is not None:
-            rows = torch.arange(self.n, dtype=torch.int32, device=self.order.device)
-            self._inverse = torch.empty_like(self.order).scatter_(0, self.order.long(), rows)
-        return self._inverse
+        return None if self.order is None else _inverse(self.order)
 
-    @property
+    @functools.cached_property
     def sorted_cells(self) -> Tensor:
         """int64 [n], the cell of each sorted row."""
-        if self._sorted_cells is None:
-            if self.cells is None or self.order is None:
-                self._sorted_cells = torch.zeros(self.n, dtype=torch.int64, device=self.offsets.device)
-            else:
-                self._sorted_cells = self.cells.index_select(0, self.order).long()
-        return self._sorted_cells
+        if self.cells is None or self.order is None:
+            return torch.zeros(self.n, dtype=torch.int64, device=self.offsets.device)
+        return self.cells.index_select(0, self.order).long()
 
     def scaled_offsets(self, m: int) -> Tensor:
         """``offsets`` of tensors with m entries a sample."""
-        if m == 1:
-            return self.offsets
-        if m not in self._offsets:
-            self._offsets[m] = self.offsets * m
-        return self._offsets[m]
+        return self.offsets if m == 1 else self.offsets * m
+
+    @functools.cached_property
+    def _bounds(self) -> list[int]:
+        return self.offsets.tolist()
 
     def occupied(self) -> list[tuple[int, int, int]]:
         """(cell, first row, row behind the last) of every cell that has samples; reads them on the host."""
-        if self._bounds is None:
-            self._bounds = self.offsets.tolist()
-        pairs = zip(self._bounds, self._bounds[1:], strict=False)
-        return [(cell, first, last) for cell, (first, last) in enumerate(pairs) if last > first]
+        pairs = enumerate(itertools.pairwise(self._bounds))
+        return [(cell, first, last) for cell, (first, last) in pairs if last > first]
 
     def parts(self, rows: int) -> list[Grouping]:
         """Sorted rows in parts of whole cells, at most ``rows`` each; a cell of more is cut into parts of its own."""
@@ -133,12 +119,12 @@ class Grouping:
             self._entry_offsets[entries, m] = first if m == 1 else first.repeat_interleave(m)
         return self._entry_offsets[entries, m]
 
-    def slots(self, most: int) -> Tensor:
-        """int64 [n], the row of each sorted row where every cell has room for ``most``."""
-        if self._slots is None:
-            starts = torch.arange(self.k, device=self.device) * most - self.offsets[:-1]
-            self._slots = torch.arange(self.n, device=self.device) + starts[self.sorted_cells]
-        return self._slots
+    @functools.cached_property
+    def slots(self) -> Tensor:
+        """int64 [n], the row of each sorted row where every cell has room for as many as the fullest."""
+        most = max(last - first for _, first, last in self.occupied())
+        starts = torch.arange(self.k, device=self.device) * most - self.offsets[:-1]
+        return torch.arange(self.n, device=self.device) + starts[self.sorted_cells]
 
     def sort(self, x: Tensor) -> Tensor:
         """[n, ...] in the original order -> sorted by cell."""
@@ -148,7 +134,7 @@ class Grouping:
         """int32 [n], the ray of each sorted row, for a number of samples a ray."""
         rows = self.order
         if rows is None:
-            rows = torch.arange(self.n, dtype=torch.int32, device=self.device)
+            rows = torch.arange(self._first, self._first + self.n, dtype=torch.int32, device=self.device)
         return torch.div(rows, samples, rounding_mode="floor")
 
     def unsort(self, x: Tensor) -> Tensor:
@@ -173,22 +159,16 @@ class Grouping:
 class Entries(Grouping):
     """Samples in cells that are not their own: each entry names a sample, any number of times, and a cell.
 
-    ``order`` gives the sample of each sorted entry, and ``unsort`` the order of the entries.
-
-    Args:
-        rows: int64 [m], the samples.
-        cells: int32 [m].
-        k: number of cells.
-        backend: of the operations on the sorted rows.
+    ``order`` gives the sample of each sorted entry, and ``unsort`` the order of the entries: samples ``rows``, int64
+    [m], in ``cells``, int32 [m].
     """
 
     def __init__(self, rows: Tensor, cells: Tensor, k: int, backend: str) -> None:
         super().__init__(cells, rows.shape[0], k, cells.device, backend)
         order, offsets = ops.cell_sort(cells, k, backend=backend)
         self._sorted = rows.to(torch.int32).index_select(0, order), offsets
-        self._sorted_cells = cells.index_select(0, order).long()
-        place = torch.arange(self.n, dtype=torch.int32, device=cells.device)
-        self._place = torch.empty_like(order).scatter_(0, order.long(), place)
+        self.sorted_cells = cells.index_select(0, order).long()
+        self._place = _inverse(order)
 
     def sort(self, x: Tensor) -> Tensor:
         """[samples, ...] -> [m, ...], the entries sorted by cell."""
@@ -211,8 +191,8 @@ class Part(Grouping):
         order = whole.order
         offsets = whole.offsets[start : stop + 1].clamp(first, last) - first
         self._sorted = (None if order is None else order[first:last]), offsets
-        self._sorted_cells = whole.sorted_cells[first:last] - start
-        self._first, self.start, self.stop = first, start, stop
+        self.sorted_cells = whole.sorted_cells[first:last] - start
+        self._first, self.start = first, start
 
     def sort(self, x: Tensor) -> Tensor:
         """[samples of the whole, ...] in the original order -> this part's rows."""
@@ -220,13 +200,6 @@ class Part(Grouping):
             return x[self._first : self._first + self.n]
         # The gradient is added three times as fast by int64 indices.
         return x.index_select(0, self.order.long() if x.requires_grad else self.order)
-
-    def rays(self, samples: int) -> Tensor:
-        """int32 [n], the ray of each sorted row, for a number of samples a ray."""
-        rows = self.order
-        if rows is None:
-            rows = torch.arange(self._first, self._first + self.n, dtype=torch.int32, device=self.device)
-        return torch.div(rows, samples, rounding_mode="floor")
 
 
 class _Permute(torch.autograd.Function):
@@ -244,6 +217,12 @@ class _Permute(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         index, inverse = ctx.saved_tensors
         return permute(gradient, inverse, index), None, None
+
+
+def _inverse(order: Tensor) -> Tensor:
+    """int32 [n]: where each number is in a permutation."""
+    rows = torch.arange(order.shape[0], dtype=torch.int32, device=order.device)
+    return torch.empty_like(order).scatter_(0, order.long(), rows)
 
 
 def permute(x: Tensor, index: Tensor | None, inverse: Tensor | None) -> Tensor:
@@ -269,11 +248,7 @@ class Assignments:
     def find(self, method: str, source: Tensor | None, positions: Tensor, key: tuple[Any, ...]) -> Grouping | None:
         """The assignment made for the same positions, or None. One that was drawn serves each method once.
 
-        Args:
-            method: that is called.
-            source: the tensor that holds the positions, or None where they have been computed.
-            positions: [..., 3].
-            key: what else the assignment depends on.
+        ``source`` is the tensor that holds the positions [..., 3], or None where they have been computed.
         """
         if self._grouping is None or key != self._key or positions.numel() == 0:
             return None

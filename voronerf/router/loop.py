@@ -1,9 +1,9 @@
-"""The loop over cells: the definition of a routed call. Each cell's module runs on the contiguous rows of its cell."""
+"""Running a module on rows that are sorted by cell: in a loop over cells, which defines the result, or once for all."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,9 +11,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouping import Grouping
+from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable
+from voronerf.router.grouping import Grouping, Part
 from voronerf.router.layout import Call, Layout
 from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
+from voronerf.router.tables import Tables
 from voronerf.router.trees import map_tree, rebuild, tensors_of
 from voronerf.tolerances import agree
 
@@ -96,14 +98,8 @@ def run_cells(
 ) -> Results:
     """A module's results for sorted rows, one call for each cell that has any.
 
-    Args:
-        module: With stacked parameters.
-        call: Of a method of it.
-        layout: Of its arguments.
-        given: The arguments, sorted.
-        grouping: Of the rows.
-        again: Whether the module's code runs again in the backward pass (``torch.utils.checkpoint``): every cell has a
-            copy of the module then, which keeps the cell's parameters.
+    Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a copy of the
+    module, which keeps the cell's parameters.
 
     Raises:
         ValueError: For a result without a row for each sample, or other results in some cells.
@@ -169,14 +165,85 @@ def check_rows(module: nn.Module, call: Call, layout: Layout, given: Given, grou
             )
 
 
+def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, piece: int) -> Results:
+    """A module's results for the samples of all cells, in one run, or on a CPU in pieces of so many rows.
+
+    Raises:
+        Ungroupable: Where that is not possible.
+    """
+    parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
+    tables, chunks = Tables(), _chunks(module, parts)
+    found = [
+        run_part(module, call, layout, Given(*call.arranged(layout, part)), part, chunk, tables)[0]
+        for part, chunk in zip(parts, chunks, strict=True)
+    ]
+    first = found[0]
+    if len(found) == 1:
+        return first
+    tensors = [
+        torch.cat([results.tensors[i] for results in found]) if first.rows[i] else tensor
+        for i, tensor in enumerate(first.tensors)
+    ]
+    return replace(first, tensors=tensors)
+
+
+def _chunks(module: nn.Module, parts: list[Grouping]) -> list[dict[int, Tensor] | None]:
+    """For each part the parameters of its cells, by the ids of those of all cells; None for all of them.
+
+    They are split once for all parts: their gradient is then put together once, where that of a slice would fill a
+    tensor of all cells for each part.
+    """
+    own = [part for part in parts if isinstance(part, Part)]
+    if not own:
+        return [None] * len(parts)
+    sizes = {part.start: part.k for part in own}
+    pieces = {id(p): p.split(list(sizes.values())) for _, _, p in cell_parameters(module)}
+    number = {start: i for i, start in enumerate(sizes)}
+    return [{key: split[number[part.start]] for key, split in pieces.items()} for part in own]
+
+
+def run_part(
+    module: nn.Module,
+    call: Call,
+    layout: Layout,
+    given: Given,
+    part: Grouping,
+    chunk: dict[int, Tensor] | None = None,
+    tables: Tables | None = None,
+) -> tuple[Results, GroupedRun]:
+    """The results for some rows, and the run that gave them; ``chunk`` is None where the part has all cells."""
+    run = GroupedRun(part, layout.axis, tables)
+    for tensor in given.rows:
+        run.mark(tensor)
+    stand_ins: dict[int, Tensor] = {
+        id(p): PerCell(p if chunk is None else chunk[id(p)], is_parameter=True, origin=(p, part.start))
+        for _, _, p in cell_parameters(module)
+    }
+    with in_place_of_parameters(module, stand_ins), run:
+        value = call.function(module)(*given.args, **given.kwargs)
+    if run.failed is not None:
+        raise run.failed
+    results = Results(value, [], [], [])
+    buffers = {id(buffer) for buffer in module.buffers()}
+    for tensor in tensors_of(value):
+        if isinstance(tensor, PerCell):
+            raise Ungroupable("a result is made of parameters alone")
+        marked, rows = run.is_rows(tensor), layout.rows_of(tensor)
+        if marked and (rows.dim() == 0 or not rows.shape[0] or rows.shape[0] % part.n):
+            raise Ungroupable(f"a result of shape {list(tensor.shape)} has no row for each of {part.n} samples", True)
+        if not marked and rows.shape[:1] == (part.n,) and id(tensor) not in buffers:
+            raise Ungroupable("a result has rows that no PyTorch function was seen to make")
+        results.tensors.append(rows if marked else tensor)
+        results.rows.append(marked)
+        results.flattened.append(layout.axis > 0 and rows.shape == tensor.shape)
+    return results, run
+
+
 def restored(results: Results, layout: Layout, grouping: Grouping | None, flat: Sequence[bool]) -> Any:
     """Results in the caller's order, with the leading dimensions of the call.
 
-    Args:
-        results: Sorted by cell; in the original order where ``grouping`` is None.
-        layout: Of the call.
-        grouping: Of the samples.
-        flat: Which of the tensors the module itself flattens to [rays * samples, ...].
+    They are in that order already where ``grouping`` is None; ``flat`` says which tensors the module itself flattens to
+    [rays * samples, ...].
     """
     tensors = []
     for i, tensor in enumerate(results.tensors):

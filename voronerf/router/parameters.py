@@ -49,11 +49,16 @@ def is_shared(owner: nn.Module, name: str) -> bool:
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
     """A deep copy, also of a module that keeps results of its last call (which torch refuses to copy)."""
     memo = {} if memo is None else memo
+    detach_results(module, memo)
+    return copy.deepcopy(module, memo)
+
+
+def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
+    """Has ``copy.deepcopy`` take copies without a graph of the results that a module keeps."""
     for part in module.modules():
         for value in vars(part).values():
             if isinstance(value, Tensor) and not value.is_leaf:
                 memo[id(value)] = value.detach().clone()
-    return copy.deepcopy(module, memo)
 
 
 def check_module(module: nn.Module) -> None:

@@ -19,14 +19,7 @@ from voronerf.diagram.blending import Mixture
 from voronerf.router.cells import CellModules
 from voronerf.router.evaluate import Choices, evaluate, mixed
 from voronerf.router.grouping import Assignments, Grouping
-from voronerf.router.layered import (
-    LayeredField,
-    coords_by_rule,
-    described_by_table,
-    each_direction,
-    evaluate_blended,
-    evaluate_table,
-)
+from voronerf.router.layered import LayeredField, coords_by_rule, described_by_table, each_direction, evaluate_table
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.parameters import check_module, check_options, fill_cell
 
@@ -214,10 +207,8 @@ class VoronoiRouter(CellModules):
             self._by_table = described_by_table(self.module) and not self.share
         if self._by_table:
             coords = coords_by_rule(self.coords, args, kwargs) if coords is None else coords
-            if self._blends:
-                at = self._mixture
-                return evaluate_blended(self.field, self._where, self.backend, at, *args, coords=coords, **kwargs)
-            return evaluate_table(self.field, self._where, self.backend, *args, coords=coords, **kwargs)
+            at = self._mixture
+            return evaluate_table(self.field, self._where, self.backend, at, *args, coords=coords, **kwargs)
         if self._layered:
             args, kwargs = each_direction(args, kwargs)
         return self._call_method("forward", *args, coords=coords, **kwargs)
@@ -286,17 +277,15 @@ class VoronoiRouter(CellModules):
                 grouping = self._group(positions, layout.n)
                 self._assignments.keep(method, source, positions, key, grouping)
             result, choice = evaluate(self.module, call, layout, grouping, self._choices, fuse=self.fuse)
-            mixture = self._mixture(positions) if self._blends else None
+            mixture = self._mixture(positions)
             if mixture is None:
                 return result
             return mixed(result, self.module, call, layout, mixture, grouping, self._choices, choice)
 
-    @property
-    def _blends(self) -> bool:
-        return self.blend > 0 and not self.training and self.num_cells > 1
-
     def _mixture(self, positions: Tensor) -> Mixture | None:
-        return Mixture.of(self.diagram, positions, self.blend, self.backend)
+        """The other cells that samples near borders are evaluated in too."""
+        blends = self.blend > 0 and not self.training and self.num_cells > 1
+        return Mixture.of(self.diagram, positions, self.blend, self.backend) if blends else None
 
     def _group(self, positions: Tensor, n: int) -> Grouping:
         flat, k = positions.detach().reshape(-1, 3), self.num_cells

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from voronerf.ops import grouped_linear
 from voronerf.router import tables
-from voronerf.router.grouped import GroupedRun, register
-from voronerf.router.percell import PerCell
+from voronerf.router.grouped import GroupedRun, PerCell, register
 from voronerf.router.trees import map_tree, tensors_of
 
 _ELEMENTWISE = """

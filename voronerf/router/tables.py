@@ -144,7 +144,7 @@ def grid_sample(grouping: Grouping, planes: Tensor, grid: Tensor, place: int, **
     occupied = grouping.occupied()
     most = max(last - first for _, first, last in occupied)
     if len(occupied) > 1 and grouping.k * most - n <= _WASTE * len(occupied):
-        slots = grouping.slots(most)
+        slots = grouping.slots
         padded = points.new_zeros(grouping.k * most, *points.shape[1:]).index_copy(0, slots, points)
         found = read(planes, padded.reshape(grouping.k, most, *points.shape[1:]))
         found = found.transpose(1, 2).reshape(-1, c, points.shape[1]).index_select(0, slots).transpose(0, 1)[None]

@@ -15,11 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouped import METADATA
+from voronerf.router.grouped import METADATA, name_of, user_line
 from voronerf.router.layout import Call
 from voronerf.router.loop import RANDOM, Given
 from voronerf.router.parameters import cell_parameters, in_place_of_parameters, owned_parameters
-from voronerf.router.percell import name_of, user_line
 from voronerf.router.trees import rebuild, tensors_of
 
 ROWS = 37  # in a trace
