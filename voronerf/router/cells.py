@@ -291,12 +291,7 @@ def _is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
 def watch_optimizers(module: nn.Module, line: str) -> Any:
     """Raises at the next step of an optimiser that holds state of other cells than a module's parameters have.
 
-    Args:
-        module: Whose parameters have got other cells.
-        line: What to write, so that the optimiser follows.
-
-    Returns:
-        A handle whose ``remove()`` ends the watch.
+    The error says which ``line`` to write, so that the optimiser follows. ``remove()`` of the handle ends the watch.
     """
     watched = {id(parameter): weakref.ref(parameter) for _, _, parameter in cell_parameters(module)}
 

@@ -38,6 +38,7 @@ class Choices:
 
     Attributes:
         lock: Held during a call: stand-ins are in the place of the module's parameters.
+        kinds: What was found for each kind of call.
     """
 
     def __init__(self) -> None:
@@ -46,7 +47,7 @@ class Choices:
 
     def forget(self) -> None:
         """Begins anew, after a change of dtype, device or parameters' names."""
-        self._kinds: dict[Any, Choice] = {}
+        self.kinds: dict[Any, Choice] = {}
         self._said: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
@@ -59,20 +60,6 @@ class Choices:
         modes = (call.method, module.training, torch.is_grad_enabled(), autocast, layout.one_ray, tuple(call.kwargs))
         d = len(layout.lead)
         return (*modes, d, *[_description(value, d, fuse) for value in (*call.args, *call.kwargs.values())])
-
-    def find(self, kind: Any) -> Choice | None:
-        """What is known of a kind of call."""
-        return self._kinds.get(kind)
-
-    def keep(self, kind: Any, choice: Choice) -> None:
-        """Remembers a choice."""
-        if len(self._kinds) >= _KINDS:
-            self._kinds = {}
-        self._kinds[kind] = choice
-
-    def all_fusable(self) -> bool:
-        """Whether ``fuse=True`` would serve for every kind of call so far."""
-        return all(choice.fusable for choice in self._kinds.values())
 
     def note(self, call: Call, choice: Choice) -> None:
         """For :meth:`explain`: how a method was carried out."""
@@ -185,7 +172,7 @@ def _carry_out(
 
 def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
     kind = choices.kind(module, call, layout, grouping.device, fuse)
-    choice = choices.find(kind)
+    choice = choices.kinds.get(kind)
     if choice is not None and not choice.open:
         return choice
     if layout.n < _FEWEST:
@@ -199,8 +186,10 @@ def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, c
         if choice is not None and not trial.is_groupable():
             return choice
         found = replace(admitted(trial, fuse), flat=flat)
-    choices.keep(kind, found)
-    if found.fusable and choices.all_fusable():
+    if len(choices.kinds) >= _KINDS:
+        choices.kinds.clear()
+    choices.kinds[kind] = found
+    if found.fusable and all(known.fusable for known in choices.kinds.values()):
         name = f"{type(module).__name__}.{call.method}"
         choices.say_once(
             f"fuse {call.method}",

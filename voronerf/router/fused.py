@@ -80,9 +80,6 @@ class _Linear:
 class Program:
     """A layer table with the steps before and behind it.
 
-    Args:
-        trace: Of a call.
-
     Raises:
         Unfusable: Where the steps are not such a network.
     """

@@ -27,6 +27,7 @@ from voronerf.router.trees import map_tree, tensors_of
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
 _WRITES = ("requires_grad_", "register_hook", "retain_grad", "backward", "__set__", "__setitem__")
+_INPLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "div", "floordiv", "mod", "pow", "and", "or")}
 _MARK = "_voronerf_rows"
 
 Rule = Callable[..., Any]
@@ -143,14 +144,7 @@ class PerCell(torch.Tensor):
 
 
 def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Exception] = Ungroupable) -> Any:
-    """A function of parameters and constants alone, for all cells at once; results are :class:`PerCell`.
-
-    Args:
-        func: Of PyTorch.
-        args: With a PerCell for each parameter.
-        kwargs: Likewise.
-        fail: Makes the error of a reason.
-    """
+    """A function of parameters and constants alone, for all cells at once; results are :class:`PerCell`."""
     stacks = [leaf.stacked for leaf in tensors_of((args, kwargs)) if isinstance(leaf, PerCell)]
 
     if func is torch.autograd.grad:
@@ -198,6 +192,12 @@ def name_of(function: Any) -> str:
     """A function's name for messages."""
     resolved = torch.overrides.resolve_name(function)
     return resolved or getattr(function, "__qualname__", None) or str(function)
+
+
+def writes_in_place(function: Any) -> bool:
+    """Whether a function writes to its first argument."""
+    name = getattr(function, "__name__", "")
+    return name == "__setitem__" or name in _INPLACE or (name.endswith("_") and not name.startswith("__"))
 
 
 def is_inside(file: str, package: bool = False) -> bool:
@@ -291,11 +291,11 @@ class GroupedRun(TorchFunctionMode):
                     if tensor.dim() > self.axis and tensor.shape[self.axis] == self.n:
                         self.mark(tensor)
             return result
-        name = getattr(func, "__name__", "")
-        if name == "__setitem__" or (name.endswith("_") and not name.startswith("__")):
+        if writes_in_place(func):
             self.mark(operands[0])
         if isinstance(kwargs.get("out"), Tensor):
             self.mark(kwargs["out"])
+        name = getattr(func, "__name__", "")
         tag = name if name in ("any", "all") else ""
         for tensor in found:
             self.mark(tensor, tag)

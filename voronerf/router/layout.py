@@ -248,11 +248,6 @@ class _Order:
 def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> tuple[Tensor, Tensor | None]:
     """The positions of a call's samples.
 
-    Args:
-        rule: Positions [..., 3], "first3", a slice of the features of the first tensor, or a function.
-        args: Of the call.
-        kwargs: Of the call.
-
     Returns:
         Positions [..., 3], and the tensor whose identity stands for them, or None.
 

@@ -146,12 +146,7 @@ def check_options(
 
 
 def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
-    """Gives every parameter of a module k equal entries, in place.
-
-    Args:
-        module: Changed in place.
-        k: Cells.
-        share: Patterns of names, as ``fnmatch`` has them; such parameters stay as they are, one for all cells.
+    """Gives every parameter of a module k equal entries, in place, but for those that the patterns ``share`` name.
 
     Raises:
         ValueError: For a pattern that no parameter has.

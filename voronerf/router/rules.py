@@ -7,7 +7,7 @@ cell's part. A rule returns ``NotImplemented`` for arguments that have no form f
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from voronerf.ops import grouped_linear
 from voronerf.router import tables
-from voronerf.router.grouped import GroupedRun, PerCell, register
+from voronerf.router.grouped import GroupedRun, PerCell, register, writes_in_place
 from voronerf.router.trees import map_tree, tensors_of
 
 _ELEMENTWISE = """
@@ -160,8 +160,7 @@ def _elementwise(func: Any, run: GroupedRun, *args: Any, **kwargs: Any) -> Any:
         return NotImplemented
     if any(tensor.dim() > dim or (tensor.dim() == dim and tensor.shape[0] != 1) for tensor in others):
         return NotImplemented
-    name = getattr(func, "__name__", "")
-    if isinstance(args[0], PerCell) and ((name.endswith("_") and not name.endswith("__")) or name[:3] == "__i"):
+    if isinstance(args[0], PerCell) and writes_in_place(func):
         return NotImplemented  # it writes samples into a parameter
     wide = [tensor.dtype for tensor in tensors if tensor.dim() > 0 and tensor.is_floating_point()]
 
@@ -224,54 +223,33 @@ def _scale_and_shift(run: GroupedRun, x: Tensor, weight: Tensor | None, bias: Te
     return x
 
 
-@rule(F.layer_norm)
-def layer_norm(
+def _norm(
+    func: Any,
     run: GroupedRun,
     input: Tensor,
-    normalized_shape: Sequence[int],
+    over: Any,
     weight: Tensor | None = None,
     bias: Tensor | None = None,
-    eps: float = 1e-5,
+    **options: Any,
 ) -> Any:
-    """The norm without its parameters, then those."""
-    if not run.is_rows(input) or len(normalized_shape) >= input.dim():
-        return NotImplemented
-    return _scale_and_shift(run, F.layer_norm(input, normalized_shape, None, None, eps), weight, bias)
-
-
-@rule(F.rms_norm)
-def rms_norm(
-    run: GroupedRun,
-    input: Tensor,
-    normalized_shape: Sequence[int],
-    weight: Tensor | None = None,
-    eps: float | None = None,
-) -> Any:
-    """The norm without its parameter, then that."""
-    if not run.is_rows(input) or len(normalized_shape) >= input.dim():
-        return NotImplemented
-    return _scale_and_shift(run, F.rms_norm(input, normalized_shape, None, eps), weight, None)
-
-
-@rule(F.group_norm)
-def group_norm(
-    run: GroupedRun,
-    input: Tensor,
-    num_groups: int,
-    weight: Tensor | None = None,
-    bias: Tensor | None = None,
-    eps: float = 1e-5,
-) -> Any:
-    """The norm without its parameters, then those."""
+    """A norm over the last dimensions, or of groups of features: without its parameters, then those."""
     if not run.is_rows(input):
         return NotImplemented
-    trailing = [1] * (input.dim() - 2)
-    parameters = [
-        PerCell(p.stacked.reshape(*p.stacked.shape, *trailing)) if isinstance(p, PerCell) else p for p in (weight, bias)
-    ]
-    if any(p is not None and not isinstance(p, PerCell) for p in parameters):
+    parameters = [weight, bias]
+    if func is F.group_norm:
+        if any(p is not None and not isinstance(p, PerCell) for p in parameters):
+            return NotImplemented
+        ones = [1] * (input.dim() - 2)
+        parameters = [
+            PerCell(p.stacked.reshape(*p.stacked.shape, *ones)) if isinstance(p, PerCell) else p for p in parameters
+        ]
+    elif len(over) >= input.dim():
         return NotImplemented
-    return _scale_and_shift(run, F.group_norm(input, num_groups, None, None, eps), *parameters)
+    return _scale_and_shift(run, func(input, over, **options), *parameters)
+
+
+for _function in (F.layer_norm, F.rms_norm, F.group_norm):
+    register(_function, functools.partial(_norm, _function))
 
 
 @rule(F.prelu)
@@ -306,20 +284,11 @@ def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Ten
 
 
 @rule(F.embedding)
-def embedding(
-    run: GroupedRun,
-    input: Tensor,
-    weight: Tensor,
-    padding_idx: int | None = None,
-    max_norm: float | None = None,
-    norm_type: float = 2.0,
-    scale_grad_by_freq: bool = False,
-    sparse: bool = False,
-) -> Any:
-    """Rows of indices into a table [e, c]."""
+def embedding(run: GroupedRun, input: Tensor, weight: Tensor, *, norm_type: float = 2.0, **options: Any) -> Any:
+    """Rows of indices into a table [e, c], without any of the options."""
     if not isinstance(weight, PerCell) or weight.dim() != 2 or not run.is_rows(input):
         return NotImplemented
-    if padding_idx is not None or max_norm is not None or scale_grad_by_freq or sparse:
+    if any(value is not None and value is not False for value in options.values()):
         return NotImplemented
     return _look_up(run, weight, input, 0)
 
@@ -333,19 +302,11 @@ def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
 
 
 @rule(F.grid_sample)
-def grid_sample(
-    run: GroupedRun,
-    input: Tensor,
-    grid: Tensor,
-    mode: str = "bilinear",
-    padding_mode: str = "zeros",
-    align_corners: bool | None = None,
-) -> Any:
+def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) -> Any:
     """A plane [1, c, h, w] or volume [1, c, d, h, w] at rows [1, ..., 2] or [1, ..., 3]."""
     if not isinstance(input, PerCell) or input.shape[0] != 1 or not run.is_rows(grid):
         return NotImplemented
     places = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
     if len(places) != 1 or grid.shape[0] != 1:
         return NotImplemented
-    options = {"mode": mode, "padding_mode": padding_mode, "align_corners": align_corners}
     return tables.grid_sample(run.grouping, input.stacked.squeeze(1), grid, places[0], **options)

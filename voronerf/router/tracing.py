@@ -15,14 +15,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouped import METADATA, name_of, user_line
+from voronerf.router.grouped import METADATA, name_of, user_line, writes_in_place
 from voronerf.router.layout import Call
 from voronerf.router.loop import RANDOM, Given
 from voronerf.router.parameters import cell_parameters, in_place_of_parameters, owned_parameters
 from voronerf.router.trees import rebuild, tensors_of
 
 ROWS = 37  # in a trace
-_INPLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "div", "floordiv", "mod", "pow", "and", "or")}
 _APPLY = torch.autograd.Function.apply.__func__.__code__  # type: ignore[attr-defined]
 _ACTIVATIONS: dict[str, set[Any]] = {
     "relu": {F.relu, torch.relu, torch.relu_, torch.Tensor.relu, torch.Tensor.relu_, F.relu_},
@@ -127,13 +126,7 @@ def map_arguments(value: Any, change: Callable[[Any], Any]) -> Any:
 
 
 def trace_call(original: nn.Module, module: nn.Module, call: Call, given: Given) -> Trace:
-    """Follows one call of a module.
-
-    Args:
-        original: The routed module.
-        module: A copy of it, with stacked parameters; those of its first cell are used.
-        call: Of a method.
-        given: Its arguments, for ``ROWS`` samples.
+    """Follows one call of a copy of the routed module, with the parameters of its first cell, for ``ROWS`` samples.
 
     Raises:
         Unfusable: For a step that cannot be done again for other samples.
@@ -225,13 +218,12 @@ class _Recorder(TorchFunctionMode):
             return result
         if torch.is_grad_enabled() != self._grad:
             raise Unfusable(f"the gradient mode changes{step.line}")
-        if func in RANDOM and not _is_idle(func, args, kwargs):
+        idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
+        if func in RANDOM and not idle:
             raise Unfusable(f"{name_of(func)} draws random numbers{step.line}")
         if func is torch.autograd.grad:
             raise Unfusable(f"gradients are taken{step.line}")
-        name = getattr(func, "__name__", "")
-        inplace = (name.endswith("_") and not name.startswith("__")) or name in _INPLACE or name == "__setitem__"
-        step.inplace = inplace or bool(kwargs.get("inplace"))
+        step.inplace = writes_in_place(func) or bool(kwargs.get("inplace"))
         if isinstance(kwargs.get("out"), Tensor):
             raise Unfusable(f"{name_of(func)} writes to out={step.line}")
         if not found and not step.inplace:
@@ -266,14 +258,6 @@ def _custom_function() -> Any:
         found = frame if frame.f_code is _APPLY else found
         frame = frame.f_back
     return found
-
-
-def _is_idle(func: Any, args: Any, kwargs: dict[str, Any]) -> bool:
-    """Whether it is ``F.dropout`` outside of training."""
-    if func is not F.dropout:
-        return False
-    given = {**dict(zip(("input", "p", "training"), args, strict=False)), **kwargs}
-    return not given.get("training", True) or given.get("p", 0.5) == 0
 
 
 def activation_of(step: Step) -> str | None:
