@@ -111,7 +111,8 @@ def evaluate(
     """
     choice = _choose(module, call, layout, grouping, choices, fuse)
     results, choice = _carry_out(module, call, layout, grouping, choices, choice)
-    return restored(results, layout, grouping if choice.program is None else None, choice.flat), choice
+    given = grouping if choice.program is None or not layout.n else None
+    return restored(results, layout, given, choice.flat), choice
 
 
 def mixed(
@@ -137,10 +138,11 @@ def mixed(
 def _carry_out(
     module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, choice: Choice
 ) -> tuple[Results, Choice]:
-    """Results sorted by cell; of a fused network in the original order, but for entries."""
+    """Results sorted by cell; of a fused network in the original order, but for entries and placeholders."""
     if choice.program is not None:
         choices.note(call, choice)
-        given = Given(*call.arranged(layout, grouping if isinstance(grouping, Entries) else None))
+        in_order = layout.n and not isinstance(grouping, Entries)
+        given = Given(*call.arranged(layout, None if in_order else grouping))
         return choice.program.run(given.rows, grouping), choice
     if choice.way == "grouped" and grouping.k > 1:
         try:
