@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from convention_harness import Case
-from convention_listed import RAYS, first, one, uniform
+from convention_harness import RAYS, Case, one, uniform
+from convention_listed import pair
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
+
+from voronerf import NeRF
 
 
 class Heads(nn.Module):
@@ -226,38 +228,62 @@ class Operations(nn.Module):
         return self.out(torch.hstack(parts))
 
 
+class TruncExp(torch.autograd.Function):
+    """As torch-ngp's: the exponential of small numbers only in the backward pass, under automatic mixed precision."""
+
+    @staticmethod
+    @torch.amp.custom_fwd(device_type="cpu", cast_inputs=torch.float32)
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return torch.exp(x)
+
+    @staticmethod
+    @torch.amp.custom_bwd(device_type="cpu")
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        return gradient * torch.exp(x.clamp(max=-1))
+
+
+class Truncated(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(7, 8), nn.ReLU(inplace=True), nn.Linear(8, 4))
+
+    def forward(self, x: Tensor) -> dict[str, Tensor]:
+        h = self.net(x)
+        return {"sigma": TruncExp.apply(h[..., 0]), "rgb": torch.sigmoid(h[..., 1:])}
+
+
 def query(lead: tuple[int, ...]) -> Any:
-    return (Query(uniform(lead), {"f": uniform(lead)}), [uniform(lead, 1), uniform(lead)]), {
-        "options": {"double": True}
-    }
+    args = Query(uniform(lead), {"f": uniform(lead)}), [uniform(lead, 1), uniform(lead)]
+    return args, {"options": {"double": True}}
+
+
+def points_of(query: Query, *_: Any, **__: Any) -> Tensor:
+    return query.points
 
 
 CALLS = [
-    Case("heads", Heads, one(), first),
-    Case("control flow, near", ControlFlow, lambda lead: ((uniform(lead, 7),), {"scale": 2.0}), first),
-    Case(
-        "control flow, far", ControlFlow, lambda lead: ((uniform(lead, 7), "far"), {"extra": uniform(lead, 8)}), first
-    ),
-    Case("branches", Branches, one(3), first),
-    Case("normals inside", Normals, one(3), first),
+    Case("table", lambda: NeRF(width=10, depth=3, skips=(1,)), pair, options={}, way="fused"),
+    Case("heads", Heads),
+    Case("control flow, near", ControlFlow, lambda lead: ((uniform(lead, 7),), {"scale": 2.0})),
+    Case("control flow, far", ControlFlow, lambda lead: ((uniform(lead, 7), "far"), {"extra": uniform(lead, 8)})),
+    Case("branches", Branches, one(3)),
+    Case("normals inside", Normals, one(3)),
+    Case("evaluations, interleaved", lambda: Evaluations("interleaved"), one(3)),
     *(
-        Case(f"evaluations, {way}", lambda way=way: Evaluations(way), one(3), first, one_pass=way == "interleaved")
-        for way in ("interleaved", "one after the other", "repeated", "stacked")
+        Case(f"evaluations, {way}", lambda way=way: Evaluations(way), one(3), way="cell by cell")
+        for way in ("one after the other", "repeated", "stacked")
     ),
     *(
-        Case(f"row order, {way}", lambda way=way: RowOrder(way), one(), first, one_pass=False)
+        Case(f"row order, {way}", lambda way=way: RowOrder(way), way="cell by cell")
         for way in ("box", "chunks", "loop", "sorted")
     ),
-    Case("scripted", Scripted, one(), first, one_pass=False),
-    Case("operations", Operations, one(), first),
-    Case("checkpointed", Checkpointed, one(), first, one_pass=False),
-    Case("named tuple", Named, one(), first, lead=RAYS),
-    Case(
-        "containers",
-        TakesContainers,
-        query,
-        lambda query, *_, **__: query.points,
-        options={"coords": lambda query, *_, **__: query.points},
-    ),
-    Case("code per ray", PerRay, lambda lead: ((uniform(lead), uniform(lead[:1], 5)), {}), first, RAYS),
+    Case("scripted", Scripted, way="cell by cell"),
+    Case("truncated exponential", Truncated, fuses=True),
+    Case("operations", Operations),
+    Case("checkpointed", Checkpointed, way="cell by cell"),
+    Case("named tuple", Named, lead=RAYS, fuses=True),
+    Case("containers", TakesContainers, query, points_of, options={"coords": points_of}, fuses=True),
+    Case("code per ray", PerRay, lambda lead: ((uniform(lead), uniform(lead[:1], 5)), {}), lead=RAYS),
 ]

@@ -7,8 +7,10 @@ cells come from the case itself, so the loop shares no code with the router. Let
 from __future__ import annotations
 
 import dataclasses
+import fnmatch
 import functools
 import importlib.util
+import itertools
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf import VoronoiRouter
+from voronerf import VoronoiDiagram, VoronoiRouter
+from voronerf.diagram.blending import blend_cells
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 K = 5
@@ -35,6 +38,26 @@ def example(name: str) -> ModuleType:
     return sys.modules[full]
 
 
+Arguments = tuple[tuple[Any, ...], dict[str, Any]]
+RAYS = (9, 7)  # unlike any number of features
+
+
+def uniform(lead: tuple[int, ...], features: int = 3) -> Tensor:
+    return torch.rand(*lead, features) * 2 - 1
+
+
+def first(x: Tensor, *_: Any, **__: Any) -> Tensor:
+    return x[..., :3]
+
+
+def one(features: int = 7) -> Callable[[tuple[int, ...]], Arguments]:
+    """One tensor, whose first three features are the position."""
+    return lambda lead: ((uniform(lead, features),), {})
+
+
+of_seven = one()
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """A field and how it is called.
@@ -48,29 +71,43 @@ class Case:
         options: of the router.
         given: whether positions are passed at the call.
         method: what is called.
-        one_pass: the module and each of its functions run once for all cells; else they may run cell by cell.
+        way: how the router runs it: "fused" or "grouped", where the module and each of its functions run once for all
+            cells, or "cell by cell".
+        fuses: whether it is a case with ``fuse=True`` too.
         rank: dimensions of a sample's tensors as the loop passes them; 3 is [m, 1, d].
-        smooth: whether second derivatives are compared.
+        by_parameters: whether gradients of the parameters' gradients are compared; those of ``torch._weight_norm`` are
+            wrong in PyTorch itself.
     """
 
     name: str
     make: Callable[[], nn.Module]
-    arguments: Callable[[tuple[int, ...]], tuple[tuple[Any, ...], dict[str, Any]]]
-    positions: Callable[..., Tensor]
+    arguments: Callable[[tuple[int, ...]], Arguments] = of_seven
+    positions: Callable[..., Tensor] = first
     lead: tuple[int, ...] = (61,)
     options: dict[str, Any] = dataclasses.field(default_factory=lambda: {"coords": "first3"})
     given: bool = False
     method: str = "forward"
-    one_pass: bool = True
+    way: str = "grouped"
+    fuses: bool = False
     rank: int = 2
-    smooth: bool = False
+    by_parameters: bool = True
 
     def __str__(self) -> str:
         return self.name
 
-    def modules(self, dtype: torch.dtype = torch.float32) -> list[nn.Module]:
-        """A module of its own for each of K cells, every parameter random, biases too."""
-        return [randomised(self.make()).to(dtype) for _ in range(K)]
+    def fused(self) -> Case:
+        options = {**self.options, "fuse": True}
+        return dataclasses.replace(self, name=f"{self.name}, fused", options=options, way="fused")
+
+    def modules(self, dtype: torch.dtype = torch.float32, k: int = K) -> list[nn.Module]:
+        """A module of its own for each of k cells, every parameter random, biases too; what they share is one."""
+        modules = [randomised(self.make()).to(dtype) for _ in range(k)]
+        for name, parameter in modules[0].named_parameters():
+            if any(fnmatch.fnmatch(name, pattern) for pattern in self.options.get("share", ())):
+                parent, _, leaf = name.rpartition(".")
+                for module in modules:
+                    setattr(module.get_submodule(parent), leaf, parameter)
+        return modules
 
     def call(self, module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """The field's method on a module or a router."""
@@ -146,10 +183,9 @@ def nearest(case: Case, centres: Tensor, args: Any, kwargs: Any) -> Tensor:
     return (positions[:, None] - centres.double()).square().sum(-1).argmin(1)
 
 
-def loop(case: Case, modules: list[nn.Module], centres: Tensor, args: Any, kwargs: Any) -> dict[str, Tensor]:
-    """Outputs by path, each sample evaluated by the module of its nearest centre, one cell after the other."""
-    cells, lead = nearest(case, centres, args, kwargs), case.lead
-    n = cells.shape[0]
+def loop(case: Case, modules: list[nn.Module], cells: Tensor, args: Any, kwargs: Any) -> dict[str, Tensor]:
+    """Outputs by path, each sample evaluated by the module of its cell, int64 [n], one cell after the other."""
+    n, lead = cells.shape[0], case.lead
 
     def rows(index: Tensor) -> Callable[[Tensor], Tensor]:
         def take(tensor: Tensor) -> Tensor:
@@ -180,9 +216,26 @@ def loop(case: Case, modules: list[nn.Module], centres: Tensor, args: Any, kwarg
     return result
 
 
-def routed(case: Case, modules: list[nn.Module], centres: Tensor) -> VoronoiRouter:
+def blended(case: Case, modules: list[nn.Module], router: VoronoiRouter, args: Any, kwargs: Any) -> dict[str, Tensor]:
+    """Outputs by path: numbers are the weighted sums of what a sample's cells say, everything else its own cell's."""
+    positions = case.positions(*args, **kwargs).detach().reshape(-1, 3)
+    own, blend = router.diagram.locate(positions).long(), blend_cells(router.diagram, positions, router.blend)
+    assert blend.rows.numel(), "no sample lies near a border"
+    weights = torch.nn.functional.one_hot(own, len(modules)).to(blend.weights)
+    weights[blend.rows] = 0
+    weights[blend.rows, blend.cells.long()] = blend.weights
+    expected = loop(case, modules, own, args, kwargs)
+    every = [loop(case, modules, torch.full_like(own, cell), args, kwargs) for cell in range(len(modules))]
+    for key, value in expected.items():
+        if isinstance(value, Tensor) and value.is_floating_point():
+            parts = torch.stack([outputs[key].flatten(0, len(case.lead) - 1) for outputs in every], 1)  # [n, k, ...]
+            expected[key] = torch.einsum("nk,nk...->n...", weights.to(parts), parts).view_as(value)
+    return expected
+
+
+def routed(case: Case, modules: list[nn.Module], centres: Tensor | VoronoiDiagram, **options: Any) -> VoronoiRouter:
     """A router whose cells are the given modules."""
-    return VoronoiRouter.from_modules(modules, centres, **case.options)
+    return VoronoiRouter.from_modules(modules, centres, **{**case.options, **options})
 
 
 def close(
@@ -206,26 +259,21 @@ def scalar(outputs: dict[str, Any]) -> Tensor:
     return torch.stack(parts).sum()
 
 
-def gradients_of_cells(
-    modules: list[nn.Module], loss: Tensor, inputs: list[Tensor]
-) -> tuple[dict[str, Tensor], list[Tensor]]:
-    """Gradients of a loop's loss: of the parameters, stacked [k, ...] by name, and of the inputs."""
+def gradients(
+    of: list[nn.Module] | VoronoiRouter, loss: Tensor, inputs: list[Tensor], **options: Any
+) -> dict[str, Tensor]:
+    """Gradients by name: of a router's parameters, or of those of a loop's modules, stacked [k, ...]; of the inputs."""
+    modules = [of.module] if isinstance(of, VoronoiRouter) else of
     names = [name for name, p in modules[0].named_parameters() if p.requires_grad]
-    wanted = [module.get_parameter(name) for module in modules for name in names]
-    found = torch.autograd.grad(loss, [*wanted, *inputs], allow_unused=True, retain_graph=True)
-    filled = [torch.zeros_like(p) if g is None else g for p, g in zip([*wanted, *inputs], found)]
-    parameters = {name: torch.stack(filled[i : len(wanted) : len(names)]) for i, name in enumerate(names)}
-    return parameters, filled[len(wanted) :]
-
-
-def gradients_of_router(
-    router: VoronoiRouter, names: list[str], loss: Tensor, inputs: list[Tensor]
-) -> tuple[dict[str, Tensor], list[Tensor]]:
-    """The same of the router's loss."""
-    wanted = [router.module.get_parameter(name) for name in names]
-    found = torch.autograd.grad(loss, [*wanted, *inputs], allow_unused=True, retain_graph=True)
-    filled = [torch.zeros_like(p) if g is None else g for p, g in zip([*wanted, *inputs], found)]
-    return dict(zip(names, filled)), filled[len(wanted) :]
+    own = [list(dict.fromkeys(m.get_parameter(name) for m in modules)) for name in names]  # one, where cells share it
+    wanted = [*itertools.chain(*own), *inputs]
+    options = {"allow_unused": True, "materialize_grads": True, "retain_graph": True, **options}
+    found = iter(torch.autograd.grad(loss, wanted, **options))
+    result = {}
+    for name, parameters in zip(names, own):
+        parts = [next(found) for _ in parameters]
+        result[name] = parts[0] if len(parts) == 1 else torch.stack(parts)
+    return {**result, **{f"input {i}": gradient for i, gradient in enumerate(found)}}
 
 
 class Counter:

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from convention_harness import Case
-from convention_listed import first, one, pair, uniform
+from convention_harness import Case, one, uniform
+from convention_listed import pair
 from torch import Tensor, nn
 
 
@@ -53,6 +53,18 @@ class OldWeightNorm(nn.Module):
 
     def sdf(self, x: Tensor) -> Tensor:
         return self.forward(x)[:, :1]
+
+
+def by_hooks() -> nn.Module:
+    return OldWeightNorm(nn.utils.weight_norm)
+
+
+def parametrized() -> nn.Module:
+    return OldWeightNorm(nn.utils.parametrizations.weight_norm)
+
+
+def normed() -> nn.Module:
+    return nn.Sequential(nn.utils.weight_norm(nn.Linear(7, 8)), nn.ReLU(), nn.Linear(8, 4))
 
 
 class Residual(nn.Module):
@@ -253,45 +265,33 @@ def images(lead: tuple[int, ...]) -> Any:
     return (uniform(lead, 7), torch.randint(0, 6, lead)), {}
 
 
+SDF = {"coords": "first3", "methods": ["sdf"]}
+
 LAYERS = [
-    Case("siren", Siren, one(3), first, smooth=True),
-    Case("learned scale", LearnedScale, one(), first, smooth=True),
-    Case(
-        "weight_norm by hooks",
-        lambda: OldWeightNorm(torch.nn.utils.weight_norm),
-        one(3),
-        first,
-        options={"coords": "first3", "methods": ["sdf"]},
-        method="sdf",
-        smooth=True,
-    ),
-    Case(
-        "weight_norm by parametrization",
-        lambda: OldWeightNorm(torch.nn.utils.parametrizations.weight_norm),
-        one(3),
-        first,
-        smooth=True,
-    ),
-    Case("layer norm", lambda: Residual(lambda: nn.LayerNorm(8)), one(), first, smooth=True),
-    Case("group norm", lambda: Residual(lambda: nn.GroupNorm(2, 8)), one(), first),
-    Case("rms norm", lambda: Residual(lambda: nn.RMSNorm(8)), one(), first),
-    Case("activations", Activations, one(), first),
+    Case("siren", Siren, one(3), fuses=True),
+    Case("learned scale", LearnedScale),
+    Case("weight_norm by hooks", by_hooks, one(3), options=SDF, method="sdf", by_parameters=False),
+    Case("weight_norm by parametrization", parametrized, one(3), by_parameters=False),
+    Case("weight_norm that fuses", normed, fuses=True, by_parameters=False),
+    Case("layer norm", lambda: Residual(lambda: nn.LayerNorm(8))),
+    Case("group norm", lambda: Residual(lambda: nn.GroupNorm(2, 8))),
+    Case("rms norm", lambda: Residual(lambda: nn.RMSNorm(8))),
+    Case("activations", Activations),
+    Case("raw weights, transposed", lambda: RawWeights("transposed"), way="cell by cell"),
+    Case("raw weights, linear", lambda: RawWeights("linear"), fuses=True),
+    *(Case(f"raw weights, {way}", lambda way=way: RawWeights(way)) for way in ("matmul", "addmm", "einsum")),
+    Case("reads its weights", ReadsWeights),
+    Case("tied", Tied),
     *(
-        Case(f"raw weights, {way}", lambda way=way: RawWeights(way), one(), first, one_pass=way != "transposed")
-        for way in ("linear", "matmul", "addmm", "transposed", "einsum")
-    ),
-    Case("reads its weights", ReadsWeights, one(), first),
-    Case("tied", Tied, one(), first),
-    *(
-        Case(f"latent code, {way}", lambda way=way: LatentCode(way), one(), first, one_pass=way != "index")
+        Case(f"latent code, {way}", lambda way=way: LatentCode(way))
         for way in ("expand", "repeat", "index", "row", "mean", "ones")
     ),
-    Case("embedding", Lookup, images, first),
-    Case("embedding's average", Lookup, one(), first),
-    Case("low rank", LowRank, one(), first),
-    Case("lipschitz", Lipschitz, one(), first),
-    Case("fourier features", FourierFeatures, one(3), first),
-    Case("convolution", Convolution, one(), first, one_pass=False),
-    Case("bilinear", Bilinear, pair, first, one_pass=False),
-    Case("grid", Grid, one(3), first, one_pass=False),
+    Case("embedding", Lookup, images),
+    Case("embedding's average", Lookup),
+    Case("low rank", LowRank, fuses=True),
+    Case("lipschitz", Lipschitz),
+    Case("fourier features", FourierFeatures, one(3), fuses=True),
+    Case("convolution", Convolution, way="cell by cell"),
+    Case("bilinear", Bilinear, pair, way="cell by cell"),
+    Case("grid", Grid, one(3)),
 ]

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
-from convention_harness import Case, example
-from torch import Tensor, nn
+from convention_harness import RAYS, Arguments, Case, example, first, one, uniform
+from torch import nn
 
 nerf_pytorch, flexible, nerf_pl, mip = (example(n) for n in ("nerf_pytorch", "flexible_nerf", "nerf_pl", "mipnerf_pl"))
 nerfacc, studio, ngp, mega = (example(n) for n in ("nerfacc_field", "nerfstudio_field", "torch_ngp", "mega_nerf"))
 
 Lead = tuple[int, ...]
-Arguments = tuple[tuple[Any, ...], dict[str, Any]]
-
-
-def uniform(lead: Lead, features: int = 3) -> Tensor:
-    return torch.rand(*lead, features) * 2 - 1
-
-
-def first(x: Tensor, *_: Any, **__: Any) -> Tensor:
-    return x[..., :3]
 
 
 def encoded(octaves: int, direction_octaves: int | None) -> Any:
@@ -34,11 +24,6 @@ def encoded(octaves: int, direction_octaves: int | None) -> Any:
         return (x,), {}
 
     return arguments
-
-
-def one(features: int = 7) -> Callable[[Lead], Arguments]:
-    """One tensor, whose first three features are the position."""
-    return lambda lead: ((uniform(lead, features),), {})
 
 
 def pair(lead: Lead) -> Arguments:
@@ -90,132 +75,73 @@ def mega_arguments(noise: bool) -> Any:
 STUDIO = {"coords": studio.positions_of, "methods": ["get_density", "get_outputs", "density_fn"]}
 NERFACC = {"coords": "first3", "methods": ["query_density", "query_opacity"]}
 NGP = {"coords": "first3", "methods": ["density", "color"]}
-RAYS = (9, 7)  # unlike any number of features
 
+
+def skips() -> nn.Module:
+    return nerf_pytorch.NeRF(D=4, W=10, input_ch=15, input_ch_views=9, skips=[1], use_viewdirs=True)
+
+
+def plain() -> nn.Module:
+    return nerf_pytorch.NeRF(D=3, W=8, input_ch=15, input_ch_views=0, output_ch=5, skips=[0])
+
+
+def flexible_field() -> nn.Module:
+    return flexible.FlexibleNeRFModel(6, 8, 2, num_encoding_fn_xyz=2, num_encoding_fn_dir=1)
+
+
+def pl_field() -> nn.Module:
+    return nerf_pl.NeRF(3, 8, 15, 9, skips=[1])
+
+
+def nerfacc_field() -> nn.Module:
+    return nerfacc.VanillaNeRFRadianceField(3, 10, 1, 6)
+
+
+def ngp_field() -> nn.Module:
+    return ngp.NeRFNetwork(8, 4)
+
+
+def studio_case(method: str, arguments: Any) -> Case:
+    name = f"nerfstudio {method}"
+    return Case(name, appearance_field, arguments, studio.positions_of, RAYS, STUDIO, method=method)
+
+
+def other(method: str, options: Any, make: Any, arguments: Any, **more: Any) -> Case:
+    """A method beside forward."""
+    return Case(f"{make.__name__} {method}", make, arguments, options=options, method=method, fuses=True, **more)
+
+
+SLICE = {"coords": slice(0, 3)}
+WITH_VIEW, WITH_CONDITION = {"per_ray": ["view_direction"]}, {**NERFACC, "per_ray": ["condition"]}
+PART = Case(
+    "torch-ngp color of a part of the samples",
+    ngp_field,
+    lambda lead: ((*pair(lead)[0], torch.rand(lead) < 0.5), {"geo_feat": uniform(lead, 4)}),
+    options=NGP,
+    method="color",
+    way="cell by cell",  # the module takes some of its rows, so that cells end elsewhere
+)
 LISTED = [
-    Case(
-        "nerf-pytorch",
-        lambda: nerf_pytorch.NeRF(D=4, W=10, input_ch=15, input_ch_views=9, skips=[1], use_viewdirs=True),
-        encoded(2, 1),
-        first,
-    ),
-    Case(
-        "nerf-pytorch without views",
-        lambda: nerf_pytorch.NeRF(D=3, W=8, input_ch=15, input_ch_views=0, output_ch=5, skips=[0]),
-        encoded(2, None),
-        first,
-        options={"coords": slice(0, 3)},
-    ),
-    Case(
-        "FlexibleNeRF",
-        lambda: flexible.FlexibleNeRFModel(6, 8, 2, num_encoding_fn_xyz=2, num_encoding_fn_dir=1),
-        encoded(2, 1),
-        first,
-        lead=RAYS,
-    ),
-    Case("nerf_pl", lambda: nerf_pl.NeRF(3, 8, 15, 9, skips=[1]), encoded(2, 1), first),
-    Case(
-        "nerf_pl sigma_only",
-        lambda: nerf_pl.NeRF(3, 8, 15, 9, skips=[1]),
-        lambda lead: (encoded(2, None)(lead)[0], {"sigma_only": True}),
-        first,
-    ),
-    Case(
-        "mipnerf_pl",
-        mip_field,
-        mip_arguments(True),
-        first,
-        lead=RAYS,
-        options={"per_ray": ["view_direction"]},
-        given=True,
-        rank=3,
-    ),
-    Case("mipnerf_pl without views", mip_field, mip_arguments(False), first, RAYS, {}, given=True, rank=3),
-    Case("nerfacc packed", lambda: nerfacc.VanillaNeRFRadianceField(3, 10, 1, 6), pair, first, options=NERFACC),
-    Case(
-        "nerfacc with a condition per ray",
-        lambda: nerfacc.VanillaNeRFRadianceField(3, 10, 1, 6),
-        with_rays,
-        first,
-        lead=RAYS,
-        options={**NERFACC, "per_ray": ["condition"]},
-    ),
-    Case(
-        "nerfacc query_density",
-        lambda: nerfacc.VanillaNeRFRadianceField(2, 8),
-        lambda lead: ((uniform(lead),), {}),
-        first,
-        options=NERFACC,
-        method="query_density",
-    ),
-    Case(
-        "nerfacc query_opacity",
-        lambda: nerfacc.VanillaNeRFRadianceField(2, 8),
-        lambda lead: ((uniform(lead), 0.01), {}),
-        first,
-        options=NERFACC,
-        method="query_opacity",
-    ),
-    Case("nerfstudio", appearance_field, lambda lead: ((ray_samples(lead),), {}), studio.positions_of, RAYS, STUDIO),
-    Case(
-        "nerfstudio get_density",
-        appearance_field,
-        lambda lead: ((ray_samples(lead),), {}),
-        studio.positions_of,
-        RAYS,
-        STUDIO,
-        method="get_density",
-    ),
-    Case(
-        "nerfstudio get_outputs",
-        appearance_field,
-        outputs_arguments,
-        studio.positions_of,
-        RAYS,
-        STUDIO,
-        method="get_outputs",
-    ),
-    Case(
-        "nerfstudio density_fn",
-        appearance_field,
-        lambda lead: ((uniform(lead),), {}),
-        studio.positions_of,
-        RAYS,
-        STUDIO,
-        method="density_fn",
-    ),
-    Case("torch-ngp", lambda: ngp.NeRFNetwork(8, 4), pair, first, options=NGP),
-    Case(
-        "torch-ngp density",
-        lambda: ngp.NeRFNetwork(8, 4),
-        lambda lead: ((uniform(lead),), {}),
-        first,
-        options=NGP,
-        method="density",
-    ),
-    Case(
-        "torch-ngp color",
-        lambda: ngp.NeRFNetwork(8, 4),
-        lambda lead: (pair(lead)[0], {"geo_feat": uniform(lead, 4)}),
-        first,
-        options=NGP,
-        method="color",
-    ),
-    Case(
-        "torch-ngp color of a part of the samples",
-        lambda: ngp.NeRFNetwork(8, 4),
-        lambda lead: ((*pair(lead)[0], torch.rand(lead) < 0.5), {"geo_feat": uniform(lead, 4)}),
-        first,
-        options=NGP,
-        method="color",
-        one_pass=False,  # the module takes some of its rows, so that cells end elsewhere
-    ),
-    Case("mega-nerf", mega_field(), mega_arguments(False), first),
-    Case("mega-nerf affine with noise", mega_field(affine=True), mega_arguments(True), first),
-    Case(
-        "mega-nerf sigma_only",
-        mega_field(),
-        lambda lead: ((uniform(lead), True), {}),
-        first,
-    ),
+    Case("nerf-pytorch", skips, encoded(2, 1), fuses=True),
+    Case("nerf-pytorch without views", plain, encoded(2, None), options=SLICE, fuses=True),
+    Case("FlexibleNeRF", flexible_field, encoded(2, 1), lead=RAYS, fuses=True),
+    Case("nerf_pl", pl_field, encoded(2, 1), fuses=True),
+    Case("nerf_pl sigma_only", pl_field, lambda lead: (encoded(2, None)(lead)[0], {"sigma_only": True}), fuses=True),
+    Case("mipnerf_pl", mip_field, mip_arguments(True), first, RAYS, WITH_VIEW, given=True, fuses=True, rank=3),
+    Case("mipnerf_pl without views", mip_field, mip_arguments(False), first, RAYS, {}, given=True, fuses=True, rank=3),
+    Case("nerfacc packed", nerfacc_field, pair, options=NERFACC, fuses=True),
+    Case("nerfacc with a condition per ray", nerfacc_field, with_rays, first, RAYS, WITH_CONDITION, fuses=True),
+    other("query_density", NERFACC, nerfacc_field, one(3)),
+    other("query_opacity", NERFACC, nerfacc_field, lambda lead: ((uniform(lead), 0.01), {})),
+    studio_case("forward", lambda lead: ((ray_samples(lead),), {})),
+    studio_case("get_density", lambda lead: ((ray_samples(lead),), {})),
+    studio_case("get_outputs", outputs_arguments),
+    studio_case("density_fn", one(3)),
+    Case("torch-ngp", ngp_field, pair, options=NGP, fuses=True),
+    other("density", NGP, ngp_field, one(3)),
+    other("color", NGP, ngp_field, lambda lead: (pair(lead)[0], {"geo_feat": uniform(lead, 4)})),
+    PART,
+    Case("mega-nerf", mega_field(), mega_arguments(False)),
+    Case("mega-nerf affine with noise", mega_field(affine=True), mega_arguments(True)),
+    Case("mega-nerf sigma_only", mega_field(), lambda lead: ((uniform(lead), True), {}), fuses=True),
 ]

@@ -1,7 +1,7 @@
 """Fields of other people's codebases through VoronoiRouter: every case against a loop over masks.
 
 The cases: `convention_listed.py` has the codebases of examples/, `convention_layers.py` and `convention_calls.py`
-what nobody listed.
+what nobody listed, `convention_rules.py` single steps; each that fuses is a case of its own with ``fuse=True``.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from convention_harness import (
     Case,
     Counter,
     K,
+    blended,
     close,
-    gradients_of_cells,
-    gradients_of_router,
+    gradients,
     loop,
     nearest,
     prepared,
@@ -31,11 +31,13 @@ from convention_harness import (
 )
 from convention_layers import LAYERS
 from convention_listed import LISTED
+from convention_rules import RULES
 from torch import Tensor
 
 from voronerf import VoronoiDiagram, VoronoiRouter
 
-CASES = [*LISTED, *LAYERS, *CALLS]
+CASES = [*LISTED, *LAYERS, *CALLS, *RULES]
+CASES += [case.fused() for case in CASES if case.fuses]
 every_case = pytest.mark.parametrize("case", CASES, ids=str)
 
 
@@ -53,70 +55,46 @@ def _quiet() -> Any:
 
 
 @every_case
-def test_identical_cells_give_the_fields_own_output(case: Case, centres: Tensor) -> None:
-    field = randomised(case.make())
-    router = VoronoiRouter(field, centres, **case.options)
-    args, kwargs, _ = prepared(case, torch.float32)
-    close(tensors(case.call(router, args, kwargs)), tensors(case.call(field, args, kwargs)), rtol=1e-4, atol=1e-5)
-
-
-@every_case
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
 def test_distinct_cells_equal_a_loop_over_masks(case: Case, dtype: torch.dtype, centres: Tensor) -> None:
+    """Values, gradients, and gradients of gradients, as the eikonal loss takes them."""
     modules = case.modules(dtype)
     router = routed(case, modules, centres)
     args, kwargs, inputs = prepared(case, dtype)
-    expected = loop(case, modules, centres, args, kwargs)
+    expected = loop(case, modules, nearest(case, centres, args, kwargs), args, kwargs)
     # A network is recognised after some calls: both ways of running it must be right.
     first, _, found = (tensors(case.call(router, args, kwargs)) for _ in range(3))
     # float32: sums in another order, and a sample near the kink of a ReLU may fall on either side.
     rtol, atol = (1e-9, 1e-10) if dtype == torch.float64 else (2e-3, 2e-4)
-    close(first, expected, rtol=rtol, atol=atol)
-    close(found, expected, rtol=rtol, atol=atol)
-    parameters, taken = gradients_of_cells(modules, scalar(expected), inputs)
+    slopes = gradients(modules, scalar(expected), inputs, create_graph=True)
+    compared = [name for name in slopes if case.by_parameters or name.startswith("input")]
+    curves = gradients(modules, scalar({name: slopes[name] for name in compared}), inputs)
     for outputs in (first, found):
-        router_parameters, router_taken = gradients_of_router(router, list(parameters), scalar(outputs), inputs)
-        close(router_parameters, parameters, rtol=rtol, atol=10 * atol)
-        torch.testing.assert_close(router_taken, taken, rtol=rtol, atol=10 * atol)
-
-
-@pytest.mark.parametrize("case", [case for case in CASES if case.smooth], ids=str)
-def test_second_derivatives_equal_the_loops(case: Case, centres: Tensor) -> None:
-    """The eikonal loss: gradients of the parameters through the gradient of the input."""
-    modules = case.modules(torch.float64)
-    router = routed(case, modules, centres)
-    args, kwargs, inputs = prepared(case, torch.float64)
-    found = []
-    case.call(router, args, kwargs)
-    case.call(router, args, kwargs)
-    for outputs in (loop(case, modules, centres, args, kwargs), tensors(case.call(router, args, kwargs))):
-        (gradient,) = torch.autograd.grad(scalar(outputs), inputs[:1], create_graph=True)
-        loss = (gradient.norm(dim=-1) - 1).square().sum()
-        names = [name for name, p in modules[0].named_parameters() if p.requires_grad]
-        found.append(
-            gradients_of_router(router, names, loss, inputs) if found else gradients_of_cells(modules, loss, inputs)
-        )
-    close(found[1][0], found[0][0], rtol=1e-8, atol=1e-9)
-    torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-8, atol=1e-9)
+        close(outputs, expected, rtol=rtol, atol=atol)
+        ours = gradients(router, scalar(outputs), inputs, create_graph=True)
+        close(ours, slopes, rtol=rtol, atol=10 * atol)
+        bent = gradients(router, scalar({name: ours[name] for name in compared}), inputs)
+        close(bent, curves, rtol=rtol, atol=100 * atol)
 
 
 @every_case
-def test_how_often_the_module_runs(case: Case, centres: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once for all cells, or where that may not be, once for each cell that has samples."""
-    field = case.make()
+def test_identical_cells_give_the_fields_own_output(
+    case: Case, centres: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It runs once for all cells, or where that may not be, once for each cell that has samples."""
+    field = randomised(case.make())
+    args, kwargs, _ = prepared(case, torch.float32)
+    expected = tensors(case.call(field, args, kwargs))
     counter = Counter(monkeypatch, type(field), case.method)
     # No sample is near the last of the centres: its cell is empty.
     router = VoronoiRouter(field, torch.cat([centres, torch.full((1, 3), 50.0)]), **case.options)
-    args, kwargs, _ = prepared(case, torch.float32)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        case.call(router, args, kwargs)
-    counter.rows.clear()  # whatever is found out on the first call
-    case.call(router, args, kwargs)
+    for _ in range(2):
+        counter.rows.clear()  # whatever is found out on the first call
+        close(tensors(case.call(router, args, kwargs)), expected, rtol=1e-4, atol=1e-5)
+    assert f"{case.method}: {case.way}" in router.explain()
     assert 0 not in counter.rows
-    if case.one_pass:
+    if case.way != "cell by cell":
         assert len(counter.rows) <= 1, f"ran {len(counter.rows)} times for {K} cells"
-        assert not [str(w.message) for w in said if "cell by cell" in str(w.message)]
     elif len(counter.rows) > 1:
         counts = nearest(case, centres, args, kwargs).unique(return_counts=True)[1].tolist()
         # Where another batch may do without the loop, that is looked at on a few samples.
@@ -124,28 +102,35 @@ def test_how_often_the_module_runs(case: Case, centres: Tensor, monkeypatch: pyt
 
 
 @every_case
-def test_without_samples_sizes_and_dtypes_are_kept(case: Case, centres: Tensor) -> None:
-    router = VoronoiRouter(case.make(), centres, **case.options)
-    args, kwargs, _ = prepared(case, torch.float32)
-    some = tensors(case.call(router, args, kwargs))
-    for empty in [(0,)] if len(case.lead) == 1 else [(0, case.lead[1])]:
-        args, kwargs, _ = prepared(case, torch.float32, empty)
-        none = tensors(case.call(router, args, kwargs))
-        assert list(none) == list(some)
-        for key, value in some.items():
-            if isinstance(value, Tensor):
-                assert none[key].shape == (*empty, *value.shape[len(case.lead) :]), key
-                assert none[key].dtype == value.dtype, key
+def test_blended_cells_equal_a_weighted_sum_over_cells(case: Case) -> None:
+    modules = [module.eval() for module in case.modules(torch.float64)]
+    diagram = VoronoiDiagram(torch.rand(3, 3) * 2 - 1).refine({1: torch.rand(3, 3) * 2 - 1})[0]
+    router = routed(case, modules, diagram, blend=0.3).eval()
+    args, kwargs, _ = prepared(case, torch.float64)
+    for _ in range(3):
+        found = tensors(case.call(router, args, kwargs))
+        close(found, blended(case, modules, router, args, kwargs), rtol=1e-5, atol=1e-5)
 
 
 @every_case
-def test_one_sample(case: Case, centres: Tensor) -> None:
+def test_few_samples_and_none(case: Case, centres: Tensor) -> None:
     modules = case.modules(torch.float64)
     router = routed(case, modules, centres)
-    single = (1,) if len(case.lead) == 1 else (1, 1)
+    args, kwargs, _ = prepared(case, torch.float64)
+    some = tensors(case.call(router, args, kwargs))
+    single, empty = ((1,), (0,)) if len(case.lead) == 1 else ((1, 1), (0, case.lead[1]))
     args, kwargs, _ = prepared(case, torch.float64, single)
-    lone = dataclasses.replace(case, lead=single)
-    close(tensors(case.call(router, args, kwargs)), loop(lone, modules, centres, args, kwargs), rtol=1e-9, atol=1e-10)
+    expected = loop(dataclasses.replace(case, lead=single), modules, nearest(case, centres, args, kwargs), args, kwargs)
+    close(tensors(case.call(router, args, kwargs)), expected, rtol=1e-9, atol=1e-10)
+    args, kwargs, inputs = prepared(case, torch.float64, empty)
+    none = tensors(case.call(router, args, kwargs))
+    assert list(none) == list(some)
+    for key, value in some.items():
+        if isinstance(value, Tensor):
+            assert none[key].shape == (*empty, *value.shape[len(case.lead) :]), key
+            assert none[key].dtype == value.dtype, key
+    if scalar(none).requires_grad:
+        assert all(not gradient.any() for gradient in gradients(router, scalar(none), inputs).values())
 
 
 @every_case

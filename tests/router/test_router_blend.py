@@ -1,4 +1,4 @@
-"""Blended routing against a loop over the entries, for every kind of module, and where it leaves things alone."""
+"""Blended routing against a loop over the entries, and where it leaves things alone."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from router_fields import BY_CELL, ONE_PASS, Heads, SkipNet, perturb, tensors
+from router_fields import Heads, SkipNet, perturb, tensors
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
@@ -44,17 +44,6 @@ def near(found: list[Tensor], expected: list[Tensor]) -> None:
     assert len(found) == len(expected)
     for a, b in zip(found, expected):
         assert a.shape == b.shape and torch.allclose(a.detach().double(), b, rtol=1e-4, atol=2e-5)
-
-
-@pytest.mark.filterwarnings("ignore:VoronoiRouter.*runs cell by cell")
-@pytest.mark.parametrize(("kind", "inputs"), ONE_PASS + BY_CELL, ids=lambda value: getattr(value, "__name__", ""))
-def test_any_module(kind, inputs) -> None:
-    generator = torch.Generator().manual_seed(5)
-    router = perturb(VoronoiRouter(kind(), nested(), coords="first3", blend=MARGIN), generator).eval()
-    for n in (300, 300, 300, 7):  # the third call of a kind may run fused
-        args = inputs(n, torch.float32, generator)
-        expected = by_entries(router, args[0][:, :3], args)
-        near(tensors(router(*args)), expected)
 
 
 def test_one_sample_and_none() -> None:

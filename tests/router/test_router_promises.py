@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import pickle
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +13,8 @@ import torch
 import torch.nn.functional as F
 from convention_harness import randomised
 from convention_listed import LISTED, ngp, uniform
-from router_fields import SkipNet, gradients, masked_loop, perturb, tensors
+from convention_rules import Encoded, Scales, two_layers
+from router_fields import SkipNet, masked_loop, perturb, tensors
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiRouter
@@ -30,110 +30,11 @@ def centres(k: int = 6) -> Tensor:
     return torch.rand(k, 3, generator=torch.Generator().manual_seed(k)) * 2 - 1
 
 
-def equal_to_loop(router: VoronoiRouter, args: list[Tensor], generator: torch.Generator, second: bool = False) -> None:
-    """Results and gradients against a mask and a module for each cell."""
-    args = [a.clone().requires_grad_() for a in args]
-    found = tensors(router(*args))
-    expected, modules = masked_loop(router, router.diagram.locate(args[0][:, :3].detach()), args)
-    factors = [torch.randn(e.shape, generator=generator) for e in expected]
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
-    names = [name for name, _ in router.module.named_parameters()]
-    ours = gradients(found, factors, [*args, *router.module.parameters()], second)
-    theirs = gradients(expected, factors, [*args, *(m.get_parameter(n) for n in names for m in modules)], second)
-    for a, b in zip(ours[: len(args)], theirs[: len(args)], strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
-    for i, gradient in enumerate(ours[len(args) :]):
-        first = len(args) + i * len(modules)
-        parts = torch.stack(theirs[first : first + len(modules)])
-        shared = gradient.shape == parts.shape[1:]
-        torch.testing.assert_close(
-            gradient, parts.sum(0) if shared else parts, rtol=2e-3, atol=2e-3 if second else 2e-4
-        )
+def equal_to_loop(router: VoronoiRouter, x: Tensor) -> None:
+    torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x[:, :3]), [x])[0][0])
 
 
 # fuse -----------------------------------------------------------------------------------------------------------------
-
-
-class Siren(nn.Module):
-    """Sines of scaled layers; the last scale is a number on the left."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.a, self.b, self.out = nn.Linear(3, 8), nn.Linear(8, 8), nn.Linear(8, 2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.out(torch.sin(3.0 * self.b(torch.sin(self.a(x) * 5))))
-
-
-class WeightNorm(nn.Module):
-    """Weights computed from parameters by hooks."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            self.a, self.b = (nn.utils.weight_norm(nn.Linear(i, o)) for i, o in ((3, 8), (8, 4)))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.b(F.relu(self.a(x)))
-
-
-class TruncExp(torch.autograd.Function):
-    """As torch-ngp's: the exponential of small numbers only in the backward pass, under automatic mixed precision."""
-
-    @staticmethod
-    @torch.amp.custom_fwd(device_type="cpu", cast_inputs=torch.float32)
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        ctx.save_for_backward(x)
-        return torch.exp(x)
-
-    @staticmethod
-    @torch.amp.custom_bwd(device_type="cpu")
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return gradient * torch.exp(x.clamp(max=-1))
-
-
-trunc_exp = TruncExp.apply
-
-
-class Truncated(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = nn.Sequential(nn.Linear(3, 8), nn.ReLU(inplace=True), nn.Linear(8, 4))
-
-    def forward(self, x: Tensor) -> dict[str, Tensor]:
-        h = self.net(x)
-        return {"sigma": trunc_exp(h[..., 0]), "rgb": torch.sigmoid(h[..., 1:])}
-
-
-FUSED: list[tuple[type[nn.Module], int]] = [(SkipNet, 15), (Siren, 3), (WeightNorm, 3), (Truncated, 3)]
-
-
-@pytest.mark.parametrize(("make", "features"), FUSED)
-def test_fused_networks_equal_a_loop_over_masks(
-    make: type[nn.Module], features: int, generator: torch.Generator
-) -> None:
-    router = perturb(VoronoiRouter(make(), centres(), coords="first3", fuse=True), generator)
-    x = torch.rand(77, features, generator=generator) * 2 - 1
-    equal_to_loop(router, [x], generator)
-    assert router.explain() == "forward: fused"
-    if make in (SkipNet, Siren):
-        equal_to_loop(router, [x], generator, second=True)
-
-
-@pytest.mark.parametrize("case", [c for c in LISTED if "studio" not in c.name and "mega" not in c.name], ids=str)
-def test_the_codebases_of_examples_fuse(case: Any) -> None:
-    field = randomised(case.make())
-    if case.name == "torch-ngp color of a part of the samples":
-        return
-    router = VoronoiRouter(field, centres(), fuse=True, **case.options)
-    args, kwargs = case.arguments(case.lead)
-    found, expected = (tensors(case.call(module, args, kwargs)) for module in (router, field))
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
-    assert f"{case.method}: fused" in router.explain()
 
 
 class Rough(nn.Module):
@@ -233,28 +134,16 @@ def test_fused_networks_follow_parameters_cells_and_copies(generator: torch.Gene
 # share ----------------------------------------------------------------------------------------------------------------
 
 
-class Encoded(nn.Module):
-    """An encoder that all cells share, and a network of each."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.encoder = nn.Sequential(nn.Linear(3, 6), nn.ReLU())
-        self.table, self.head = nn.Embedding(4, 2), nn.Linear(8, 2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.head(torch.cat([self.encoder(x), self.table((x[:, 0] > 0).long())], -1))
-
-
 @pytest.mark.parametrize("fuse", [False, True])
 def test_shared_parameters_are_one_copy(fuse: bool, generator: torch.Generator) -> None:
-    module = Encoded() if not fuse else nn.Sequential(nn.Linear(3, 6), nn.ReLU(), nn.Linear(6, 2))
+    module = two_layers() if fuse else Encoded()
     names = ["encoder.*", "table.weight"] if not fuse else ["0.*"]
     router = perturb(VoronoiRouter(module, centres(), coords="first3", share=names, fuse=fuse), generator)
     shapes = {name: tuple(p.shape) for name, p in router.module.named_parameters()}
     first = "encoder.0.weight" if not fuse else "0.weight"
     assert shapes[first] == (6, 3) and shapes["head.bias" if not fuse else "2.bias"] == (6, 2)
     x = torch.rand(80, 3, generator=generator) * 2 - 1
-    equal_to_loop(router, [x], generator)
+    equal_to_loop(router, x)
     assert router.explain() == f"forward: {'fused' if fuse else 'grouped'}"
 
     same, optimizer = router(x), torch.optim.Adam(router.parameters())
@@ -406,34 +295,21 @@ def test_a_method_that_is_not_routed_names_the_remedy() -> None:
         router.color(uniform((4,)), uniform((4,)))
 
 
-def scale_rows(rows: Tensor, factor: Tensor) -> Tensor:
+def doubled(rows: Tensor, factor: Tensor) -> Tensor:
     """A function that PyTorch's function modes see."""
     if torch.overrides.has_torch_function((rows, factor)):
-        return torch.overrides.handle_torch_function(scale_rows, (rows, factor), rows, factor)
-    return rows * factor.exp()
+        return torch.overrides.handle_torch_function(doubled, (rows, factor), rows, factor)
+    return rows * 2 * factor
 
 
-class Scales(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc, self.factor = nn.Linear(3, 4), nn.Parameter(torch.randn(4))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return scale_rows(self.fc(x), self.factor)
-
-
-def test_a_rule_of_ones_own(generator: torch.Generator) -> None:
-    x = torch.rand(50, 3, generator=generator)
-    with pytest.warns(UserWarning, match="scale_rows meets parameters and has no rule"):
-        VoronoiRouter(Scales(), centres(), coords="first3")(x)
-    register(scale_rows, lambda run, rows, factor: rows * run.rows_of(factor).exp())
-    router = perturb(VoronoiRouter(Scales(), centres(), coords="first3"), generator)
-    equal_to_loop(router, [x], generator)
-    assert router.explain() == "forward: grouped"
-    register(scale_rows, lambda run, rows, factor: rows * run.rows_of(factor))
-    wrong = perturb(VoronoiRouter(Scales(), centres(), coords="first3"), generator)
+def test_a_rule_of_ones_own_may_be_wrong(generator: torch.Generator) -> None:
+    x = torch.rand(50, 7, generator=generator)
+    with pytest.warns(UserWarning, match="doubled meets parameters and has no rule"):
+        VoronoiRouter(Scales(doubled), centres(), coords="first3")(x)
+    register(doubled, lambda run, rows, factor: rows * run.rows_of(factor))
+    wrong = perturb(VoronoiRouter(Scales(doubled), centres(), coords="first3"), generator)
     with pytest.warns(UserWarning, match="gives other results than on those of one cell"):
-        equal_to_loop(wrong, [x], generator)
+        equal_to_loop(wrong, x)
 
 
 class Box(nn.Module):
@@ -456,26 +332,8 @@ def test_a_batch_that_needs_the_loop_uses_it_alone(generator: torch.Generator) -
     for batches in ((near, far, near), (far, near, far)):
         router = perturb(VoronoiRouter(Box(), centres(), coords="first3"), generator)
         for x in batches:
-            equal_to_loop(router, [x], generator)
+            equal_to_loop(router, x)
         assert "forward: grouped" in router.explain() and "cell by cell" in router.explain()
-
-
-def test_lists_may_hold_parameters_that_are_registered(generator: torch.Generator) -> None:
-    class Listed(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.fc = nn.Linear(3, 4)
-            self.weights, self.unregistered = [self.fc.weight, {"bias": self.fc.bias}], [1]
-
-        def forward(self, x: Tensor) -> Tensor:
-            return F.linear(x, self.weights[0], self.weights[1]["bias"])
-
-    router = perturb(VoronoiRouter(Listed(), centres(), coords="first3"), generator)
-    x = torch.rand(50, 3, generator=generator)
-    equal_to_loop(router, [x], generator)
-    assert router.explain() == "forward: grouped"
-    cell = router.cell(2)
-    assert cell.weights[0] is cell.fc.weight and cell.fc.weight.shape == (4, 3)
 
 
 # Resuming -------------------------------------------------------------------------------------------------------------
@@ -542,64 +400,3 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
     assert not torch.equal(before, router.module.weight)
     with pytest.raises(ValueError, match="load_state_dict: optimizer must hold the router's parameters"):
         router.load_state_dict(state, optimizer=torch.optim.SGD([nn.Parameter(torch.zeros(2))]))
-
-
-# Arguments that a rule does not serve ---------------------------------------------------------------------------------
-
-
-class Odd(nn.Module):
-    """Parameters of many shapes, and a step with some of them."""
-
-    def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
-        super().__init__()
-        self.fc, self.step = nn.Linear(3, 4), [step]
-        self.vector, self.square, self.one = (nn.Parameter(torch.randn(s)) for s in ((4,), (4, 4), (1, 4)))
-        self.cube, self.table = nn.Parameter(torch.randn(1, 2, 4)), nn.Embedding(5, 4, padding_idx=0)
-        self.norm = nn.GroupNorm(2, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.step[0](self, self.fc(x))
-
-
-def index(h: Tensor) -> Tensor:
-    return (h[:, 0] > 0).long()
-
-
-ODD: list[Callable[[Any, Tensor], Tensor]] = [
-    lambda net, h: h @ net.vector,
-    lambda net, h: (net.square @ h[..., None])[..., 0],
-    lambda net, h: (net.square @ h.t()).t(),
-    lambda net, h: torch.addmm(net.one, h, net.square),
-    lambda net, h: torch.addmm(net.vector, h, net.square, alpha=2),
-    lambda net, h: torch.einsum("ni,oi", h, net.square),
-    lambda net, h: torch.einsum("in,oi->no", h.t(), net.square),
-    lambda net, h: torch.einsum("ni,oi,o->no", [h, net.square, net.vector]),
-    lambda net, h: torch.einsum("nci,oi->nco", h[:, None], net.square)[:, 0],
-    lambda net, h: (h[:, None] * net.cube).sum(1),
-    lambda net, h: (h[:, None].expand(-1, 2, -1) * net.cube[0]).sum(1),
-    lambda net, h: h * net.square.sum(),
-    lambda net, h: torch.where(h > 0, h, net.vector),
-    lambda net, h: h.add(net.vector).clamp(net.one - 1, net.vector + 1),
-    lambda net, h: F.layer_norm(h, (4,), net.vector, torch.ones(4)),
-    lambda net, h: F.rms_norm(h, (4,), net.vector),
-    lambda net, h: net.norm(h[..., None])[..., 0],
-    lambda net, h: F.prelu(h, net.vector),
-    lambda net, h: F.prelu(h[..., None], net.vector)[..., 0],
-    lambda net, h: net.table(index(h)),
-    lambda net, h: net.square[index(h) - 1],
-    lambda net, h: net.square[:, index(h)].t(),
-    lambda net, h: net.cube[0].repeat(len(h), 1, 1).sum(1),
-    lambda net, h: net.vector.type_as(h).expand_as(h) + h,
-    lambda net, h: net.one.expand(len(h), 4) + net.vector.data,
-    lambda net, h: h * max(net.vector.tolist()),
-    lambda net, h: h * torch.stack(torch.unbind(net.square)).norm(),
-    lambda net, h: F.linear(h, net.square, torch.ones(4)) + F.linear(h, torch.eye(4), net.vector),
-    lambda net, h: h + torch.autograd.grad(net.vector.square().sum(), net.vector, create_graph=True)[0],
-]
-
-
-@pytest.mark.filterwarnings("ignore:VoronoiRouter")
-@pytest.mark.parametrize("number", range(len(ODD)))
-def test_whatever_a_rule_does_not_serve_is_right(number: int, generator: torch.Generator) -> None:
-    router = perturb(VoronoiRouter(Odd(ODD[number]), centres(), coords="first3"), generator)
-    equal_to_loop(router, [torch.rand(50, 3, generator=generator) * 2 - 1], generator)

@@ -6,38 +6,10 @@ from collections.abc import Callable
 
 import pytest
 import torch
-import torch.nn.functional as F
+from convention_rules import Corners, Planes
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
-
-
-class Corners(nn.Module):
-    """Several look-ups into one table, and one into another, with positions between them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.table, self.codes = nn.Parameter(torch.randn(11, 2)), nn.Embedding(7, 3)
-
-    def forward(self, x: Tensor) -> Tensor:
-        index = (x[:, :2].abs() * 5).long()
-        low, high = self.table[index], self.table[-1 - index]
-        mixed = (low * x[:, :2, None] + high * (1 - x[:, :2, None]) ** 2).sum(1)
-        return torch.cat([mixed, mixed**2, self.codes(index[:, 0]) * x[:, 2:3] ** 3], 1)
-
-
-class Planes(nn.Module):
-    """A plane read with the samples in the second dimension, and a volume with them in the last but one."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.plane, self.volume = nn.Parameter(torch.randn(1, 3, 5, 4)), nn.Parameter(torch.randn(1, 2, 3, 4, 5))
-
-    def forward(self, x: Tensor) -> Tensor:
-        pairs = torch.stack([x[:, :2], x[:, 1:]], 1)
-        plane = F.grid_sample(self.plane, pairs[None], align_corners=True)
-        volume = F.grid_sample(self.volume, x.view(1, 1, 1, -1, 3), padding_mode="border", align_corners=False)
-        return torch.cat([plane[0].permute(1, 0, 2).flatten(1), volume.view(2, -1).T], -1)
 
 
 def _loop(router: VoronoiRouter, x: Tensor) -> Tensor:
@@ -73,22 +45,6 @@ def test_look_ups_give_what_one_module_for_each_cell_gives(make: Callable[[], nn
         ours = torch.autograd.grad(found, parameters, weights, retain_graph=True)
         for a, b in zip(ours, theirs, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("of_parameters", [False, True])
-def test_second_derivatives_through_look_ups(of_parameters: bool) -> None:
-    torch.manual_seed(2)
-    router = _router(Corners(), 4)
-    parameters = list(router.parameters())
-    results = []
-    for call in (router, lambda x: _loop(router, x)):
-        x = torch.rand(50, 3, generator=torch.Generator().manual_seed(1)).requires_grad_()
-        leaves = [x, *parameters] if of_parameters else [x]
-        slopes = torch.autograd.grad((call(x) ** 3).sum(), leaves, create_graph=True)
-        total = sum((slope**2).sum() for slope in slopes)
-        results.append(torch.autograd.grad(total, [x, *parameters]))
-    for a, b in zip(*results, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
 
 
 def test_indices_outside_of_a_table_are_refused() -> None:
