@@ -1,7 +1,7 @@
 """VoronoiRouter: any module as one network per Voronoi cell."""
 
+from voronerf.router.evaluate import LayeredField
 from voronerf.router.grouped import register
-from voronerf.router.layered import LayeredField
 from voronerf.router.router import VoronoiRouter
 
 __all__ = ["LayeredField", "VoronoiRouter", "register"]

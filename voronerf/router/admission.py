@@ -287,6 +287,7 @@ def _picked(layout: Layout, lead: tuple[int, ...]) -> tuple[Tensor, Tensor]:
 
 
 def _as_samples(module: nn.Module, call: Call, layout: Layout, lead: tuple[int, ...]) -> list[Tensor]:
+    """Its results for the same samples as a routed call would show them."""
     _, samples = _picked(layout, lead)
     device = tensors_of((call.args, call.kwargs))[0].device
     cells = torch.zeros(samples.shape[0], dtype=torch.int32, device=device)

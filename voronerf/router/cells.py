@@ -30,19 +30,8 @@ from voronerf.router.parameters import (
 )
 
 _OP = "VoronoiRouter"
-_ELEMENTWISE_OPTIMIZERS = (
-    torch.optim.Adam,
-    torch.optim.AdamW,
-    torch.optim.RAdam,
-    torch.optim.NAdam,
-    torch.optim.Adamax,
-    torch.optim.SGD,
-    torch.optim.RMSprop,
-    torch.optim.Adagrad,
-    torch.optim.Adadelta,
-    torch.optim.Rprop,
-    torch.optim.ASGD,
-)
+_ELEMENTWISE = "Adam AdamW RAdam NAdam Adamax SGD RMSprop Adagrad Adadelta Rprop ASGD"
+_ELEMENTWISE_OPTIMIZERS = tuple(getattr(torch.optim, name) for name in _ELEMENTWISE.split())
 """Optimisers whose state is of the parameter's shape, entry by entry, or a number."""
 
 

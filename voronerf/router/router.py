@@ -17,9 +17,17 @@ from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.blending import Mixture
 from voronerf.router.cells import CellModules
-from voronerf.router.evaluate import Choices, evaluate, mixed
+from voronerf.router.evaluate import (
+    Choices,
+    LayeredField,
+    coords_by_rule,
+    described_by_table,
+    each_direction,
+    evaluate,
+    evaluate_table,
+    mixed,
+)
 from voronerf.router.grouping import Assignments, Grouping
-from voronerf.router.layered import LayeredField, coords_by_rule, described_by_table, each_direction, evaluate_table
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.parameters import check_module, check_options, fill_cell
 
