@@ -131,13 +131,19 @@ class Scales(nn.Module):
         return self.function(self.fc(x), self.factor)
 
 
-def scale_rows(rows: Tensor, factor: Tensor) -> Tensor:
-    """A function that PyTorch's function modes see."""
-    if torch.overrides.has_torch_function((rows, factor)):
-        return torch.overrides.handle_torch_function(scale_rows, (rows, factor), rows, factor)
-    return rows * factor.exp()
+def seen(name: str) -> Callable[[Tensor, Tensor], Tensor]:
+    """A function of that name that PyTorch's function modes see, as those of other libraries are."""
+
+    def function(rows: Tensor, factor: Tensor) -> Tensor:
+        if torch.overrides.has_torch_function((rows, factor)):
+            return torch.overrides.handle_torch_function(function, (rows, factor), rows, factor)
+        return rows * factor.exp()
+
+    function.__name__ = function.__qualname__ = name
+    return function
 
 
+scale_rows = seen("scale_rows")
 register(scale_rows, lambda run, rows, factor: rows * run.rows_of(factor).exp())
 
 SHARED = {"coords": "first3", "share": ["encoder.*", "table.weight"]}

@@ -1,7 +1,8 @@
 """Fields of other people's codebases through VoronoiRouter: every case against a loop over masks.
 
-The cases: `convention_listed.py` has the codebases of examples/, `convention_layers.py` and `convention_calls.py`
-what nobody listed, `convention_rules.py` single steps; each that fuses is a case of its own with ``fuse=True``.
+The cases: `convention_listed.py` has the codebases of examples/, `convention_layers.py`, `convention_calls.py` and
+`convention_arguments.py` what nobody listed, `convention_rules.py` single steps; each that fuses is a case of its own
+with ``fuse=True``.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from convention_arguments import ARGUMENTS
 from convention_calls import CALLS
 from convention_harness import (
     Case,
@@ -36,7 +38,7 @@ from torch import Tensor
 
 from voronerf import VoronoiDiagram, VoronoiRouter
 
-CASES = [*LISTED, *LAYERS, *CALLS, *RULES]
+CASES = [*LISTED, *LAYERS, *CALLS, *ARGUMENTS, *RULES]
 CASES += [case.fused() for case in CASES if case.fuses]
 every_case = pytest.mark.parametrize("case", CASES, ids=str)
 

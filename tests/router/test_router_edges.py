@@ -80,15 +80,6 @@ def directions(n: int) -> Tensor:
     return nn.functional.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
 
 
-@pytest.mark.filterwarnings("ignore:.*runs cell by cell")
-def test_a_forward_that_a_derived_field_overrides() -> None:
-    field, x = Moved(width=16, depth=2), samples()[:, :3]
-    router = VoronoiRouter(field, centres())
-    for _ in range(3):
-        for found, expected in zip(router(x, directions(40)), field(x, directions(40)), strict=True):
-            close(found, expected)
-
-
 class Wrapped(Moved):
     """One whose arguments have no names of their own."""
 

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from convention_harness import randomised
 from convention_listed import LISTED, ngp, uniform
-from convention_rules import Encoded, Scales, two_layers
+from convention_rules import Encoded, Scales, seen, two_layers
 from router_fields import SkipNet, masked_loop, perturb, tensors
 from torch import Tensor, nn
 
@@ -295,19 +295,12 @@ def test_a_method_that_is_not_routed_names_the_remedy() -> None:
         router.color(uniform((4,)), uniform((4,)))
 
 
-def doubled(rows: Tensor, factor: Tensor) -> Tensor:
-    """A function that PyTorch's function modes see."""
-    if torch.overrides.has_torch_function((rows, factor)):
-        return torch.overrides.handle_torch_function(doubled, (rows, factor), rows, factor)
-    return rows * 2 * factor
-
-
 def test_a_rule_of_ones_own_may_be_wrong(generator: torch.Generator) -> None:
-    x = torch.rand(50, 7, generator=generator)
-    with pytest.warns(UserWarning, match="doubled meets parameters and has no rule"):
-        VoronoiRouter(Scales(doubled), centres(), coords="first3")(x)
-    register(doubled, lambda run, rows, factor: rows * run.rows_of(factor))
-    wrong = perturb(VoronoiRouter(Scales(doubled), centres(), coords="first3"), generator)
+    x, wrongly = torch.rand(50, 7, generator=generator), seen("wrongly")
+    with pytest.warns(UserWarning, match="wrongly meets parameters and has no rule"):
+        VoronoiRouter(Scales(wrongly), centres(), coords="first3")(x)
+    register(wrongly, lambda run, rows, factor: rows * run.rows_of(factor))
+    wrong = perturb(VoronoiRouter(Scales(wrongly), centres(), coords="first3"), generator)
     with pytest.warns(UserWarning, match="gives other results than on those of one cell"):
         equal_to_loop(wrong, x)
 
