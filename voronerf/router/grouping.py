@@ -20,12 +20,7 @@ from voronerf import ops
 class Grouping:
     """An assignment of n samples to k cells, sorted.
 
-    Attributes:
-        n: samples.
-        k: cells.
-        tables: what ``routed_mlp`` finds the cells with; None where there is one cell or the cells are given.
-        device: of the samples.
-        backend: of the operations on the sorted rows.
+    ``tables`` are what ``routed_mlp`` finds the cells with; None where there is one cell or the cells are given.
     """
 
     def __init__(

@@ -156,14 +156,7 @@ def _sizes(shape: Sequence[int], empty: str = "") -> str:
 
 @dataclasses.dataclass
 class Call:
-    """A method of the module with the arguments of one call.
-
-    Attributes:
-        method: Its name.
-        names: Of the arguments, positional ones first.
-        args: As they came.
-        kwargs: As they came.
-    """
+    """A method of the module with the arguments of one call, and their names, of positional ones first."""
 
     method: str
     names: list[str]
@@ -175,11 +168,7 @@ class Call:
         return module.__call__ if self.method == "forward" else getattr(module, self.method)
 
     def arranged(self, layout: Layout, grouping: Grouping | None) -> tuple[list[Any], dict[str, Any], list[Tensor]]:
-        """The arguments as the module sees them, in the order of a grouping.
-
-        Args:
-            layout: Of the arguments.
-            grouping: Of the samples; None keeps the original order.
+        """The arguments as the module sees them, in the order of a grouping; None keeps the original order.
 
         Returns:
             Positional arguments, keyword arguments, and the tensors among them that have rows.

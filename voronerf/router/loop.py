@@ -43,13 +43,7 @@ class NoRandomness(TorchFunctionMode):
 
 @dataclass
 class Given:
-    """Arguments as a module sees them, with rows sorted by cell.
-
-    Attributes:
-        args: Positional.
-        kwargs: Keyword.
-        rows: The tensors among them that have rows.
-    """
+    """Arguments as a module sees them, sorted by cell, and the tensors among them that have rows."""
 
     args: Sequence[Any]
     kwargs: dict[str, Any]
