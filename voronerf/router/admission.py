@@ -6,6 +6,7 @@ their results and gradients are compared with the loop's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,6 +39,7 @@ class Choice:
         why: What stands in the way of a faster one; empty where nothing does.
         flat: For the tensors of a result, whether the module itself flattens them to [rays * samples, ...].
         piece: Rows that a grouped module runs on at once on a CPU.
+        most: Samples a cell up to which the grouped way is the faster one.
         again: Whether the module's code runs again in the backward pass.
         open: Whether another batch may be carried out in a faster way.
         fusable: Whether ``fuse=True`` would serve.
@@ -48,6 +50,7 @@ class Choice:
     why: str = ""
     flat: tuple[bool, ...] = ()
     piece: int = 1 << 16
+    most: float = math.inf
     again: bool = False
     open: bool = False
     fusable: bool = False
@@ -84,7 +87,7 @@ def admitted(trial: Trial, fuse: bool) -> Choice:
     try:
         if trial.agrees(lambda one: one.grouped, expected):
             piece = min(max(_PIECE * _TRIED // trial.widest, 1 << 10), 1 << 16)
-            return Choice("grouped", piece=piece, again=again, fusable=trial.is_fusable(expected))
+            return Choice("grouped", piece=piece, most=trial.most, again=again, fusable=trial.is_fusable(expected))
         why = "its forward on the samples of all cells gives other results than on those of one cell"
     except BackendUnavailable:
         raise
@@ -114,7 +117,7 @@ class Trial:
         picked = torch.arange(_TRIED, device=device) * layout.n // _TRIED
         cells = (torch.arange(_TRIED, device=device) * 7 % 5 // 2).int()
         self.entries = Entries(picked, cells, _CELLS, grouping.backend)
-        self.widest = 0
+        self.widest, self.most = 0, math.inf
         generator = torch.Generator().manual_seed(0)
         memo: dict[int, Any] = {}
         for _, _, parameter in cell_parameters(module):
@@ -183,6 +186,7 @@ class Trial:
     def grouped(self, given: Given) -> Results:
         """All cells at once."""
         results, run = run_part(self.module, self.call, self.layout, given, self.entries)
+        self.most = run.most
         self.widest = max(run.widest, *[t.numel() * t.element_size() for t in given.rows], 1)
         return results
 

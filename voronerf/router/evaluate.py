@@ -143,11 +143,15 @@ def _carry_out(
     module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, choice: Choice
 ) -> tuple[Results, Choice]:
     """Results sorted by cell; of a fused network in the original order, but for entries and placeholders."""
+    loud = True
     if choice.program is not None:
         choices.note(call, choice)
         in_order = layout.n and not isinstance(grouping, Entries)
         given = Given(*call.arranged(layout, None if in_order else grouping))
         return choice.program.run(given.rows, grouping), choice
+    if choice.way == "grouped" and grouping.n > choice.most * grouping.k:
+        why = f"faster so beyond {choice.most} samples a cell, for its look-ups in planes"
+        choice, loud = replace(choice, way="cell by cell", why=why), False
     if choice.way == "grouped" and grouping.k > 1:
         try:
             results = run_grouped(module, call, layout, grouping, choice.piece)
@@ -170,7 +174,7 @@ def _carry_out(
         raise
     one = Choice("the module itself", "there is one cell")
     choices.note(call, choice if grouping.k > 1 or choice.way != "grouped" else one)
-    if grouping.k > 1 and choice.why and layout.n >= _FEWEST:
+    if loud and grouping.k > 1 and choice.why and layout.n >= _FEWEST:
         name = f"{type(module).__name__}.{call.method}"
         choices.say_once(f"cells {call.method}", f"{name} runs cell by cell: {choice.why}")
     return results, choice

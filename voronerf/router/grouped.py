@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import inspect
 import linecache
+import math
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -233,13 +234,14 @@ class GroupedRun(TorchFunctionMode):
         n: Samples.
         failed: Why the results are not valid, also where the module caught the error; None where they are.
         widest: Bytes of the largest tensor of rows that was made.
+        most: Samples a cell beyond which a rule says that the loop over cells is faster.
     """
 
     def __init__(self, grouping: Grouping, axis: int = 0, tables: Tables | None = None) -> None:
         super().__init__()
         self.grouping, self.n, self.axis, self.tables = grouping, grouping.n, axis, tables or Tables()
         self.failed: Ungroupable | None = None
-        self.widest = 0
+        self.widest, self.most = 0, math.inf
         self._token = object()
 
     # For rules --------------------------------------------------------------------------------------------------------

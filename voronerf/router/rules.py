@@ -301,6 +301,10 @@ def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
     return _look_up(run, source, index, -source.shape[0]) if index.dtype in _INTEGERS else NotImplemented
 
 
+_PLANES = 128
+"""Samples a cell beyond which planes are read faster cell by cell: each read has a gradient as large as its planes."""
+
+
 @rule(F.grid_sample)
 def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) -> Any:
     """A plane [1, c, h, w] or volume [1, c, d, h, w] at rows [1, ..., 2] or [1, ..., 3]."""
@@ -309,4 +313,5 @@ def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) ->
     places = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
     if len(places) != 1 or grid.shape[0] != 1:
         return NotImplemented
+    run.most = _PLANES
     return tables.grid_sample(run.grouping, input.stacked.squeeze(1), grid, places[0], **options)
