@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # From the bottom up; a module may import its own layer and those below.
 LAYERS = (
-    {"backends", "checks", "compiler", "files", "layers", "tolerances"},
+    {"backends", "checks", "compiler", "files", "grids", "layers", "tolerances"},
     {
         "native",
         "_C",

@@ -14,6 +14,7 @@ from voronerf.diagram import (
     uniform_centres,
 )
 from voronerf.fields import NeRF
+from voronerf.grids import HashGrid
 from voronerf.layers import MLP, Layer
 from voronerf.ops import (
     CentreGrid,
@@ -25,6 +26,7 @@ from voronerf.ops import (
     frequency_encode,
     grouped_linear,
     grouped_mlp,
+    hash_encode,
     integrated_encode,
     locate_cell,
     march_rays,
@@ -43,6 +45,7 @@ __all__ = [
     "Balance",
     "CentreGrid",
     "Composite",
+    "HashGrid",
     "Layer",
     "NeRF",
     "OccupancyGrid",
@@ -59,6 +62,7 @@ __all__ = [
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",
+    "hash_encode",
     "imbalance",
     "integrated_encode",
     "locate_cell",

@@ -5,6 +5,7 @@ octaves. Index tensors are int32. ``offsets`` is always [k + 1]: cell c owns row
 of arrays sorted by cell.
 """
 
+from voronerf.grids import HashGrid
 from voronerf.layers import MLP, Layer
 from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.camera_rays import camera_rays
@@ -16,6 +17,7 @@ from voronerf.ops.draw_cell import draw_cell
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
+from voronerf.ops.hash_encode import hash_encode
 from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
@@ -29,6 +31,7 @@ __all__ = [
     "MLP",
     "CentreGrid",
     "Composite",
+    "HashGrid",
     "Layer",
     "March",
     "balance_centres",
@@ -41,6 +44,7 @@ __all__ = [
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",
+    "hash_encode",
     "integrated_encode",
     "locate_cell",
     "march_rays",

@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from op_cases import FLOATS, need, refused, strided
+from tolerances import assert_as_exact
+
+from voronerf import HashGrid
+from voronerf.ops import hash_encode
+from voronerf.reference.hash_encode import hash_encode as reference
+
+pytestmark = pytest.mark.op("hash_encode")
+
+BOX = ((-1.0, 0.0, 2.0), (1.0, 3.0, 2.5))
+GRIDS = {
+    "dense": HashGrid(levels=2, features=2, base=3, finest=8),
+    "hashed": HashGrid(levels=3, features=2, log2_entries=10, base=20, finest=300),
+    "both": HashGrid(levels=8, features=2, log2_entries=12, base=4, finest=128, box=BOX),
+    "one level": HashGrid(levels=1, features=1, log2_entries=10, base=7, finest=7),
+    "one feature": HashGrid(levels=5, features=1, log2_entries=11, base=2, finest=100, interpolation="smoothstep"),
+    "four features": HashGrid(levels=4, features=4, log2_entries=10, finest=64, interpolation="smoothstep", box=BOX),
+    "eight features": HashGrid(levels=3, features=8, log2_entries=10, base=8, finest=64),
+    "many levels": HashGrid(levels=24, features=2, log2_entries=10, base=16, finest=2**19),
+    "torch-ngp": HashGrid(levels=6, features=2, log2_entries=12, base=5, finest=77, convention="torch-ngp"),
+    "nerfstudio": HashGrid(levels=6, features=2, log2_entries=12, base=5, finest=77, convention="nerfstudio"),
+}
+grids = pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
+
+
+def points(n, grid, dtype=torch.float32):
+    """Points in the box, a tenth of which lie outside."""
+    low, high = torch.tensor(grid.box, dtype=torch.float64)
+    return (low + (high - low) * (1.1 * torch.rand(n, 3, dtype=torch.float64) - 0.05)).to(dtype)
+
+
+def features(grid, dtype=torch.float32):
+    return torch.randn(grid.table_shape, dtype=torch.float64).to(dtype)
+
+
+def peer(place, table, *, convention, levels, features, log2_entries, base, finest):
+    """One point in 0..1 as the libraries encode it, written from their sources with their names, a number at a time.
+
+    tiny-cuda-nn: grid.h, grid_scale, grid_resolution, grid_index. torch-ngp: gridencoder.cu, get_grid_index, and
+    grid.py. nerfstudio: field_components/encodings.py, HashEncoding.pytorch_fwd.
+    """
+    encoded, offset = [], 0
+    growth = math.exp((math.log(finest) - math.log(base)) / (levels - 1))
+    for level in range(levels):
+        table_size = 2**log2_entries
+        if convention == "nerfstudio":
+            scaled = [x * float(torch.floor(base * growth ** torch.arange(levels))[level]) for x in place]
+            low, side = [math.floor(x) for x in scaled], None
+        else:
+            scale = base * growth**level - 1
+            resolution = math.ceil(scale - 1e-4) + 1
+            side = resolution if convention == "tiny-cuda-nn" else resolution + 1
+            table_size = min(table_size, 8 * math.ceil(side**3 / 8))
+            scaled = [x * scale + 0.5 for x in place]
+            low = [math.floor(x) for x in scaled]
+        fraction = [x - i for x, i in zip(scaled, low)]
+        total = [0.0] * features
+        for corner in range(8):
+            weight, local = 1.0, []
+            for dim in range(3):
+                upper = corner >> dim & 1
+                weight *= fraction[dim] if upper else 1 - fraction[dim]
+                local.append(low[dim] + upper)
+            index, stride = 0, 1
+            for dim in range(3):
+                if side is None or stride > table_size:
+                    break
+                index += local[dim] * stride
+                stride *= side
+            if side is None or table_size < stride:
+                index = 0
+                for x, prime in zip(local, (1, 2654435761, 805459861)):
+                    index ^= (x * prime) % 2**32
+            row = table[offset + index % table_size]
+            total = [t + weight * float(value) for t, value in zip(total, row)]
+        encoded += total
+        offset += table_size
+    return encoded
+
+
+@pytest.mark.parametrize("convention", ["tiny-cuda-nn", "torch-ngp", "nerfstudio"])
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"levels": 8, "features": 2, "log2_entries": 12, "base": 4, "finest": 128},
+        {"levels": 4, "features": 1, "log2_entries": 10, "base": 5, "finest": 9},
+        {"levels": 16, "features": 2, "log2_entries": 14, "base": 16, "finest": 1000},
+    ],
+)
+def test_reads_the_tables_of_other_libraries(convention, sizes):
+    grid = HashGrid(**sizes, convention=convention)
+    table, places = features(grid, torch.float64), torch.rand(60, 3, dtype=torch.float64)
+    expected = [peer(place, table, convention=convention, **sizes) for place in places.tolist()]
+    found = hash_encode(places, table, grid)
+    # The scales of tiny-cuda-nn and torch-ngp are float32's.
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-3)
+
+
+@grids
+@pytest.mark.parametrize("n", [0, 1, 17, 1000])
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_matches_the_reference(device, backend, grid, n, dtype):
+    need("hash_encode", backend, device, dtype)
+    x, table = points(n, grid), features(grid, dtype)
+    exact = reference(x.double(), table.double(), grid)
+    found = hash_encode(x.to(device), table.to(device), grid, backend=backend)
+    assert found.dtype == torch.promote_types(dtype, torch.float32)
+    assert_as_exact(found, reference(x, table, grid), exact)
+
+
+@grids
+def test_gradients_of_two_orders(device, backend, grid):
+    need("hash_encode", backend, device, torch.float32)
+    x, table = points(40, grid), features(grid)
+    g, v = torch.randn(40, grid.out_features), torch.randn(40, 3)
+
+    def derivatives(encode, dtype):
+        leaves = [t.to(device if encode is not reference else "cpu", dtype).requires_grad_() for t in (x, table, g)]
+        out = encode(*leaves[:2], grid)
+        first = torch.autograd.grad(out, leaves[:2], leaves[2], create_graph=True)
+        second = torch.autograd.grad((first[0] * v.to(first[0])).sum(), leaves)
+        return [*first, *second]
+
+    exact, plain = derivatives(reference, torch.float64), derivatives(reference, torch.float32)
+    found = derivatives(lambda x, t, grid: hash_encode(x, t, grid, backend=backend), torch.float32)
+    for a, b, c in zip(found, plain, exact, strict=True):
+        a, b, c = a.cpu().double(), b.double(), c
+        # A point within rounding of a corner may be interpolated on the other side of it.
+        assert (a - c).norm() <= 2 * (b - c).norm() + 1e-5 * c.norm() + 1e-30
+
+
+def test_gradcheck():
+    grid = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=40, interpolation="smoothstep", box=BOX)
+    x = points(4, grid, torch.float64).requires_grad_()
+    table = features(grid, torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: hash_encode(x, table, grid), x)
+    assert torch.autograd.gradgradcheck(lambda x: hash_encode(x, table.detach(), grid), x)
+
+
+def test_a_table_for_each_cell(device, backend):
+    grid = GRIDS["both"]
+    tables = torch.randn(3, *grid.table_shape, device=device)
+    x, cells = points(50, grid).to(device), torch.randint(3, (50,), dtype=torch.int32, device=device)
+    found = hash_encode(x, tables, grid, cells=cells, backend=backend)
+    for cell, table in enumerate(tables):
+        rows = cells == cell
+        torch.testing.assert_close(found[rows], hash_encode(x[rows], table, grid, backend=backend), rtol=0, atol=1e-6)
+
+
+def test_outside_of_the_box_and_nan(device, backend):
+    grid = HashGrid(levels=2, base=4, finest=8, box=BOX)
+    table = features(grid).to(device)
+    x = torch.tensor([[-9.0, 1, 2.2], [-1, 1, 2.2], [0, torch.inf, 2.2], [0, 3, 2.2]], device=device).requires_grad_()
+    encoded = hash_encode(x, table, grid, backend=backend)
+    torch.testing.assert_close(encoded[::2], encoded[1::2], rtol=0, atol=0)
+    (gradient,) = torch.autograd.grad(encoded.sum(), x)
+    assert gradient[0, 0] == 0 and gradient[2, 1] == 0 and gradient[0, 1] != 0
+    assert hash_encode(x * torch.nan, table, grid, backend=backend).isnan().all()
+
+
+def test_strided(device, backend):
+    grid = GRIDS["both"]
+    x, table = points(33, grid).to(device), features(grid).to(device)
+    found = hash_encode(strided(x), strided(table), grid, backend=backend)
+    torch.testing.assert_close(found, hash_encode(x, table, grid, backend=backend), rtol=0, atol=0)
+
+
+def test_compiles(device, backend):
+    grid = GRIDS["both"]
+    table = features(grid).to(device)
+    compiled = torch.compile(
+        lambda x: hash_encode(x, table, grid, backend=backend), fullgraph=True, backend="aot_eager"
+    )
+    for n in (5, 8):
+        x = points(n, grid).to(device)
+        torch.testing.assert_close(compiled(x), hash_encode(x, table, grid, backend=backend), rtol=0, atol=1e-6)
+
+
+def test_errors():
+    grid = GRIDS["dense"]
+    x, table = torch.rand(4, 3), features(grid)
+    with refused(ValueError, "hash_encode: positions must have shape [n, 3], got [4, 2]"):
+        hash_encode(x[:, :2], table, grid)
+    with refused(ValueError, f"hash_encode: table must have shape [{len(table)}, 2], got [{len(table) - 1}, 2]"):
+        hash_encode(x, table[1:], grid)
+    with refused(TypeError, "hash_encode: table must have dtype ... or float64, got int32"):
+        hash_encode(x, table.int(), grid)
+    with refused(ValueError, f"hash_encode: table must have shape [k, {len(table)}, 2], got [{len(table)}, 2]"):
+        hash_encode(x, table, grid, cells=torch.zeros(4, dtype=torch.int32))
+    with refused(ValueError, "hash_encode: cells must lie in 0 to 1, got values from 0 to 2"):
+        hash_encode(x, table.expand(2, -1, -1), grid, cells=torch.tensor([0, 2, 0, 0], dtype=torch.int32))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"levels": 25}, "HashGrid: levels must be an integer from 1 to 24, got 25"),
+        ({"log2_entries": 9}, "HashGrid: log2_entries must be an integer from 10 to 24, got 9"),
+        ({"features": 3}, "HashGrid: features must be 1, 2, 4 or 8, got 3"),
+        ({"base": 64, "finest": 32}, "HashGrid: base and finest must be 1 <= base <= finest <= 2^20, got 64 and 32"),
+        ({"finest": math.nan}, "HashGrid: base and finest must be 1 <= base <= finest <= 2^20, got 16 and nan"),
+        ({"box": ((0, 0, 0), (1, 0, 1))}, "HashGrid: box must be two corners ... got ((0, 0, 0), (1, 0, 1))"),
+        ({"interpolation": "cubic"}, "HashGrid: interpolation must be one of linear, smoothstep, got 'cubic'"),
+        ({"convention": "ngp"}, "HashGrid: convention must be one of tiny-cuda-nn, ... nerfstudio, got 'ngp'"),
+    ],
+)
+def test_grids_that_cannot_be(change, message):
+    with refused(ValueError, message):
+        HashGrid(**change)
+
+
+def test_a_grid_is_text():
+    for grid in GRIDS.values():
+        assert HashGrid.parse(grid.text) == grid

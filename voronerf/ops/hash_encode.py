@@ -1,0 +1,64 @@
+"""The hash encoding of Instant NGP. n points, k tables, e entries of all levels, f features of a level."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
+from voronerf.grids import HashGrid
+
+_OP = backends.declare("hash_encode")
+
+
+def hash_encode(
+    positions: Tensor, table: Tensor, grid: HashGrid, *, cells: Tensor | None = None, backend: str = "auto"
+) -> Tensor:
+    """Features of points, interpolated between the corners of every level of a hash grid.
+
+    Müller et al. 2022, section 3: for each level, the eight corners around a point name eight entries of the table, by
+    the place of the corner or by its hash, and their features are interpolated. Gradients of every order to positions
+    and table; with linear interpolation the gradient to the positions jumps where a point passes a corner. Sums are
+    float32 at least. Results do not depend on the number of threads.
+
+    Args:
+        positions: [n, 3] floating point, n < 2**31, in the units of ``grid.box``. A coordinate outside of the box
+            counts as the nearest one inside, with no gradient. NaN gives NaN.
+        table: [e, f], ``grid.table_shape``, floating point, levels one after the other; or [k, e, f] with ``cells``.
+        grid: the levels.
+        cells: int32 [n], the table of each point, 0 to k - 1. Values outside are refused on the CPU.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        [n, grid.out_features], the features of the coarsest level first, in float32, or float64 if positions or table
+        are float64.
+
+    Raises:
+        ValueError: shapes, a table of another size than the grid's, cells without several tables, an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import HashGrid, hash_encode
+        >>> grid = HashGrid(levels=2, features=1, log2_entries=10, base=2, finest=4)
+        >>> table = torch.ones(grid.table_shape)
+        >>> table[: grid.rows[1].offset] = 0.5  # the coarse level
+        >>> hash_encode(torch.rand(3, 3), table, grid)
+        tensor([[0.5000, 1.0000],
+                [0.5000, 1.0000],
+                [0.5000, 1.0000]])
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "positions", positions, ("n", 3), sizes)
+    check_dtype(_OP, "positions", positions)
+    check_count(_OP, "positions", sizes["n"])
+    check_shape(_OP, "table", table, (() if cells is None else ("k",)) + grid.table_shape, sizes)
+    check_dtype(_OP, "table", table)
+    if cells is not None:
+        check_shape(_OP, "cells", cells, ("n",), sizes)
+        check_dtype(_OP, "cells", cells, INDEX)
+    check_same_device(_OP, positions=positions, table=table, cells=cells)
+    run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=table.dtype)
+    encoded: Tensor = run(positions, table, grid, cells=cells)
+    return encoded
