@@ -13,7 +13,7 @@ from voronerf.diagram import (
     split_diagram,
     uniform_centres,
 )
-from voronerf.fields import NeRF
+from voronerf.fields import HashGridField, NeRF
 from voronerf.grids import HashGrid
 from voronerf.layers import MLP, Layer
 from voronerf.ops import (
@@ -46,6 +46,7 @@ __all__ = [
     "CentreGrid",
     "Composite",
     "HashGrid",
+    "HashGridField",
     "Layer",
     "NeRF",
     "OccupancyGrid",

@@ -14,8 +14,10 @@ import functools
 import json
 from dataclasses import dataclass, field
 
+from voronerf.grids import HashGrid
+
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
-ENCODINGS = ("frequency", "integrated")
+ENCODINGS = ("frequency", "integrated", "hash")
 POSITIONS = "positions"
 DIRECTIONS = "directions"
 
@@ -52,12 +54,15 @@ class MLP:
         position_octaves: octaves of the encoding of the positions; None takes the positions as they come.
         direction_octaves: octaves of the frequency encoding of the view directions, or None.
         position_encoding: "frequency", ``frequency_encode`` with the input included (d -> d + 2dL); or "integrated",
-            ``integrated_encode`` of Gaussians: positions are [n, 6], the mean and then the diagonal variance (6 -> 6L).
+            ``integrated_encode`` of Gaussians: positions are [n, 6], the mean and then the diagonal variance (6 -> 6L);
+            or "hash", ``hash_encode`` (3 -> levels * features), whose table of features is an argument of its own.
+        grid: the levels of the "hash" encoding, else None.
         text: the whole table as JSON, the form in which it passes through a ``torch.library`` operator; see ``parse``.
 
     Raises:
         ValueError: a table that cannot be evaluated: no layers or outputs, a source that is not an earlier layer, a
-            width below 1, an unknown activation or encoding, negative octaves, the integrated encoding without octaves.
+            width below 1, an unknown activation or encoding, negative octaves, the integrated encoding without octaves,
+            the hash encoding without a grid or with octaves.
 
     Examples:
         >>> from voronerf import MLP, Layer
@@ -73,6 +78,7 @@ class MLP:
     position_octaves: int | None = None
     direction_octaves: int | None = None
     position_encoding: str = "frequency"
+    grid: HashGrid | None = None
     text: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -99,11 +105,19 @@ class MLP:
             raise ValueError(
                 f"MLP: position_octaves must be at least 1 with the integrated encoding, got {self.position_octaves}"
             )
+        hashed = self.position_encoding == "hash"
+        if hashed != (self.grid is not None) or (hashed and self.position_octaves is not None):
+            raise ValueError(
+                "MLP: grid must come with the hash encoding, and without position_octaves, got "
+                f"{self.position_encoding} with {self.position_octaves} octaves and the grid {self.grid}"
+            )
         rows = [[list(layer.inputs), layer.width, layer.activation] for layer in self.layers]
         table = [rows, list(self.outputs), self.position_octaves, self.direction_octaves]
         # Tables from before there was a choice have four entries.
-        if self.integrated:
+        if self.position_encoding != "frequency":
             table.append(self.position_encoding)
+        if self.grid is not None:
+            table.append(self.grid.text)
         object.__setattr__(self, "text", json.dumps(table))
 
     @staticmethod
@@ -111,6 +125,8 @@ class MLP:
     def parse(text: str) -> MLP:
         """The table whose ``text`` this is."""
         rows, outputs, *encodings = json.loads(text)
+        if len(encodings) == 4:
+            encodings[3] = HashGrid.parse(encodings[3])
         layers = tuple(Layer(tuple(inputs), width, activation) for inputs, width, activation in rows)
         return MLP(layers, tuple(outputs), *encodings)
 
@@ -132,6 +148,8 @@ class MLP:
     def source_width(self, source: int | str, positions_d: int, directions_d: int = 0) -> int:
         """Features that a source contributes to a layer's input, after encoding."""
         if source == POSITIONS:
+            if self.grid is not None:
+                return self.grid.out_features
             if self.integrated:
                 assert self.position_octaves is not None
                 return positions_d * self.position_octaves

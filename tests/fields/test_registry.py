@@ -175,7 +175,7 @@ def test_options_reach_the_field(scene: Scene) -> None:
     [
         (
             {"field": "siren"},
-            "--field must be nerf, mipnerf, kilonerf, table, own-encoding, fourier, fo",
+            "--field must be nerf, mipnerf, kilonerf, hashgrid, table, own-encoding, fourier, fo",
         ),
         ({"field": "table", "depth": 3}, "--depth must not come with --field table, got 3"),
         ({"field": "table", "view_directions": False}, "--view-directions must not come with --field table, got False"),
@@ -183,7 +183,10 @@ def test_options_reach_the_field(scene: Scene) -> None:
         ({"field_options": ("gain=2",)}, "--field-options of nerf are density_scale, .*; got 'gain=2'"),
         ({"field_options": ("width=2",)}, "--field-options must not hold width, use --width; got 'width=2'"),
         ({"field": "balls", "field_options": ("gain=2",)}, "--field-options of balls are none; got 'gain=2'"),
-        ({"field": "balls", "occupancy": True}, "--occupancy must come with --field nerf, kilonerf, table, own-enc"),
+        (
+            {"field": "balls", "occupancy": True},
+            "--occupancy must come with --field nerf, kilonerf, hashgrid, table, own-enc",
+        ),
     ],
 )
 def test_settings_that_a_field_has_no_option_for(settings: dict[str, Any], message: str) -> None:

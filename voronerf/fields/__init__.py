@@ -1,6 +1,7 @@
 """Networks from positions and directions to colours and densities. They do not depend on rays or images."""
 
 from voronerf.fields.density import DensityField, density_table
+from voronerf.fields.hashgrid import HashGridField
 from voronerf.fields.kilonerf import KiloNeRF
 from voronerf.fields.mipnerf import MipNeRF
 from voronerf.fields.nerf import NeRF, nerf_table
@@ -9,11 +10,13 @@ from voronerf.fields.registry import FIELDS, FieldType, register_field
 register_field("nerf")(NeRF)
 register_field("mipnerf")(MipNeRF)
 register_field("kilonerf")(KiloNeRF)
+register_field("hashgrid")(HashGridField)
 
 __all__ = [
     "FIELDS",
     "DensityField",
     "FieldType",
+    "HashGridField",
     "KiloNeRF",
     "MipNeRF",
     "NeRF",

@@ -8,6 +8,8 @@ have these attributes, all of which are optional:
     training_defaults        options that differ in training from the defaults of the constructor
     learning_rate(**options) static method: Adam's rate at the start of a training; default ``LEARNING_RATE``
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
+    scene_options(pixel, box) static method: options from the width of a pixel at the middle of the scene and the
+                             corners of the space that the field sees, both in scene units; for those not given
     octaves(finest)          static method: position_octaves for images that show ``finest`` octaves; default all
 
 Its options are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is called with
@@ -94,6 +96,12 @@ class FieldType:
         """Octaves of the position's encoding for images that show ``finest`` octaves of detail."""
         rule: Callable[[int], int] | None = getattr(self.network, "octaves", None)
         return finest if rule is None else rule(finest)
+
+    @property
+    def scene_options(self) -> Callable[..., dict[str, Any]] | None:
+        """The rule for options that come from the scene, if the field has one."""
+        rule: Callable[..., dict[str, Any]] | None = getattr(self.network, "scene_options", None)
+        return rule
 
 
 FIELDS: dict[str, FieldType] = {}

@@ -17,6 +17,7 @@ def run_network(
     positions: Tensor,
     directions: Tensor | None = None,
     ray_index: Tensor | None = None,
+    features: Tensor | None = None,
 ) -> Tensor:
     """The raw outputs [n, layers.out_features] of one network.
 
@@ -26,6 +27,7 @@ def run_network(
         positions: [n, 3], or Gaussians [n, 6] for the integrated encoding.
         directions: [n, 3], or [r, 3] together with `ray_index`; None where no layer reads them.
         ray_index: int32 [n].
+        features: the table of the hash encoding, where `layers` have a grid.
 
     Raises:
         ValueError: shapes that disagree.
@@ -39,4 +41,5 @@ def run_network(
         layers=layers,
         directions=directions,
         direction_index=ray_index,
+        features=features,
     )

@@ -22,6 +22,7 @@ from voronerf.derivatives import asked_for
 from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 from voronerf.native.custom_op import custom_op, on_huge_pages
 from voronerf.native.layer_table import Table, compiled_table, in_float32, network
+from voronerf.reference.grouped_mlp import cells_of
 
 # Of one layer, whose width does not matter here.
 _LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
@@ -62,12 +63,15 @@ def grouped_mlp(
     layers: MLP,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
+    features: Tensor | None = None,
 ) -> Tensor:
     """Every sample through the network of its cell; see ``voronerf.ops.grouped_mlp``.
 
     Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
     """
-    given = network(positions, weights, biases, layers, directions)
+    own = features is not None and features.dim() == 3
+    cells = cells_of(offsets, positions) if own else None
+    given = network(positions, weights, biases, layers, directions, features, cells)
     out: Tensor = _forward(
         given.positions, offsets, given.weights, given.biases, given.table, given.directions, direction_index
     )

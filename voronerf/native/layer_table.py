@@ -20,6 +20,7 @@ from voronerf import native
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_mlp import encode_positions
+from voronerf.reference.hash_encode import hash_encode
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
 
@@ -41,11 +42,20 @@ def network(
     biases: Sequence[Tensor | None],
     layers: MLP,
     directions: Tensor | None,
+    features: Tensor | None = None,
+    cells: Tensor | None = None,
     caller: str = "grouped_mlp",
 ) -> Network:
-    """What the ops take for a layer table. Positions and directions in float64 are encoded in float64, beforehand."""
+    """What the ops take for a layer table.
+
+    Positions and directions in float64 are encoded in float64, beforehand; so are positions that are hashed.
+    """
     encoded = ""
-    if positions.dtype == torch.float64 and layers.position_octaves is not None:
+    if layers.grid is not None:
+        assert features is not None
+        positions = hash_encode(positions, features, layers.grid, cells=cells if features.dim() == 3 else None)
+        encoded += POSITIONS
+    elif positions.dtype == torch.float64 and layers.position_octaves is not None:
         positions = encode_positions(positions, layers)
         encoded += POSITIONS
     if directions is not None and directions.dtype == torch.float64 and layers.direction_octaves is not None:
@@ -111,7 +121,7 @@ class Table:
         said = json.loads(text)
         layers = MLP.parse(json.dumps(said["layers"]))
         if POSITIONS in said["encoded"]:
-            layers = replace(layers, position_octaves=None, position_encoding="frequency")
+            layers = replace(layers, position_octaves=None, position_encoding="frequency", grid=None)
         if DIRECTIONS in said["encoded"]:
             layers = replace(layers, direction_octaves=None)
         return Table(said["caller"], said["operands"], layers)

@@ -37,9 +37,19 @@ def routed_mlp(
     coords: Tensor | None = None,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
+    features: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
-    given = network(positions, weights, biases, layers, directions, "routed_mlp")
+    if features is not None and features.dim() == 3 and len(features) > 1 and cells is None:
+        assert coords is not None and centres is not None
+        if child_offsets is None or child is None:
+            cells = nearest_centre.nearest_centre(coords, centres, weights=centre_weights)
+        else:
+            cells = locate_cell.locate_cell(coords, centres, child_offsets, child, depth=depth, weights=centre_weights)
+        centres = None
+    if features is not None and cells is None and features.dim() == 3:
+        features = features[0]
+    given = network(positions, weights, biases, layers, directions, features, cells, "routed_mlp")
     tables = centres, child_offsets, child, centre_weights
     if cells is None and weights[0].shape[0] == 1:
         coords, tables = None, (None, None, None, None)

@@ -27,13 +27,15 @@ def grouped_mlp(
     layers: MLP,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
+    features: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
     """Evaluates every sample by the network of its cell, encodings included.
 
-    Equivalent to ``frequency_encode`` (or ``integrated_encode``) where ``layers`` has octaves, followed by one
-    ``grouped_linear`` for each layer on the concatenation of its sources. Gradients of every order to positions,
-    directions, weights and biases. Encodings are computed in float32 at least, and rounded to the dtype of the weights.
+    Equivalent to ``frequency_encode`` (or ``integrated_encode``) where ``layers`` has octaves, or ``hash_encode`` where
+    it has a grid, followed by one ``grouped_linear`` for each layer on the concatenation of its sources. Gradients of
+    every order to positions, directions, features, weights and biases. Encodings are computed in float32 at least, and
+    rounded to the dtype of the weights.
     Under ``torch.autocast``, layers run in its dtype.
 
     Args:
@@ -48,6 +50,8 @@ def grouped_mlp(
         directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample. A direction is then
             encoded once for each ray instead of once for each sample.
+        features: the table of the hash encoding, [e, f] for all cells (``layers.grid.table_shape``), or [k, e, f] with
+            one for each cell; None without a grid.
         backend: "auto", "reference" or "native".
 
     Returns:
@@ -78,19 +82,27 @@ def grouped_mlp(
     check_dtype(_OP, "offsets", offsets, INDEX)
     if sizes["k"] < 1:
         raise ValueError(f"{_OP}: offsets must have at least two entries, got [{sizes['k'] + 1}]")
-    check_network(_OP, weights, biases, layers, directions, direction_index, sizes)
+    check_network(_OP, weights, biases, layers, directions, direction_index, features, sizes)
     check_same_device(
         _OP,
         positions=positions,
         offsets=offsets,
         directions=directions,
         direction_index=direction_index,
+        features=features,
         **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
         **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
     )
     check_count(_OP, "positions", sizes["n"])
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=weights[0].dtype)
     out: Tensor = run(
-        positions, offsets, weights, biases, layers=layers, directions=directions, direction_index=direction_index
+        positions,
+        offsets,
+        weights,
+        biases,
+        layers=layers,
+        directions=directions,
+        direction_index=direction_index,
+        features=features,
     )
     return out

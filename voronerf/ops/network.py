@@ -18,6 +18,7 @@ def check_network(
     layers: MLP,
     directions: Tensor | None,
     direction_index: Tensor | None,
+    features: Tensor | None,
     sizes: dict[str, int],
 ) -> None:
     """Checks parameters and directions against a layer table; ``sizes`` holds n and p, and k where it is known."""
@@ -25,13 +26,14 @@ def check_network(
     if layers.integrated and sizes["p"] != 6:
         p = sizes["p"]
         raise ValueError(f"{op}: positions must have 6 features, mean and variance, where they are integrated, got {p}")
+    _check_features(op, features, layers, sizes)
     count = len(layers.layers)
     for name, parameters in (("weights", weights), ("biases", biases)):
         if len(parameters) != count:
             raise ValueError(f"{op}: {name} must have one entry for each of {count} layers, got {len(parameters)}")
-    for source, features in ((POSITIONS, sizes["p"]), (DIRECTIONS, sizes["q"])):
-        if features < 1 and any(source in layer.inputs for layer in layers.layers):
-            raise ValueError(f"{op}: {source} must have at least one feature where a layer reads them, got {features}")
+    for source, width in ((POSITIONS, sizes["p"]), (DIRECTIONS, sizes["q"])):
+        if width < 1 and any(source in layer.inputs for layer in layers.layers):
+            raise ValueError(f"{op}: {source} must have at least one feature where a layer reads them, got {width}")
     for index, (o, i) in enumerate(layers.weight_shapes(sizes["p"], sizes["q"])):
         check_shape(op, f"weights[{index}]", weights[index], ("k", o, i), sizes)
         check_dtype(op, f"weights[{index}]", weights[index], FLOATS if index == 0 else (weights[0].dtype,))
@@ -58,3 +60,17 @@ def _check_directions(
     if direction_index is not None:
         check_shape(op, "direction_index", direction_index, ("n",), sizes)
         check_dtype(op, "direction_index", direction_index, INDEX)
+
+
+def _check_features(op: str, features: Tensor | None, layers: MLP, sizes: dict[str, int]) -> None:
+    if layers.grid is None:
+        if features is not None:
+            raise ValueError(f"{op}: features must be None for layers without a hash grid, got {list(features.shape)}")
+        return
+    if features is None:
+        raise ValueError(f"{op}: features must be given for layers with a hash grid, got None")
+    if sizes["p"] != 3:
+        raise ValueError(f"{op}: positions must have 3 features where they are hashed, got {sizes['p']}")
+    shape = layers.grid.table_shape
+    check_shape(op, "features", features, ("k", *shape) if features.dim() == 3 else shape, sizes)
+    check_dtype(op, "features", features)

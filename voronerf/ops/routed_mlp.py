@@ -39,15 +39,16 @@ def routed_mlp(
     coords: Tensor | None = None,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
+    features: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Evaluates every sample by the network of the cell it lies in; results are in the order of the samples.
 
     Equivalent to ``locate_cell``, ``cell_sort``, permuting the inputs, ``grouped_mlp``, and undoing the permutation.
     The native CPU implementation gathers and scatters rows inside the tiles of the network: it makes no permuted copy,
-    and keeps only the order (int32) for the backward pass. Gradients of every order to positions, directions, weights
-    and biases; none through the choice of the cell. A sample whose coordinates are not finite goes to the first cell,
-    as in ``locate_cell``. A network of one cell (k = 1) needs no tables, and is neither located nor sorted.
+    and keeps only the order (int32) for the backward pass. Gradients of every order to positions, directions, features,
+    weights and biases; none through the choice of the cell. A sample whose coordinates are not finite goes to the first
+    cell, as in ``locate_cell``. A network of one cell (k = 1) needs no tables, and is neither located nor sorted.
 
     Args:
         positions: [n, p] floating point, n < 2**31: the input of the layers, as in ``grouped_mlp``.
@@ -66,6 +67,7 @@ def routed_mlp(
             positions.
         directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
+        features: the table of the hash encoding, as in ``grouped_mlp``; None without a grid.
         backend: "auto", "reference" or "native". If there is no fused implementation, "auto" calls the separate
             operations, each on the backend it chooses.
 
@@ -97,7 +99,7 @@ def routed_mlp(
     check_shape(_OP, "positions", positions, ("n", "p"), sizes)
     check_dtype(_OP, "positions", positions)
     check_count(_OP, "positions", sizes["n"])
-    check_network(_OP, weights, biases, layers, directions, direction_index, sizes)
+    check_network(_OP, weights, biases, layers, directions, direction_index, features, sizes)
     _check_tables(centres, child_offsets, child, depth, centre_weights, cells, sizes)
     if coords is not None:
         if centres is None:
@@ -117,6 +119,7 @@ def routed_mlp(
         cells=cells,
         directions=directions,
         direction_index=direction_index,
+        features=features,
         **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
         **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
     )
@@ -143,6 +146,7 @@ def routed_mlp(
         coords=coords,
         directions=directions,
         direction_index=direction_index,
+        features=features,
     )
     return out, found
 

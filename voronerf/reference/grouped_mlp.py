@@ -10,6 +10,7 @@ from torch import Tensor
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_linear import check_offsets, grouped_linear
+from voronerf.reference.hash_encode import hash_encode
 from voronerf.reference.integrated_encode import integrated_encode
 
 
@@ -22,6 +23,7 @@ def grouped_mlp(
     layers: MLP,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
+    features: Tensor | None = None,
     linear: Callable[..., Tensor] = grouped_linear,
 ) -> Tensor:
     """Every sample through the network of its cell; see ``voronerf.ops.grouped_mlp``. ``linear`` runs each layer."""
@@ -29,7 +31,9 @@ def grouped_mlp(
         check_offsets("grouped_mlp", offsets, positions.shape[0])
     check_direction_index("grouped_mlp", directions, direction_index)
     dtype = weights[0].dtype
-    sources: dict[int | str, Tensor] = {POSITIONS: encode_positions(positions, layers).to(dtype)}
+    own = features is not None and features.dim() == 3
+    encoded = encode_positions(positions, layers, features, cells_of(offsets, positions) if own else None)
+    sources: dict[int | str, Tensor] = {POSITIONS: encoded.to(dtype)}
     if directions is not None and layers.uses_directions:
         encoded = encode(directions, layers.direction_octaves).to(dtype)
         sources[DIRECTIONS] = encoded if direction_index is None else encoded[direction_index]
@@ -39,13 +43,24 @@ def grouped_mlp(
     return torch.cat([sources[index] for index in layers.outputs], dim=1)
 
 
-def encode_positions(positions: Tensor, layers: MLP) -> Tensor:
-    """Positions as the layers of a table read them."""
+def encode_positions(
+    positions: Tensor, layers: MLP, features: Tensor | None = None, cells: Tensor | None = None
+) -> Tensor:
+    """Positions as the layers of a table read them; ``cells`` where each has features of its own."""
+    if layers.grid is not None:
+        assert features is not None
+        return hash_encode(positions, features, layers.grid, cells=cells)
     if not layers.integrated:
         return encode(positions, layers.position_octaves)
     assert layers.position_octaves is not None
     means, variances = positions.to(torch.promote_types(positions.dtype, torch.float32)).chunk(2, dim=1)
     return integrated_encode(means, variances, layers.position_octaves)
+
+
+def cells_of(offsets: Tensor, rows: Tensor) -> Tensor:
+    """int32 [n], the cell of each row that is sorted by cell; the nearest one for a row of no cell."""
+    index = torch.arange(rows.shape[0], dtype=torch.int32, device=rows.device)
+    return torch.searchsorted(offsets[1:-1].contiguous(), index, right=True, out_int32=True)
 
 
 def encode(x: Tensor, octaves: int | None) -> Tensor:

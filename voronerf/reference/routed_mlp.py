@@ -48,6 +48,7 @@ def routed_mlp(
     coords: Tensor | None = None,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
+    features: Tensor | None = None,
     operations: Operations = REFERENCE,
 ) -> tuple[Tensor, Tensor]:
     """Output [n, out] in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
@@ -63,6 +64,7 @@ def routed_mlp(
             layers=layers,
             directions=directions,
             direction_index=direction_index,
+            features=features,
         )
         return out, torch.zeros(n, dtype=torch.int32, device=positions.device)
     if cells is None:
@@ -88,6 +90,7 @@ def routed_mlp(
         layers=layers,
         directions=directions,
         direction_index=direction_index,
+        features=features,
     )
     # The backward of index_copy is a gather, where that of an index would be a scatter that adds.
     return torch.zeros_like(out).index_copy(0, order.long(), out), cells

@@ -222,6 +222,8 @@ def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, c
 class LayeredField(Protocol):
     """A field that describes its network by a layer table, like :class:`voronerf.fields.NeRF`. It runs fused.
 
+    Where the table has a hash grid, the field has a parameter ``features``, [e, f], as :class:`voronerf.HashGridField`.
+
     Examples:
         >>> from voronerf import NeRF
         >>> from voronerf.router import LayeredField
@@ -282,6 +284,7 @@ def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple
 def evaluate_table(
     field: LayeredField,
     where: Callable[[Tensor, Tensor | None], dict[str, Any]],
+    k: int,
     backend: str,
     mixture_at: Callable[[Tensor], Mixture | None],
     positions: Tensor,
@@ -295,6 +298,7 @@ def evaluate_table(
     Args:
         field: Whose ``activate`` gives the results; they are mixed behind it.
         where: What tells ``routed_mlp`` the cells, for positions and coords.
+        k: The number of cells.
         backend: Of the operation.
         mixture_at: Other cells that some samples are evaluated in too, or None.
         positions: [n, 3] in scene units; [n, 6], means and variances, where the table integrates over Gaussians.
@@ -325,10 +329,13 @@ def evaluate_table(
             f"{directions.shape[0]} rows for {n} positions"
         )
     linears = field.linears()
-    weights, biases = [layer.weight for layer in linears], [layer.bias for layer in linears]
+    # A parameter that all cells share has no dimension of cells; the operation takes one for each.
+    weights = [w if w.dim() == 3 else w.expand(k, -1, -1) for w in [layer.weight for layer in linears]]
+    biases = [b if b is None or b.dim() == 2 else b.expand(k, -1) for b in [layer.bias for layer in linears]]
+    hashed = {} if table.grid is None else {"features": field.features}  # type: ignore[attr-defined]
 
     def run(x: Tensor, d: Tensor | None, index: Tensor | None, cells: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        given = {"directions": d, "direction_index": index, "backend": backend, **cells}
+        given = {"directions": d, "direction_index": index, "backend": backend, **hashed, **cells}
         return field.activate(ops.routed_mlp(x, weights, biases, layers=table, **given)[0])
 
     own = run(positions, directions, ray_index, where(positions, coords))

@@ -150,7 +150,7 @@ class VoronoiRouter(CellModules):
         self.fuse, self.layout = fuse, layout
         self._choices, self._assignments = Choices(), Assignments()
         self._argument_names: dict[tuple[str, int], list[str]] = {}
-        self._by_table = self._layered and described_by_table(self.module) and not self.share
+        self._by_table = self._layered and described_by_table(self.module)
 
     @classmethod
     def from_modules(
@@ -212,11 +212,13 @@ class VoronoiRouter(CellModules):
             TypeError: For a module that mixes samples.
         """
         if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
-            self._by_table = described_by_table(self.module) and not self.share
+            self._by_table = described_by_table(self.module)
         if self._by_table:
             coords = coords_by_rule(self.coords, args, kwargs) if coords is None else coords
             at = self._mixture
-            return evaluate_table(self.field, self._where, self.backend, at, *args, coords=coords, **kwargs)
+            return evaluate_table(
+                self.field, self._where, self.num_cells, self.backend, at, *args, coords=coords, **kwargs
+            )
         if self._layered:
             args, kwargs = each_direction(args, kwargs)
         return self._call_method("forward", *args, coords=coords, **kwargs)

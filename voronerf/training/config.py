@@ -51,14 +51,14 @@ class TrainConfig:
     """Number of training steps, instead of a time."""
 
     field: str = "nerf"
-    """Kind of network: nerf, mipnerf (cones instead of rays), kilonerf (nerf in the size of KiloNeRF's networks), or
-    another name in `voronerf.fields.FIELDS`."""
+    """Kind of network: nerf, mipnerf (cones instead of rays), kilonerf (nerf in the size of KiloNeRF's networks),
+    hashgrid (small networks on a hash grid that the cells share), or another name in `voronerf.fields.FIELDS`."""
     field_options: tuple[str, ...] = ()
     """Further options of the field, each as NAME=VALUE, such as density_scale=20."""
     width: int | None = None
-    """Channels of the networks' hidden layers; default 64, kilonerf 32."""
+    """Channels of the networks' hidden layers; default 64, kilonerf and hashgrid 32."""
     depth: int | None = None
-    """Hidden layers before the heads; default 4, kilonerf 2."""
+    """Hidden layers before the heads; default 4, kilonerf 2, hashgrid 1."""
     parameters: int | None = None
     """Upper limit for the number of parameters of all final cells together; --width becomes the largest that fits."""
     skips: tuple[int, ...] | None = None

@@ -16,6 +16,7 @@ from voronerf.fields import DensityField
 from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
 from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.renderers import make_contraction
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
@@ -24,19 +25,40 @@ PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
 def octaves_for(scene: Scene) -> int:
     """Frequencies that positions need so that the finest wave spans two pixels of the training views.
 
-    The wave of octave l has length 2 pi / 2^l. A pixel at the middle of the scene is distance / focal length wide. The
-    100 x 100 images of a Blender scene give 8, its 400 x 400 images the 10 of the NeRF paper; finer waves would be
-    noise to the images, and cost time.
+    The wave of octave l has length 2 pi / 2^l. The 100 x 100 images of a Blender scene give 8, its 400 x 400 images the
+    10 of the NeRF paper; finer waves would be noise to the images, and cost time.
     """
+    return min(max(1 + math.ceil(math.log2(math.pi / pixel_at_the_middle(scene))), 4), 14)
+
+
+def pixel_at_the_middle(scene: Scene) -> float:
+    """Width of a pixel of the training views at the middle of the scene: distance / focal length, in scene units."""
     cameras = scene.train.cameras
     centre = torch.zeros(3) if scene.box is None else scene.box.mean(0)
     distance = float((cameras.origins - centre).norm(dim=-1).mean()) or scene.near  # of a panorama from one place
-    pixel = distance / float(cameras.intrinsics[:, :2].mean())
-    return min(max(1 + math.ceil(math.log2(math.pi / pixel)), 4), 14)
+    return distance / float(cameras.intrinsics[:, :2].mean())
+
+
+def space_of(config: TrainConfig, scene: Scene) -> tuple[tuple[float, ...], ...]:
+    """The corners of the space that the networks see: the scene's box, or the cube of a contraction.
+
+    Raises:
+        ConfigError: for a scene without a box that is not contracted.
+    """
+    if config.contraction == "sphere":
+        sphere = make_contraction(scene)
+        box = torch.stack((sphere.centre - 2 * sphere.radius, sphere.centre + 2 * sphere.radius))
+    elif scene.box is not None:
+        box = scene.box
+    else:
+        raise ConfigError(f"--field {config.field} needs --contraction sphere for {scene.name}, a scene without a box")
+    low, high = (tuple(round(x, 6) for x in corner) for corner in box.tolist())
+    return low, high
 
 
 def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
-    """Fills in the settings that depend on the scene: octaves, and with ``parameters`` the width and learning rate.
+    """Fills in the settings that depend on the scene: octaves, options of the field, and with ``parameters`` the width
+    and learning rate.
 
     Raises:
         ConfigError: When the smallest networks have more parameters than asked for.
@@ -44,6 +66,10 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     kind = config.field_type
     if config.position_octaves is None and "position_octaves" in kind.options:
         config = replace(config, position_octaves=kind.octaves(octaves_for(scene)))
+    if kind.scene_options is not None:
+        found = kind.scene_options(pixel_at_the_middle(scene), space_of(config, scene))
+        more = [f"{name}={value}" for name, value in found.items() if name not in config.network_options]
+        config = replace(config, field_options=(*config.field_options, *more))
     if config.parameters is None:
         return config
     config = replace(config, width=solve_width(config, config.parameters))

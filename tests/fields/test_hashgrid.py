@@ -1,0 +1,76 @@
+"""The field on a hash grid, alone and in a router, and its settings from the scene."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from voronerf import HashGridField, VoronoiRouter
+from voronerf.data import load_scene
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.networks import make_routers, resolve_config
+
+
+def rays(n):
+    return torch.rand(n, 3), torch.nn.functional.normalize(torch.randn(n, 3), dim=-1)
+
+
+def test_cells_share_the_grid_and_inherit_their_networks():
+    field = HashGridField(width=16, log2_entries=10, levels=4)
+    router = VoronoiRouter(field, torch.zeros(1, 3), share=["features"])
+    x, d = rays(200)
+    expected = field(x, d)
+    router.subdivide(7, points=x, weights=torch.ones(200))
+    assert router.module.features.shape == field.features.shape and router.module.colour.weight.shape == (7, 3, 16)
+    for a, b in zip(router(x, d), expected, strict=True):
+        torch.testing.assert_close(a, b)
+    router(x, d)[1].sum().backward()
+    assert router.module.features.grad is not None and router.module.features.grad.abs().sum() > 0
+
+
+def test_cells_with_tables_of_their_own():
+    router = VoronoiRouter(HashGridField(width=16, log2_entries=10, levels=4), torch.rand(3, 3))
+    x, d = rays(50)
+    with torch.no_grad():
+        router.module.features.normal_()
+    found, cells = router(x, d), router.diagram.locate(x)
+    for cell in range(3):
+        expected = router.cell(cell)(x[cells == cell], d[cells == cell])
+        for a, b in zip(found, expected, strict=True):
+            torch.testing.assert_close(a[cells == cell], b)
+
+
+def test_shared_layers_of_a_table():
+    router = VoronoiRouter(HashGridField(width=16, levels=4), torch.rand(3, 3), share=["features", "trunk.*"])
+    assert router.module.trunk[0].weight.shape == (16, 8) and router.module.view.weight.dim() == 3
+    x, d = rays(50)
+    expected = router.cell(0)(x, d)
+    for a, b in zip(router(x, d), expected, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_settings_come_from_the_scene():
+    scene = load_scene("builtin", downscale=5)
+    config = resolve_config(TrainConfig(field="hashgrid", field_options=("log2_entries=11", "levels=6")), scene)
+    field = make_routers(config, "cpu")["field"].module
+    assert field.layers.grid.log2_entries == 11 and field.features.dim() == 2
+    torch.testing.assert_close(torch.tensor(field.layers.grid.box), scene.box)
+    finer = resolve_config(TrainConfig(field="hashgrid"), load_scene("builtin", downscale=2))
+    fine = make_routers(finer, "cpu")["field"].module.layers.grid.finest
+    assert 2.4 < fine / field.layers.grid.finest < 2.6
+    assert resolve_config(config, scene) == config
+    kept = resolve_config(TrainConfig(field="hashgrid", field_options=("finest=99",)), scene)
+    assert make_routers(kept, "cpu")["field"].module.layers.grid.finest == 99
+
+
+def test_bad_settings():
+    with pytest.raises(ValueError, match="HashGridField: width must be at least 2 and depth 1, got 1 and 1"):
+        HashGridField(width=1)
+    with pytest.raises(ValueError, match="HashGrid: log2_entries must be an integer from 10 to 24, got 30"):
+        HashGridField(log2_entries=30)
+    with pytest.raises(ValueError, match="HashGridField: directions must be given"):
+        HashGridField(log2_entries=10)(torch.rand(2, 3))
+    capture = load_scene("builtin", downscale=10)
+    object.__setattr__(capture, "box", None)
+    with pytest.raises(ConfigError, match="--field hashgrid needs --contraction sphere for builtin, a scene without"):
+        resolve_config(TrainConfig(field="hashgrid"), capture)

@@ -1,0 +1,149 @@
+"""Networks whose positions are encoded by a hash grid, against hash_encode and a network of encoded positions."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import need, offsets_of, refused
+
+from voronerf import MLP, HashGrid, Layer
+from voronerf.ops import grouped_mlp, hash_encode, nearest_centre, routed_mlp
+from voronerf.reference.grouped_mlp import cells_of
+
+GRIDS = {
+    "plain": HashGrid(levels=4, features=2, log2_entries=10, base=4, finest=64),
+    "odd": HashGrid(levels=3, features=1, log2_entries=12, base=3, finest=9, interpolation="smoothstep"),
+    "wide": HashGrid(levels=5, features=8, log2_entries=10, base=8, finest=100, box=((-1, -1, -1), (2, 2, 2))),
+}
+grids = pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
+own_tables = pytest.mark.parametrize("own", [False, True], ids=["shared", "own tables"])
+COUNTS = [5, 0, 130, 1]
+
+
+def table_of(grid, **options):
+    """A layer that reads positions, a skip that reads them again, a head that sees directions."""
+    layers = (
+        Layer(("positions",), 17, "relu"),
+        Layer((0, "positions"), 16, "softplus"),
+        Layer((1,), 1),
+        Layer((1, "directions"), 3),
+    )
+    hashed = {"position_encoding": "hash", "grid": grid} if grid is not None else {}
+    return MLP(layers, (3, 2), direction_octaves=2, **hashed, **options)
+
+
+def network(grid, own, device="cpu", dtype=torch.float32, k=4):
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape):
+        return torch.randn(shape, generator=generator, dtype=torch.float64).to(device, dtype)
+
+    shapes = table_of(grid).weight_shapes(3, 3)
+    features = random(*([k] if own else []), *grid.table_shape)
+    return [random(k, o, i) / i**0.5 for o, i in shapes], [random(k, o) / 4 for o, _ in shapes], features
+
+
+def inputs(n, device="cpu", dtype=torch.float32):
+    generator = torch.Generator().manual_seed(2)
+    x = torch.rand(n, 3, generator=generator, dtype=torch.float64)
+    rays, index = torch.randn(9, 3, generator=generator, dtype=torch.float64), torch.arange(n, dtype=torch.int32) % 9
+    return x.to(device, dtype), rays.to(device, dtype), index.to(device)
+
+
+@grids
+@own_tables
+@pytest.mark.op("grouped_mlp")
+def test_grouped_equals_encoding_and_network(device, backend, grid, own):
+    offsets, n = offsets_of(COUNTS, device), sum(COUNTS)
+    weights, biases, features = network(grid, own, device)
+    x, rays, index = inputs(n, device)
+    leaves = [t.requires_grad_() for t in (x, rays, features, *weights, *biases)]
+    given = {"directions": rays, "direction_index": index, "backend": backend}
+    found = grouped_mlp(x, offsets, weights, biases, layers=table_of(grid), features=features, **given)
+    encoded = hash_encode(x, features, grid, cells=cells_of(offsets, x) if own else None, backend="reference")
+    expected = grouped_mlp(encoded, offsets, weights, biases, layers=table_of(None), **given)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    g = torch.randn_like(found)
+    for a, b in zip(torch.autograd.grad(found, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+@grids
+@own_tables
+@pytest.mark.parametrize("where", ["centres", "cells", "one cell"])
+@pytest.mark.op("routed_mlp")
+def test_routed_equals_grouped(device, backend, grid, own, where):
+    k = 1 if where == "one cell" else len(COUNTS)
+    weights, biases, features = network(grid, own, device, k=k)
+    x, rays, index = inputs(90, device)
+    centres = torch.rand(k, 3, device=device)
+    cells = nearest_centre(x, centres)
+    leaves = [t.requires_grad_() for t in (x, rays, features, *weights, *biases)]
+    given = {"directions": rays, "direction_index": index, "backend": backend}
+    place = {"centres": {"centres": centres}, "cells": {"cells": cells}, "one cell": {}}[where]
+    found, _ = routed_mlp(x, weights, biases, layers=table_of(grid), features=features, **place, **given)
+    encoded = hash_encode(x, features, grid, cells=cells if own else None, backend="reference")
+    expected, _ = routed_mlp(encoded, weights, biases, layers=table_of(None), cells=cells, **given)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    g = torch.randn_like(found)
+    for a, b in zip(torch.autograd.grad(found, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+@own_tables
+@pytest.mark.op("grouped_mlp")
+def test_second_derivatives(device, backend, own):
+    grid, offsets = GRIDS["odd"], offsets_of(COUNTS, device)
+    x, rays, index = inputs(sum(COUNTS), device)
+
+    def eikonal(dtype, backend):
+        weights, biases, features = network(grid, own, device, dtype)
+        leaves = [t.to(dtype).detach().requires_grad_() for t in (x, features, weights[0], biases[1])]
+        at, features, weights[0], biases[1] = leaves
+        given = {"directions": rays.to(dtype), "direction_index": index, "backend": backend}
+        out = grouped_mlp(at, offsets, weights, biases, layers=table_of(grid), features=features, **given)
+        (slope,) = torch.autograd.grad(out[:, 0].sum(), at, create_graph=True)
+        return torch.autograd.grad(((slope.norm(dim=1) - 1) ** 2).sum(), leaves)
+
+    for a, b in zip(eikonal(torch.float32, backend), eikonal(torch.float64, "reference"), strict=True):
+        assert (a.double() - b).norm() <= 1e-4 * b.norm()
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
+@pytest.mark.op("grouped_mlp")
+def test_dtypes(device, backend, dtype):
+    need("grouped_mlp", backend, device, dtype)
+    grid, offsets = GRIDS["plain"], offsets_of(COUNTS, device)
+    x, rays, index = inputs(sum(COUNTS), device)
+    weights, biases, features = network(grid, False, device, dtype)
+    given = {"layers": table_of(grid), "direction_index": index}
+    found = grouped_mlp(x, offsets, weights, biases, features=features, directions=rays, backend=backend, **given)
+    wide = [[t.double() for t in part] for part in (weights, biases)]
+    more = {"features": features.double(), "directions": rays.double(), "backend": "reference"}
+    exact = grouped_mlp(x.double(), offsets, *wide, **more, **given)
+    assert found.dtype == dtype
+    size = {torch.bfloat16: 3e-2, torch.float16: 4e-3, torch.float64: 1e-5}[dtype]
+    assert (found.double() - exact).abs().max() <= size * exact.abs().max()
+
+
+def test_errors():
+    grid, offsets = GRIDS["plain"], offsets_of(COUNTS)
+    weights, biases, features = network(grid, False)
+    x, rays, index = inputs(sum(COUNTS))
+    given = {"directions": rays, "direction_index": index, "layers": table_of(grid)}
+    with refused(ValueError, "grouped_mlp: features must be given for layers with a hash grid, got None"):
+        grouped_mlp(x, offsets, weights, biases, **given)
+    e = len(features)
+    with refused(ValueError, f"grouped_mlp: features must have shape [{e}, 2], got [{e - 1}, 2]"):
+        grouped_mlp(x, offsets, weights, biases, features=features[1:], **given)
+    with refused(ValueError, "grouped_mlp: positions must have 3 features where they are hashed, got 2"):
+        grouped_mlp(x[:, :2], offsets, weights, biases, features=features, **given)
+    with refused(ValueError, f"routed_mlp: features must be None for layers without a hash grid, got [{e}, 2]"):
+        routed_mlp(x.repeat(1, 3), weights, biases, **{**given, "layers": table_of(None)}, features=features)
+    with refused(ValueError, "MLP: grid must come with the hash encoding, and without position_octaves, got hash ..."):
+        MLP((Layer(("positions",), 4),), (0,), position_encoding="hash")
+
+
+def test_a_table_with_a_grid_is_text():
+    table = table_of(GRIDS["wide"])
+    assert MLP.parse(table.text) == table

@@ -1,0 +1,150 @@
+"""A field on a hash grid: Instant NGP, with a small network for each cell. Units as in `voronerf.fields.nerf`."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from voronerf.fields.nerf import INITIAL_DENSITY
+from voronerf.fields.single import run_network
+from voronerf.grids import UNIT_CUBE, HashGrid
+from voronerf.layers import MLP, Layer
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+class HashGridField(nn.Module):
+    """A hash grid with a small network behind it (Müller et al. 2022, section 5.4).
+
+    A layer of ``width`` channels reads the features of the position. A linear head gives the density. A second layer,
+    which also sees the view direction, gives the colour through a linear head.
+
+    In :class:`voronerf.VoronoiRouter` the cells share the grid (``share=["features"]``), and each has its own network:
+    the cell tells apart what has the same entry of the table. Without ``share``, each cell has a table of its own.
+
+    Args:
+        width: Channels of the hidden layers, at least 2.
+        depth: Hidden layers before the heads, at least 1.
+        levels: Resolutions of the grid, 1 to 24.
+        level_features: Features of a level: 1, 2, 4 or 8.
+        log2_entries: The logarithm of the most entries of a level, 10 to 24.
+        base: The coarsest resolution.
+        finest: The finest resolution.
+        box: The space that the grid covers, two corners; None is the unit cube.
+        direction_octaves: Octaves of the encoding of the view direction.
+        view_directions: Whether colour depends on the view direction.
+        density_scale: Factor on the density, per scene unit, > 0.
+
+    Raises:
+        ValueError: For a size out of range.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import HashGridField, VoronoiRouter
+        >>> field = HashGridField(width=32, log2_entries=12)
+        >>> router = VoronoiRouter(field, torch.rand(16, 3), share=["features"])
+        >>> router.module.features.shape[1], router.module.trunk[0].weight.shape  # one table, 16 networks
+        (2, torch.Size([16, 32, 16]))
+        >>> colour, density = router(torch.rand(10, 3), torch.nn.functional.normalize(torch.rand(10, 3), dim=-1))
+        >>> colour.shape, density.shape
+        (torch.Size([10, 3]), torch.Size([10]))
+    """
+
+    router_options: ClassVar[dict[str, Any]] = {"share": ["features"]}
+    sparse_parameters = ("features",)
+
+    def __init__(
+        self,
+        width: int = 32,
+        depth: int = 1,
+        levels: int = 8,
+        level_features: int = 2,
+        log2_entries: int = 15,
+        base: float = 16,
+        finest: float = 256,
+        box: Box | None = None,
+        direction_octaves: int = 2,
+        view_directions: bool = True,
+        density_scale: float = 10.0,
+    ) -> None:
+        super().__init__()
+        if width < 2 or depth < 1:
+            raise ValueError(f"HashGridField: width must be at least 2 and depth 1, got {width} and {depth}")
+        if direction_octaves < 0:
+            raise ValueError(f"HashGridField: direction_octaves must not be negative, got {direction_octaves}")
+        if not density_scale > 0:
+            raise ValueError(f"HashGridField: density_scale must be positive, got {density_scale}")
+        grid = HashGrid(levels, level_features, log2_entries, base, finest, box or UNIT_CUBE)
+        trunk = [Layer(("positions",) if i == 0 else (i - 1,), width, "relu") for i in range(depth)]
+        view: tuple[int | str, ...] = (depth - 1, "directions") if view_directions else (depth - 1,)
+        heads = [Layer((depth - 1,), 1), Layer(view, width, "relu"), Layer((depth + 1,), 3)]
+        self.view_directions, self.density_scale = view_directions, density_scale
+        self.layers = MLP(
+            (*trunk, *heads),
+            outputs=(depth + 2, depth),
+            direction_octaves=direction_octaves if view_directions else None,
+            position_encoding="hash",
+            grid=grid,
+        )
+        self.features = nn.Parameter(torch.empty(grid.table_shape))
+        linears = [nn.Linear(i, o) for o, i in self.layers.weight_shapes(3, 3)]
+        self.trunk = nn.ModuleList(linears[:depth])
+        self.density, self.view, self.colour = linears[depth:]
+        self.reset_parameters()
+
+    @staticmethod
+    def learning_rate(**_: object) -> float:
+        """Adam's rate at the start, as published."""
+        return 0.01
+
+    @staticmethod
+    def scene_options(pixel: float, box: Box) -> dict[str, Any]:
+        """The grid covers the space, and its finest cells are half as wide as a pixel."""
+        extent = max(high - low for low, high in zip(*box))
+        return {"box": box, "finest": max(round(2 * extent / pixel), 32)}
+
+    def reset_parameters(self) -> None:
+        """Features near zero, as published; He initialisation, small heads and a density that can grow, as NeRF."""
+        nn.init.uniform_(self.features, -1e-4, 1e-4)
+        for layer in self.linears():
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)
+        for head in (self.density, self.colour):
+            nn.init.xavier_uniform_(head.weight, gain=0.1)
+        start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale)).log()
+        nn.init.constant_(self.density.bias, float(start))
+
+    def linears(self) -> list[nn.Linear]:
+        """The linear layers in the order of ``layers``."""
+        trunk = [layer for layer in self.trunk if isinstance(layer, nn.Linear)]
+        return [*trunk, self.density, self.view, self.colour]
+
+    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Raw [n, 4] to (colour [n, 3] in 0..1, density [n] >= 0 per scene unit), float32 or wider."""
+        raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
+        colour, density = (part.contiguous() for part in raw.split([3, 1], dim=-1))
+        return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
+
+    def forward(
+        self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Evaluates the field.
+
+        Args:
+            positions: [n, 3] in scene units; outside of the box, the features are those of the nearest point inside.
+            directions: Unit vectors [n, 3], or [r, 3] together with ``ray_index``; not needed without view directions.
+            ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
+
+        Returns:
+            (colour [n, 3] in 0..1, density [n] per scene unit).
+
+        Raises:
+            ValueError: When view directions are needed and missing, or shapes disagree.
+        """
+        if self.view_directions and directions is None:
+            raise ValueError("HashGridField: directions must be given, since the colour depends on the view direction")
+        seen = (directions, ray_index) if self.view_directions else (None, None)
+        return self.activate(run_network(self.layers, self.linears(), positions, *seen, features=self.features))
