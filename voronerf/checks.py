@@ -10,6 +10,7 @@ checks makes a letter mean the same number in all of them.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 
 import torch
@@ -127,3 +128,8 @@ def check_choice(op: str, name: str, value: object, choices: Sequence[str]) -> N
 
 def _short(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
+
+
+def physical_memory() -> int:
+    """Bytes of memory of this machine."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

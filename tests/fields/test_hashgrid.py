@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from voronerf import HashGridField, VoronoiRouter
 from voronerf.data import load_scene
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.networks import make_routers, resolve_config
+from voronerf.training.networks import check_memory, count_parameters, make_routers, resolve_config
 
 
 def rays(n):
@@ -61,6 +63,15 @@ def test_settings_come_from_the_scene():
     assert resolve_config(config, scene) == config
     kept = resolve_config(TrainConfig(field="hashgrid", field_options=("finest=99",)), scene)
     assert make_routers(kept, "cpu")["field"].module.layers.grid.finest == 99
+    own = make_routers(replace(config, cell_tables=True), "cpu")["field"]
+    assert own.module.features.dim() == 3
+
+
+def test_shared_parameters_count_once():
+    shared, own = (TrainConfig(field="hashgrid", cells=(4,), cell_tables=own) for own in (False, True))
+    field = HashGridField()
+    assert count_parameters(own) - count_parameters(shared) == 3 * field.features.numel()
+    assert count_parameters(own) == 4 * sum(parameter.numel() for parameter in field.parameters())
 
 
 def test_bad_settings():
@@ -68,9 +79,22 @@ def test_bad_settings():
         HashGridField(width=1)
     with pytest.raises(ValueError, match="HashGrid: log2_entries must be an integer from 10 to 24, got 30"):
         HashGridField(log2_entries=30)
+    with pytest.raises(ConfigError, match="--cell-tables must come with a field whose cells share parameters"):
+        TrainConfig(cell_tables=True)
+    with pytest.raises(
+        ConfigError, match=r"--field hashgrid with 4096 cells needs .* GiB for parameters, gradients and"
+    ):
+        check_memory(TrainConfig(field="hashgrid", cells=(4096,), cell_tables=True))
     with pytest.raises(ValueError, match="HashGridField: directions must be given"):
         HashGridField(log2_entries=10)(torch.rand(2, 3))
     capture = load_scene("builtin", downscale=10)
     object.__setattr__(capture, "box", None)
     with pytest.raises(ConfigError, match="--field hashgrid needs --contraction sphere for builtin, a scene without"):
         resolve_config(TrainConfig(field="hashgrid"), capture)
+
+
+def test_a_table_that_does_not_fit_into_memory(monkeypatch):
+    monkeypatch.setattr("voronerf.fields.hashgrid.physical_memory", lambda: 2**20)
+    size = r"log2_entries must be smaller: 8 levels of 2 features and up to 2\^15 entries take 1.6 MiB, the machine has 1.0"
+    with pytest.raises(ValueError, match=size):
+        HashGridField()

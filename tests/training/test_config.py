@@ -69,7 +69,7 @@ def test_json_of_something_else(text):
         ({"proposal_anneal": 0.5, "sampling": "proposal"}, "--proposal-anneal must be 0, or a slope of at least 1"),
         ({"distortion": -0.1}, "--distortion must be a factor of 0 or more, got -0.1"),
         ({"distortion": 0.1, "occupancy": True}, "--distortion must be 0 with --occupancy, got 0.1"),
-        ({"field": "mip-nerf"}, "--field must be nerf, mipnerf or kilonerf, got 'mip-nerf'"),
+        ({"field": "mip-nerf"}, "--field must be nerf, mipnerf, kilonerf or hashgrid, got 'mip-nerf'"),
         ({"sampling": "hierachical"}, "--sampling must be stratified, hierarchical or proposal, got 'hierachical'"),
         ({"init": "inherited"}, "--init must be inherit or random, got 'inherited'"),
         ({"background": None}, "--background must be random or white, got None"),

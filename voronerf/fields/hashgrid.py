@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from voronerf.checks import physical_memory
 from voronerf.fields.nerf import INITIAL_DENSITY
 from voronerf.fields.single import run_network
 from voronerf.grids import UNIT_CUBE, HashGrid
@@ -39,7 +41,7 @@ class HashGridField(nn.Module):
         density_scale: Factor on the density, per scene unit, > 0.
 
     Raises:
-        ValueError: For a size out of range.
+        ValueError: For a size out of range, or a table that does not fit into memory.
 
     Examples:
         >>> import torch
@@ -89,6 +91,12 @@ class HashGridField(nn.Module):
             position_encoding="hash",
             grid=grid,
         )
+        size, memory = 4 * math.prod(grid.table_shape), physical_memory()
+        if size > memory:
+            raise ValueError(
+                f"HashGridField: log2_entries must be smaller: {levels} levels of {level_features} features and up to "
+                f"2^{log2_entries} entries take {size / 2**20:.1f} MiB, the machine has {memory / 2**20:.1f}"
+            )
         self.features = nn.Parameter(torch.empty(grid.table_shape))
         linears = [nn.Linear(i, o) for o, i in self.layers.weight_shapes(3, 3)]
         self.trunk = nn.ModuleList(linears[:depth])

@@ -71,6 +71,9 @@ class TrainConfig:
     """Octaves of the encoding of view directions; default 4."""
     view_directions: bool = True
     """Whether colour depends on the view direction."""
+    cell_tables: bool = False
+    """Each cell has all parameters of its network for itself: with hashgrid a table of features too, which the cells
+    share otherwise."""
 
     cells: tuple[int, ...] = (16,)
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, no number is one network."""
@@ -189,6 +192,14 @@ class TrainConfig:
         settings = {name: getattr(self, name) for name in NETWORK_SETTINGS if name in self.field_type.options}
         given = {name: value for name, value in settings.items() if value is not None}
         return given | dict(parse_option(text) for text in self.field_options)
+
+    @property
+    def router_options(self) -> dict[str, Any]:
+        """Further arguments of the router around the field."""
+        options = dict(self.field_type.router_options)
+        if self.cell_tables:
+            options.pop("share")
+        return options
 
     @property
     def split_unit(self) -> TimeUnit:

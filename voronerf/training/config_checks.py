@@ -116,6 +116,8 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(graphed or not config.cuda_graph, "cuda_graph", "come with --device cuda and without --occupancy")
     need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
     _check_splits(config, need)
+    shares = "share" in config.field_type.router_options
+    need(shares or not config.cell_tables, "cell_tables", "come with a field whose cells share parameters, as hashgrid")
     plain = not config.field_type.cones and config.sampling == "stratified" and config.contraction == "none"
     points = [name for name, kind in FIELDS.items() if not kind.cones]
     need(plain or not config.occupancy, "occupancy", OCCUPANCY_RULE.format(either(points)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from voronerf.checks import physical_memory
 from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import DensityField
@@ -99,8 +101,25 @@ def count_parameters(config: TrainConfig, width: int | None = None) -> int:
     with torch.random.fork_rng(devices=[]):  # counting draws nothing from the caller's random numbers
         for name in network_names(config):
             cells = 1 if name == "proposal" and not config.split_proposal else config.final_cells
-            total += cells * sum(parameter.numel() for parameter in make_network(config, name).parameters())
+            share = config.router_options.get("share", ()) if name != "proposal" else ()
+            for parameter_name, parameter in make_network(config, name).named_parameters():
+                shared = any(fnmatch.fnmatchcase(parameter_name, pattern) for pattern in share)
+                total += (1 if shared else cells) * parameter.numel()
     return total
+
+
+def check_memory(config: TrainConfig) -> None:
+    """Refuses networks that do not fit into the machine: a parameter, its gradient and Adam's moments are 16 bytes.
+
+    Raises:
+        ConfigError: with the sizes.
+    """
+    needed, there = 16 * count_parameters(config), physical_memory()
+    if needed > there:
+        raise ConfigError(
+            f"--field {config.field} with {config.final_cells} cells needs {needed / 2**30:.1f} GiB for parameters, "
+            f"gradients and moments, the machine has {there / 2**30:.1f} GiB"
+        )
 
 
 def solve_width(config: TrainConfig, total: int) -> int:
@@ -136,7 +155,7 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
             assignment=config.assignment,
             temperature=config.temperature,
             backend=config.backend,
-            **({} if name == "proposal" else config.field_type.router_options),
+            **({} if name == "proposal" else config.router_options),
         ).to(device)
         for name, network in networks.items()
     }

@@ -28,7 +28,7 @@ from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import save_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
-from voronerf.training.networks import make_optimizer, make_routers, resolve_config
+from voronerf.training.networks import check_memory, make_optimizer, make_routers, resolve_config
 from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.renderers import make_renderer
@@ -73,6 +73,7 @@ class Trainer:
             raise ValueError("Trainer: config.out must name the run directory, got None")
         self.out = config.out
         config = resolve_config(config, scene)
+        check_memory(config)
         self.config = config
         self.plan = config.planned_splits
         self.scene = scene
