@@ -95,6 +95,7 @@ def test_bad_settings():
 
 def test_a_table_that_does_not_fit_into_memory(monkeypatch):
     monkeypatch.setattr("voronerf.fields.hashgrid.physical_memory", lambda: 2**20)
-    size = r"log2_entries must be smaller: 8 levels of 2 features and up to 2\^15 entries take 1.6 MiB, the machine has 1.0"
-    with pytest.raises(ValueError, match=size):
+    with pytest.raises(
+        ValueError, match=r"log2_entries must be smaller: 8 levels .* take 1.6 MiB, the machine has 1.0"
+    ):
         HashGridField()
