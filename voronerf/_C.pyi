@@ -88,6 +88,31 @@ class Encoding(NamedTuple):
     include_input: bool
     width: int  # int64
 
+class GridLevel(NamedTuple):
+    scale: float  # float32
+    shift: float  # float32
+    side: int  # int32
+    entries: int  # int64
+    offset: int  # int64
+    hashed: bool
+
+class HashGrid(NamedTuple):
+    levels: Sequence[GridLevel]  # GridLevel[]
+    low: Sequence[float]  # float32[]
+    high: Sequence[float]  # float32[]
+    features: int  # int64
+    smooth: bool
+
+class HashInputs(NamedTuple):
+    positions: Tensor | None  # const float32*
+    direction: Tensor | None  # const float32*
+    table: Tensor | None  # const any*
+    type: str  # TableType
+    cells: Tensor | None  # const int32*
+    n: int  # int64
+    tables: int  # int64
+    entries: int  # int64
+
 Isa: tuple[str, ...]  # portable avx2 avx512
 
 class LinearGradients(NamedTuple):
@@ -167,6 +192,8 @@ class MlpTable(NamedTuple):
     caller: str  # MlpCaller
 
 Peak: tuple[str, ...]  # float32 bfloat16 copy
+
+TableType: tuple[str, ...]  # float32 bfloat16 float16
 
 # any*, int64
 def advise_huge_pages(_0: Tensor | None, _1: int) -> None: ...
@@ -269,6 +296,12 @@ def grouped_mlp_backward(_0: MlpTable, _1: MlpInputs, _2: MlpGradients, _3: str,
 
 # MlpTable, int64, int64, bool, bool, MlpPrecision, MlpCudaWay, Cuda
 def grouped_mlp_workspace(_0: MlpTable, _1: int, _2: int, _3: bool, _4: bool, _5: str, _6: str, _7: Cuda) -> int: ...
+
+# HashInputs, HashGrid, float32*, Cpu
+def hash_encode(_0: HashInputs, _1: HashGrid, _2: Tensor | None, _3: Cpu) -> None: ...
+
+# HashInputs, HashGrid, const float32*, float32*, float32*, Cpu
+def hash_encode_backward(_0: HashInputs, _1: HashGrid, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
 
 # Isa
 def isa_supported(_0: str) -> bool: ...

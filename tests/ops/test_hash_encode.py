@@ -218,3 +218,94 @@ def test_grids_that_cannot_be(change, message):
 def test_a_grid_is_text():
     for grid in GRIDS.values():
         assert HashGrid.parse(grid.text) == grid
+
+
+def derivatives(encode, grid, x, table, cells, dtype):
+    """Features, their gradients, and the gradients of those along a direction and of the table's."""
+    generator = torch.Generator().manual_seed(1)
+    leaves = [x.to(torch.promote_types(dtype, torch.float32)).requires_grad_(), table.to(dtype).requires_grad_()]
+    out = encode(*leaves, grid, cells=cells)
+    arriving, *cotangents = (
+        torch.randn(like.shape, generator=generator).bfloat16().to(like.dtype) for like in (out, *leaves)
+    )
+    arriving.requires_grad_()
+    first = torch.autograd.grad(out, leaves, arriving, create_graph=True)
+    return [out, *first, *torch.autograd.grad(first, (arriving, *leaves), cotangents)]
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("several", [False, True])
+@pytest.mark.parametrize("name", ["both", "one feature", "four features", "eight features"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+def test_every_instruction_set(isa, poisoned, name, dtype, several):
+    grid, n = GRIDS[name], 131
+    x, cells = points(n, grid), torch.randint(3, (n,), dtype=torch.int32) if several else None
+    table = torch.randn((3, *grid.table_shape) if several else grid.table_shape).to(dtype)
+    found = derivatives(lambda *a, **o: hash_encode(*a, **o, backend="native"), grid, x, table, cells, dtype)
+    exact = derivatives(reference, grid, x.double(), table.double(), cells, torch.float64)
+    plain = derivatives(reference, grid, x, table, cells, torch.float32)
+    for a, b, c in zip(found, plain, exact, strict=True):
+        rounding = torch.finfo(a.dtype).eps
+        assert (a.double() - c).norm() <= 2 * (b.double() - c).norm() + (2 * rounding + 1e-6) * c.norm()
+
+
+@pytest.mark.native
+def test_bits_do_not_depend_on_threads():
+    grid, n = GRIDS["both"], 3000
+    x, table = points(n, grid), features(grid)
+    before, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            found.append(derivatives(hash_encode, grid, x, table, None, torch.float32))
+    finally:
+        torch.set_num_threads(before)
+    for others in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], others, strict=True))
+
+
+def test_third_derivatives(backend):
+    need("hash_encode", backend, torch.device("cpu"), torch.float32)
+    grid = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=20, interpolation="smoothstep", box=BOX)
+    x, table, v = points(20, grid), features(grid), torch.randn(20, 3)
+
+    def third(encode, dtype):
+        leaves = [x.to(dtype).requires_grad_(), table.to(dtype).requires_grad_()]
+        slopes = encode(*leaves, grid).square().sum()
+        for _ in range(2):
+            (slopes,) = torch.autograd.grad(slopes, leaves[0], create_graph=True)
+            slopes = (slopes * v.to(dtype)).sum()
+        return torch.autograd.grad(slopes, leaves)
+
+    found = third(lambda *arguments: hash_encode(*arguments, backend=backend), torch.float32)
+    for a, b, c in zip(found, third(reference, torch.float32), third(reference, torch.float64), strict=True):
+        assert (a - c).norm() <= 2 * (b - c).norm() + 1e-5 * c.norm()
+
+
+@pytest.mark.native
+def test_only_what_is_asked_for_is_computed():
+    grid = GRIDS["both"]
+    x, table = points(30, grid).requires_grad_(), features(grid).requires_grad_()
+    encoded = hash_encode(x, table, grid, backend="native")
+    (of_x,) = torch.autograd.grad(encoded.sum(), x, retain_graph=True)
+    (of_table,) = torch.autograd.grad(encoded.sum(), table)
+    assert of_x.shape == x.shape and of_table.shape == table.shape
+    x.requires_grad_(False)
+    hash_encode(x, table, grid, backend="native").sum().backward()
+    assert x.grad is None and torch.equal(table.grad, of_table)
+
+
+@pytest.mark.native
+def test_opcheck():
+    grid = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=20, box=BOX)
+    hash_encode(points(3, grid), features(grid), grid, backend="native")  # registers the ops
+    x, table = points(7, grid).requires_grad_(), features(grid).requires_grad_()
+    cells = torch.zeros(7, dtype=torch.int32)
+    for direction, which in ((None, None), (torch.randn(7, 3), cells)):
+        tables = table if which is None else table.detach()[None]
+        torch.library.opcheck(torch.ops.voronerf.hash_encode_native.default, (x, tables, direction, which, grid.text))
+        gradient = torch.randn(7, grid.out_features)
+        torch.library.opcheck(
+            torch.ops.voronerf.hash_encode_native_backward.default,
+            (gradient, x, tables, direction, which, grid.text, True, True),
+        )

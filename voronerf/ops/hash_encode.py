@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from voronerf import backends
+from voronerf.backends import FLOATS, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
 from voronerf.grids import HashGrid
 
-_OP = backends.declare("hash_encode")
+_OP = backends.declare("hash_encode", native=Implementation(("cpu",), FLOATS))
 
 
 def hash_encode(
@@ -59,6 +61,7 @@ def hash_encode(
         check_shape(_OP, "cells", cells, ("n",), sizes)
         check_dtype(_OP, "cells", cells, INDEX)
     check_same_device(_OP, positions=positions, table=table, cells=cells)
-    run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=table.dtype)
+    dtype = torch.promote_types(positions.dtype, table.dtype)
+    run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=dtype)
     encoded: Tensor = run(positions, table, grid, cells=cells)
     return encoded

@@ -18,6 +18,11 @@ def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, *, cells: Tens
         first, last = (int(bound) for bound in cells.aminmax())
         if first < 0 or last >= len(table):
             raise ValueError(f"hash_encode: cells must lie in 0 to {len(table) - 1}, got values from {first} to {last}")
+    return interpolate(positions, table, grid, cells)
+
+
+def interpolate(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None) -> Tensor:
+    """The same, of cells that are known to have a table."""
     dtype = torch.promote_types(torch.promote_types(positions.dtype, table.dtype), torch.float32)
     low, high = torch.tensor(grid.box, dtype=dtype, device=positions.device)
     places = ((positions.to(dtype) - low) * (1 / (high - low))).clamp(0, 1)

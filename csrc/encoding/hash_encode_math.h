@@ -1,0 +1,112 @@
+// Arithmetic of the hash encoding, one point and one level at a time, and what a call is described by. The CPU has
+// vectors of the same formulas in hash_encode_tile.h.
+//
+// The weights of the eight corners around a point are products of one factor for each axis: w(t) or 1 - w(t), t being
+// the distance from the lower corner, w(t) = t or t^2 (3 - 2 t). All that derivatives need is other factors with the
+// same corners.
+#pragma once
+
+#include <cstdint>
+
+#include "common/hd.h"
+
+namespace voronerf {
+
+constexpr int kMaxHashLevels = 24;
+constexpr uint32_t kHashPrimeY = 2654435761u, kHashPrimeZ = 805459861u;
+
+// As in voronerf/grids.py.
+struct GridLevel {
+  float scale, shift;
+  int32_t side;     // stride of the second axis
+  int64_t entries;  // at most 2^24
+  int64_t offset;   // first entry in the table
+  bool hashed;
+};
+
+enum class TableType : int { float32 = 0, bfloat16 = 1, float16 = 2 };
+
+struct HashInputs {
+  const float* positions;  // [n,3]
+  const float* direction;  // [n,3]: the derivative along it is encoded instead; or null
+  const void* table;       // [tables, entries, features]
+  TableType type;
+  const int32_t* cells;  // [n], the table of each point; null where there is one
+  int64_t n, tables, entries;
+};
+
+// A call: the levels, and the box by its lower corner and the inverse of its size.
+struct HashEncoding {
+  HashInputs in;
+  GridLevel levels[kMaxHashLevels];
+  int32_t count, features;
+  bool smooth;
+  float low[3], inverse[3];
+};
+
+// Where a coordinate lies in 0..1, and the derivative: none outside of the box. NaN stays NaN.
+struct HashPlace {
+  float place, slope;
+};
+VN_HD HashPlace hash_place(float x, float low, float inverse) {
+  const float place = (x - low) * inverse;
+  if (place < 0.0f) return {0.0f, 0.0f};
+  if (place > 1.0f) return {1.0f, 0.0f};
+  return {place, place == place ? inverse : 0.0f};
+}
+
+// One axis of a level: the lower corner, and of the lower and the upper one the factor of a weight, its first and its
+// second derivative by the place.
+struct HashAxis {
+  uint32_t corner;
+  float at[2], slope[2], bend[2];
+};
+VN_HD HashAxis hash_axis(float place, const GridLevel& level, bool smooth) {
+  // Rounded twice, as in the reference: both then choose the same corners.
+#ifdef __CUDA_ARCH__
+  const float where = __fadd_rn(__fmul_rn(place, level.scale), level.shift);
+#else
+  const float where = place * level.scale + level.shift;
+#endif
+  HashAxis axis;
+  axis.corner = where == where ? static_cast<uint32_t>(where) : 0u;  // it is not negative
+  const float t = where - static_cast<float>(axis.corner);
+  const float w = smooth ? t * t * (3.0f - 2.0f * t) : t;
+  const float d = smooth ? level.scale * (6.0f * t * (1.0f - t)) : level.scale;
+  const float e = smooth ? level.scale * level.scale * (6.0f - 12.0f * t) : 0.0f;
+  axis.at[0] = 1.0f - w, axis.at[1] = w;
+  axis.slope[0] = -d, axis.slope[1] = d;
+  axis.bend[0] = -e, axis.bend[1] = e;
+  return axis;
+}
+
+// The entry of a corner within its level. A dense index is below twice the entries: the last corners of an axis may
+// stand one past its stride.
+VN_HD uint32_t hash_entry(const GridLevel& level, uint32_t x, uint32_t y, uint32_t z) {
+  const uint32_t entries = static_cast<uint32_t>(level.entries);
+  if (level.hashed) return (x ^ y * kHashPrimeY ^ z * kHashPrimeZ) & (entries - 1u);
+  const uint32_t side = static_cast<uint32_t>(level.side);
+  const uint32_t entry = x + side * (y + side * z);
+  return entry < entries ? entry : entry - entries;
+}
+
+// What multiplies the entry of a corner: the weight; with `along`, which scales the derivatives of each axis, the
+// weight's derivative along a direction.
+VN_HD float hash_weight(const HashAxis* axes, const float* along, int x, int y, int z) {
+  const HashAxis &a = axes[0], &b = axes[1], &c = axes[2];
+  if (along == nullptr) return a.at[x] * (b.at[y] * c.at[z]);
+  return along[0] * a.slope[x] * (b.at[y] * c.at[z]) +
+         a.at[x] * (along[1] * b.slope[y] * c.at[z] + b.at[y] * (along[2] * c.slope[z]));
+}
+
+// The derivative of that by the place on axis i.
+VN_HD float hash_weight_slope(const HashAxis* axes, const float* along, int i, const int* corner) {
+  const int j = (i + 1) % 3, k = (i + 2) % 3;
+  const HashAxis &a = axes[i], &b = axes[j], &c = axes[k];
+  const int x = corner[i], y = corner[j], z = corner[k];
+  if (along == nullptr) return a.slope[x] * (b.at[y] * c.at[z]);
+  return along[i] * a.bend[x] * (b.at[y] * c.at[z]) +
+         a.slope[x] * (along[j] * b.slope[y] * c.at[z] + b.at[y] * (along[k] * c.slope[z]));
+}
+
+}  // namespace voronerf
