@@ -18,9 +18,10 @@ from torch import Tensor
 
 from voronerf import native
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.native.hash_encode import hash_encode
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_mlp import encode_positions
-from voronerf.reference.hash_encode import hash_encode
+from voronerf.reference.hash_encode import hash_encode as reference
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
 
@@ -53,7 +54,8 @@ def network(
     encoded = ""
     if layers.grid is not None:
         assert features is not None
-        positions = hash_encode(positions, features, layers.grid, cells=cells if features.dim() == 3 else None)
+        encode = reference if native.on_cuda(positions) else hash_encode
+        positions = encode(positions, features, layers.grid, cells=cells if features.dim() == 3 else None)
         encoded += POSITIONS
     elif positions.dtype == torch.float64 and layers.position_octaves is not None:
         positions = encode_positions(positions, layers)
