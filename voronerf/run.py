@@ -16,10 +16,11 @@ from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.router import VoronoiRouter
+from voronerf.training.average import load_averages
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
-from voronerf.training.networks import make_routers, restore_routers
+from voronerf.training.networks import make_routers, parameter_groups, restore_routers
 from voronerf.training.occupancy import make_picture_grid
 from voronerf.training.renderers import make_renderer
 from voronerf.training.run_directory import checkpoint_path
@@ -168,6 +169,7 @@ def open_run(
     config = TrainConfig.from_json(json.dumps(checkpoint.values["config"]), str(file))
     routers = make_routers(config, device)
     restore_routers(routers, checkpoint)
+    load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
     for router in routers.values():
         router.backend = backend
         router.blend = config.blend if blend is None else blend

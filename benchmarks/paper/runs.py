@@ -47,6 +47,8 @@ LATER = {
     "uniform_scale": 1.0,
     "blend": 0.0,
     "field_options": [],
+    "cell_tables": False,
+    "average": 0.0,
 }
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device", "blend"}
@@ -144,6 +146,7 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: 
         "samples": settings.samples,
         "backend": settings.backend,
         "checkpoint_every": 1e9,
+        "average": 0.0,  # the method as published
         **settings.further,
         **variant.changes,
     }

@@ -45,6 +45,7 @@ def test_json_of_something_else(text):
         ({"lr": 0.0}, "--lr must be positive, got 0.0"),
         ({"lr_final": 2.0}, r"--lr-final must lie in \(0, 1\], got 2.0"),
         ({"warmup": 1.0}, r"--warmup must lie in \[0, 1\), got 1.0"),
+        ({"average": 1.0}, r"--average must lie in \[0, 1\), got 1.0"),
         ({"cells": (0,)}, r"--cells must be at least 2 on every level \(none for one network\), got \(0,\)"),
         ({"cells": (4,), "split_at": (0.2, 0.4)}, "--split-at must have one fraction for each of the 1 levels"),
         ({"cells": (4, 4), "split_at": (0.4, 0.2)}, "--split-at must be rising fractions between 0 and 1"),

@@ -52,7 +52,8 @@ def test_a_loaded_run_renders_the_same(tmp_path, scene):
     run = open_run(tmp_path, scene=scene)
     config = run.config
     assert config == trainer.config
-    assert evaluate(run.renderer, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
+    with trainer.averaged():
+        assert evaluate(run.renderer, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
     coarser = open_run(tmp_path, scene=scene, samples=3, backend="reference").renderer
     assert (coarser.samples, coarser.backend) == (3, "reference")
     # Another configuration, another architecture.

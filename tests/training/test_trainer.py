@@ -128,7 +128,8 @@ def test_the_final_scores_are_blended_as_the_pictures_are(tmp_path, scene):
     trainer = Trainer(small(tmp_path / "blended", blend=0.3), scene)
     blended = trainer.run()
     assert plain["steps"] == blended["steps"] and plain["psnr"] != blended["psnr"]
-    assert blended["psnr"] == mean_scores(evaluate(trainer.renderer, scene, views=2))["psnr"]
+    with trainer.averaged():
+        assert blended["psnr"] == mean_scores(evaluate(trainer.renderer, scene, views=2))["psnr"]
     assert open_run(tmp_path / "blended", scene=scene).config.blend == 0.3
     assert open_run(tmp_path / "blended", scene=scene, blend=0.0).evaluate(views=2)["psnr"] == plain["psnr"]
 
@@ -359,7 +360,8 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
     grid = loaded.occupancy
     assert grid is not None and torch.equal(grid.occupied, trainer.occupancy.occupied)
     assert trainer.renderer.occupancy is trainer.occupancy
-    assert evaluate(loaded, scene, views=1) == evaluate(trainer.renderer, scene, views=1)
+    with trainer.averaged():
+        assert evaluate(loaded, scene, views=1) == evaluate(trainer.renderer, scene, views=1)
 
 
 @pytest.mark.cuda

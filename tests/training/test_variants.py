@@ -62,7 +62,8 @@ def test_every_variant_with_every_kind_of_cells(tmp_path, scene, variant, cells)
             assert router.num_cells == config.final_cells
     run = open_run(tmp_path, scene=scene)
     assert run.config == config
-    assert evaluate(run.renderer, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
+    with trainer.averaged():
+        assert evaluate(run.renderer, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
     assert len(write_panels(run.renderer, run.diagram, scene, tmp_path / "images", views=1)) == 1
 
 

@@ -80,7 +80,8 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene) -> dict[str, A
         say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}")
         return summary
     if config.panels:
-        write_panels(trainer.renderer, trainer.router.diagram, scene, out / "images", views=config.panels)
+        with trainer.averaged():
+            write_panels(trainer.renderer, trainer.router.diagram, scene, out / "images", views=config.panels)
     write_curve(out)
     say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
     return summary

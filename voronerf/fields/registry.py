@@ -8,6 +8,7 @@ have these attributes, all of which are optional:
     training_defaults        options that differ in training from the defaults of the constructor
     learning_rate(**options) static method: Adam's rate at the start of a training; default ``LEARNING_RATE``
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
+    sparse_parameters        names of tables, as patterns, of which a step of training reads few entries
     scene_options(pixel, box) static method: options from the width of a pixel at the middle of the scene and the
                              corners of the space that the field sees, both in scene units; for those not given
     octaves(finest)          static method: position_octaves for images that show ``finest`` octaves; default all
@@ -24,7 +25,7 @@ parameters. Any other module runs its own ``forward``.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -71,6 +72,12 @@ class FieldType:
         """Further arguments of the router around it."""
         options: Mapping[str, Any] = getattr(self.network, "router_options", {})
         return options
+
+    @property
+    def sparse_parameters(self) -> Sequence[str]:
+        """Names of tables, as patterns, of which a step of training reads few entries."""
+        names: Sequence[str] = getattr(self.network, "sparse_parameters", ())
+        return names
 
     def build(self, options: Mapping[str, Any]) -> nn.Module:
         """A field with these options and the defaults of the others.

@@ -149,6 +149,9 @@ class TrainConfig:
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
     lr_split: float = 1.0
     """Factor on the learning rate at each split, after which the gradients of a cell come from fewer samples."""
+    average: float = 0.98
+    """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. It is smaller in the first
+    steps. Training goes on with the weights themselves."""
     warmup: float = 0.02
     """Fraction of the run over which the learning rate rises from a hundredth of --lr."""
     background: Literal["random", "white"] = "random"

@@ -101,6 +101,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
     need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
     need(0 < config.lr_split < float("inf"), "lr_split", "be a positive factor")
+    need(0 <= config.average < 1, "average", "lie in [0, 1)")
     need(0 <= config.warmup < 1, "warmup", "lie in [0, 1)")
     need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
     need(0 < config.temperature_final <= 1, "temperature_final", "lie in (0, 1]")

@@ -109,16 +109,17 @@ def count_parameters(config: TrainConfig, width: int | None = None) -> int:
 
 
 def check_memory(config: TrainConfig) -> None:
-    """Refuses networks that do not fit into the machine: a parameter, its gradient and Adam's moments are 16 bytes.
+    """Refuses networks that do not fit into the machine: a parameter, its gradient and Adam's moments are 16 bytes, its
+    average 4 more.
 
     Raises:
         ConfigError: with the sizes.
     """
-    needed, there = 16 * count_parameters(config), physical_memory()
+    needed, there = (20 if config.average else 16) * count_parameters(config), physical_memory()
     if needed > there:
         raise ConfigError(
             f"--field {config.field} with {config.final_cells} cells needs {needed / 2**30:.1f} GiB for parameters, "
-            f"gradients and moments, the machine has {there / 2**30:.1f} GiB"
+            f"gradients, moments and averages, the machine has {there / 2**30:.1f} GiB"
         )
 
 
@@ -161,6 +162,20 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
     }
 
 
+def parameter_groups(
+    routers: Mapping[str, VoronoiRouter], config: TrainConfig
+) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """The parameters in the order that the optimiser numbers them: those of the networks, then the tables."""
+    dense: list[nn.Parameter] = []
+    tables: list[nn.Parameter] = []
+    for network, router in routers.items():
+        patterns = () if network == "proposal" else config.field_type.sparse_parameters
+        for name, parameter in router.module.named_parameters():
+            sparse = any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+            (tables if sparse else dense).append(parameter)
+    return dense, tables
+
+
 def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) -> torch.optim.Adam:
     """Adam with a decay of 0.99 for the squared gradients, where the default is 0.999.
 
@@ -169,7 +184,7 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) ->
     100 x 100.
     """
     assert config.lr is not None
-    parameters = [parameter for router in routers.values() for parameter in router.parameters()]
+    parameters = [parameter for group in parameter_groups(routers, config) for parameter in group]
     options: dict[str, Any] = {"lr": config.lr}
     if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=parameters[0].device), "capturable": True}

@@ -9,6 +9,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from typing import Any
 
@@ -24,6 +25,7 @@ from voronerf.files import read_json_lines, write_text
 from voronerf.rendering.marching import Marched
 from voronerf.rendering.volume import Rendered
 from voronerf.router import VoronoiRouter
+from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import save_checkpoint
 from voronerf.training.config import TrainConfig
@@ -158,6 +160,10 @@ class Trainer:
         slope, done = self.config.proposal_anneal, self.fraction
         return slope * done / ((slope - 1) * done + 1) if slope else 1.0
 
+    def averaged(self) -> AbstractContextManager[None]:
+        """A context in which the networks have their averaged weights, for pictures; not for training."""
+        return averages_in_place(self.optimizer)
+
     def request_stop(self) -> None:
         """Ends training after the step in hand, with a checkpoint; what Ctrl-C does."""
         self.stopped = True
@@ -244,6 +250,8 @@ class Trainer:
             revisit_cells(self.occupancy, self.renderer.field, self.generator, backend=self.config.backend)
         self.renderer.train()
         loss, positions, importance = self._compute()
+        if self.config.average:
+            update_averages(self.optimizer, self.config.average, self.step)
         if positions is not None and importance is not None:
             self.reservoir.add(positions, importance)
         return loss
@@ -312,6 +320,8 @@ class Trainer:
                 router.subdivide(
                     split.diagram, split.parents, optimizer=self.optimizer, inherit=config.init == "inherit"
                 )
+        if config.init == "random":  # the averages are of other networks
+            drop_averages(self.optimizer)
         before = median([balance.imbalance_before for balance in balances])
         after = median([balance.imbalance_after for balance in balances])
         self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
@@ -332,7 +342,8 @@ class Trainer:
 
     def _evaluate(self, views: int | None, lpips: Lpips | None = None) -> list[ViewScore]:
         self.evaluated = self._due()
-        scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips)
+        with self.averaged():
+            scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips)
         now = {
             "step": self.step,
             "seconds": round(self.seconds, 3),
