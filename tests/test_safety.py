@@ -128,6 +128,7 @@ def test_odd_numbers_propagate_as_in_the_reference(bad):
         agree(v.grouped_linear, points[order.long()], offsets, broken)
     for octaves in (0, 4):
         agree(v.frequency_encode, points, octaves)
+    agree(v.spherical_harmonics, points, 4)
     variances = torch.rand(70, 3)
     variances[::7, 2] = bad
     agree(v.integrated_encode, torch.rand(70, 3), variances.abs(), 4)

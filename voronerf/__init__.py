@@ -33,6 +33,7 @@ from voronerf.ops import (
     nearest_centre,
     resample,
     routed_mlp,
+    spherical_harmonics,
     update_occupancy,
 )
 from voronerf.rendering import OccupancyGrid
@@ -72,6 +73,7 @@ __all__ = [
     "open_run",
     "resample",
     "routed_mlp",
+    "spherical_harmonics",
     "split_diagram",
     "uniform_centres",
     "update_occupancy",

@@ -17,6 +17,7 @@ from voronerf.reference.composite import composite
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.hash_encode import interpolate
 from voronerf.reference.integrated_encode import integrated_encode
+from voronerf.reference.spherical_harmonics import spherical_harmonics
 
 
 def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
@@ -258,3 +259,35 @@ class HashDerivatives:
             (slopes,) = torch.autograd.grad(out, positions, gradient, create_graph=True)
             pairs = [(leaf, part) for leaf, part in ((positions, p), (table, t)) if part is not None]
             return second_derivatives([(slopes, direction)], pairs, leaves, graph)
+
+
+def harmonics_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    """Keeps directions and degree."""
+    directions, ctx.degree = inputs
+    ctx.save_for_backward(directions)
+
+
+def harmonics_gradient(backward: Callable[..., Tensor]) -> Callable[..., tuple[Tensor, None]]:
+    """Backward of spherical_harmonics by a backend's op, which takes the gradient, the directions and the degree."""
+
+    def run(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (directions,) = ctx.saved_tensors
+        return backward(gradient, directions, ctx.degree), None
+
+    return run
+
+
+def harmonics_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    """Keeps the arguments of the backward op."""
+    gradient, directions, ctx.degree = inputs
+    ctx.save_for_backward(gradient, directions)
+
+
+def harmonics_backward_backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+    """Derivative of the gradient of spherical_harmonics."""
+    leaves, graph = aliases(ctx.saved_tensors)
+    with torch.enable_grad():
+        gradient, directions = leaves
+        assert directions is not None
+        out = spherical_harmonics(directions, ctx.degree)
+        return (*second_derivatives([(out, gradient)], [(directions, cotangent)], leaves, graph), None)

@@ -186,6 +186,10 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             lambda: close(lambda x, b: voronerf.frequency_encode(x[0], 10, backend=b), [torch.rand(90, 3)]),
         ),
         (
+            "spherical_harmonics",
+            lambda: close(lambda x, b: voronerf.spherical_harmonics(x[0], 4, backend=b), [torch.rand(300, 3)]),
+        ),
+        (
             "integrated_encode",
             lambda: close(
                 lambda x, b: voronerf.integrated_encode(x[0], x[1], 4, backend=b),

@@ -1,4 +1,4 @@
-"""Cases of frequency_encode, integrated_encode, composite and resample. n points or samples."""
+"""Cases of frequency_encode, integrated_encode, spherical_harmonics, composite and resample. n points or samples."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ FULL, HALF = torch.float32, torch.bfloat16
 BASE = 1 << 18
 ALL = ("native", "reference", "warp")
 OCTAVES = 10
+DEGREE = 4
 SAMPLES = 64
 """Of a ray, on average where rays are packed."""
 FINE = 128
@@ -45,6 +46,14 @@ def cases() -> list[Case]:
             shown = ALL if base else ("native",)
             quick = base and direction == FORWARD
             found.append(Case(op, f"L={OCTAVES} n={n}", dtype, direction, n, None, work, shown, quick))
+    for n, direction in ((BASE, FORWARD), (BASE, BACKWARD), (1 << 14, FORWARD)):
+        base = n == BASE
+        work = functools.partial(_harmonics_work, n, direction, base)
+        shown = ALL if base else ("native",)
+        quick = base and direction == FORWARD
+        found.append(
+            Case("spherical_harmonics", f"degree {DEGREE} n={n}", FULL, direction, n, None, work, shown, quick)
+        )
     for n, packed, direction in (
         *[(BASE, packed, direction) for packed in (False, True) for direction in (FORWARD, BACKWARD)],
         *[(n, False, direction) for n in (1 << 10, 1 << 14, 1 << 20) for direction in (FORWARD, BACKWARD)],
@@ -176,6 +185,61 @@ def _encode_work(op: str, n: int, dtype: torch.dtype, direction: str, compiled: 
         ["torch, octave by octave"] if compiled else [],  # the other form is slower, above all its gradient
         1e-3 if dtype == FULL else 1.5,  # angles of hundreds of radians have no digits left in a bfloat16 formula
     )
+
+
+def _harmonics_work(n: int, direction: str, compiled: bool, device: torch.device) -> Work:
+    features = DEGREE**2
+    sets = [
+        [F.normalize(uniform_points(n, seed, device) - 0.5, dim=1)] for seed in range(rotation(n * 4 * (3 + features)))
+    ]
+    gradients = None
+    if direction == BACKWARD:
+        gradients = [torch.randn(n, features, generator=generator(5)).to(device)]
+    run, step = ops.spherical_harmonics, max(1, n // CHECKED)
+
+    def exact() -> list[Tensor]:
+        rows = [sets[0][0][::step].double()]
+        given = None if gradients is None else [gradients[0][::step].double()]
+        return _flat(_contender(lambda x: run(x, DEGREE, backend="reference"), [rows], given).run(0))
+
+    amount = float(n) * 4 * (3 + features)
+    if direction == BACKWARD:
+        amount += float(n) * 4 * (6 + features)
+    return _work(
+        lambda x, backend: run(x, DEGREE, backend=backend),
+        {"torch, value by value": _harmonics_by_value},
+        sets,
+        gradients,
+        lambda found: [tensor[::step] for tensor in found],
+        exact,
+        amount,
+        ["torch, value by value"] if compiled else [],
+        1e-5,
+    )
+
+
+def _harmonics_by_value(directions: Tensor) -> Tensor:
+    """Written into columns one by one, as nerfstudio does."""
+    x, y, z = directions.unbind(1)
+    xx, yy, zz = x**2, y**2, z**2
+    out = directions.new_empty(directions.shape[0], 16)
+    out[:, 0] = 0.28209479177387814
+    out[:, 1] = -0.4886025119029199 * y
+    out[:, 2] = 0.4886025119029199 * z
+    out[:, 3] = -0.4886025119029199 * x
+    out[:, 4] = 1.0925484305920792 * x * y
+    out[:, 5] = -1.0925484305920792 * y * z
+    out[:, 6] = 0.9461746957575601 * zz - 0.31539156525251999
+    out[:, 7] = -1.0925484305920792 * x * z
+    out[:, 8] = 0.5462742152960396 * (xx - yy)
+    out[:, 9] = -0.5900435899266435 * y * (3 * xx - yy)
+    out[:, 10] = 2.890611442640554 * x * y * z
+    out[:, 11] = -0.4570457994644658 * y * (5 * zz - 1)
+    out[:, 12] = 0.3731763325901154 * z * (5 * zz - 3)
+    out[:, 13] = -0.4570457994644658 * x * (5 * zz - 1)
+    out[:, 14] = 1.445305721320277 * z * (xx - yy)
+    out[:, 15] = -0.5900435899266435 * x * (xx - 3 * yy)
+    return out
 
 
 def _frequency_by_octave(x: Tensor) -> Tensor:

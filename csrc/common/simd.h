@@ -93,6 +93,14 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
   z = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, z_ab, b), z_c, c);
 }
 
+// The lanes of a and b in turns: a[0], b[0], a[1], b[1], ... in `low`, from the middle on in `high`.
+VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
+  const I32 first = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+  const I32 second = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+  low = _mm512_permutex2var_ps(a, first, b);
+  high = _mm512_permutex2var_ps(a, second, b);
+}
+
 // Lane i: the sum of v[i]'s lanes, every one added up in the same order.
 VN_INLINE F32 lane_sums(const F32* v) {
   F32 four[4];  // lane 4 j + i of the g-th: what v[4 g + i] has in its j-th quarter
@@ -155,6 +163,12 @@ VN_INLINE unsigned bits(Mask m) {
 }
 VN_INLINE void store(int32_t* to, I32 a) {
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(to), a);
+}
+
+VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
+  const F32 even = _mm256_unpacklo_ps(a, b), odd = _mm256_unpackhi_ps(a, b);
+  low = _mm256_permute2f128_ps(even, odd, 0x20);
+  high = _mm256_permute2f128_ps(even, odd, 0x31);
 }
 
 VN_INLINE F32 lane_sums(const F32* v) {
@@ -234,6 +248,11 @@ VN_INLINE void store(int32_t* to, I32 a) {
   __builtin_memcpy(to, &a, sizeof a);
 }
 
+VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
+  low = F32{a[0], b[0], a[1], b[1]};
+  high = F32{a[2], b[2], a[3], b[3]};
+}
+
 VN_INLINE F32 lane_sums(const F32* v) {
   F32 sums;
   for (int i = 0; i < 4; ++i) sums[i] = (v[i][0] + v[i][2]) + (v[i][1] + v[i][3]);
@@ -247,6 +266,16 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
 }
 
 #endif
+
+// Vector i gets lane i of all kLanes vectors. A step turns the bits of an element's number, vector and lane together,
+// by one place to the left; as many of them as a lane's number has bits swap the two.
+VN_INLINE void transpose(F32* v) {
+  for (int step = 1; step < kLanes; step *= 2) {
+    F32 turned[kLanes];
+    for (int i = 0; i < kLanes / 2; ++i) zip(v[i], v[i + kLanes / 2], turned[2 * i], turned[2 * i + 1]);
+    for (int i = 0; i < kLanes; ++i) v[i] = turned[i];
+  }
+}
 
 // Float64 needs no more than operators: the compiler's own vectors, of this instruction set's width. A comparison gives
 // an I64 of ones and zeros, to be used as `mask ? a : b`.

@@ -19,6 +19,7 @@
 #include "rays/composite.h"
 #include "geometry/draw_cell.h"
 #include "encoding/encode.h"
+#include "encoding/spherical_harmonics.h"
 #include "network/grouped_linear.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre.h"
@@ -294,6 +295,25 @@ void encode(Isa isa) {
   }
 }
 
+void harmonics(Isa isa) {
+  const int64_t n = below(3) == 0 ? below(3) : below(3000), degree = 1 + below(4), width = degree * degree;
+  const Array<float> directions = uniform<float>(3 * n), gradient = uniform<float>(n * width);
+  Array<float> results[2][2];
+  for (int i = 0; i < 2; ++i) {
+    results[i][0] = poisoned(n * width);
+    results[i][1] = poisoned(3 * n);
+    voronerf::spherical_harmonics_cpu(directions.data(), results[i][0].data(), n, degree, isa, 1 + 2 * i);
+    voronerf::spherical_harmonics_backward_cpu(directions.data(), gradient.data(), results[i][1].data(), n, degree, isa,
+                                               1 + 2 * i);
+  }
+  for (int j = 0; j < 2; ++j) {
+    same(results[0][j], results[1][j], "spherical_harmonics");
+    for (const float value : results[0][j]) {
+      if (!wild && !std::isfinite(value)) fail("spherical_harmonics: a result is not finite");
+    }
+  }
+}
+
 // bfloat16 is bits here: halves of the floats that are there anyway.
 template <typename T>
 Array<T> stored(int64_t size) {
@@ -376,6 +396,7 @@ int main(int count, char** arguments) {
       if (i % 4 == 0) locate<double>(isa);
       composite(isa);
       encode(isa);
+      harmonics(isa);
       linear<float>(isa);
       linear<uint16_t>(isa);
     }

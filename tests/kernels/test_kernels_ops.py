@@ -10,7 +10,15 @@ import torch
 from composite_cases import PARTS, dense, evaluate, leaves_of, scene
 from torch import Tensor
 
-from voronerf.ops import centre_grid, composite, frequency_encode, integrated_encode, march_rays, resample
+from voronerf.ops import (
+    centre_grid,
+    composite,
+    frequency_encode,
+    integrated_encode,
+    march_rays,
+    resample,
+    spherical_harmonics,
+)
 
 pytestmark = pytest.mark.warp
 
@@ -64,6 +72,8 @@ def encodings(backend: str) -> list[Callable[..., Tensor]]:
         lambda x: frequency_encode(x, 4, backend=backend),
         lambda x: frequency_encode(x, 3, include_input=False, backend=backend),
         lambda x, v: integrated_encode(x, v.exp(), 4, backend=backend),
+        lambda x: spherical_harmonics(x, 3, backend=backend),
+        lambda x: spherical_harmonics(x, 4, backend=backend),
     ]
 
 
@@ -107,7 +117,9 @@ def test_locate_cell_stays_inside_unsound_tables() -> None:
 
 
 def test_opcheck() -> None:
-    for name in ("composite", "encode", "resample", "locate_cell", "cell_sort", "march_rays", "update_occupancy"):
+    for name in ("composite", "encode", "spherical_harmonics", "resample", "locate_cell", "cell_sort"):
+        with_kernels(name)
+    for name in ("march_rays", "update_occupancy"):
         with_kernels(name)
     check = torch.library.opcheck
     cast, _ = leaves_of(scene([3, 0, 5], 2, "all", (1, 1)), torch.float32)
@@ -120,6 +132,9 @@ def test_opcheck() -> None:
         check(op("encode_warp"), given)
         gradient = torch.rand(5, 3 * (4 + given[3]), requires_grad=True)
         check(op("encode_warp_backward"), (gradient, *given))
+    for degree in (1, 4):
+        check(op("spherical_harmonics_warp"), (x, degree))
+        check(op("spherical_harmonics_warp_backward"), (torch.rand(5, degree**2, requires_grad=True), x, degree))
     check(op("resample_warp"), (torch.rand(4, 3), torch.rand(4, 4).cumsum(1), 6, torch.rand(4, 6)))
     tables = (torch.tensor([0, 4], dtype=torch.int32), torch.tensor([-1, -2, -3, -4], dtype=torch.int32))
     check(op("locate_cell_warp"), (torch.rand(5, 3), torch.rand(4, 3), *tables, 1, torch.rand(4)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from tolerances import assert_as_exact
 from torch import Tensor
 
-from voronerf.ops import frequency_encode, integrated_encode, resample
+from voronerf.ops import frequency_encode, integrated_encode, resample, spherical_harmonics
 
 pytestmark = pytest.mark.native
 
@@ -29,8 +30,12 @@ def points(n: int, d: int = 3) -> Tensor:
     return 4 * torch.rand(n, d, dtype=torch.float64) - 2
 
 
+def _harmonics(degree: int, x: Tensor, backend: str) -> Tensor:
+    return spherical_harmonics(x, degree, backend=backend)
+
+
 def encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], list[Tensor]]]:
-    """Both encodings, each with float64 inputs."""
+    """The encodings, each with float64 inputs."""
     return [
         (lambda x, backend: frequency_encode(x, octaves, backend=backend), [points(n)]),
         (lambda x, backend: frequency_encode(x, octaves, include_input=False, backend=backend), [points(n)]),
@@ -38,6 +43,7 @@ def encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], lis
             lambda x, variances, backend: integrated_encode(x, variances, octaves, backend=backend),
             [points(n), torch.rand(n, 3, dtype=torch.float64) / 10],
         ),
+        *((functools.partial(_harmonics, degree), [points(n)]) for degree in (2, 3, 4)),
     ]
 
 
@@ -177,6 +183,10 @@ def test_opcheck(octaves: int) -> None:
         torch.library.opcheck(ops.encode_native.default, inputs)
         gradient = torch.rand(5, 3 * (2 * octaves + inputs[3]), requires_grad=True)
         torch.library.opcheck(ops.encode_native_backward.default, (gradient, *inputs))
+    for degree in (1, 4):
+        torch.library.opcheck(ops.spherical_harmonics_native.default, (x, degree))
+        gradient = torch.rand(5, degree**2, requires_grad=True)
+        torch.library.opcheck(ops.spherical_harmonics_native_backward.default, (gradient, x, degree))
     weights, edges = torch.rand(4, 3), torch.rand(4, 4).cumsum(1)
     for uniforms in (None, torch.rand(4, 6)):
         torch.library.opcheck(ops.resample_native.default, (weights, edges, 6, uniforms))

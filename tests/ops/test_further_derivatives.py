@@ -46,6 +46,10 @@ def gaussians(backend, x, variances):
     return ops.integrated_encode(x, variances.square(), 2, backend=backend)
 
 
+def harmonics(backend, x):
+    return ops.spherical_harmonics(x, 4, backend=backend)
+
+
 def rays(backend, x, sigma):
     depths = torch.linspace(1, 2, N).to(x)
     deltas = torch.full((N,), 0.3).to(x)
@@ -60,6 +64,7 @@ CASES: dict[str, tuple[Call, list[Tensor]]] = {
     "routed_mlp": (routed, [draw(N, 3, seed=1), draw(K, 6, 15, seed=2), draw(K, 2, 6, seed=3)]),
     "frequency_encode": (frequencies, [draw(N, 3, seed=1)]),
     "integrated_encode": (gaussians, [draw(N, 3, seed=1), draw(N, 3, seed=2)]),
+    "spherical_harmonics": (harmonics, [draw(N, 3, seed=1)]),
     "composite": (rays, [draw(N, 3, seed=1), draw(N, seed=2)]),
 }
 

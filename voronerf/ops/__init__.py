@@ -25,6 +25,7 @@ from voronerf.ops.nearest_centre import nearest_centre
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.select_heaviest import select_heaviest
+from voronerf.ops.spherical_harmonics import spherical_harmonics
 from voronerf.ops.update_occupancy import update_occupancy
 
 __all__ = [
@@ -52,5 +53,6 @@ __all__ = [
     "resample",
     "routed_mlp",
     "select_heaviest",
+    "spherical_harmonics",
     "update_occupancy",
 ]

@@ -1,0 +1,123 @@
+"""``spherical_harmonics`` as Warp kernels. n directions, a thread each.
+
+The arithmetic is float32; second derivatives come from the reference formula.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from voronerf.derivatives import (
+    harmonics_backward_backward,
+    harmonics_backward_setup,
+    harmonics_gradient,
+    harmonics_setup,
+)
+from voronerf.kernels._launch import array, launch
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _harmonics_kernel(
+    directions: wp.array2d(dtype=wp.float32), degree: wp.int32, out: wp.array2d(dtype=wp.float32)
+) -> None:
+    i = wp.tid()
+    x = directions[i, 0]
+    y = directions[i, 1]
+    z = directions[i, 2]
+    out[i, 0] = 0.28209479177387814
+    if degree > 1:
+        out[i, 1] = -0.48860251190291987 * y
+        out[i, 2] = 0.48860251190291987 * z
+        out[i, 3] = -0.48860251190291987 * x
+    if degree > 2:
+        out[i, 4] = 1.0925484305920792 * x * y
+        out[i, 5] = -1.0925484305920792 * y * z
+        out[i, 6] = 0.94617469575755997 * z * z - 0.31539156525251999
+        out[i, 7] = -1.0925484305920792 * x * z
+        out[i, 8] = 0.54627421529603959 * (x * x - y * y)
+    if degree > 3:
+        out[i, 9] = 0.59004358992664352 * y * (y * y - 3.0 * x * x)
+        out[i, 10] = 2.8906114426405538 * x * y * z
+        out[i, 11] = 0.45704579946446572 * y * (1.0 - 5.0 * z * z)
+        out[i, 12] = 0.3731763325901154 * z * (5.0 * z * z - 3.0)
+        out[i, 13] = 0.45704579946446572 * x * (1.0 - 5.0 * z * z)
+        out[i, 14] = 1.4453057213202769 * z * (x * x - y * y)
+        out[i, 15] = 0.59004358992664352 * x * (3.0 * y * y - x * x)
+
+
+@wp.kernel
+def _harmonics_backward_kernel(
+    gradient: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.float32),
+    degree: wp.int32,
+    found: wp.array2d(dtype=wp.float32),
+) -> None:
+    i = wp.tid()
+    x = directions[i, 0]
+    y = directions[i, 1]
+    z = directions[i, 2]
+    to_x = wp.float32(0.0)
+    to_y = wp.float32(0.0)
+    to_z = wp.float32(0.0)
+    if degree > 1:
+        to_x = -0.48860251190291987 * gradient[i, 3]
+        to_y = -0.48860251190291987 * gradient[i, 1]
+        to_z = 0.48860251190291987 * gradient[i, 2]
+    if degree > 2:
+        c = 1.0925484305920792
+        to_x += c * (y * gradient[i, 4] - z * gradient[i, 7] + x * gradient[i, 8])
+        to_y += c * (x * gradient[i, 4] - z * gradient[i, 5] - y * gradient[i, 8])
+        to_z += 1.8923493915151199 * z * gradient[i, 6] - c * (y * gradient[i, 5] + x * gradient[i, 7])
+    if degree > 3:
+        a = 1.7701307697799306
+        b = 2.8906114426405538
+        d = x * x - y * y
+        e = 0.45704579946446572 * (1.0 - 5.0 * z * z)
+        to_x += -2.0 * a * x * y * gradient[i, 9] + b * y * z * gradient[i, 10] + e * gradient[i, 13]
+        to_x += b * x * z * gradient[i, 14] - a * d * gradient[i, 15]
+        to_y += -a * d * gradient[i, 9] + b * x * z * gradient[i, 10] + e * gradient[i, 11]
+        to_y += -b * y * z * gradient[i, 14] + 2.0 * a * x * y * gradient[i, 15]
+        to_z += b * x * y * gradient[i, 10] - 4.5704579946446572 * z * (y * gradient[i, 11] + x * gradient[i, 13])
+        to_z += 1.1195289977703462 * (5.0 * z * z - 1.0) * gradient[i, 12] + 0.5 * b * d * gradient[i, 14]
+    found[i, 0] = to_x
+    found[i, 1] = to_y
+    found[i, 2] = to_z
+
+
+def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
+    """Bands 0 to degree - 1; see ``voronerf.ops.spherical_harmonics``."""
+    encoded: Tensor = _forward(directions.float(), degree)
+    return encoded.to(directions.dtype)
+
+
+@torch.library.custom_op("voronerf::spherical_harmonics_warp", mutates_args=())
+def _forward(directions: Tensor, degree: int) -> Tensor:
+    out = directions.new_empty(directions.shape[0], degree**2)
+    launch(_harmonics_kernel, out.shape[0], [array(directions, directions), degree, array(out, out)], directions)
+    return out
+
+
+@torch.library.custom_op("voronerf::spherical_harmonics_warp_backward", mutates_args=())
+def _backward(gradient: Tensor, directions: Tensor, degree: int) -> Tensor:
+    found = directions.new_empty(directions.shape)
+    given = [array(gradient, directions), array(directions, directions), degree, array(found, directions)]
+    launch(_harmonics_backward_kernel, found.shape[0], given, directions)
+    return found
+
+
+@_forward.register_fake
+def _(directions: Tensor, degree: int) -> Tensor:
+    return directions.new_empty(directions.shape[0], degree**2)
+
+
+@_backward.register_fake
+def _(gradient: Tensor, directions: Tensor, degree: int) -> Tensor:
+    return directions.new_empty(directions.shape)
+
+
+_forward.register_autograd(harmonics_gradient(_backward), setup_context=harmonics_setup)
+_backward.register_autograd(harmonics_backward_backward, setup_context=harmonics_backward_setup)

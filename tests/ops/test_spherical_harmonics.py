@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from op_cases import FLOATS, need, refused, strided
+from tolerances import assert_as_exact
+
+from voronerf.ops import spherical_harmonics
+
+pytestmark = pytest.mark.op("spherical_harmonics")
+
+
+def directions_of(n):
+    return torch.nn.functional.normalize(torch.randn(n, 3, dtype=torch.float64), dim=1)
+
+
+def legendre(band, order, z):
+    """The associated Legendre function of cos(theta) = z, with the phase of Condon and Shortley, by its recurrence."""
+    before, value = 0.0, (-1) ** order * math.prod(range(1, 2 * order, 2)) * math.sqrt(1 - z * z) ** order
+    for l in range(order + 1, band + 1):
+        before, value = value, ((2 * l - 1) * z * value - (l + order - 1) * before) / (l - order)
+    return value
+
+
+def slow(directions, degree):
+    """One harmonic of one unit vector at a time, by its definition in spherical coordinates."""
+    rows = []
+    for x, y, z in directions.double().tolist():
+        row, angle = [], math.atan2(y, x)
+        for band in range(degree):
+            for order in range(-band, band + 1):
+                m = abs(order)
+                norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
+                wave = 1 if m == 0 else math.sqrt(2) * (math.cos if order > 0 else math.sin)(m * angle)
+                row.append(norm * wave * legendre(band, m, max(-1.0, min(1.0, z))))
+        rows.append(row)
+    return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), -1)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+@pytest.mark.parametrize("n", [1, 3, 17, 64, 65, 200])
+def test_matches_the_definition(device, backend, n, degree):
+    directions = directions_of(n)
+    found = spherical_harmonics(directions.float().to(device), degree, backend=backend)
+    assert found.shape == (n, degree**2)
+    torch.testing.assert_close(found.double().cpu(), slow(directions, degree), rtol=0, atol=2e-6)
+
+
+def test_poles_and_axes(device, backend):
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    found = spherical_harmonics(axes.to(device), 4, backend=backend)
+    torch.testing.assert_close(found.double().cpu(), slow(axes, 4), rtol=0, atol=1e-6)
+
+
+def tiny_cuda_nn(x, y, z):
+    """The polynomials of its kernel_sh (sphericalharmonics.h, degree 4), as they are written there."""
+    xy, xz, yz, x2, y2, z2 = x * y, x * z, y * z, x * x, y * y, z * z
+    return [
+        0.28209479177387814,
+        -0.48860251190291987 * y,
+        0.48860251190291987 * z,
+        -0.48860251190291987 * x,
+        1.0925484305920792 * xy,
+        -1.0925484305920792 * yz,
+        0.94617469575755997 * z2 - 0.31539156525251999,
+        -1.0925484305920792 * xz,
+        0.54627421529603959 * x2 - 0.54627421529603959 * y2,
+        0.59004358992664352 * y * (-3.0 * x2 + y2),
+        2.8906114426405538 * xy * z,
+        0.45704579946446572 * y * (1.0 - 5.0 * z2),
+        0.3731763325901154 * z * (5.0 * z2 - 3.0),
+        0.45704579946446572 * x * (1.0 - 5.0 * z2),
+        1.4453057213202769 * z * (x2 - y2),
+        0.59004358992664352 * x * (-x2 + 3.0 * y2),
+    ]
+
+
+def test_of_any_length_as_in_tiny_cuda_nn(device, backend):
+    x = 4 * torch.rand(40, 3, dtype=torch.float64) - 2
+    expected = torch.tensor([tiny_cuda_nn(*row) for row in x.tolist()], dtype=torch.float64)
+    found = spherical_harmonics(x.float().to(device), 4, backend=backend)
+    torch.testing.assert_close(found.double().cpu(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_empty(device, backend):
+    directions = torch.empty(0, 3, device=device, requires_grad=True)
+    found = spherical_harmonics(directions, 3, backend=backend)
+    assert found.shape == (0, 9)
+    found.sum().backward()
+    assert directions.grad is not None and directions.grad.shape == (0, 3)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_dtypes(device, backend, dtype):
+    need("spherical_harmonics", backend, device, dtype)
+    directions = directions_of(300).to(dtype)
+    exact = spherical_harmonics(directions.double(), 4, backend="reference")
+    found = spherical_harmonics(strided(directions.to(device)), 4, backend=backend)
+    assert_as_exact(found, exact.to(dtype), exact)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+@pytest.mark.parametrize("n", [1, 31, 64, 130])
+def test_gradient_matches_autograd_in_float64(device, backend, n, degree):
+    directions = directions_of(n)
+    slopes = torch.randn(n, degree**2, dtype=torch.float64)
+    exact = directions.clone().requires_grad_()
+    spherical_harmonics(exact, degree, backend="reference").backward(slopes)
+    leaf = directions.float().to(device).requires_grad_()
+    spherical_harmonics(leaf, degree, backend=backend).backward(slopes.float().to(device))
+    torch.testing.assert_close(leaf.grad.double().cpu(), exact.grad, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+def test_gradcheck(degree):
+    directions = directions_of(3).requires_grad_()
+    run = lambda d: spherical_harmonics(d, degree)  # noqa: E731
+    if degree > 1:
+        assert torch.autograd.gradcheck(run, directions)
+    if degree > 2:
+        assert torch.autograd.gradgradcheck(run, directions)
+
+
+def test_not_a_number_stays_in_its_row(device, backend):
+    directions = directions_of(20).float().to(device)
+    directions[7, 1] = torch.nan
+    found = spherical_harmonics(directions, 4, backend=backend)
+    assert found[7, 1].isnan() and found[:7].isfinite().all() and found[8:].isfinite().all()
+
+
+def test_compiles(device, backend):
+    run = lambda d: spherical_harmonics(d, 4, backend=backend)  # noqa: E731
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    for n in (5, 8):
+        directions = directions_of(n).float().to(device)
+        torch.testing.assert_close(compiled(directions), run(directions), rtol=0, atol=1e-6)
+
+
+def test_errors():
+    directions = torch.rand(4, 3)
+    with refused(ValueError, "spherical_harmonics: directions must have shape [n, 3], got [4, 2]"):
+        spherical_harmonics(directions[:, :2], 2)
+    with refused(ValueError, "spherical_harmonics: degree must be at least 1, got 0"):
+        spherical_harmonics(directions, 0)
+    with refused(ValueError, "spherical_harmonics: degree must be at most 4, got 5"):
+        spherical_harmonics(directions, 5)
+    with refused(TypeError, "spherical_harmonics: degree must be an integer, got float"):
+        spherical_harmonics(directions, 2.0)
+    with refused(TypeError, "spherical_harmonics: directions must have dtype ... or float64, got int32"):
+        spherical_harmonics(directions.int(), 2)

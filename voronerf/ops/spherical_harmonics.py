@@ -1,0 +1,56 @@
+"""Spherical harmonics, an encoding of view directions. n directions."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.checks import check_count, check_dtype, check_integer, check_shape
+
+_OP = backends.declare(
+    "spherical_harmonics",
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+)
+
+
+def spherical_harmonics(directions: Tensor, degree: int, *, backend: str = "auto") -> Tensor:
+    """The real spherical harmonics of bands 0 to degree - 1, an orthonormal basis of functions of a direction.
+
+    Order, signs and constants are those of tiny-cuda-nn's ``SphericalHarmonics`` and torch-ngp's ``SHEncoder`` (Müller
+    et al. 2022 encode view directions so): band after band, of each the orders -l to l, with the phase of Condon and
+    Shortley. As in torch-ngp the input is the direction itself; tiny-cuda-nn takes ``(direction + 1) / 2`` and undoes
+    that. The result is a polynomial in x, y and z, whatever their length. Gradients of every order.
+
+    Args:
+        directions: [n, 3] floating point, unit vectors, n < 2**31.
+        degree: number of bands, 1 to 4.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        [n, degree**2] in the dtype of the directions: 1, 4, 9 or 16 values, computed in float32 at least.
+
+    Raises:
+        ValueError: shape, degree or an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import spherical_harmonics
+        >>> up = torch.tensor([[0.0, 0.0, 1.0]])
+        >>> spherical_harmonics(up, 2).abs().round(decimals=4)  # a constant, then -y, z and -x, scaled
+        tensor([[0.2821, 0.0000, 0.4886, 0.0000]])
+        >>> spherical_harmonics(up, 4).shape
+        torch.Size([1, 16])
+    """
+    check_shape(_OP, "directions", directions, ("n", 3))
+    check_dtype(_OP, "directions", directions)
+    check_integer(_OP, "degree", degree, 1)
+    if degree > 4:
+        raise ValueError(f"{_OP}: degree must be at most 4, got {degree}")
+    check_count(_OP, "directions", directions.shape[0])
+    run = backends.resolve(_OP, backend=backend, device=directions.device, dtype=directions.dtype)
+    encoded: Tensor = run(directions, degree)
+    return encoded
