@@ -15,7 +15,7 @@ void harmonics_of_rows(const float* x, int64_t rows, int64_t degree, float* out,
   for (int64_t row = 0; row < rows; row += kLanes) {
     F32 at_x, at_y, at_z, value[kMostHarmonics];
     load_points(x + 3 * row, at_x, at_y, at_z);
-    for (int64_t column = degree * degree; column < kMostHarmonics; ++column) value[column] = splat(0.0f);
+    for (F32& column : value) column = splat(0.0f);
     spherical_harmonics_of(at_x, at_y, at_z, static_cast<int>(degree), value);
     for (int64_t column = 0; column < kMostHarmonics; column += kLanes) {
       transpose(value + column);

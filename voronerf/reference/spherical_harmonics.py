@@ -8,11 +8,12 @@ from torch import Tensor
 
 def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     """Bands 0 to degree - 1 as polynomials; see ``voronerf.ops.spherical_harmonics``."""
-    x, y, z = directions.to(torch.promote_types(directions.dtype, torch.float32)).unbind(1)
+    wide = directions.to(torch.promote_types(directions.dtype, torch.float32))
+    x, y, z = wide.unbind(1)
     # Constants: of band l and order m the square root of (2l + 1) (l - |m|)! / (4 pi (l + |m|)!), times the square root
     # of 2 where m is not 0, and the factors of the polynomial.
     bands = [
-        [torch.full_like(x, 0.28209479177387814)],
+        [0.28209479177387814 + wide[:, :0].sum(1)],  # a constant, with a gradient of 0
         [-0.48860251190291987 * y, 0.48860251190291987 * z, -0.48860251190291987 * x],
         [
             1.0925484305920792 * x * y,
