@@ -32,6 +32,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "published, global": {"normalise": "global"},
     "published, weighted": {"init": "weighted"},
     "transport": {"method": "transport"},
+    "centroidal": {"method": "centroidal"},
+    "centroidal-transport": {"method": "centroidal-transport"},
 }
 
 
@@ -44,7 +46,8 @@ class Options:
     cells: tuple[int, ...] = (4, 16, 32, 64, 256)
     """Numbers of cells."""
     methods: tuple[str, ...] = tuple(METHODS)
-    """Rows of the table, of: published; published, global; published, weighted; transport."""
+    """Rows of the table, of: published; published, global; published, weighted; transport; centroidal;
+    centroidal-transport."""
     seeds: int = 5
     """Calls of each row, with seeds 0, 1, ..."""
     objects: int = 9

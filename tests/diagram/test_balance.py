@@ -211,7 +211,7 @@ NAN = float("nan")
         (POINTS, ONES[:4], 2, {}, ValueError, "importance must have shape [9], got [4]"),
         (POINTS.long(), ONES, 2, {}, TypeError, "points must be floating-point"),
         (POINTS, ONES.int(), 2, {}, TypeError, "importance must be floating-point"),
-        (POINTS, ONES, 2, {"method": "magic"}, ValueError, "method must be one of published, transport, got 'magic'"),
+        (POINTS, ONES, 2, {"method": "magic"}, ValueError, "centroidal-transport, got 'magic'"),
         (POINTS, ONES, 2, {"init": "grid"}, ValueError, "init must be one of"),
         (POINTS, ONES, 2, {"normalise": "all"}, ValueError, "normalise must be one of"),
         (POINTS, ONES, 2, {"steps": -1}, ValueError, "steps must be >= 0"),

@@ -120,7 +120,7 @@ def test_bad_input_gets_one_clear_line():
         ({"k": 2, "cells": [1, 1]}, "each once"),
         ({"k": 2, "cells": "best"}, "got 'best'"),
         ({"k": 2, "centres": "uniform", "uniform_scale": 0.0}, "uniform_scale must be positive and finite, got 0.0"),
-        ({"k": 2, "centres": "grid"}, "centres must be one of balanced, random, uniform, got 'grid'"),
+        ({"k": 2, "centres": "grid"}, "centres must be one of balanced, random, uniform, centroidal, got 'grid'"),
     ):
         refuses(message, split_diagram, ROOT, points, importance, **arguments)
     refuses("split_diagram: importance must be finite", split_diagram, ROOT, points, importance / 0 * 0, 2)

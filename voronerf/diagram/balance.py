@@ -15,9 +15,12 @@ import torch
 from torch import Tensor
 
 from voronerf import ops
+from voronerf.diagram.centroidal import lloyd
 from voronerf.diagram.transport import transport
 from voronerf.diagram.uniform import uniform_centres
 from voronerf.diagram.voronoi import VoronoiDiagram
+
+METHODS = ("published", "transport", "centroidal", "centroidal-transport")
 
 
 @dataclass(frozen=True)
@@ -113,14 +116,18 @@ def balance(
         points: floating [m, 3], finite.
         importance: floating [m], finite, >= 0, not all 0.
         k: number of cells, 1 <= k <= number of distinct points.
-        method: "published" (a plain Voronoi diagram) or "transport" (a power diagram).
+        method: "published" (a plain Voronoi diagram); "transport" (a power diagram of equal importance); "centroidal"
+            (a plain Voronoi diagram whose centres are the centroids of their cells, weighted by importance: compact
+            cells, which hold unequal importance; Du, Faber and Gunzburger 1999); or "centroidal-transport" (a power
+            diagram of both, equal importance and compact cells; Balzer, Schloemer and Deussen 2009, de Goes et al.
+            2012).
         steps: number of updates; 0 keeps the first centres.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
         normalise: "neighbourhood" or "global".
         init: the first centres. "random": distinct samples, all equally likely (as in the paper; default of
             "published"). "weighted": distinct samples drawn one by one with probability proportional to importance
-            (default of "transport"). "uniform": `uniform_centres` over the bounding box of the samples.
+            (default of the other methods). "uniform": `uniform_centres` over the bounding box of the samples.
         uniform_scale: factor > 0 on the size of that box about its middle.
         generator: CPU generator of the draws; None for torch's global one.
         backend: of the ops, see `voronerf.backends`.
@@ -142,7 +149,7 @@ def balance(
         True
     """
     check_samples("balance", points, importance)
-    _check_choice("method", method, ("published", "transport"))
+    _check_choice("method", method, METHODS)
     init = init or ("random" if method == "published" else "weighted")
     _check_choice("init", init, ("random", "weighted", "uniform"))
     _check_choice("normalise", normalise, ("neighbourhood", "global"))
@@ -165,10 +172,15 @@ def balance(
     centres = first_centres(samples, masses, k, init=init, generator=generator, uniform_scale=uniform_scale)
     power = None
     before = after = weigh(centres)
-    if method == "transport" and k > 1:
-        centres, power = transport(samples, masses, centres, generator=generator)
+    if "centroidal" in method:
+        centres = lloyd(samples, masses, centres, backend=backend)
+        after = weigh(centres)
+    if "transport" in method and k > 1:
+        centres, power = transport(
+            samples, masses, centres, centroidal=method == "centroidal-transport", generator=generator
+        )
         after = weigh(centres, power)
-    elif k > 1:
+    elif method == "published" and k > 1:
         centres, after = ops.balance_centres(
             samples,
             masses,

@@ -13,7 +13,7 @@ from torch import Tensor
 from voronerf.diagram.balance import Balance, balance, cell_weights, check_samples
 from voronerf.diagram.voronoi import VoronoiDiagram
 
-CENTRES = ("balanced", "random", "uniform")
+CENTRES = ("balanced", "random", "uniform", "centroidal")
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,13 @@ def split_diagram(
         min_samples: number of distinct samples that a cell needs to be split.
         centres: "balanced": moved by `balance`; "random": samples drawn at random and not moved; "uniform":
             `uniform_centres` over the bounding box of the samples in the cell, not moved (some may lie outside the cell
-            and have no samples). The last two are ablations of the paper.
+            and have no samples); "centroidal": the centroids of their cells, weighted by importance, with
+            method="transport" those of cells of equal importance. "random" and "uniform" are ablations of the paper.
         uniform_scale: factor > 0 on the size of the box of "uniform", or of init="uniform", about its middle.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.backends`.
-        **options: arguments of `balance` for "balanced": method, steps, alpha, neighbours, normalise, init.
+        **options: arguments of `balance` for "balanced" and "centroidal": method, steps, alpha, neighbours, normalise,
+            init.
 
     Returns:
         The split. Cells that are too small stay leaves; `balances` has the cells that were split.
@@ -118,7 +120,9 @@ def split_diagram(
         accumulated = cell_weights(leaves, importance, diagram.num_cells)
         chosen = [max(chosen, key=lambda cell: float(accumulated[cell]))]
 
-    if centres != "balanced":
+    if centres == "centroidal":
+        options["method"] = "centroidal-transport" if options.get("method") == "transport" else "centroidal"
+    elif centres != "balanced":
         options = {"method": "published", "steps": 0, "init": centres}
     balances: dict[int, Balance] = {}
     for cell in chosen if k > 1 else []:

@@ -20,6 +20,10 @@ half a sample whatever the weights; but a centre's three coordinates and its wei
 at its border. Small random changes of all four are tried, and the best is taken if it lowers the sum of squares of the
 cells' importance. What remains is bounded by the heaviest samples: one that outweighs the mean of a cell cannot be
 shared.
+
+With `centroidal`, `centre` comes before: it moves the centres to the centroids of their cells, so that cells of equal
+importance are compact as well (Balzer, Schloemer and Deussen 2009, "Capacity-constrained point distributions"; de Goes,
+Breeden, Ostromoukhov and Desbrun 2012, "Blue noise through optimal transport").
 """
 
 import torch
@@ -30,6 +34,8 @@ _COOLEST = 0.003  # last temperature, in squared typical distances of neighbouri
 _RIDGE = 0.01  # added to the Hessian, whose diagonal is about 1: cells that share no sample leave it singular
 _LONGEST = 4.0  # longest change of a weight in one step, in temperatures: beyond that the quadratic model says nothing
 
+_ROUNDS = 4  # moves of all centres to the centroids of their cells; more hardly lower the energy
+
 _MOVES = 2048  # centres visited in all, in sweeps over all of them ...
 _SWEEPS = (8, 32)  # ... of which there are no fewer and no more
 _TRIALS = 256  # random changes tried of each centre in each sweep
@@ -38,7 +44,12 @@ _TOLERANCE = 1e-3  # sweeps end at this root-mean-square deviation from equal ce
 
 
 def transport(
-    samples: Tensor, masses: Tensor, centres: Tensor, *, generator: torch.Generator | None = None
+    samples: Tensor,
+    masses: Tensor,
+    centres: Tensor,
+    *,
+    centroidal: bool = False,
+    generator: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Power weights, and slightly moved centres, whose cells hold equal mass.
 
@@ -46,6 +57,7 @@ def transport(
         samples: float32 [m, 3] on the CPU.
         masses: float64 [m], >= 0, not all 0.
         centres: float32 [k, 3], distinct, k >= 2.
+        centroidal: move the centres to the centroids of their cells first.
         generator: CPU generator; None for torch's global one.
 
     Returns:
@@ -55,6 +67,8 @@ def transport(
     origin = samples.mean(0)
     scale = (samples - origin).square().sum(1).mean().sqrt().clamp(min=torch.finfo(torch.float32).tiny)
     samples, centres = (samples - origin) / scale, (centres - origin) / scale
+    if centroidal:
+        centres = centre(samples, masses, centres)
     power = anneal(samples, masses, centres)
     centres, power = polish(samples, masses, centres, power, generator=generator)
     return centres * scale + origin, (power - power.mean()) * scale.square()
@@ -94,6 +108,22 @@ def anneal(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
         step = step * (_LONGEST / step.abs().max()).clamp(max=1.0)
         power = power + temperature * step.to(power.dtype)
     return power
+
+
+def centre(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
+    """Centres float32 [k, 3] near the centroids of their cells of equal mass; arguments scaled, see above.
+
+    Alternates between the weights of the present centres and the centroids of the present cells (de Goes et al. 2012).
+    """
+    k = centres.shape[0]
+    for _ in range(_ROUNDS):
+        power = anneal(samples, masses, centres)
+        cells = (_squared_distances(samples, centres) - power[:, None]).argmin(0)
+        mass = torch.bincount(cells, weights=masses, minlength=k)
+        sums = [torch.bincount(cells, weights=masses * axis, minlength=k) for axis in samples.unbind(1)]
+        centroids = torch.stack(sums, 1) / mass[:, None]
+        centres = torch.where(mass[:, None] > 0, centroids, centres.double()).to(samples.dtype)
+    return centres
 
 
 def polish(

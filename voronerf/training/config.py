@@ -89,8 +89,9 @@ class TrainConfig:
     """With --split worst: split the worst cell again and again until there are this many cells. The first split makes
     the first number of --cells, each later one divides the worst cell into the last number; the splits are evenly
     spaced between the two times of --split-at."""
-    centres: Literal["balanced", "random", "uniform"] = "balanced"
-    """Centres of the new cells: balanced by importance, drawn from the samples, or a regular grid."""
+    centres: Literal["balanced", "random", "uniform", "centroidal"] = "balanced"
+    """Centres of the new cells: balanced by importance, drawn from the samples, a regular grid, or centroids of their
+    cells, which makes cells compact (with --balance transport, of equal importance as well)."""
     uniform_scale: float = 1.0
     """Size of the grid of --centres uniform along each axis, relative to the box of the kept samples."""
     balance: Literal["published", "transport"] = "published"

@@ -1,0 +1,126 @@
+"""Centroidal centres: against a plain loop, weighted, re-seeded, nested, and of equal importance."""
+
+import pytest
+import torch
+from helpers import refuses, seeded
+
+from voronerf.diagram import VoronoiDiagram, balance, split_diagram
+from voronerf.diagram.centroidal import lloyd
+
+METHODS = ("centroidal", "centroidal-transport")
+
+
+def blobs(seed=0, m=2000):
+    """Samples in three clumps, whose importance grows along the x axis."""
+    generator = seeded(seed)
+    places = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 4, 1]])
+    points = places[torch.randint(3, (m,), generator=generator)] + 0.4 * torch.randn(m, 3, generator=generator)
+    return points, (0.5 * points[:, 0]).exp() * (0.5 + torch.rand(m, generator=generator))
+
+
+def centroids(points, importance, result):
+    """float64 [k, 3], by one loop over the cells."""
+    cells = result.diagram().locate(points)
+    found = []
+    for cell in range(result.centres.shape[0]):
+        inside = cells == cell
+        masses = importance[inside].double()[:, None]
+        found.append((masses * points[inside].double()).sum(0) / masses.sum())
+    return torch.stack(found)
+
+
+def energy(points, importance, result):
+    """Importance times squared distance to the centroid of the cell."""
+    means = centroids(points, importance, result)[result.diagram().locate(points).long()]
+    return float((importance.double() * (points.double() - means).square().sum(1)).sum())
+
+
+def test_lloyd_is_the_plain_loop():
+    points, importance = blobs(m=300)
+    start = centres = points[:7]
+    for _ in range(200):
+        nearest = torch.cdist(points.double(), centres.double()).argmin(1)
+        moved = []
+        for cell in range(7):
+            weights = importance[nearest == cell].double()[:, None]
+            moved.append((weights * points[nearest == cell].double()).sum(0) / weights.sum())
+        centres = torch.stack(moved).float()
+    torch.testing.assert_close(lloyd(points, importance.double(), start), centres, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("k", [1, 2, 16, 64])
+def test_centres_are_the_weighted_centroids_of_their_cells(k):
+    points, importance = blobs()
+    result = balance(points, importance, k, method="centroidal", generator=seeded(1))
+    expected = centroids(points, importance, result)
+    apart = float((result.centres - expected).norm(dim=1).max())
+    assert result.power is None and bool((result.after > 0).all()) and apart < 0.02
+    # Without the weights the centroids lie elsewhere.
+    unweighted = balance(points, torch.ones_like(importance), k, method="centroidal", generator=seeded(1))
+    assert float((unweighted.centres - result.centres).norm(dim=1).max()) > 0.02
+
+
+def test_a_cell_without_samples_goes_to_the_sample_that_costs_most():
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [12, 0, 0]])
+    centres = torch.tensor([[0.5, 0, 0], [100.0, 0, 0]])
+    found = lloyd(points, torch.tensor([1.0, 1, 1, 1]).double(), centres)
+    assert torch.equal(found, torch.tensor([[0.5, 0, 0], [11, 0, 0]]))
+    # The samples at 0 and 1 cost 400 * 0.25 each, that at 10 only 1 * 90.25.
+    found = lloyd(points[:3], torch.tensor([400.0, 400, 1]).double(), centres)
+    assert torch.equal(torch.sort(found[:, 0]).values[:1], torch.zeros(1))
+    # Two of them go to different places, and one that could gain nothing stays.
+    found = lloyd(points, torch.ones(4).double(), torch.tensor([[0.5, 0, 0], [100.0, 0, 0], [200.0, 0, 0]]))
+    assert len({tuple(row) for row in found.tolist()}) == 3 and float(found.max()) <= 12
+    found = lloyd(torch.zeros(3, 3), torch.ones(3).double(), torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
+    assert torch.equal(found, torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
+
+
+@pytest.mark.parametrize("k", [2, 16, 64])
+def test_with_transport_cells_are_equal_and_more_compact(k):
+    points, importance = blobs(2, m=4000)
+    plain, both = (
+        balance(points, importance, k, method=method, generator=seeded(1))
+        for method in ("transport", "centroidal-transport")
+    )
+    assert both.power is not None and both.imbalance_after < 0.01
+    assert energy(points, importance, both) < energy(points, importance, plain)
+    free = balance(points, importance, k, method="centroidal", generator=seeded(1))
+    assert energy(points, importance, free) <= energy(points, importance, both) and free.imbalance_after > 0.01
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_same_generator_same_centres_and_k_of_one(method):
+    points, importance = blobs()
+    first, second, other = (
+        balance(points, importance, 12, method=method, generator=seeded(seed)) for seed in (3, 3, 4)
+    )
+    assert torch.equal(first.centres, second.centres) and not torch.equal(first.centres, other.centres)
+    one = balance(points, importance, 1, method=method)
+    assert one.power is None
+    torch.testing.assert_close(one.centres.double(), centroids(points, importance, one), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_bad_input_gets_one_clear_line(method):
+    points, importance = blobs(m=5)
+    refuses("k must be at most the number of distinct samples, 5, got 6", balance, points, importance, 6, method=method)
+    refuses("k must be at least 1, got 0", balance, points, importance, 0, method=method)
+    refuses("importance must be finite", balance, points, importance / 0, 2, method=method)
+    refuses("method must be one of published, transport, centroidal", balance, points, importance, 2, method="lloyd")
+    assert balance(points, importance, 5, method=method, generator=seeded(0)).centres.isfinite().all()
+
+
+@pytest.mark.parametrize("method", ["published", "transport"])
+def test_nested_cells_are_centroidal_among_the_samples_of_their_parent(method):
+    points, importance = blobs()
+    root = VoronoiDiagram(torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 4, 1]]))
+    split = split_diagram(root, points, importance, 8, centres="centroidal", method=method, generator=seeded(1))
+    assert split.diagram.num_cells == 24 and (split.diagram.power is None) == (method == "published")
+    parents = root.locate(points)
+    for cell, result in split.balances.items():
+        inside = parents == cell
+        expected = centroids(points[inside], importance[inside], result)
+        radius = (points[inside].double() - expected[result.diagram().locate(points[inside]).long()]).norm(dim=1).mean()
+        off = (result.centres - expected).norm(dim=1)
+        assert float(off.median()) < 0.3 * float(radius)
+        assert (result.imbalance_after < 0.02) == (method == "transport")
