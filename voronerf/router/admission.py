@@ -21,7 +21,7 @@ from voronerf.router.grouping import Entries, Grouping
 from voronerf.router.layout import RAY, SHARED, Call, Layout
 from voronerf.router.loop import Given, NoRandomness, Results, check_rows, run_cells, run_part
 from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
-from voronerf.router.tracing import ROWS, Unfusable, trace_call
+from voronerf.router.tracing import ROWS, Unfusable
 from voronerf.router.trees import map_tree, tensors_of
 from voronerf.tolerances import agree, agree_gradients
 
@@ -192,7 +192,7 @@ class Trial:
 
     def fused(self, program: Program) -> Run:
         """As one operation, with the parameters of the copy."""
-        here = program.with_parameters_of(self.original, self.module)
+        here = program.with_parameters_of(self.module)
         return lambda given: here.run(given.rows, self.entries)
 
     def is_groupable(self) -> bool:
@@ -209,7 +209,7 @@ class Trial:
         if self.layout.axis:
             raise Unfusable("the module sees one ray, [1, samples, f]; layout='flat' gives it [samples, f]")
         with NoRandomness():
-            return Program(trace_call(self.original, self.module, self.call, self.given().part(0, ROWS, 0)))
+            return Program(self.original, self.module, self.call, self.given().part(0, ROWS, 0))
 
     def is_fusable(self, expected: tuple[Results, list[Tensor]]) -> bool:
         """Whether ``fuse=True`` would serve."""

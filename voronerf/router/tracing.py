@@ -1,14 +1,23 @@
-"""What a module does with the rows of one call, as a list of steps: functions of rows, and functions of parameters.
+"""One call of a module taken down: its linear layers, and the steps before and behind them.
 
-A row count that no other size is a multiple of tells the number of samples from other numbers.
+The call has a number of samples that no other size is a multiple of. Every function is put in its place on the way:
+before the first layer (encodings), among the layers (activations, and what moves columns), or behind them (activations
+of heads, dicts).
+
+Letters: n samples, d features. A segment is a range of columns of a value from before the layers, or of a layer.
 """
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any
+import contextlib
+import itertools
+import math
+import threading
+import types
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+from unittest import mock
 
 import torch
 import torch.nn.functional as F
@@ -22,7 +31,10 @@ from voronerf.router.parameters import cell_parameters, in_place_of_parameters, 
 from voronerf.router.trees import rebuild, tensors_of
 
 ROWS = 37  # in a trace
-_APPLY = torch.autograd.Function.apply.__func__.__code__  # type: ignore[attr-defined]
+_PATCHES = threading.RLock()  # one thread at a time changes what torch calls for a custom function
+BEFORE, TABLE, BEHIND = range(3)  # where a value comes from
+_ROW_CODE = 1 << 32  # more than there are columns
+_PLAIN = ("none", 1.0)
 _ACTIVATIONS: dict[str, set[Any]] = {
     "relu": {F.relu, torch.relu, torch.relu_, torch.Tensor.relu, torch.Tensor.relu_, F.relu_},
     "sigmoid": {torch.sigmoid, torch.Tensor.sigmoid, F.sigmoid, torch.sigmoid_, torch.Tensor.sigmoid_},
@@ -30,6 +42,15 @@ _ACTIVATIONS: dict[str, set[Any]] = {
     "softplus": {F.softplus},
 }
 _PRODUCTS = (torch.mul, torch.multiply, torch.Tensor.mul, torch.Tensor.__mul__, torch.Tensor.__rmul__)
+_MOVES = """
+    cat concat concatenate hstack dstack stack split chunk tensor_split unbind __getitem__ narrow select index_select
+    permute transpose swapaxes swapdims movedim moveaxis reshape view view_as reshape_as flatten unflatten unsqueeze
+    squeeze expand expand_as broadcast_to contiguous clone repeat tile flip roll
+"""
+_MOVERS = frozenset(
+    getattr(place, name) for place in (torch, torch.Tensor) for name in _MOVES.split() if hasattr(place, name)
+)
+"""What may move columns without changing them."""
 
 
 class Unfusable(Exception):
@@ -67,14 +88,18 @@ class Step:
     args: Any
     kwargs: Any
     values: list[int]
-    inplace: bool = False
-    line: str = ""
+    inplace: bool
+    line: str
+
+    def leaves(self) -> list[Any]:
+        """All entries of its arguments."""
+        found: list[Any] = []
+        map_arguments((self.args, self.kwargs), found.append)
+        return found
 
     def refs(self) -> list[int]:
         """The values among its arguments."""
-        found: list[int] = []
-        map_arguments((self.args, self.kwargs), lambda v: found.append(v.value) if isinstance(v, Ref) else None)
-        return found
+        return [leaf.value for leaf in self.leaves() if isinstance(leaf, Ref)]
 
     def run(self, values: dict[int, Any], n: int) -> None:
         """Does the step again, for n rows."""
@@ -86,31 +111,34 @@ class Step:
 
         args, kwargs = map_arguments((self.args, self.kwargs), fill)
         result = self.function(*args, **kwargs)
-        if self.inplace:
-            values[self.values[0]] = args[0]
-        else:
-            values.update(zip(self.values, tensors_of(result), strict=True))
+        values.update(zip(self.values, [args[0]] if self.inplace else tensors_of(result), strict=True))
+
+    def activation(self) -> str | None:
+        """The name that a layer table has for its function, or None."""
+        rest = (self.args[1:], {key: value for key, value in self.kwargs.items() if key != "inplace"})
+        name = next((name for name, functions in _ACTIVATIONS.items() if self.function in functions), None)
+        plain = rest in (((), {}), ((1, 20), {}), ((1.0, 20.0), {}), ((), {"beta": 1}))
+        return name if name != "softplus" or plain else None
+
+
+class Segment(NamedTuple):
+    """Columns ``start`` to ``stop`` of a value, or of layer ``layer`` after an activation of so many times its sums."""
+
+    value: int
+    layer: int
+    activation: tuple[str, float]
+    start: int
+    stop: int
 
 
 @dataclass
-class Trace:
-    """The steps of a call.
+class Linear:
+    """A linear layer of the trace: the values of its parameters, and where its inputs come from."""
 
-    Attributes:
-        inputs: How many values are inputs, in the order of the arguments.
-        steps: In order.
-        sizes: Of every value of rows, rows for each sample and the dimensions behind; None for one of parameters.
-        parameters: Values that are parameters, with their owner in the routed module and their name.
-        result: What the module returned, for its structure.
-        outputs: For each tensor of the result a Ref, or the tensor where it depends on no sample.
-    """
-
-    inputs: int = 0
-    steps: list[Step] = field(default_factory=list)
-    sizes: list[tuple[int, ...] | None] = field(default_factory=list)
-    parameters: dict[int, tuple[nn.Module, str]] = field(default_factory=dict)
-    result: Any = None
-    outputs: list[Any] = field(default_factory=list)
+    weight: int
+    bias: int | None
+    inputs: tuple[Segment, ...]
+    width: int
 
 
 def map_arguments(value: Any, change: Callable[[Any], Any]) -> Any:
@@ -125,50 +153,63 @@ def map_arguments(value: Any, change: Callable[[Any], Any]) -> Any:
     return change(value)
 
 
-def trace_call(original: nn.Module, module: nn.Module, call: Call, given: Given) -> Trace:
-    """Follows one call of a copy of the routed module, with the parameters of its first cell, for ``ROWS`` samples.
+class Trace(TorchFunctionMode):
+    """Takes down the functions that a module calls, each in its place.
+
+    Args:
+        original: The routed module.
+        module: A copy of it, which runs with the parameters of its first cell.
+        call: The method.
+        given: Its arguments, for ``ROWS`` samples.
+
+    Attributes:
+        sizes: Of every value of rows, rows for each sample and the dimensions behind; None for one of parameters.
+        stages: Where every value comes from.
+        parameters: Values that are parameters, with their place among ``owned_parameters``.
+        before, behind, weights: Steps before and behind the table, and of parameters alone.
+        layers: In order.
+        result: What the module returned, for its structure.
+        outputs: For each tensor of the result a Ref, or the tensor where it depends on no sample.
 
     Raises:
-        Unfusable: For a step that cannot be done again for other samples.
+        Unfusable: For a step that cannot be done again for other samples, or a layer that fits no table.
     """
-    single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for _, _, p in cell_parameters(module)}
-    places = {}
-    for (owner, name, _), (_, _, parameter) in zip(owned_parameters(original), owned_parameters(module), strict=True):
-        places[id(single.get(id(parameter), parameter))] = (owner, name)
-    buffers = {id(own): other for own, other in zip(module.buffers(), original.buffers(), strict=True)}
-    recorder = _Recorder(places, buffers)
-    for tensor in given.rows:
-        recorder.new(tensor)
-    recorder.trace.inputs = len(given.rows)
-    with in_place_of_parameters(module, single), recorder:
-        result = call.function(module)(*given.args, **given.kwargs)
-    recorder.trace.outputs = [recorder.ref(tensor) for tensor in tensors_of(result)]
-    recorder.trace.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
-    return recorder.trace
 
-
-class _Recorder(TorchFunctionMode):
-    """Takes down the functions that a module calls."""
-
-    def __init__(self, places: dict[int, tuple[nn.Module, str]], buffers: dict[int, Tensor]) -> None:
+    def __init__(self, original: nn.Module, module: nn.Module, call: Call, given: Given) -> None:
         super().__init__()
-        self.trace = Trace()
-        self._places, self._buffers = places, buffers
-        self._grad = torch.is_grad_enabled()
+        self.sizes: list[tuple[int, ...] | None] = []
+        self.stages: list[int] = []
+        self.parameters: dict[int, int] = {}
+        self.before: list[Step] = []
+        self.behind: list[Step] = []
+        self.weights: list[Step] = []
+        self.layers: list[Linear] = []
+        single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for _, _, p in cell_parameters(module)}
+        owned = enumerate(owned_parameters(module))
+        self._places = {id(single.get(id(parameter), parameter)): i for i, (_, _, parameter) in owned}
+        self._buffers = {id(own): other for own, other in zip(module.buffers(), original.buffers(), strict=True)}
+        self._grad, self._running = torch.is_grad_enabled(), False
         self._known: dict[int, tuple[Tensor, int]] = {}
-        self._frame: Any = None  # of a custom function's apply
-        self._inner: dict[int, tuple[Tensor, Step]] = {}
+        self._codes: dict[int, Tensor] = {}  # like each value, with the number of its column in each entry
+        self._columns: list[tuple[int, int, tuple[str, float], int]] = []  # as in a segment
+        self._scaled: dict[int, tuple[int, float]] = {}
+        for tensor in given.rows:
+            self.new(tensor)
+        with in_place_of_parameters(module, single), _custom_functions(self), self:
+            result = call.function(module)(*given.args, **given.kwargs)
+        self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
+        self.outputs = [self.ref(tensor) for tensor in tensors_of(result)]
 
     def new(self, tensor: Tensor, rows: bool = True) -> int:
         """Numbers a value."""
-        number = len(self.trace.sizes)
+        number = len(self.sizes)
         self._known[id(tensor)] = (tensor, number)  # kept, so that no other tensor gets its id
-        sizes = (tensor.shape[0] // ROWS, *tensor.shape[1:]) if rows and tensor.dim() else None
-        self.trace.sizes.append(sizes)
-        if rows and (sizes is None or not sizes[0] or tensor.shape[0] % ROWS):
+        if rows and (not tensor.dim() or not tensor.shape[0] or tensor.shape[0] % ROWS):
             raise Unfusable(
                 f"a tensor of shape {list(tensor.shape)} has no row for each of {ROWS} samples{user_line()}"
             )
+        self.sizes.append((tensor.shape[0] // ROWS, *tensor.shape[1:]) if rows else None)
+        self.stages.append(BEFORE)
         return number
 
     def ref(self, value: Any) -> Any:
@@ -177,121 +218,163 @@ class _Recorder(TorchFunctionMode):
             return Rows(value // ROWS)
         if not isinstance(value, Tensor):
             return value
-        if id(value) in self._inner and id(value) not in self._known:
-            step = self._inner[id(value)][1]
-            if step.values:
-                raise Unfusable(f"{name_of(step.function)} has more than one result{step.line}")
-            step.values.append(self.new(value, self._depends_on_rows(step)))
+        if id(value) in self._places and id(value) not in self._known:
+            self.parameters[self.new(value, rows=False)] = self._places[id(value)]
         if id(value) in self._known:
             return Ref(self._known[id(value)][1])
-        if id(value) in self._places:
-            number = self.new(value, rows=False)
-            self.trace.parameters[number] = self._places[id(value)]
-            return Ref(number)
         if id(value) in self._buffers:
             return self._buffers[id(value)]
         if value.requires_grad or value.shape[:1] == (ROWS,):
             raise Unfusable(f"a tensor comes from what is no PyTorch function{user_line()}")
         return value
 
-    def _depends_on_rows(self, step: Step) -> bool:
-        found: list[Any] = []
-        map_arguments((step.args, step.kwargs), found.append)
-        return any(
-            isinstance(item, Rows) or (isinstance(item, Ref) and self.trace.sizes[item.value] is not None)
-            for item in found
-        )
-
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        kwargs = kwargs or {}
-        if func in METADATA:
+        return self.follow(func, args, kwargs or {})
+
+    def follow(self, func: Any, args: Any, kwargs: Any) -> Any:
+        """Calls a function and takes it down."""
+        if self._running or func in METADATA:
             return func(*args, **kwargs)
-        frame = _custom_function()
-        if frame is not None:
-            return self._inside(frame, func, args, kwargs)
         given = map_arguments((args, kwargs), self.ref)
-        step = Step(func, given[0], given[1], [], line=user_line())
+        inplace = writes_in_place(func) or bool(kwargs.get("inplace"))
+        step = Step(func, given[0], given[1], [], inplace, user_line())
         operands = tensors_of((args, kwargs))
-        result = func(*args, **kwargs)
-        found = tensors_of(result)
-        if not step.refs() and not self._depends_on_rows(step):
+        self._running = True  # what it calls itself is part of the step
+        try:
+            result = func(*args, **kwargs)
+        finally:
+            self._running = False
+        leaves = step.leaves()
+        if not any(isinstance(leaf, (Ref, Rows)) for leaf in leaves):
             return result
         if torch.is_grad_enabled() != self._grad:
             raise Unfusable(f"the gradient mode changes{step.line}")
-        idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
-        if func in RANDOM and not idle:
+        if func in RANDOM and not (func is F.dropout and not (kwargs["training"] and kwargs["p"])):
             raise Unfusable(f"{name_of(func)} draws random numbers{step.line}")
         if func is torch.autograd.grad:
             raise Unfusable(f"gradients are taken{step.line}")
-        step.inplace = writes_in_place(func) or bool(kwargs.get("inplace"))
         if isinstance(kwargs.get("out"), Tensor):
             raise Unfusable(f"{name_of(func)} writes to out={step.line}")
-        if not found and not step.inplace:
-            if result is None:
-                return result
+        found = [operands[0]] if inplace else tensors_of(result)
+        if not found and result is not None:
             raise Unfusable(f"{name_of(func)} reads values{step.line}")
-        if not step.inplace and any(result is tensor for tensor in operands):
+        if not found or (not inplace and any(result is tensor for tensor in operands)):
             return result
-        rows = self._depends_on_rows(step)
-        for tensor in [operands[0]] if step.inplace else found:
-            step.values.append(self.new(tensor, rows))
-        self.trace.steps.append(step)
+        rows = any(isinstance(x, Rows) or (isinstance(x, Ref) and self.sizes[x.value] is not None) for x in leaves)
+        step.values = [self.new(tensor, rows) for tensor in found]
+        self._place(step, rows)
         return result
 
-    def _inside(self, frame: Any, func: Any, args: Any, kwargs: Any) -> Any:
-        """A function within a custom function's ``forward``: the custom function is the step."""
-        if frame is not self._frame:
-            self._frame = frame
-            given = map_arguments(frame.f_locals["args"], self.ref)
-            step = Step(frame.f_locals["cls"].apply, given, {}, [], line=user_line())
-            self.trace.steps.append(step)
-        result = func(*args, **kwargs)
-        for tensor in tensors_of(result):
-            self._inner[id(tensor)] = (tensor, self.trace.steps[-1])
-        return result
-
-
-def _custom_function() -> Any:
-    """The frame of the outermost ``autograd.Function.apply`` that is under way, or None."""
-    frame, found = inspect.currentframe(), None
-    while frame is not None and frame.f_code is not trace_call.__code__:
-        found = frame if frame.f_code is _APPLY else found
-        frame = frame.f_back
-    return found
-
-
-def activation_of(step: Step) -> str | None:
-    """The name that a layer table has for a step's function, or None."""
-    rest = (step.args[1:], {key: value for key, value in step.kwargs.items() if key != "inplace"})
-    for name, functions in _ACTIVATIONS.items():
-        if step.function in functions:
-            plain = rest in (((), {}), ((1, 20), {}), ((1.0, 20.0), {}), ((), {"beta": 1}))
-            return name if name != "softplus" or plain else None
-    return None
-
-
-def with_scales(trace: Trace) -> list[Step]:
-    """The steps of a trace, with the factor of ``sin(factor * layer(x))`` in the layer."""
-    steps = list(trace.steps)
-    uses: dict[int, int] = {}
-    for step in steps:
-        for ref in step.refs():
-            uses[ref] = uses.get(ref, 0) + 1
-    for item in trace.outputs:
-        if isinstance(item, Ref):
-            uses[item.value] = uses.get(item.value, 0) + 1
-    made = {value: step for step in steps for value in step.values}
-    for step in list(steps):
+    def _place(self, step: Step, rows: bool) -> None:
         refs = step.refs()
-        factors = [item for item in step.args if isinstance(item, (int, float)) and not isinstance(item, bool)]
-        source = made.get(refs[0]) if len(refs) == 1 else None
-        if step.function not in _PRODUCTS or len(factors) != 1 or len(step.args) != 2 or source is None:
-            continue
-        wave = next((s for s in steps if refs and step.values[0] in s.refs()), None)
-        once = uses.get(refs[0]) == 1 and uses.get(step.values[0]) == 1
-        if source.function is F.linear and once and wave is not None and activation_of(wave) == "sine":
-            linear = replace(source, values=step.values, kwargs={**source.kwargs, "scale": factors[0]})
-            steps[steps.index(source)] = linear
-            steps.remove(step)
-            made[step.values[0]] = linear
-    return steps
+        stage = max((self.stages[ref] for ref in refs), default=BEFORE)
+        if any(self.sizes[ref] is None for ref in refs):
+            if step.function is F.linear:
+                self._add_layer(step)
+            elif rows:
+                raise Unfusable(f"parameters meet samples in {name_of(step.function)}{step.line}")
+            else:
+                self.weights.append(step)
+        elif stage == BEFORE:
+            if step.inplace:  # in the original order, which may be what the caller gave
+                raise Unfusable(f"{name_of(step.function)} changes a tensor before the first layer{step.line}")
+            self.before.append(step)
+        elif not (self._activate(step, refs) or (stage == TABLE and self._move(step, refs))):
+            self.stages[step.values[0] : step.values[-1] + 1] = [BEHIND] * len(step.values)
+            self.behind.append(step)
+            factor = next((item for item in step.args if type(item) in (int, float)), None)
+            if step.function in _PRODUCTS and factor is not None and stage == TABLE:
+                self._scaled[step.values[0]] = (refs[0], factor)
+
+    def _add_layer(self, step: Step) -> None:
+        given = {**dict(zip(("input", "weight", "bias"), step.args)), **step.kwargs}
+        source, weight, bias = (
+            item.value if isinstance(item, Ref) else None
+            for item in (given["input"], given["weight"], given.get("bias"))
+        )
+        own = None if source is None else self.sizes[source]
+        if source is None or own is None or weight is None or self.sizes[weight] is not None:
+            raise Unfusable(f"a layer has weights or inputs that are neither parameters nor samples{step.line}")
+        if self.stages[source] == BEHIND:
+            earlier = next(s for s in self.behind if source in s.values)
+            name = f"{name_of(earlier.function)}{earlier.line}"
+            raise Unfusable(f"a layer reads the result of {name}, which is no activation or arrangement of a table")
+        if math.prod(own[:-1]) != 1:
+            raise Unfusable(f"a layer runs on more than one row for each sample{step.line}")
+        out = self.sizes[step.values[0]]
+        assert out is not None
+        self.layers.append(Linear(weight, bias, self.segments(source), out[-1]))
+        self._name(step.values[0], -1, len(self.layers) - 1, _PLAIN, 0)
+
+    def _activate(self, step: Step, refs: list[int]) -> bool:
+        """Has the columns of one layer go through an activation; ``sin(factor * layer)`` is one."""
+        name = step.activation()
+        if name is None or len(refs) != 1:
+            return False
+        source, factor = self._scaled.get(refs[0], (refs[0], 1.0)) if name == "sine" else (refs[0], 1.0)
+        segments = self.segments(source) if self.stages[source] == TABLE else ()
+        if len(segments) != 1 or segments[0].activation != _PLAIN or segments[0].layer < 0:
+            return False
+        self._name(step.values[0], -1, segments[0].layer, (name, factor), segments[0].start)
+        return True
+
+    def _move(self, step: Step, refs: list[int]) -> bool:
+        """Runs a function that may only move columns on the numbers of the columns, and reads where they went."""
+        if step.function not in _MOVERS or step.inplace:
+            return False
+        moved: dict[int, Any] = {ref: self._coded(ref) for ref in refs}
+        try:
+            step.run(moved, ROWS)
+        except Exception:
+            return False
+        for value in step.values:
+            m, *rest = self.sizes[value] or ()
+            codes, rows = moved[value], torch.arange(ROWS)[:, None] * _ROW_CODE
+            if codes.shape != (ROWS * m, *rest) or codes.dtype != torch.int64:
+                return False
+            by_row = codes.reshape(ROWS, -1)
+            if not torch.equal(by_row, by_row[:1] + rows):
+                return False
+        for value in step.values:
+            self._codes[value], self.stages[value] = moved[value], TABLE
+        return True
+
+    def _name(self, value: int, source: int, layer: int, activation: tuple[str, float], start: int) -> None:
+        """Numbers the columns of a value anew."""
+        m, *rest = self.sizes[value] or ()
+        width, first = m * math.prod(rest), len(self._columns)
+        self._columns += [(source, layer, activation, start + i) for i in range(width)]
+        codes = torch.arange(first, first + width) + torch.arange(ROWS)[:, None] * _ROW_CODE
+        self._codes[value] = codes.reshape(ROWS * m, *rest)
+        self.stages[value] = TABLE if layer >= 0 else BEFORE
+
+    def _coded(self, value: int) -> Tensor:
+        if value not in self._codes:
+            self._name(value, value, -1, _PLAIN, 0)
+        return self._codes[value]
+
+    def segments(self, value: int) -> tuple[Segment, ...]:
+        """The columns of a value, in as few segments as possible."""
+        m = (self.sizes[value] or (1,))[0]
+        columns = [self._columns[code] for code in self._coded(value)[:m].flatten().tolist()]
+        found = []
+        for _, group in itertools.groupby(enumerate(columns), lambda pair: (pair[1][:3], pair[1][3] - pair[0])):
+            run = [column for _, column in group]
+            source, layer, activation, start = run[0]
+            found.append(Segment(source, layer, activation, start, start + len(run)))
+        return tuple(found)
+
+
+@contextlib.contextmanager
+def _custom_functions(trace: Trace) -> Iterator[None]:
+    """Shows a trace the custom functions of this thread, which no mode sees."""
+    here = threading.get_ident()
+    with _PATCHES:
+        own = torch.autograd.Function.apply.__func__  # type: ignore[attr-defined]
+
+        def apply(cls: Any, *args: Any, **kwargs: Any) -> Any:
+            function = types.MethodType(own, cls)
+            return function(*args, **kwargs) if threading.get_ident() != here else trace.follow(function, args, kwargs)
+
+        with mock.patch.object(torch.autograd.Function, "apply", classmethod(apply)):
+            yield
