@@ -18,8 +18,8 @@ from voronerf.backends import BackendUnavailable
 from voronerf.router.fused import Program
 from voronerf.router.grouped import Ungroupable
 from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import RAY, SHARED, Call, Layout
-from voronerf.router.loop import Given, NoRandomness, Results, check_rows, run_cells, run_part
+from voronerf.router.layout import RAY, SHARED, Call, Given, Layout
+from voronerf.router.loop import NoRandomness, Results, check_rows, run_cells, run_part
 from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
 from voronerf.router.tracing import ROWS, Unfusable
 from voronerf.router.trees import map_tree, tensors_of
@@ -137,7 +137,7 @@ class Trial:
 
     def given(self) -> Given:
         """The arguments, fresh for each run."""
-        return Given(*self.call.arranged(self.layout, self.entries))
+        return self.call.arranged(self.layout, self.entries)
 
     def outcome(self, run: Run) -> tuple[Results, list[Tensor]]:
         """Results, and gradients of a weighted sum of them."""
@@ -241,7 +241,7 @@ def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Paramet
 # Rays -----------------------------------------------------------------------------------------------------------------
 
 
-def flattened(module: nn.Module, call: Call, layout: Layout) -> tuple[bool, ...]:
+def flattened(module: nn.Module, call: Call, layout: Layout, device: torch.device) -> tuple[bool, ...]:
     """For each tensor that a call with rays returns, whether the module itself makes [rays * samples, ...] of it.
 
     The module runs on a few samples of two rays, as rays and as it would see them.
@@ -251,86 +251,60 @@ def flattened(module: nn.Module, call: Call, layout: Layout) -> tuple[bool, ...]
         ValueError: When the module gives other results for [n, 1, f] than for [rays, samples, f].
     """
     *outer, rays, along = layout.lead
+    name = type(module).__name__
     for samples in (6, along):  # a module may be made for a number of samples
         lead = (*[1] * len(outer), min(rays, 2), min(along, samples))
+        n = lead[-1] * lead[-2]
+        picked = torch.arange(lead[-2], device=device)[:, None] * along + torch.arange(lead[-1], device=device)
+        one = Entries(picked.flatten(), picked.new_zeros(n, dtype=torch.int32), 1, "auto")
         try:
-            whole = _on_rays(module, call, layout, lead)
-            alone = _as_samples(module, call, layout, lead)
-            changed = _on_rays(module, call, layout, lead, change=True)
+            whole = _in_first(module, call, _on_rays(call, layout, lead, picked))
+            alone = _in_first(module, call, call.arranged(layout, one))
+            changed = _in_first(module, call, _on_rays(call, layout, lead, picked, change=True))
         except Exception:
             continue
-        mixed = any(
-            a.shape[: len(lead)] == lead and not agree(b[..., 0, :], a[..., 0, :])
-            for a, b in zip(whole, changed, strict=True)
-            if a.dim() > len(lead)
-        )
-        same = len(whole) == len(alone) and all(
+        for a, b in zip(whole, changed, strict=True):
+            if a.dim() > len(lead) and a.shape[: len(lead)] == lead and not agree(b[..., 0, :], a[..., 0, :]):
+                raise TypeError(
+                    f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when "
+                    "others along its ray change: it mixes the samples of a ray"
+                )
+        if len(whole) != len(alone) or not all(
             a.numel() == b.numel() and a.dtype == b.dtype and agree(b.flatten(), a.flatten())
             for a, b in zip(whole, alone)
-        )
-        name = type(module).__name__
-        if mixed:
-            raise TypeError(
-                f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when "
-                "others along its ray change: it mixes the samples of a ray"
-            )
-        if not same:
+        ):
             raise ValueError(
                 f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but {name} does not; "
                 "layout='flat' calls it with [n, f], for modules that squeeze or flatten their arguments"
             )
-        n = lead[-1] * lead[-2]
         return tuple(tuple(a.shape[: len(lead)]) != lead and a.shape[:1] == (n,) for a in whole)
     return ()
 
 
-def _picked(layout: Layout, lead: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Numbers of rays, and of their samples."""
-    rays = torch.arange(lead[-2])
-    return rays, (rays[:, None] * layout.lead[-1] + torch.arange(lead[-1])).flatten()
-
-
-def _as_samples(module: nn.Module, call: Call, layout: Layout, lead: tuple[int, ...]) -> list[Tensor]:
-    """Its results for the same samples as a routed call would show them."""
-    _, samples = _picked(layout, lead)
-    device = tensors_of((call.args, call.kwargs))[0].device
-    cells = torch.zeros(samples.shape[0], dtype=torch.int32, device=device)
-    return _run_first(module, call, *call.arranged(layout, Entries(samples.to(device), cells, 1, "auto"))[:2])
-
-
-def _on_rays(
-    module: nn.Module, call: Call, layout: Layout, lead: tuple[int, ...], change: bool = False
-) -> list[Tensor]:
-    """The module's own results for [rays, samples, f]; ``change`` alters all but the first sample of each ray."""
-    rays, samples = _picked(layout, lead)
+def _on_rays(call: Call, layout: Layout, lead: tuple[int, ...], picked: Tensor, change: bool = False) -> Given:
+    """The arguments for [rays, samples] samples alone; ``change`` alters all but the first sample of each ray."""
 
     def pick(name: str, value: Any, nested: bool) -> Any:
         if not isinstance(value, Tensor):
             shape = tuple(value.shape)
             if shape not in (layout.lead, layout.lead[:-1]):
                 return value
-            ray = shape != layout.lead
-            picked = value.flatten()[rays if ray else samples]
-            return picked.reshape(lead[:-1] if ray else lead)
+            some = picked if shape == layout.lead else picked[:, 0] // layout.lead[-1]
+            return value.flatten()[some.flatten()].reshape(lead[: len(shape)])
         kind = layout.kind(name, value, nested)
         if kind == SHARED:
             return value
-        flat = layout.flatten(value.detach(), kind)[(rays if kind == RAY else samples).to(value.device)]
-        if kind == RAY:
-            return flat.reshape(*lead[:-1], *flat.shape[1:])
-        flat = flat.reshape(*lead, *flat.shape[1:])
-        if change and flat.is_floating_point():
-            first = flat.narrow(len(lead) - 1, 0, 1)
-            rest = flat.narrow(len(lead) - 1, 1, lead[-1] - 1) * 0.7 + 0.01
-            flat = torch.cat([first, rest], len(lead) - 1)
-        return flat
+        some = picked[:, 0] // layout.lead[-1] if kind == RAY else picked
+        found = layout.flatten(value.detach(), kind)[some]
+        if change and kind != RAY and found.is_floating_point():
+            found = torch.cat([found[:, :1], found[:, 1:] * 0.7 + 0.01], 1)
+        return found.reshape(*lead[: len(lead) - (kind == RAY)], *found.shape[some.dim() :])
 
-    values = (*call.args, *call.kwargs.values())
-    picked = [map_tree(v, pick, name, batches=True) for name, v in zip(call.names, values, strict=True)]
-    return _run_first(module, call, picked[: len(call.args)], dict(zip(call.kwargs, picked[len(call.args) :])))
+    return call.changed(pick)
 
 
-def _run_first(module: nn.Module, call: Call, args: list[Any], kwargs: dict[str, Any]) -> list[Tensor]:
+def _in_first(module: nn.Module, call: Call, given: Given) -> list[Tensor]:
+    """The tensors that the module returns with the parameters of its first cell."""
     first = {id(parameter): parameter.detach()[0] for _, _, parameter in cell_parameters(module)}
     with torch.no_grad(), NoRandomness(), in_place_of_parameters(module, first):
-        return tensors_of(call.function(module)(*args, **kwargs))
+        return tensors_of(call.run(module, given))

@@ -28,7 +28,7 @@ from voronerf.router.admission import Choice, Trial, admitted, flattened
 from voronerf.router.grouped import Ungroupable, is_inside
 from voronerf.router.grouping import Entries, Grouping
 from voronerf.router.layout import Call, Layout
-from voronerf.router.loop import Given, Results, restored, run_cells, run_grouped
+from voronerf.router.loop import Results, restored, run_cells, run_grouped
 from voronerf.router.trees import rebuild, tensors_of
 
 _OP = "VoronoiRouter"
@@ -146,7 +146,7 @@ def _carry_out(
     if choice.program is not None:
         choices.note(call, choice)
         in_order = layout.n and not isinstance(grouping, Entries)
-        given = Given(*call.arranged(layout, None if in_order else grouping))
+        given = call.arranged(layout, None if in_order else grouping)
         return choice.program.run(given.rows, grouping), choice
     if choice.way == "grouped" and grouping.k > 1:
         if grouping.n > choice.most * grouping.k:  # no warning: nothing stands in the way
@@ -178,7 +178,7 @@ def _carry_out(
 def _by_cells(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choice: Choice) -> Results:
     """The loop over cells."""
     try:
-        given = Given(*call.arranged(layout, grouping))
+        given = call.arranged(layout, grouping)
         return run_cells(module, call, layout, given, grouping, again=choice.again)
     except Exception as error:
         if hasattr(error, "add_note") and len(layout.lead) > 1 and not layout.flat:  # since Python 3.11
@@ -197,7 +197,7 @@ def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, c
     with torch.random.fork_rng(devices):
         flat: tuple[bool, ...] = () if choice is None else choice.flat
         if choice is None and len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat and not layout.one_ray:
-            flat = flattened(module, call, layout)
+            flat = flattened(module, call, layout, grouping.device)
         trial = Trial(module, call, layout, grouping)
         if choice is not None and not trial.is_groupable():
             return choice

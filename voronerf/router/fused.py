@@ -19,8 +19,8 @@ from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
 from voronerf.router.grouped import PerCell, for_all_cells
 from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import Call
-from voronerf.router.loop import Given, Results
+from voronerf.router.layout import Call, Given
+from voronerf.router.loop import Results
 from voronerf.router.parameters import is_shared, owned_parameters
 from voronerf.router.tracing import TABLE, Linear, Ref, Segment, Step, Trace, Unfusable, map_arguments
 from voronerf.router.trees import tensors_of

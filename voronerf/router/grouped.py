@@ -22,8 +22,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouping import Grouping
-from voronerf.router.tables import Tables
+from voronerf.router.grouping import Grouping, Tables
 from voronerf.router.trees import map_tree, tensors_of
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.router.grouping import Grouping
-from voronerf.router.trees import map_children, map_tree, tensors_of
+from voronerf.router.trees import Change, map_children, map_tree, tensors_of
 
 _OP = "VoronoiRouter"
 SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
@@ -155,6 +155,35 @@ def _sizes(shape: Sequence[int], empty: str = "") -> str:
 
 
 @dataclasses.dataclass
+class Given:
+    """Arguments as a module sees them, sorted by cell, and the tensors among them that have rows."""
+
+    args: Sequence[Any]
+    kwargs: dict[str, Any]
+    rows: list[Tensor]
+
+    def part(self, first: int, last: int, axis: int) -> Given:
+        """Rows ``first`` to ``last`` alone."""
+        rows = {id(tensor) for tensor in self.rows}
+        found: list[Tensor] = []
+
+        def cut(name: str, value: Any, nested: bool) -> Any:
+            if not isinstance(value, Tensor):
+                if not any(id(tensor) in rows for tensor in tensors_of(value)):
+                    return value
+                value = value[(slice(None),) * axis + (slice(first, last),)]
+                found.extend(tensors_of(value))
+                return value
+            if id(value) not in rows:
+                return value
+            found.append(value.narrow(axis, first, last - first))
+            return found[-1]
+
+        args, kwargs = map_tree((tuple(self.args), self.kwargs), cut, batches=True)
+        return Given(args, kwargs, found)
+
+
+@dataclasses.dataclass
 class Call:
     """A method of the module with the arguments of one call, and their names, of positional ones first."""
 
@@ -163,22 +192,23 @@ class Call:
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
 
-    def function(self, module: nn.Module) -> Callable[..., Any]:
-        """The bound method; ``forward`` by way of the module, whose hooks run then."""
-        return module.__call__ if self.method == "forward" else getattr(module, self.method)
+    def run(self, module: nn.Module, given: Given) -> Any:
+        """Calls the method; ``forward`` by way of the module, whose hooks run then."""
+        method = module if self.method == "forward" else getattr(module, self.method)
+        return method(*given.args, **given.kwargs)
 
-    def arranged(self, layout: Layout, grouping: Grouping | None) -> tuple[list[Any], dict[str, Any], list[Tensor]]:
-        """The arguments as the module sees them, in the order of a grouping; None keeps the original order.
-
-        Returns:
-            Positional arguments, keyword arguments, and the tensors among them that have rows.
-        """
+    def arranged(self, layout: Layout, grouping: Grouping | None) -> Given:
+        """The arguments as the module sees them, in the order of a grouping; None keeps the original order."""
         order = _Order(layout, grouping)
+        return dataclasses.replace(self.changed(order.change), rows=order.found)
+
+    def changed(self, change: Change) -> Given:
+        """The arguments with every tensor and batch-like object changed, see :func:`map_tree`."""
         values = [
-            map_tree(value, order.change, name, batches=True)
+            map_tree(value, change, name, batches=True)
             for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
         ]
-        return values[: len(self.args)], dict(zip(self.kwargs, values[len(self.args) :])), order.found
+        return Given(values[: len(self.args)], dict(zip(self.kwargs, values[len(self.args) :])), [])
 
 
 class _Order:

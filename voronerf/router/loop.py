@@ -12,11 +12,10 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable
-from voronerf.router.grouping import Grouping, Part
-from voronerf.router.layout import Call, Layout
+from voronerf.router.grouping import Grouping, Part, Tables
+from voronerf.router.layout import Call, Given, Layout
 from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
-from voronerf.router.tables import Tables
-from voronerf.router.trees import map_tree, rebuild, tensors_of
+from voronerf.router.trees import rebuild, tensors_of
 from voronerf.tolerances import agree
 
 _DRAWS = """
@@ -39,35 +38,6 @@ class NoRandomness(TorchFunctionMode):
         if "dropout" in getattr(func, "__name__", ""):
             return args[0] if args else kwargs["input"]
         return func(*args, **kwargs).zero_()
-
-
-@dataclass
-class Given:
-    """Arguments as a module sees them, sorted by cell, and the tensors among them that have rows."""
-
-    args: Sequence[Any]
-    kwargs: dict[str, Any]
-    rows: list[Tensor]
-
-    def part(self, first: int, last: int, axis: int) -> Given:
-        """Rows ``first`` to ``last`` alone."""
-        rows = {id(tensor) for tensor in self.rows}
-        found: list[Tensor] = []
-
-        def cut(name: str, value: Any, nested: bool) -> Any:
-            if not isinstance(value, Tensor):
-                if not any(id(tensor) in rows for tensor in tensors_of(value)):
-                    return value
-                value = value[(slice(None),) * axis + (slice(first, last),)]
-                found.extend(tensors_of(value))
-                return value
-            if id(value) not in rows:
-                return value
-            found.append(value.narrow(axis, first, last - first))
-            return found[-1]
-
-        args, kwargs = map_tree((tuple(self.args), self.kwargs), cut, batches=True)
-        return Given(args, kwargs, found)
 
 
 @dataclass
@@ -107,10 +77,10 @@ def run_cells(
         part = given if len(occupied) == 1 else given.part(first, last, layout.axis)
         if again:
             kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
-            results.append(call.function(clone_module(module, kept | own))(*part.args, **part.kwargs))
+            results.append(call.run(clone_module(module, kept | own), part))
             continue
         with in_place_of_parameters(module, own):
-            results.append(call.function(module)(*part.args, **part.kwargs))
+            results.append(call.run(module, part))
     return _join(results, [last - first for _, first, last in occupied], module, layout)
 
 
@@ -168,7 +138,7 @@ def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Groupin
     parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
     tables, chunks = Tables(), _chunks(module, parts)
     found = [
-        run_part(module, call, layout, Given(*call.arranged(layout, part)), part, chunk, tables)[0]
+        run_part(module, call, layout, call.arranged(layout, part), part, chunk, tables)[0]
         for part, chunk in zip(parts, chunks, strict=True)
     ]
     first = found[0]
@@ -214,7 +184,7 @@ def run_part(
         for _, _, p in cell_parameters(module)
     }
     with in_place_of_parameters(module, stand_ins), run:
-        value = call.function(module)(*given.args, **given.kwargs)
+        value = call.run(module, given)
     if run.failed is not None:
         raise run.failed
     results = Results(value, [], [], [])

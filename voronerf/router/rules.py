@@ -15,8 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops import grouped_linear
-from voronerf.router import tables
 from voronerf.router.grouped import GroupedRun, PerCell, register, writes_in_place
+from voronerf.router.grouping import Grouping
 from voronerf.router.trees import map_tree, tensors_of
 
 _ELEMENTWISE = """
@@ -301,6 +301,8 @@ def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
     return _look_up(run, source, index, -source.shape[0]) if index.dtype in _INTEGERS else NotImplemented
 
 
+_WASTE = 512
+"""Rows of padding that cost as much as one more call of ``grid_sample``."""
 _PLANES = 128
 """Samples a cell beyond which planes are read faster cell by cell: each read has a gradient as large as its planes."""
 
@@ -314,4 +316,41 @@ def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) ->
     if len(places) != 1 or grid.shape[0] != 1:
         return NotImplemented
     run.most = _PLANES
-    return tables.grid_sample(run.grouping, input.stacked.squeeze(1), grid, places[0], **options)
+    return _sampled(run.grouping, input.stacked.squeeze(1), grid, places[0], **options)
+
+
+def _sampled(grouping: Grouping, planes: Tensor, grid: Tensor, place: int, **options: Any) -> Tensor:
+    """``F.grid_sample`` of each cell's own plane or volume.
+
+    Args:
+        grouping: Of the samples.
+        planes: [k, c, h, w] or [k, c, d, h, w].
+        grid: [1, ..., 2] or [1, ..., 3].
+        place: The dimension of ``grid`` that is the n sorted samples.
+        **options: Of ``F.grid_sample``.
+
+    Returns:
+        [1, c, ...] with the sizes of ``grid``.
+    """
+    n, c = grouping.n, planes.shape[1]
+    rest = [size for d, size in enumerate(grid.shape[1:-1], 1) if d != place]
+    points = grid[0].movedim(place - 1, 0).reshape(n, -1, grid.shape[-1])
+    volume = [1] * (planes.dim() - 4)
+
+    def read(own: Tensor, at: Tensor) -> Tensor:
+        """[cells, c, h, w] at [cells, rows, q, 2] -> [cells, c, rows, q]."""
+        cells, rows, q, _ = at.shape
+        return F.grid_sample(own, at.reshape(cells, rows, q, *volume, -1), **options).reshape(cells, c, rows, q)
+
+    occupied = grouping.occupied()
+    most = max(last - first for _, first, last in occupied)
+    if len(occupied) > 1 and grouping.k * most - n <= _WASTE * len(occupied):
+        slots = grouping.slots
+        padded = points.new_zeros(grouping.k * most, *points.shape[1:]).index_copy(0, slots, points)
+        found = read(planes, padded.reshape(grouping.k, most, *points.shape[1:]))
+        found = found.transpose(1, 2).reshape(-1, c, points.shape[1]).index_select(0, slots).transpose(0, 1)[None]
+    else:
+        own = planes.split(1)
+        parts = [read(own[cell], points[None, first:last]) for cell, first, last in occupied]
+        found = parts[0] if len(parts) == 1 else torch.cat(parts, 2)
+    return found.reshape(1, c, n, *rest).movedim(2, 1 + place)

@@ -25,8 +25,8 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.grouped import METADATA, name_of, user_line, writes_in_place
-from voronerf.router.layout import Call
-from voronerf.router.loop import RANDOM, Given
+from voronerf.router.layout import Call, Given
+from voronerf.router.loop import RANDOM
 from voronerf.router.parameters import cell_parameters, in_place_of_parameters, owned_parameters
 from voronerf.router.trees import rebuild, tensors_of
 
@@ -196,7 +196,7 @@ class Trace(TorchFunctionMode):
         for tensor in given.rows:
             self.new(tensor)
         with in_place_of_parameters(module, single), _custom_functions(self), self:
-            result = call.function(module)(*given.args, **given.kwargs)
+            result = call.run(module, given)
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self.ref(tensor) for tensor in tensors_of(result)]
 
