@@ -1,6 +1,7 @@
 """Samples sorted by cell: the order, its inverse, and what running a module on the sorted rows needs to know.
 
-n samples, k cells, e entries of a table with c numbers each. A sorted tensor may have m entries a sample: its first dimension is then n * m, sample after sample.
+n samples, k cells, e entries of a table with c numbers each. A sorted tensor may have m entries a sample: its first
+dimension is then n * m, sample after sample.
 """
 
 from __future__ import annotations
