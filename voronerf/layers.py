@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from voronerf.grids import HashGrid
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
-ENCODINGS = ("frequency", "integrated", "hash")
+POSITION_ENCODINGS = ("frequency", "integrated", "hash")
+DIRECTION_ENCODINGS = ("frequency", "spherical")
 POSITIONS = "positions"
 DIRECTIONS = "directions"
 
@@ -57,12 +58,15 @@ class MLP:
             ``integrated_encode`` of Gaussians: positions are [n, 6], the mean and then the diagonal variance (6 -> 6L);
             or "hash", ``hash_encode`` (3 -> levels * features), whose table of features is an argument of its own.
         grid: the levels of the "hash" encoding, else None.
+        direction_encoding: "frequency", or "spherical", ``spherical_harmonics`` of unit vectors (3 -> degree^2).
+        direction_degree: of the spherical harmonics, 1 to 4, else None.
         text: the whole table as JSON, the form in which it passes through a ``torch.library`` operator; see ``parse``.
 
     Raises:
         ValueError: a table that cannot be evaluated: no layers or outputs, a source that is not an earlier layer, a
             width below 1, an unknown activation or encoding, negative octaves, the integrated encoding without octaves,
-            the hash encoding without a grid or with octaves.
+            the hash encoding without a grid or with octaves, spherical harmonics without a degree or with octaves, a
+            degree without them.
 
     Examples:
         >>> from voronerf import MLP, Layer
@@ -79,6 +83,8 @@ class MLP:
     direction_octaves: int | None = None
     position_encoding: str = "frequency"
     grid: HashGrid | None = None
+    direction_encoding: str = "frequency"
+    direction_degree: int | None = None
     text: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -97,10 +103,12 @@ class MLP:
         ):
             if octaves is not None and octaves < 0:
                 raise ValueError(f"MLP: {name} must be None or at least 0, got {octaves}")
-        if self.position_encoding not in ENCODINGS:
-            raise ValueError(
-                f"MLP: position_encoding must be one of {', '.join(ENCODINGS)}, got {self.position_encoding!r}"
-            )
+        for name, encoding, known in (
+            ("position_encoding", self.position_encoding, POSITION_ENCODINGS),
+            ("direction_encoding", self.direction_encoding, DIRECTION_ENCODINGS),
+        ):
+            if encoding not in known:
+                raise ValueError(f"MLP: {name} must be one of {', '.join(known)}, got {encoding!r}")
         if self.integrated and not self.position_octaves:
             raise ValueError(
                 f"MLP: position_octaves must be at least 1 with the integrated encoding, got {self.position_octaves}"
@@ -111,21 +119,33 @@ class MLP:
                 "MLP: grid must come with the hash encoding, and without position_octaves, got "
                 f"{self.position_encoding} with {self.position_octaves} octaves and the grid {self.grid}"
             )
+        self._check_degree()
         rows = [[list(layer.inputs), layer.width, layer.activation] for layer in self.layers]
         table = [rows, list(self.outputs), self.position_octaves, self.direction_octaves]
-        # Tables from before there was a choice have four entries.
-        if self.position_encoding != "frequency":
-            table.append(self.position_encoding)
-        if self.grid is not None:
-            table.append(self.grid.text)
+        # Tables from before there was a choice have four entries; nor are later choices written that are not made.
+        choices: list[object] = [self.position_encoding, self.grid and self.grid.text]
+        choices += [self.direction_encoding, self.direction_degree]
+        while choices and choices[-1] in (None, "frequency"):
+            choices.pop()
+        table += choices
         object.__setattr__(self, "text", json.dumps(table))
+
+    def _check_degree(self) -> None:
+        degree, octaves = self.direction_degree, self.direction_octaves
+        if self.direction_encoding != "spherical":
+            if degree is not None:
+                raise ValueError(f"MLP: direction_degree must be None without spherical harmonics, got {degree}")
+        elif degree not in (1, 2, 3, 4):
+            raise ValueError(f"MLP: direction_degree must be 1 to 4 with spherical harmonics, got {degree}")
+        elif octaves is not None:
+            raise ValueError(f"MLP: direction_octaves must be None with spherical harmonics, got {octaves}")
 
     @staticmethod
     @functools.lru_cache(maxsize=256)
     def parse(text: str) -> MLP:
         """The table whose ``text`` this is."""
         rows, outputs, *encodings = json.loads(text)
-        if len(encodings) == 4:
+        if len(encodings) > 3 and encodings[3] is not None:
             encodings[3] = HashGrid.parse(encodings[3])
         layers = tuple(Layer(tuple(inputs), width, activation) for inputs, width, activation in rows)
         return MLP(layers, tuple(outputs), *encodings)
@@ -155,6 +175,8 @@ class MLP:
                 return positions_d * self.position_octaves
             return encoded_width(positions_d, self.position_octaves)
         if source == DIRECTIONS:
+            if self.direction_degree is not None:
+                return self.direction_degree**2
             return encoded_width(directions_d, self.direction_octaves)
         assert isinstance(source, int)
         return self.layers[source].width

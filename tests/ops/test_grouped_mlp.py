@@ -10,7 +10,7 @@ from tolerances import assert_as_exact, error
 from torch import Tensor
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.ops import frequency_encode, grouped_mlp, integrated_encode
+from voronerf.ops import frequency_encode, grouped_mlp, integrated_encode, spherical_harmonics
 
 pytestmark = pytest.mark.op("grouped_mlp")
 
@@ -32,6 +32,19 @@ TABLES = {
         outputs=(6, 3),
         position_octaves=3,
         direction_octaves=2,
+    ),
+    # Harmonics of the direction, beside a skip connection and by themselves.
+    "spherical": MLP(
+        (
+            Layer((POSITIONS,), 16, "softplus"),
+            Layer((0, DIRECTIONS), 7, "sine"),
+            Layer((DIRECTIONS, 1, POSITIONS), 5, "sigmoid"),
+            Layer((DIRECTIONS,), 2),
+        ),
+        outputs=(2, 3),
+        position_octaves=3,
+        direction_encoding="spherical",
+        direction_degree=4,
     ),
     # Gaussians, mip-NeRF's positions.
     "integrated": MLP(
@@ -147,6 +160,21 @@ def test_encoded_and_raw_positions_agree(device, backend):
     case.table = MLP(case.table.layers, case.table.outputs)
     encoded = case.run(grouped_mlp, [frequency_encode(leaves[0], 4), *leaves[1:]], backend=backend)
     torch.testing.assert_close(raw, encoded, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+def test_harmonics_inside_and_before(device, backend, degree):
+    case = Case.make("spherical", COUNTS["odd"])
+    layers = case.table.layers
+    case.table = MLP(layers, case.table.outputs, 3, direction_encoding="spherical", direction_degree=degree)
+    shapes = case.table.weight_shapes(3, 3)
+    case.inputs[2 : 2 + len(layers)] = [torch.randn(len(COUNTS["odd"]), o, i) / i**0.5 for o, i in shapes]
+    leaves = [tensor.to(device) for tensor in case.inputs]
+    inside = case.run(grouped_mlp, leaves, backend=backend)
+    encoded = spherical_harmonics(leaves[1], degree, backend="reference")
+    case.table = MLP(layers, case.table.outputs, 3)
+    before = case.run(grouped_mlp, [leaves[0], encoded, *leaves[2:]], backend=backend)
+    torch.testing.assert_close(inside, before, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6])

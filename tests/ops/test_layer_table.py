@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from voronerf.grids import HashGrid
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 SOURCES = "MLP: layer 0 must read 'positions', 'directions' or an earlier layer"
@@ -51,8 +52,42 @@ def test_text_of_integrated_positions():
     for octaves in (None, 0):
         with pytest.raises(ValueError, match=r"^MLP: position_octaves must be at least 1 with the integrated encoding"):
             MLP(layers, (1,), octaves, position_encoding="integrated")
-    with pytest.raises(ValueError, match=r"^MLP: position_encoding must be one of frequency, integrated, got 'hash'"):
-        MLP(layers, (1,), 4, position_encoding="hash")
+    with pytest.raises(
+        ValueError, match=r"^MLP: position_encoding must be one of frequency, integrated, hash, got 'wave'"
+    ):
+        MLP(layers, (1,), 4, position_encoding="wave")
+
+
+def test_text_of_spherical_directions():
+    layers = (Layer((POSITIONS, DIRECTIONS), 4, "relu"),)
+    for degree in (1, 2, 3, 4):
+        table = MLP(layers, (0,), 2, direction_encoding="spherical", direction_degree=degree)
+        assert table.weight_shapes(3, 3) == [(4, 15 + degree**2)]
+        assert MLP.parse(table.text) == table
+    gaussians = MLP(layers, (0,), 2, None, "integrated", None, "spherical", 4)
+    assert gaussians.weight_shapes(6, 3) == [(4, 28)] and MLP.parse(gaussians.text) == gaussians
+    grid = MLP(layers, (0,), None, None, "hash", HashGrid(), "spherical", 3)
+    assert MLP.parse(grid.text) == grid
+
+
+def test_errors_of_directions():
+    layers = (Layer((DIRECTIONS,), 4),)
+    for options, message in (
+        ({"direction_encoding": "sh"}, "direction_encoding must be one of frequency, spherical, got 'sh'"),
+        ({"direction_encoding": "spherical"}, "direction_degree must be 1 to 4 with spherical harmonics, got None"),
+        (
+            {"direction_encoding": "spherical", "direction_degree": 5},
+            "direction_degree must be 1 to 4 with spherical harmonics, got 5",
+        ),
+        ({"direction_degree": 2}, "direction_degree must be None without spherical harmonics, got 2"),
+        (
+            {"direction_encoding": "spherical", "direction_degree": 2, "direction_octaves": 1},
+            "direction_octaves must be None with spherical harmonics, got 1",
+        ),
+    ):
+        with pytest.raises(ValueError) as caught:
+            MLP(layers, (0,), **options)
+        assert str(caught.value) == f"MLP: {message}"
 
 
 @pytest.mark.parametrize(

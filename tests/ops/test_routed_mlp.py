@@ -35,6 +35,7 @@ TABLES = {
     "plain": PLAIN,
     "raw": replace(PLAIN, position_octaves=None),
     "nerf": NERF,
+    "spherical": replace(NERF, direction_octaves=None, direction_encoding="spherical", direction_degree=3),
     "integrated": replace(NERF, position_encoding="integrated"),
 }
 # A tree of two levels, the second uneven: leaf 0, leaves 1 to 3 in diagram 1, leaves 4 and 5 in diagram 2.

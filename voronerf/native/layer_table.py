@@ -19,8 +19,8 @@ from torch import Tensor
 from voronerf import native
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.native.hash_encode import hash_encode
-from voronerf.reference.frequency_encode import frequency_encode
-from voronerf.reference.grouped_mlp import encode_positions
+from voronerf.native.spherical_harmonics import spherical_harmonics
+from voronerf.reference.grouped_mlp import encode_directions, encode_positions
 from voronerf.reference.hash_encode import hash_encode as reference
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
@@ -49,7 +49,8 @@ def network(
 ) -> Network:
     """What the ops take for a layer table.
 
-    Positions and directions in float64 are encoded in float64, beforehand; so are positions that are hashed.
+    Positions and directions in float64 are encoded in float64, beforehand. Positions that are hashed and directions of
+    spherical harmonics are encoded beforehand as well.
     """
     encoded = ""
     if layers.grid is not None:
@@ -60,9 +61,14 @@ def network(
     elif positions.dtype == torch.float64 and layers.position_octaves is not None:
         positions = encode_positions(positions, layers)
         encoded += POSITIONS
-    if directions is not None and directions.dtype == torch.float64 and layers.direction_octaves is not None:
-        directions = frequency_encode(directions, layers.direction_octaves)
-        encoded += DIRECTIONS
+    if directions is not None:
+        wide = directions.dtype == torch.float64
+        if wide and (layers.direction_octaves is not None or layers.direction_degree is not None):
+            directions = encode_directions(directions, layers)
+            encoded += DIRECTIONS
+        elif layers.direction_degree is not None:
+            directions = spherical_harmonics(directions.float(), layers.direction_degree)
+            encoded += DIRECTIONS
     return in_float32(positions, weights, biases, layers.text, directions, caller, encoded)
 
 
@@ -125,7 +131,7 @@ class Table:
         if POSITIONS in said["encoded"]:
             layers = replace(layers, position_octaves=None, position_encoding="frequency", grid=None)
         if DIRECTIONS in said["encoded"]:
-            layers = replace(layers, direction_octaves=None)
+            layers = replace(layers, direction_octaves=None, direction_encoding="frequency", direction_degree=None)
         return Table(said["caller"], said["operands"], layers)
 
     def with_widths(self, weights: Sequence[Tensor]) -> MLP:

@@ -32,10 +32,10 @@ def grouped_mlp(
 ) -> Tensor:
     """Evaluates every sample by the network of its cell, encodings included.
 
-    Equivalent to ``frequency_encode`` (or ``integrated_encode``) where ``layers`` has octaves, or ``hash_encode`` where
-    it has a grid, followed by one ``grouped_linear`` for each layer on the concatenation of its sources. Gradients of
-    every order to positions, directions, features, weights and biases. Encodings are computed in float32 at least, and
-    rounded to the dtype of the weights.
+    Equivalent to ``frequency_encode`` (or ``integrated_encode``) where ``layers`` has octaves, ``hash_encode`` where it
+    has a grid, or ``spherical_harmonics`` of the directions where it has a degree, followed by one ``grouped_linear``
+    for each layer on the concatenation of its sources. Gradients of every order to positions, directions, features,
+    weights and biases. Encodings are computed in float32 at least, and rounded to the dtype of the weights.
     Under ``torch.autocast``, layers run in its dtype.
 
     Args:
@@ -47,7 +47,8 @@ def grouped_mlp(
         weights: one [k, o, i] for each layer, all of one dtype; i as ``layers.input_width`` says.
         biases: one [k, o] or None for each layer.
         layers: the layer table.
-        directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
+        directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions. q = 3, unit
+            vectors, for spherical harmonics.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample. A direction is then
             encoded once for each ray instead of once for each sample.
         features: the table of the hash encoding, [e, f] for all cells (``layers.grid.table_shape``), or [k, e, f] with

@@ -26,6 +26,8 @@ def check_network(
     if layers.integrated and sizes["p"] != 6:
         p = sizes["p"]
         raise ValueError(f"{op}: positions must have 6 features, mean and variance, where they are integrated, got {p}")
+    if directions is not None and layers.direction_degree is not None and sizes["q"] != 3:
+        raise ValueError(f"{op}: directions must have 3 features where they are spherical, got {sizes['q']}")
     _check_features(op, features, layers, sizes)
     count = len(layers.layers)
     for name, parameters in (("weights", weights), ("biases", biases)):

@@ -12,6 +12,7 @@ from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.grouped_linear import check_offsets, grouped_linear
 from voronerf.reference.hash_encode import hash_encode
 from voronerf.reference.integrated_encode import integrated_encode
+from voronerf.reference.spherical_harmonics import spherical_harmonics
 
 
 def grouped_mlp(
@@ -35,7 +36,7 @@ def grouped_mlp(
     encoded = encode_positions(positions, layers, features, cells_of(offsets, positions) if own else None)
     sources: dict[int | str, Tensor] = {POSITIONS: encoded.to(dtype)}
     if directions is not None and layers.uses_directions:
-        encoded = encode(directions, layers.direction_octaves).to(dtype)
+        encoded = encode_directions(directions, layers).to(dtype)
         sources[DIRECTIONS] = encoded if direction_index is None else encoded[direction_index]
     for index, (layer, weight, bias) in enumerate(zip(layers.layers, weights, biases)):
         x = torch.cat([sources[source] for source in layer.inputs], dim=1)
@@ -55,6 +56,14 @@ def encode_positions(
     assert layers.position_octaves is not None
     means, variances = positions.to(torch.promote_types(positions.dtype, torch.float32)).chunk(2, dim=1)
     return integrated_encode(means, variances, layers.position_octaves)
+
+
+def encode_directions(directions: Tensor, layers: MLP) -> Tensor:
+    """Directions as the layers of a table read them."""
+    if layers.direction_degree is None:
+        return encode(directions, layers.direction_octaves)
+    wide = directions.to(torch.promote_types(directions.dtype, torch.float32))
+    return spherical_harmonics(wide, layers.direction_degree)
 
 
 def cells_of(offsets: Tensor, rows: Tensor) -> Tensor:
