@@ -1,4 +1,4 @@
-"""Scripts of benchmarks/ from end to end: occupancy.py on a run that is there, balance.py, step_profile.py."""
+"""Scripts of benchmarks/ from end to end: occupancy.py on a run that is there, balance.py, centres.py and others."""
 
 from pathlib import Path
 
@@ -48,3 +48,17 @@ def test_step_profile_accounts_for_the_step(tmp_path):
     operators = {row["operator"]: row["ms"] for row in rows if "operator" in row}
     assert all(parts[part] > 0 for part in ("route", "composite", "optimiser", "other operators"))
     assert sum(operators.values()) == pytest.approx(sum(parts.values()) - parts["Python and dispatch"])
+
+
+def test_centres_makes_only_the_rows_that_are_missing(tmp_path):
+    options = "--steps 12 --rays 32 --samples 8 --downscale 8 --eval-views 1 --seeds 1 --cells 3x2"
+    options += " --placements single regular"
+    about, first, _ = outcome("centres", tmp_path, options)
+    assert about["steps"] == 12 and [row["placement"] for row in first] == ["single", "regular"]
+    single, regular = first
+    assert "imbalance" not in single and single["cells"] == "1" and regular["cells"] == "3x2"
+    assert 0 < regular["radius_mean"] <= regular["radius_max"] < 1 and 0 <= regular["imbalance"] <= 0.5
+    assert regular["radius_mean"] < regular["diagonal_mean"] <= regular["diagonal_max"] <= 1
+    _, second, said = outcome("centres", tmp_path, options + " centroidal-transport")
+    assert second[:2] == first and second[2]["placement"] == "centroidal-transport"
+    assert "regular" not in said
