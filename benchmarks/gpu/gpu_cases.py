@@ -90,6 +90,12 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
                 part.isfinite().all(),
             )
 
+    def hashes(features: int) -> None:
+        grid = voronerf.HashGrid(levels=4, features=features, log2_entries=11, finest=60, interpolation="smoothstep")
+        cells = torch.randint(0, 3, (300,), dtype=torch.int32, device=where)
+        table = torch.randn(3, *grid.table_shape)
+        close(lambda x, b: voronerf.hash_encode(x[0], x[1], grid, cells=cells, backend=b), [torch.rand(300, 3), table])
+
     def composite() -> None:
         offsets = torch.tensor([0, 0, 1, 71, 180], dtype=torch.int32, device=where)
         close(
@@ -185,6 +191,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             "frequency_encode",
             lambda: close(lambda x, b: voronerf.frequency_encode(x[0], 10, backend=b), [torch.rand(90, 3)]),
         ),
+        *((f"hash_encode {features} features", functools.partial(hashes, features)) for features in (1, 2, 4, 8)),
         (
             "spherical_harmonics",
             lambda: close(lambda x, b: voronerf.spherical_harmonics(x[0], 4, backend=b), [torch.rand(300, 3)]),

@@ -42,4 +42,9 @@ void hash_encode_cpu(const HashInputs& in, const HashGrid& grid, float* out, Isa
 void hash_encode_backward_cpu(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                               float* of_positions, Isa isa, int threads);
 
+// Points whose cell has no table get zeros and give nothing. The table's gradient is added up in any order.
+void hash_encode_cuda(const HashInputs& in, const HashGrid& grid, float* out, void* stream);
+void hash_encode_backward_cuda(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
+                               float* of_positions, void* stream);
+
 }  // namespace voronerf

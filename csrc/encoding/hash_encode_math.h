@@ -90,21 +90,21 @@ VN_HD uint32_t hash_entry(const GridLevel& level, uint32_t x, uint32_t y, uint32
   return entry < entries ? entry : entry - entries;
 }
 
-// What multiplies the entry of a corner: the weight; with `along`, which scales the derivatives of each axis, the
-// weight's derivative along a direction.
-VN_HD float hash_weight(const HashAxis* axes, const float* along, int x, int y, int z) {
+// What multiplies the entry of a corner: the weight or, where it is directed, the weight's derivative along a
+// direction, of which `along` has each axis.
+VN_HD float hash_weight(const HashAxis* axes, bool directed, const float* along, int x, int y, int z) {
   const HashAxis &a = axes[0], &b = axes[1], &c = axes[2];
-  if (along == nullptr) return a.at[x] * (b.at[y] * c.at[z]);
+  if (!directed) return a.at[x] * (b.at[y] * c.at[z]);
   return along[0] * a.slope[x] * (b.at[y] * c.at[z]) +
          a.at[x] * (along[1] * b.slope[y] * c.at[z] + b.at[y] * (along[2] * c.slope[z]));
 }
 
 // The derivative of that by the place on axis i.
-VN_HD float hash_weight_slope(const HashAxis* axes, const float* along, int i, const int* corner) {
+VN_HD float hash_weight_slope(const HashAxis* axes, bool directed, const float* along, int i, const int* corner) {
   const int j = (i + 1) % 3, k = (i + 2) % 3;
   const HashAxis &a = axes[i], &b = axes[j], &c = axes[k];
   const int x = corner[i], y = corner[j], z = corner[k];
-  if (along == nullptr) return a.slope[x] * (b.at[y] * c.at[z]);
+  if (!directed) return a.slope[x] * (b.at[y] * c.at[z]);
   return along[i] * a.bend[x] * (b.at[y] * c.at[z]) +
          a.slope[x] * (along[j] * b.slope[y] * c.at[z] + b.at[y] * (along[k] * c.slope[z]));
 }

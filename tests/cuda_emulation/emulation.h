@@ -1,7 +1,7 @@
 // What nvcc gives to a .cu file, for g++: the same sources run on the CPU, a grid block by block, every thread a fiber.
 //
-// Test only: csrc/common/cuda_wrappers.h includes it under VN_EMULATE. Threads of a block run in an order shuffled by a seed,
-// and are stopped at barriers and at operations of the warp, where all lanes must meet. Shared memory is poisoned
+// Test only: csrc/common/cuda_wrappers.h includes it under VN_EMULATE. Threads of a block run in an order shuffled by a
+// seed, and are stopped at barriers and at operations of the warp, where all lanes must meet. Shared memory is poisoned
 // before every block. It proves logic, not speed; there are no partial warps (every mask names all 32 lanes).
 #pragma once
 
@@ -279,6 +279,16 @@ inline unsigned __ballot_sync(unsigned mask, int predicate) {
   return votes;
 }
 
+// Returns what was there before. Atomic for the sanitizers too, which know of threads alone.
+inline float atomicAdd(float* to, float value) {
+  float before, after;
+  __atomic_load(to, &before, __ATOMIC_RELAXED);
+  do {
+    after = before + value;
+  } while (!__atomic_compare_exchange(to, &before, &after, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
+  return before;
+}
+
 inline int __ffs(int x) {
   return __builtin_ffs(x);
 }
@@ -291,8 +301,8 @@ inline int __popc(unsigned x) {
 
 namespace voronerf {
 
-// The twins of the instructions in csrc/common/cuda_wrappers.h, by the fragment layouts of the PTX manual (section "Matrix
-// fragments for mma.m16n8k16" and after it).
+// The twins of the instructions in csrc/common/cuda_wrappers.h, by the fragment layouts of the PTX manual (section
+// "Matrix fragments for mma.m16n8k16" and after it).
 
 inline unsigned half_bits(float x, bool bfloat16) {
   if (!bfloat16) {

@@ -133,6 +133,24 @@ def encode(module):
         written(out, grad_x, *([] if second is None else [second]))
 
 
+def hash_encode(module):
+    encode_hashes(module, None, None)
+    encode_hashes(module, floats(300, 3), RANDOM.integers(0, 3, 300).astype(np.int32))
+
+
+def encode_hashes(module, direction, cells):
+    """Two levels, a dense and a hashed one, in as many tables as cells may name."""
+    gpu, tables = module.Cuda(0, 0), 1 if cells is None else 3
+    levels = module.GridLevel(3.0, 0.5, 4, 64, 0, False), module.GridLevel(80.0, 0.5, 81, 1024, 64, True)
+    grid = module.HashGrid(levels=levels, low=(0.1,) * 3, high=(0.9,) * 3, features=2, smooth=True)
+    table, positions = floats(tables, 1088, 2), floats(300, 3)
+    given = module.HashInputs(*every((positions, direction, table)), "float32", at(cells), 300, tables, 1088)
+    out, of_table, of_positions = unwritten(300, 4), unwritten(tables, 1088, 2), unwritten(300, 3)
+    module.hash_encode(given, grid, at(out), gpu)
+    module.hash_encode_backward(given, grid, *every((floats(300, 4), of_table, of_positions)), gpu)
+    written(out, of_table, of_positions)
+
+
 def resample(module):
     r, s, count = 6, 45, 70
     for uniforms in (None, floats(r, count)):
@@ -225,6 +243,8 @@ def hostile(module):
         inputs[0][::5], inputs[2][::7] = np.inf, np.nan
         composited(module, inputs, r, c)
 
+    encode_hashes(module, None, RANDOM.choice([least, -1, 0, 2, 3, most], 300).astype(np.int32))
+
     weights, edges, depths = floats(6, 45), floats(6, 46), unwritten(6, 70)
     weights[0], weights[1, ::2], weights[2], weights[3] = 0, np.nan, np.inf, -1
     edges[4, 3], uniforms = np.nan, floats(6, 70)
@@ -242,7 +262,7 @@ def hostile(module):
 def main(path, kind="usual"):
     module = load(path)
     module.name_dtypes(DTYPES)
-    usual = (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, resample, grouped_mlp)
+    usual = (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, hash_encode, resample, grouped_mlp)
     for run in (hostile,) if kind == "hostile" else usual:
         run(module)
     print("clean")

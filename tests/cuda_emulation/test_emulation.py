@@ -13,7 +13,7 @@ from emulated import module
 HERE = Path(__file__).resolve().parent
 OPERATIONS = (
     *("nearest_centre", "locate_cell", "draw_cell", "cell_sort", "composite", "frequency_encode", "integrated_encode"),
-    *("spherical_harmonics", "resample", "grouped_linear", "grouped_mlp", "routed_mlp"),
+    *("hash_encode", "spherical_harmonics", "resample", "grouped_linear", "grouped_mlp", "routed_mlp"),
 )
 """Those that have CUDA kernels."""
 BUGS = [

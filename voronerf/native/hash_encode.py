@@ -23,7 +23,7 @@ def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, *, cells: Tens
     return encoded
 
 
-@custom_op("hash_encode_native", devices=("cpu",))
+@custom_op("hash_encode_native")
 def _encode(
     positions: Tensor, table: Tensor, direction: Tensor | None, cells: Tensor | None, grid: str
 ) -> Iterator[Tensor]:
@@ -32,10 +32,10 @@ def _encode(
     yield out
     on_huge_pages(out)
     given = _inputs(positions, table, direction, cells)
-    native.compiled.hash_encode(given, _grid(grid), out, native.cpu())
+    native.compiled.hash_encode(given, _grid(grid), out, native.machine(positions))
 
 
-@custom_op("hash_encode_native_backward", devices=("cpu",))
+@custom_op("hash_encode_native_backward")
 def _backward(
     gradient: Tensor,
     positions: Tensor,
@@ -57,7 +57,7 @@ def _backward(
         gradient,
         of_table if to_table else None,
         of_positions if to_positions else None,
-        native.cpu(),
+        native.machine(positions),
     )
 
 

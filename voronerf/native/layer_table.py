@@ -21,7 +21,6 @@ from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.native.hash_encode import hash_encode
 from voronerf.native.spherical_harmonics import spherical_harmonics
 from voronerf.reference.grouped_mlp import encode_directions, encode_positions
-from voronerf.reference.hash_encode import hash_encode as reference
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
 
@@ -55,8 +54,7 @@ def network(
     encoded = ""
     if layers.grid is not None:
         assert features is not None
-        encode = reference if native.on_cuda(positions) else hash_encode
-        positions = encode(positions, features, layers.grid, cells=cells if features.dim() == 3 else None)
+        positions = hash_encode(positions, features, layers.grid, cells=cells if features.dim() == 3 else None)
         encoded += POSITIONS
     elif positions.dtype == torch.float64 and layers.position_octaves is not None:
         positions = encode_positions(positions, layers)

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import FLOATS, Implementation
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
 from voronerf.grids import HashGrid
 
-_OP = backends.declare("hash_encode", native=Implementation(("cpu",), FLOATS))
+_OP = backends.declare("hash_encode", native=Implementation(EVERYWHERE, FLOATS))
 
 
 def hash_encode(
@@ -21,7 +21,8 @@ def hash_encode(
     Müller et al. 2022, section 3: for each level, the eight corners around a point name eight entries of the table, by
     the place of the corner or by its hash, and their features are interpolated. Gradients of every order to positions
     and table; with linear interpolation the gradient to the positions jumps where a point passes a corner. Sums are
-    float32 at least. Results do not depend on the number of threads.
+    float32 at least. Results do not depend on the number of threads; on CUDA and in Warp the gradient of the table
+    is added up in any order.
 
     Args:
         positions: [n, 3] floating point, n < 2**31, in the units of ``grid.box``. A coordinate outside of the box

@@ -1,0 +1,236 @@
+// The hash encoding on CUDA: a thread a point and a level, levels one after the other along the grid, so that those
+// which are read at a time fit the second-level cache, as Mueller et al. 2022 do it in section 4. Tables may begin
+// anywhere, so features are loaded one by one; those of an entry lie in one sector of the cache.
+//
+// The table's gradient is added up by atomic operations, in any order. The gradient of the positions is a thread a
+// point, which sums over its levels.
+#include "common/cuda_wrappers.h"
+#include "encoding/hash_encode.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kThreads = 256;
+
+template <TableType kType>
+struct Element {
+  using Type = uint16_t;
+};
+template <>
+struct Element<TableType::float32> {
+  using Type = float;
+};
+
+template <TableType kType>
+__device__ __forceinline__ float element(const typename Element<kType>::Type* from) {
+  if constexpr (kType == TableType::float32) {
+    return *from;
+  } else {
+    return unpack_half<kType == TableType::bfloat16>(*from);
+  }
+}
+
+// A point in the eyes of one level.
+struct Corners {
+  HashAxis axes[3];
+  float along[3];
+  bool directed;
+};
+
+__device__ __forceinline__ void place_of(const HashEncoding& in, int64_t point, HashPlace (&places)[3]) {
+#pragma unroll
+  for (int axis = 0; axis < 3; ++axis) {
+    places[axis] = hash_place(in.in.positions[3 * point + axis], in.low[axis], in.inverse[axis]);
+  }
+}
+
+__device__ __forceinline__ Corners corners_of(const HashEncoding& in, int64_t point, const GridLevel& level,
+                                              const HashPlace (&places)[3]) {
+  Corners found;
+  found.directed = in.in.direction != nullptr;
+#pragma unroll
+  for (int axis = 0; axis < 3; ++axis) {
+    found.axes[axis] = hash_axis(places[axis].place, level, in.smooth);
+    found.along[axis] = found.directed ? places[axis].slope * in.in.direction[3 * point + axis] : 0.0f;
+  }
+  return found;
+}
+
+// First number of the level's part of the table that a point reads; negative if its cell has none.
+template <int kFeatures>
+__device__ __forceinline__ int64_t first_of(const HashEncoding& in, const GridLevel& level, int64_t point) {
+  const int64_t table = in.in.cells == nullptr ? 0 : in.in.cells[point];
+  if (table < 0 || table >= in.in.tables) return -1;
+  return (table * in.in.entries + level.offset) * kFeatures;
+}
+
+// run(number of the first feature, x, y, z) for each corner.
+template <int kFeatures, typename Run>
+__device__ __forceinline__ void for_corners(const HashAxis (&axes)[3], const GridLevel& level, int64_t first,
+                                            const Run& run) {
+#pragma unroll
+  for (int corner = 0; corner < 8; ++corner) {
+    const int x = corner & 1, y = corner >> 1 & 1, z = corner >> 2;
+    const uint32_t entry = hash_entry(level, axes[0].corner + x, axes[1].corner + y, axes[2].corner + z);
+    run(first + static_cast<int64_t>(entry) * kFeatures, x, y, z);
+  }
+}
+
+template <int kFeatures, TableType kType>
+__global__ void __launch_bounds__(kThreads) hash_encode_kernel(HashEncoding in, float* __restrict__ out) {
+  const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (point >= in.in.n) return;
+  const GridLevel& level = in.levels[blockIdx.y];
+  const auto* table = static_cast<const typename Element<kType>::Type*>(in.in.table);
+  HashPlace places[3];
+  place_of(in, point, places);
+  const Corners at = corners_of(in, point, level, places);
+  const int64_t first = first_of<kFeatures>(in, level, point);
+  float sums[kFeatures] = {};
+  if (first >= 0) {
+    for_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
+      const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
+#pragma unroll
+      for (int f = 0; f < kFeatures; ++f) sums[f] += weight * element<kType>(table + entry + f);
+    });
+  }
+  float* to = out + (point * in.count + blockIdx.y) * kFeatures;
+#pragma unroll
+  for (int f = 0; f < kFeatures; ++f) to[f] = sums[f];
+}
+
+template <int kFeatures>
+__global__ void __launch_bounds__(kThreads)
+    hash_encode_table_backward_kernel(HashEncoding in, const float* __restrict__ gradient,
+                                      float* __restrict__ of_table) {
+  const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (point >= in.in.n) return;
+  const GridLevel& level = in.levels[blockIdx.y];
+  const int64_t first = first_of<kFeatures>(in, level, point);
+  if (first < 0) return;
+  HashPlace places[3];
+  place_of(in, point, places);
+  const Corners at = corners_of(in, point, level, places);
+  float arriving[kFeatures];
+#pragma unroll
+  for (int f = 0; f < kFeatures; ++f) arriving[f] = gradient[(point * in.count + blockIdx.y) * kFeatures + f];
+  for_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
+    const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
+#pragma unroll
+    for (int f = 0; f < kFeatures; ++f) atomicAdd(of_table + entry + f, weight * arriving[f]);
+  });
+}
+
+template <int kFeatures, TableType kType>
+__global__ void __launch_bounds__(kThreads)
+    hash_encode_positions_backward_kernel(HashEncoding in, const float* __restrict__ gradient,
+                                          float* __restrict__ of_positions) {
+  const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (point >= in.in.n) return;
+  const auto* table = static_cast<const typename Element<kType>::Type*>(in.in.table);
+  HashPlace places[3];
+  place_of(in, point, places);
+  float sums[3] = {};
+  for (int number = 0; number < in.count; ++number) {
+    const GridLevel& level = in.levels[number];
+    const Corners at = corners_of(in, point, level, places);
+    const int64_t first = first_of<kFeatures>(in, level, point);
+    if (first < 0) break;
+    const float* arriving = gradient + (point * in.count + number) * kFeatures;
+    for_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
+      float product = 0.0f;
+#pragma unroll
+      for (int f = 0; f < kFeatures; ++f) product += arriving[f] * element<kType>(table + entry + f);
+      const int corner[3] = {x, y, z};
+#pragma unroll
+#pragma unroll
+      for (int axis = 0; axis < 3; ++axis) {
+        sums[axis] += product * hash_weight_slope(at.axes, at.directed, at.along, axis, corner);
+      }
+    });
+  }
+#pragma unroll
+  for (int axis = 0; axis < 3; ++axis) {
+    const float slope = places[axis].slope;
+    of_positions[3 * point + axis] = slope == 0.0f ? 0.0f : slope * sums[axis];
+  }
+}
+
+template <int kFeatures>
+struct Width {
+  static constexpr int value = kFeatures;
+};
+template <TableType kType>
+struct Kind {
+  static constexpr TableType value = kType;
+};
+
+template <typename Run>
+void for_width(int features, const Run& run) {
+  switch (features) {
+    case 1:
+      return run(Width<1>{});
+    case 2:
+      return run(Width<2>{});
+    case 4:
+      return run(Width<4>{});
+    default:
+      return run(Width<8>{});
+  }
+}
+
+template <typename Run>
+void for_table(const HashEncoding& in, const Run& run) {
+  for_width(in.features, [&](auto width) {
+    switch (in.in.type) {
+      case TableType::float32:
+        return run(width, Kind<TableType::float32>{});
+      case TableType::bfloat16:
+        return run(width, Kind<TableType::bfloat16>{});
+      default:
+        return run(width, Kind<TableType::float16>{});
+    }
+  });
+}
+
+unsigned blocks_of(int64_t n) {
+  return static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
+}
+
+}  // namespace
+
+void hash_encode_cuda(const HashInputs& in, const HashGrid& grid, float* out, void* stream) {
+  if (in.n == 0) return;
+  const HashEncoding given = hash_encoding(in, grid);
+  const dim3 blocks(blocks_of(in.n), static_cast<unsigned>(given.count));
+  for_table(given, [&](auto features, auto type) {
+    const auto kernel = hash_encode_kernel<decltype(features)::value, decltype(type)::value>;
+    VN_LAUNCH(kernel, blocks, kThreads, 0, stream, given, out);
+  });
+}
+
+void hash_encode_backward_cuda(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
+                               float* of_positions, void* stream) {
+  const HashEncoding given = hash_encoding(in, grid);
+  if (of_table != nullptr) {
+    const size_t bytes = sizeof(float) * static_cast<size_t>(in.tables * in.entries * grid.features);
+    VN_CUDA_CHECK(cudaMemsetAsync(of_table, 0, bytes, static_cast<cudaStream_t>(stream)));
+  }
+  if (in.n == 0) return;
+  const dim3 blocks(blocks_of(in.n), static_cast<unsigned>(given.count));
+  if (of_table != nullptr) {
+    for_width(given.features, [&](auto features) {
+      const auto kernel = hash_encode_table_backward_kernel<decltype(features)::value>;
+      VN_LAUNCH(kernel, blocks, kThreads, 0, stream, given, gradient, of_table);
+    });
+  }
+  if (of_positions != nullptr) {
+    for_table(given, [&](auto features, auto type) {
+      const auto kernel = hash_encode_positions_backward_kernel<decltype(features)::value, decltype(type)::value>;
+      VN_LAUNCH(kernel, blocks_of(in.n), kThreads, 0, stream, given, gradient, of_positions);
+    });
+  }
+}
+
+}  // namespace voronerf
