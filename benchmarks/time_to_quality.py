@@ -1,35 +1,48 @@
-"""PSNR over training seconds: one wide network, one narrow network, and Voronoi cells of narrow networks.
+"""PSNR over training seconds, and seconds until 26, 28, 30 and 32 dB, of settings of `voronerf train` and a rival.
 
-    python benchmarks/time_to_quality.py --data builtin --budget 120
-    python benchmarks/time_to_quality.py --data DIR --downscale 4 --budget 480 --variants w64 voronoi-16
+    python benchmarks/time_to_quality.py --data builtin --budget 60
+    python benchmarks/time_to_quality.py --data LEGO --downscale 4 --seeds 3 --common="--field hashgrid --occupancy"
+    python benchmarks/time_to_quality.py --data LEGO --downscale 4 \
+        --sides "hash grid: --field hashgrid --occupancy" "4 cells, wide: --cells 4 --width 128" "rival: ngp"
 
-All variants train the same scene for the same time with the same settings except for the networks. They take
-turns of a few seconds in one process, so that the noise of a shared machine falls on all of them alike. The JSON holds
-every evaluation; the plot shows them.
+All sides train one scene for the same time. They take turns of a few seconds in one process, so that the noise of a
+shared machine falls on all of them alike. All are evaluated at the same times on the same views, which does not count.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
-import re
+import math
+import shlex
+import statistics
 import sys
 import tempfile
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import torch
 import tyro
 from harness import metadata
+from rival_ngp import Rival, RivalConfig
 from turns import take_turns
 
 from voronerf.cli.main import EXPECTED
-from voronerf.data import load_scene
-from voronerf.evaluation.panels import write_panels
+from voronerf.data import Scene, load_scene
 from voronerf.evaluation.plots import plot_curves
 from voronerf.files import write_text
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.run_directory import read_metrics
 from voronerf.training.trainer import Trainer
+
+#: The first word of the side that is the rival.
+RIVAL = "ngp"
+#: Settings of `voronerf train` that this benchmark gives to all sides.
+GIVEN = ("data", "downscale", "out", "resume", "seed", "steps", "budget", "evaluations", "eval_views", "final_views")
+#: The PSNRs in dB whose times are printed.
+QUALITIES = (26, 28, 30, 32)
 
 
 @dataclass(frozen=True)
@@ -37,48 +50,74 @@ class Options:
     """What to compare, on which scene, for how long."""
 
     data: str = "builtin"
-    """Scene folder or "builtin"."""
+    """Scene folder or a built-in scene."""
     downscale: int = 1
     """Factor by which the images are made smaller on load."""
-    budget: float = 120.0
-    """Training seconds of every variant."""
-    variants: tuple[str, ...] = ("w256", "w64", "voronoi-16")
-    """wN: one network of width N. voronoi-K or voronoi-KxK: K cells (per level) of width 64. Followed by @LR, with that
-    learning rate."""
+    sides: tuple[str, ...] = ("cells:", "one network: --cells", "regular grid: --centres uniform", f"rival: {RIVAL}")
+    """What is compared, each as "NAME: OPTIONS" with options of `voronerf train`, or "NAME: ngp OPTIONS" for Instant
+    NGP in pure PyTorch, with options of `rival_ngp.py`."""
+    common: str = ""
+    """Options of `voronerf train` for all sides but the rival, where they do not say otherwise: --common="OPTIONS"."""
+    budget: float = 60.0
+    """Training seconds of every side."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """What counts as a second: wall time, or where others use the machine too, process CPU time / threads."""
     seeds: int = 1
-    """Runs of every variant, seeds 0, 1, ..."""
-    turn: float = 10.0
-    """Seconds that a variant trains before the next one has its turn."""
-    evaluations: int = 8
-    """Evaluations during the budget."""
+    """Runs of every side, seeds 0, 1, ..."""
+    turn: float = 5.0
+    """Seconds that a side trains before the next one has its turn."""
+    evaluations: int = 12
+    """Evaluations during the budget, evenly spaced."""
     eval_views: int = 20
-    """Test views of each evaluation, the last one included."""
-    rays: int = TrainConfig.rays
-    """Rays per step."""
-    samples: int = 64
-    """Samples per ray."""
-    lr: float | None = None
-    """Learning rate at the start; default: that of `voronerf train`, which depends on the width."""
-    backend: str = "auto"
-    """Backend of the operations."""
+    """Test views of each evaluation."""
     json: Path | None = None
     """Where the results go; default: printed only."""
     plot: Path | None = None
     """Where the plot goes."""
-    panels: Path | None = None
-    """Folder for picture panels of each variant's first seed."""
 
 
-def configuration(name: str, options: Options, seed: int, out: Path) -> TrainConfig:
-    """The training configuration that a variant's name stands for.
+def cpu_seconds() -> float:
+    """Process CPU time for each thread."""
+    return time.process_time() / torch.get_num_threads()
+
+
+def parse_side(text: str, common: str) -> tuple[str, TrainConfig | RivalConfig]:
+    """Name and settings that an entry of ``--sides`` stands for.
 
     Raises:
-        ConfigError: For a name of another form.
+        ConfigError: for an entry without a name, or one with a setting that is the same for all sides.
+        SystemExit: for an option that does not exist; the parser has said which.
     """
-    match = re.fullmatch(r"(w(?P<width>\d+)|voronoi-(?P<cells>\d+(x\d+)*))(@(?P<lr>[\d.e-]+))?", name)
-    if match is None:
-        raise ConfigError(f"--variants must be wN, voronoi-K or voronoi-KxK, got {name!r}")
-    return TrainConfig(
+    name, colon, words = text.partition(":")
+    if not colon or not name.strip():
+        raise ConfigError(f'--sides must be "NAME: OPTIONS", got {text!r}')
+    name, args = name.strip(), shlex.split(words)
+    rival = args[:1] == [RIVAL]
+    config: TrainConfig | RivalConfig = tyro.cli(
+        RivalConfig if rival else TrainConfig,
+        prog=name,
+        args=args[1:] if rival else [*shlex.split(common), *args],
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    if isinstance(config, TrainConfig):
+        default = TrainConfig()
+        for setting in GIVEN:
+            if getattr(config, setting) != getattr(default, setting):
+                raise ConfigError(f"--sides must not set --{setting.replace('_', '-')}, got {text!r}")
+    return name, config
+
+
+def make_training(
+    name: str, config: TrainConfig | RivalConfig, options: Options, scene: Scene, seed: int, out: Path
+) -> Trainer | Rival:
+    """The training of one side with one seed."""
+    clock = cpu_seconds if options.clock == "cpu" else time.perf_counter
+    say: Callable[[str], None] = lambda line: print(f"{name:14} {line}", flush=True)  # noqa: E731
+    if isinstance(config, RivalConfig):
+        numbers = {"evaluations": options.evaluations, "eval_views": options.eval_views, "seed": seed}
+        return Rival(config, scene, budget=options.budget, clock=clock, on_event=say, **numbers)
+    config = replace(
+        config,
         data=options.data,
         downscale=options.downscale,
         out=out,
@@ -87,51 +126,80 @@ def configuration(name: str, options: Options, seed: int, out: Path) -> TrainCon
         evaluations=options.evaluations,
         eval_views=options.eval_views,
         final_views=options.eval_views,
-        rays=options.rays,
-        samples=options.samples,
-        lr=float(match["lr"]) if match["lr"] else options.lr,
-        backend=options.backend,
+        lpips=Path("off"),
         checkpoint_every=1e9,
-        cells=tuple(int(k) for k in match["cells"].split("x")) if match["cells"] else (),
-        width=int(match["width"] or 64),
     )
+    return Trainer(config, scene, on_event=say, clock=clock)
 
 
 def compare(options: Options, folder: Path) -> dict[str, Any]:
-    """Trains every variant and seed in turns; returns {metadata, results}."""
+    """Trains every side and seed in turns; returns {metadata, results}."""
+    sides = dict(parse_side(text, options.common) for text in options.sides)
+    if len(sides) < len(options.sides):
+        raise ConfigError(f"--sides must have names of their own, got {', '.join(options.sides)}")
     scene = load_scene(options.data, downscale=options.downscale)
-    trainers: dict[tuple[str, int], Trainer] = {}
-    for name in options.variants:
-        for seed in range(options.seeds):
-            config = configuration(name, options, seed, folder / f"{name}-{seed}")
-            trainers[name, seed] = Trainer(config, scene, on_event=lambda line, label=name: print(f"{label:12} {line}"))
-    take_turns(trainers.values(), budget=options.budget, turn=options.turn)
+    trainings = {
+        (name, seed): make_training(name, config, options, scene, seed, folder / f"{i}-{seed}")
+        for i, (name, config) in enumerate(sides.items())
+        for seed in range(options.seeds)
+    }
+    take_turns(trainings.values(), budget=options.budget, turn=options.turn)
     results = []
-    for (name, seed), trainer in trainers.items():
-        summary = trainer.run()
-        lr = trainer.config.lr
-        results.append({"variant": name, "seed": seed, "lr": lr, **summary, "curve": read_metrics(trainer.out)})
-        if options.panels is not None and seed == 0:
-            write_panels(trainer.renderer, trainer.router.diagram, scene, options.panels / name, views=3)
-    description = metadata(
-        benchmark="time_to_quality",
-        scene=scene.name,
-        downscale=options.downscale,
-        train_views=len(scene.train),
-        budget_seconds=options.budget,
-        rays=options.rays,
-        samples=options.samples,
-        backend=options.backend,
-    )
-    return {"metadata": description, "results": results}
+    for (name, seed), training in trainings.items():
+        summary, curve = training.run(), training.metrics
+        config = training.config
+        settings = json.loads(config.to_json()) if isinstance(config, TrainConfig) else dataclasses.asdict(config)
+        results.append(
+            {
+                "side": name,
+                "seed": seed,
+                **summary,
+                "seconds_to": {str(quality): seconds_to(quality, curve) for quality in QUALITIES},
+                "curve": curve,
+                "settings": settings,
+            }
+        )
+    about = dataclasses.asdict(options) | {"data": scene.name, "sides": list(options.sides)}
+    for path in ("json", "plot"):
+        about.pop(path)
+    return {"metadata": metadata(benchmark="time_to_quality", **about), "results": results}
+
+
+def seconds_to(quality: float, curve: Sequence[dict[str, Any]]) -> float | None:
+    """Training seconds at which a curve first reaches a PSNR, on the line between two evaluations.
+
+    At the earliest the time of the first evaluation; None if it is never reached.
+    """
+    before = None
+    for now in curve:
+        if now["psnr"] >= quality:
+            if before is None:
+                return float(now["seconds"])
+            share = (quality - before["psnr"]) / (now["psnr"] - before["psnr"])
+            return float(before["seconds"] + share * (now["seconds"] - before["seconds"]))
+        before = now
+    return None
 
 
 def table(outcome: dict[str, Any]) -> str:
-    """PSNR at every evaluation, a line per run."""
-    lines = [f"{'variant':14} {'seed':>4} {'steps':>7} {'parameters':>10}  psnr [dB] at [s]"]
-    for r in outcome["results"]:
-        points = "  ".join(f"{m['psnr']:.2f} @ {m['seconds']:.0f}" for m in r["curve"])
-        lines.append(f"{r['variant']:14} {r['seed']:4} {r['steps']:7} {r['parameters']:10}  {points}")
+    """PSNR at every evaluation and seconds to the qualities, as Markdown: a side a line, medians of its seeds."""
+    about, runs = outcome["metadata"], {}
+    for result in outcome["results"]:
+        runs.setdefault(result["side"], []).append(result)
+    times = [about["budget"] * (i + 1) / about["evaluations"] for i in range(about["evaluations"])]
+    head = ["side", "steps", "parameters", *(f"{t:.3g} s" for t in times), *(f"to {q} dB" for q in QUALITIES)]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for side, found in runs.items():
+        row = [side, *(f"{statistics.median(r[name] for r in found):,.0f}" for name in ("steps", "parameters"))]
+        for t in times:
+            # a step that is longer than the time between two evaluations skips one
+            near = [[m["psnr"] for m in r["curve"] if abs(m["seconds"] - t) < times[0] / 2] for r in found]
+            row.append(f"{statistics.median(values[0] for values in near):.2f}" if all(near) else "-")
+        for quality in QUALITIES:
+            all_seconds = [r["seconds_to"][str(quality)] for r in found]
+            middle = statistics.median(math.inf if s is None else s for s in all_seconds)
+            row.append(f"{middle:.1f} s" if middle < math.inf else "-")
+        lines.append(f"| {' | '.join(row)} |")
     return "\n".join(lines)
 
 
@@ -143,10 +211,10 @@ def main(options: Options) -> None:
     if options.json is not None:
         write_text(options.json, json.dumps(outcome, indent=1) + "\n")
     if options.plot is not None:
-        results = outcome["results"]
-        curves = {f"{r['variant']} ({r['seed']})": [(m["seconds"], m["psnr"]) for m in r["curve"]] for r in results}
-        splits = {f"{r['variant']} ({r['seed']})": [s["started_at_second"] for s in r["stages"][1:]] for r in results}
-        plot_curves(options.plot, curves, splits=splits, title=f"{outcome['metadata']['scene']}, equal training time")
+        labels = {f"{r['side']} ({r['seed']})": r for r in outcome["results"]}
+        curves = {label: [(m["seconds"], m["psnr"]) for m in r["curve"]] for label, r in labels.items()}
+        splits = {label: [s["started_at_second"] for s in r["stages"][1:]] for label, r in labels.items()}
+        plot_curves(options.plot, curves, splits=splits, title=f"{outcome['metadata']['data']}, equal training time")
 
 
 if __name__ == "__main__":

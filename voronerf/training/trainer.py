@@ -58,6 +58,7 @@ class Trainer:
         scene: The scene that ``config.data`` names.
         on_step: Called after every step with a :class:`Progress`.
         on_event: Called with one line of text for each split and evaluation.
+        clock: Counts the seconds of training; default ``time.perf_counter``.
 
     Raises:
         CheckpointError: With ``config.resume``, when there is no checkpoint or it is of another configuration.
@@ -70,6 +71,7 @@ class Trainer:
         *,
         on_step: Callable[[Progress], None] | None = None,
         on_event: Callable[[str], None] | None = None,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
@@ -81,6 +83,7 @@ class Trainer:
         self.scene = scene
         self.on_step = on_step
         self.on_event = on_event
+        self.clock = clock or time.perf_counter
         self.device = torch.device(config.device)
         # Look up every op of a step now: a backend that cannot train should say so before anything is written.
         marching = ("march_rays", "update_occupancy") if config.occupancy else ()
@@ -199,12 +202,12 @@ class Trainer:
         """
         loss = None
         while self.fraction < 1 and self.seconds < until and not self.stopped:
-            started = time.perf_counter()
+            started = self.clock()
             if self.split_is_due():
                 self.split()
             loss = self.train_step()
             self.step += 1
-            self.seconds += time.perf_counter() - started
+            self.seconds += self.clock() - started
             if self.device.type == "cpu" or self.step % READ_EVERY == 0:
                 self._read(loss)
             if self.on_step is not None:
@@ -228,9 +231,9 @@ class Trainer:
         Raises:
             TrainingError: When it is not finite.
         """
-        started = time.perf_counter()
+        started = self.clock()
         self.loss = float(loss)
-        self.seconds += time.perf_counter() - started
+        self.seconds += self.clock() - started
         if not math.isfinite(self.loss):
             kept = "the checkpoint is as it was" if checkpoint_path(self.out).exists() else "there is no checkpoint"
             raise TrainingError(f"{self.out}: the loss is {self.loss} at step {self.step}, try a smaller --lr; {kept}")

@@ -1,0 +1,358 @@
+"""The rival: an Instant NGP in pure PyTorch on the CPU, as one would install it today, but faster.
+
+Written from the published descriptions: the hash grid of nerfstudio's ``HashEncoding(implementation="torch")``; the
+networks, the occupancy grid and the adaptive number of rays of nerfacc's ``train_ngp_nerf_occ.py``; the averaged
+weights of torch-ngp. One network for the whole scene. Images, rays and scores are this library's, its other operations
+are not used.
+
+It is as fast as pure PyTorch allows. Of the ways to read a table that were timed (one thread of a Zen 5, forward and
+backward of 8 levels, ns per sample), indexing took 3,950, ``F.embedding`` 8,800 and ``F.embedding_bag`` 4,300;
+``F.embedding_bag`` forward with ``scatter_add_`` backward takes 370.
+
+Letters: n samples that are kept, r rays, s strata of a ray, l levels of the grid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from voronerf.data import Scene
+from voronerf.evaluation.metrics import psnr, ssim
+from voronerf.evaluation.scores import ViewScore, mean_scores, view_numbers
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.rays import intersect_box
+from voronerf.rendering.sampling import stratified_depths
+from voronerf.training.batches import RayBatches
+from voronerf.training.networks import pixel_at_the_middle
+from voronerf.training.renderers import make_contraction
+
+PRIMES = (1, 2654435761 - 2**32, 805459861)
+#: Rays of an evaluation at a time, and cells of the occupancy grid.
+CHUNK, CELLS_CHUNK = 4096, 1 << 16
+#: Steps between updates of the occupancy grid (nerfacc).
+GRID_EVERY = 16
+#: A cell is occupied if it takes this share of the light on a thousandth of the way through the scene, or more than the
+#: average cell (nerfacc).
+GRID_OPACITY, GRID_WAY = 1e-2, 1e-3
+#: Steps over which the learning rate rises (nerfacc: 100 of 20,000).
+RISE = 20
+
+
+@dataclass(frozen=True)
+class RivalConfig:
+    """Settings of the rival. The grid is that of `--field hashgrid`; the others are the best that were tried."""
+
+    levels: int = 8
+    """Levels of the hash grid."""
+    level_features: int = 2
+    """Features of a level."""
+    log2_entries: int = 15
+    """The logarithm of a level's entries."""
+    base: float = 16
+    """The coarsest resolution."""
+    finest: float | None = None
+    """The finest resolution; default: half a pixel of the training views."""
+    width: int = 64
+    """Channels of the hidden layers: one for the density, two for the colour."""
+    samples: int = 64
+    """Strata of a ray."""
+    batch: int = 1 << 13
+    """Samples of a step that the number of rays aims at."""
+    resolution: int = 64
+    """Cells of the occupancy grid along each axis."""
+    grid_warmup: int = 64
+    """Steps during which updates of the occupancy grid evaluate all of its cells."""
+    grid_decay: float = 0.8
+    """Factor on what the occupancy grid remembers of a cell when it is evaluated again (nerfacc: 0.95)."""
+    grid_share: float = 1 / 32
+    """Share of the cells that an update evaluates afterwards, half of them among the occupied ones."""
+    lr: float = 2e-2
+    """Learning rate of Adam at the start (nerfacc: 0.01)."""
+    lr_final: float = 0.1
+    """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
+    average: float = 0.9
+    """Decay of the average of the weights at each step, which evaluation uses (torch-ngp: 0.95)."""
+
+
+class ReadTable(torch.autograd.Function):
+    """Features [m, f] of m sums of eight weighted entries of a table [entries, f]."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(index, weights)
+        ctx.entries = table.shape[0]
+        return F.embedding_bag(index, table, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        index, weights = ctx.saved_tensors
+        (gradient,) = gradients
+        found, flat = gradient.new_zeros(ctx.entries, gradient.shape[1]), index.reshape(-1).long()
+        for feature in range(gradient.shape[1]):
+            found[:, feature].scatter_add_(0, flat, (weights * gradient[:, feature, None]).reshape(-1))
+        return found, None, None
+
+
+class TruncatedExp(torch.autograd.Function):
+    """exp with a bounded gradient, the activation of the density in torch-ngp and nerfacc."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.exp()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        return gradients[0] * x.clamp(-15, 15).exp()
+
+
+class NGP(nn.Module):
+    """The field: positions in the unit cube and directions to colour and density."""
+
+    def __init__(self, config: RivalConfig, finest: float) -> None:
+        super().__init__()
+        growth = (finest / config.base) ** (1 / max(config.levels - 1, 1))
+        scales = torch.floor(config.base * growth ** torch.arange(config.levels))
+        self.register_buffer("scales", scales[:, None])
+        self.register_buffer("primes", torch.tensor(PRIMES, dtype=torch.int32))
+        self.register_buffer("first", torch.arange(config.levels, dtype=torch.int32)[:, None] << config.log2_entries)
+        self.entries, self.features = 1 << config.log2_entries, config.levels * config.level_features
+        self.table = nn.Parameter(
+            torch.empty(config.levels * self.entries, config.level_features).uniform_(-1e-4, 1e-4)
+        )
+        w = config.width
+        self.geometry = nn.Sequential(_linear(self.features, w), nn.ReLU(), _linear(w, 16))
+        self.colour = nn.Sequential(_linear(15 + 16, w), nn.ReLU(), _linear(w, w), nn.ReLU(), _linear(w, 3))
+
+    def encode(self, positions: Tensor) -> Tensor:
+        """Features [n, levels x features] of positions [n, 3] in 0..1."""
+        places = positions[:, None] * self.scales
+        corner = places.floor()
+        above = places - corner
+        low = corner.int() * self.primes
+        corners, weights = (low, low + self.primes), (1 - above, above)
+        x, y, z = ([(c[..., i], w[..., i]) for c, w in zip(corners, weights)] for i in range(3))
+        plane = [(b ^ c, v * w) for b, v in y for c, w in z]
+        index = torch.stack([a ^ b for a, _ in x for b, _ in plane], -1).bitwise_and_(self.entries - 1)
+        index += self.first
+        weight = torch.stack([u * v for _, u in x for _, v in plane], -1)
+        return ReadTable.apply(self.table, index.view(-1, 8), weight.view(-1, 8)).view(-1, self.features)
+
+    def forward(self, positions: Tensor, seen: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
+        """Colour [n, 3] and density [n] at positions [n, 3] in 0..1, seen along the encoded directions [r, 16]."""
+        found = self.geometry(self.encode(positions))
+        colour = self.colour(torch.cat((found[:, 1:], seen[ray]), 1)).sigmoid()
+        return colour, TruncatedExp.apply(found[:, 0] - 1)
+
+    def density(self, positions: Tensor) -> Tensor:
+        """Density [n] alone."""
+        return TruncatedExp.apply(self.geometry(self.encode(positions))[:, 0] - 1)
+
+
+def _linear(inputs: int, outputs: int) -> nn.Linear:
+    """A layer without bias, with the initialisation of nerfacc and tiny-cuda-nn."""
+    layer = nn.Linear(inputs, outputs, bias=False)
+    nn.init.xavier_uniform_(layer.weight)
+    return layer
+
+
+def spherical_harmonics(directions: Tensor) -> Tensor:
+    """The first four bands [r, 16] of unit directions [r, 3]."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+    return torch.stack(
+        (
+            torch.full_like(x, 0.28209479177387814),
+            *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
+            *(1.0925484305920792 * xy, -1.0925484305920792 * yz, 0.9461746957575601 * zz - 0.31539156525251999),
+            *(-1.0925484305920792 * xz, 0.5462742152960396 * (xx - yy), 0.5900435899266435 * y * (yy - 3 * xx)),
+            *(2.890611442640554 * xy * z, 0.4570457994644658 * y * (1 - 5 * zz), 0.3731763325901154 * z * (5 * zz - 3)),
+            *(0.4570457994644658 * x * (1 - 5 * zz), 1.445305721320277 * z * (xx - yy)),
+            0.5900435899266435 * x * (3 * yy - xx),
+        ),
+        -1,
+    )
+
+
+class Rival:
+    """Trains the rival on a scene; takes turns with a ``Trainer``, and is evaluated as it is.
+
+    A scene without a box is contracted, as with ``--contraction sphere``, and has no occupancy grid.
+
+    Args:
+        config: its settings.
+        scene: to train on.
+        budget: training seconds.
+        evaluations: during the budget, evenly spaced, the last one at the end.
+        eval_views: of each evaluation.
+        seed: of every random choice.
+        clock: counts the training seconds.
+        on_event: called with a line for each evaluation.
+    """
+
+    def __init__(
+        self,
+        config: RivalConfig,
+        scene: Scene,
+        *,
+        budget: float,
+        evaluations: int,
+        eval_views: int,
+        seed: int,
+        clock: Callable[[], float],
+        on_event: Callable[[str], None] = print,
+    ) -> None:
+        self.config, self.scene, self.budget, self.clock, self.on_event = config, scene, budget, clock, on_event
+        self.evaluations, self.eval_views = evaluations, eval_views
+        self.generator = torch.Generator().manual_seed(seed)
+        self.batches = RayBatches(scene, torch.device("cpu"))
+        self.contraction = make_contraction(scene) if scene.box is None else None
+        if scene.box is not None:
+            self.low, self.size = scene.box[0], scene.box[1] - scene.box[0]
+        elif self.contraction is not None:
+            self.low = self.contraction.centre - 2 * self.contraction.radius
+            self.size = torch.full((3,), 4 * self.contraction.radius)
+        finest = config.finest or max(round(2 * float(self.size.max()) / pixel_at_the_middle(scene)), 32)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.field = NGP(config, finest)
+        parameters = list(self.field.parameters())
+        self.optimizer = torch.optim.Adam(parameters, lr=config.lr, betas=(0.9, 0.99), eps=1e-15, fused=True)
+        self.averages = [p.detach().clone() for p in parameters]
+        cells = config.resolution**3
+        self.remembered, self.occupied = torch.zeros(cells), torch.ones(cells, dtype=torch.bool)
+        self.rays = max(config.batch // config.samples, 1)
+        self.step, self.seconds = 0, 0.0
+        self.metrics: list[dict[str, Any]] = []
+
+    def advance(self, until: float = math.inf) -> None:
+        """Trains until ``until`` training seconds or the end of the budget, whichever comes first."""
+        while self.seconds < min(until, self.budget):
+            started = self.clock()
+            self.train_step()
+            self.seconds += self.clock() - started
+            if self.seconds < self.budget and int(self.seconds / self.budget * self.evaluations) > len(self.metrics):
+                self.evaluate()
+
+    def run(self) -> dict[str, Any]:
+        """Trains to the end of the budget and evaluates; returns the last scores and the sizes."""
+        self.advance()
+        self.evaluate()
+        parameters = sum(p.numel() for p in self.field.parameters())
+        return {**self.metrics[-1], "steps": self.step, "parameters": parameters, "stages": []}
+
+    def train_step(self) -> None:
+        """One step."""
+        config, done = self.config, self.seconds / self.budget
+        for group in self.optimizer.param_groups:
+            group["lr"] = config.lr * min(1, 0.01 + self.step / RISE) * config.lr_final**done
+        if self.contraction is None and self.step % GRID_EVERY == 0:
+            self.update_grid()
+        batch = self.batches.draw(self.rays, self.generator)
+        background = self.scene.background_colour()
+        if batch.alpha is not None:
+            background = torch.rand(self.rays, 3, generator=self.generator)
+        colour, kept = self.render(batch.rays, batch.near, batch.far, background, jitter=True)
+        loss = F.mse_loss(colour, batch.target(background))
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        # torch-ngp's average; in the first steps it follows faster
+        decay = min(config.average, (1 + self.step) / (10 + self.step))
+        torch._foreach_lerp_(self.averages, [p.detach() for p in self.field.parameters()], 1 - decay)
+        self.step += 1
+        self.rays = min(max(self.rays * config.batch // max(kept, 1), 64), 1 << 13)
+
+    def render(
+        self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None, *, jitter: bool
+    ) -> tuple[Tensor, int]:
+        """Colours [r, 3] of rays, and how many samples they took."""
+        s = self.config.samples
+        generator = self.generator if jitter else None
+        depths, deltas, _ = stratified_depths(
+            near, far, s, jitter=jitter, spacing=self.scene.spacing, generator=generator
+        )
+        if self.contraction is None:
+            origins, directions = (rays.origins - self.low) / self.size, rays.directions / self.size
+            kept = self.occupied[self.cells_along(origins, directions, depths)].view(-1).nonzero()[:, 0]
+        else:
+            origins, directions, kept = rays.origins, rays.directions, torch.arange(depths.numel())
+        ray = kept // s
+        positions = torch.addcmul(origins[ray], directions[ray], depths.view(-1)[kept][:, None])
+        if self.contraction is not None:
+            positions = (self.contraction(positions) - self.low) / self.size
+        colour, density = self.field(positions.clamp_(0, 1), spherical_harmonics(rays.directions), ray)
+        # Padded to all strata: a cumulative sum over each ray is one operation, as exact as the ray is short.
+        flat = torch.zeros(depths.numel()).scatter(0, kept, density * deltas.reshape(-1)[kept])
+        thickness = flat.view(-1, s)
+        before = thickness.cumsum(1) - thickness
+        weights = -torch.expm1(-thickness) * torch.exp(-before)
+        found = weights.view(-1).gather(0, kept)[:, None] * colour
+        result = torch.zeros_like(rays.origins).scatter_add(0, ray[:, None].expand(-1, 3), found)
+        if background is not None:
+            result = result + background * torch.exp(-thickness.sum(1, keepdim=True))
+        return result, kept.numel()
+
+    def cells_along(self, origins: Tensor, directions: Tensor, depths: Tensor) -> Tensor:
+        """Cells [r, s] of the occupancy grid at depths [r, s] along rays in the unit cube."""
+        size, cell = self.config.resolution, None
+        for axis in range(3):
+            place = torch.addcmul(origins[:, axis, None], directions[:, axis, None], depths)
+            place = place.mul_(size).clamp_(0, size - 1).int()
+            cell = place if cell is None else cell.mul_(size).add_(place)
+        assert cell is not None
+        return cell
+
+    @torch.no_grad()
+    def update_grid(self) -> None:
+        """Evaluates cells: all of them at first, then some at random and some that are occupied."""
+        config, every = self.config, self.remembered.numel()
+        if self.step < config.grid_warmup:
+            cells = torch.arange(every)
+        else:
+            count = max(int(every * config.grid_share / 2), 1)
+            full = self.occupied.nonzero()[:, 0]
+            drawn = torch.randint(every, (count,), generator=self.generator)
+            chosen = torch.randint(max(len(full), 1), (min(count, len(full)),), generator=self.generator)
+            cells = torch.cat((drawn, full[chosen]))
+        size = config.resolution
+        place = torch.stack((cells // size**2, cells // size % size, cells % size), 1)
+        points = (place + torch.rand(len(cells), 3, generator=self.generator)) / size
+        found = torch.cat([self.field.density(part) for part in points.split(CELLS_CHUNK)])
+        opacity = found * (float(self.size.norm()) * GRID_WAY)
+        self.remembered[cells] = torch.maximum(self.remembered[cells] * config.grid_decay, opacity)
+        self.occupied = self.remembered > min(float(self.remembered.mean()), GRID_OPACITY)
+
+    @torch.no_grad()
+    def evaluate(self) -> None:
+        """Scores of the test views, with the averaged weights."""
+        parameters = list(self.field.parameters())
+        trained = [p.detach().clone() for p in parameters]
+        for parameter, average in zip(parameters, self.averages):
+            parameter.copy_(average)
+        background, test = self.scene.background_colour(), self.scene.test
+        scores = []
+        for view in view_numbers(len(test), self.eval_views):
+            truth = test.truth(view, background)
+            rays = test.cameras.image_rays(view)
+            near, far, _ = intersect_box(rays.origins, rays.directions, self.scene.box, self.scene.near, self.scene.far)
+            found = []
+            for at in range(0, len(near), CHUNK):
+                part = slice(at, at + CHUNK)
+                few = Rays(rays.origins[part], rays.directions[part])
+                found.append(self.render(few, near[part], far[part], background, jitter=False)[0])
+            image = torch.cat(found).view(truth.shape).clamp(0, 1)
+            scores.append(ViewScore(test.names[view], float(psnr(image, truth)), float(ssim(image, truth))))
+        for parameter, values in zip(parameters, trained):
+            parameter.copy_(values)
+        now = {"step": self.step, "seconds": round(self.seconds, 3), "views": len(scores), **mean_scores(scores)}
+        self.metrics.append(now)
+        self.on_event(f"{self.seconds:7.1f} s  step {self.step:6d}  psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}")
