@@ -100,15 +100,8 @@ WRONG: dict[str, tuple[Callable[[Tensor], Any], type[Exception], str]] = {
         ValueError,
         "coords=",
     ),
-    "coords of another type": (lambda c: VoronoiRouter(Field(), c, coords=3.5), (TypeError, ValueError), "coords"),
-    "two features": (lambda c: VoronoiRouter(Field(), c, coords="first3")(X[:, :2]), ValueError, r"\[6, 2\]"),
     "slice of four": (lambda c: VoronoiRouter(Field(), c, coords=slice(0, 4))(X), ValueError, "3"),
     "slice past the end": (lambda c: VoronoiRouter(Field(), c, coords=slice(6, 9))(X), ValueError, "3"),
-    "callable that gives no positions": (
-        lambda c: VoronoiRouter(Field(), c, coords=lambda x: x[:, 0])(X),
-        ValueError,
-        "coords",
-    ),
     "callable that gives None": (
         lambda c: VoronoiRouter(Field(), c, coords=lambda x: None)(X),
         (TypeError, ValueError),
@@ -124,29 +117,9 @@ WRONG: dict[str, tuple[Callable[[Tensor], Any], type[Exception], str]] = {
         (TypeError, ValueError),
         "int64",
     ),
-    "method that is no method": (
-        lambda c: VoronoiRouter(Field(), c, coords="first3", methods=["width"]),
-        (ValueError, TypeError),
-        "width",
-    ),
     "no modules": (lambda c: VoronoiRouter.from_modules([], c, coords="first3"), ValueError, "module"),
-    "modules of different sizes": (
-        lambda c: VoronoiRouter.from_modules([nn.Linear(7, 2), nn.Linear(7, 3)], c[:2], coords="first3"),
-        ValueError,
-        "weight",
-    ),
-    "modules of different classes": (
-        lambda c: VoronoiRouter.from_modules([nn.Linear(7, 2), Field()], c[:2], coords="first3"),
-        (ValueError, TypeError),
-        "parameters",
-    ),
     "module without parameters": (
         lambda c: VoronoiRouter.from_modules([nn.Linear(7, 2), nn.Identity()], c[:2], coords="first3"),
-        (ValueError, TypeError),
-        "parameters",
-    ),
-    "loading another module into a cell": (
-        lambda c: VoronoiRouter(Field(), c, coords="first3").load_cell(0, nn.Linear(3, 2)),
         (ValueError, TypeError),
         "parameters",
     ),
@@ -193,19 +166,3 @@ def test_an_error_of_the_field_itself_is_shown(centres: Tensor) -> None:
     router = VoronoiRouter(Picky(), centres, coords="first3")
     with pytest.raises(KeyError, match="wants three features, not 7"):
         router(X)
-
-
-def test_cell_by_cell_is_said_once(centres: Tensor) -> None:
-    class Mixed(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.mix, self.out = nn.Bilinear(3, 3, 4), nn.Linear(4, 2)
-
-        def forward(self, x: Tensor) -> Tensor:
-            return self.out(self.mix(x, x))
-
-    router = VoronoiRouter(Mixed(), centres, coords="first3")
-    with pytest.warns(UserWarning, match=r"(?s)VoronoiRouter.*(Bilinear|bilinear)") as said:
-        for _ in range(3):
-            router(uniform((50,)))
-    assert len([warning for warning in said if "VoronoiRouter" in str(warning.message)]) == 1

@@ -9,6 +9,7 @@ import pickle
 import pytest
 import torch
 import torch.nn.functional as F
+from router_fields import masked_loop, perturb
 from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
@@ -31,33 +32,11 @@ def samples(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     return torch.randn(n, 3, generator=generator), F.normalize(torch.randn(n, 3, generator=generator), dim=-1)
 
 
-def perturbed(router: VoronoiRouter, generator: torch.Generator) -> VoronoiRouter:
-    with torch.no_grad():
-        for parameter in router.parameters():
-            parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
-    return router
-
-
-def loop(router: VoronoiRouter, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """What the router stands for: a module for each cell."""
-    cells = router.diagram.locate(positions).tolist()
-    parts = [router.cell(cell)(positions[i : i + 1], directions[i : i + 1]) for i, cell in enumerate(cells)]
-    return torch.cat([rgb for rgb, _ in parts]), torch.cat([sigma for _, sigma in parts])
-
-
 @pytest.mark.parametrize("k", [1, 2, 16, 300])
 def test_identical_cells_are_the_field(field: NeRF, generator: torch.Generator, k: int) -> None:
     router = VoronoiRouter(field, torch.randn(k, 3, generator=generator))
     positions, directions = samples(257, generator)
     torch.testing.assert_close(router(positions, directions), field(positions, directions))
-
-
-def test_per_ray_directions(field: NeRF, generator: torch.Generator) -> None:
-    router = perturbed(VoronoiRouter(field, torch.randn(5, 3, generator=generator)), generator)
-    positions, _ = samples(40, generator)
-    _, directions = samples(8, generator)
-    index = (torch.arange(40) // 5).int()
-    torch.testing.assert_close(router(positions, directions, index), router(positions, directions[index]))
 
 
 def trained(field: NeRF, generator: torch.Generator) -> tuple[VoronoiRouter, torch.optim.Optimizer]:
@@ -117,18 +96,6 @@ def test_results_from_before_a_split_that_are_still_held_do_not_disturb(
     assert held[0].requires_grad
 
 
-def test_children_part_ways_after_the_split(field: NeRF, generator: torch.Generator) -> None:
-    router, optimizer = trained(field, generator)
-    diagram, parents = router.diagram.refine({0: torch.randn(4, 3, generator=generator)})
-    router.subdivide(diagram, parents, optimizer=optimizer)
-    rgb, sigma = router(*samples(300, generator))
-    optimizer.zero_grad()
-    (rgb.square().sum() + sigma.sum()).backward()
-    optimizer.step()
-    weight = router.module.trunk[0].weight
-    assert not torch.equal(weight[0], weight[1])
-
-
 def test_random_initialisation_is_fresh_and_reproducible(field: NeRF, generator: torch.Generator) -> None:
     weights = []
     for _ in range(2):
@@ -146,7 +113,7 @@ def test_random_initialisation_is_fresh_and_reproducible(field: NeRF, generator:
 def test_state_dict_round_trips_across_subdivisions(field: NeRF, generator: torch.Generator) -> None:
     inner = VoronoiDiagram(torch.randn(6, 3, generator=generator), weights=torch.rand(6, generator=generator))
     diagram, _ = inner.refine({2: torch.randn(3, 3, generator=generator)})
-    source = perturbed(VoronoiRouter(field, diagram), generator)
+    source = perturb(VoronoiRouter(field, diagram), generator)
     buffer = io.BytesIO()
     torch.save(source.state_dict(), buffer)
     buffer.seek(0)
@@ -165,7 +132,7 @@ def test_copies_are_independent(field: NeRF, generator: torch.Generator, clone: 
     other = clone(router)  # type: ignore[operator]
     positions, directions = samples(20, generator)
     before = router(positions, directions)[0]
-    perturbed(other, generator)
+    perturb(other, generator)
     assert torch.equal(router(positions, directions)[0], before)
     assert not torch.equal(other(positions, directions)[0], before)
 
@@ -181,10 +148,10 @@ def test_every_kind_of_diagram_equals_the_loop(
         diagram = VoronoiDiagram(diagram.centres, weights=torch.rand(4, generator=generator))
     if kind == "many":  # as if this were so many that the diagram looks cells up by itself
         monkeypatch.setattr("voronerf.router.router._MANY", 3)
-    router = perturbed(VoronoiRouter(field, diagram), generator)
+    router = perturb(VoronoiRouter(field, diagram), generator)
     positions, directions = samples(50, generator)
     positions.requires_grad_()
-    rgb, sigma = loop(router, positions, directions)
+    (rgb, sigma), _ = masked_loop(router, router.diagram.locate(positions), [positions, directions])
     found, density = router(positions, directions)
     torch.testing.assert_close(found, rgb)
     torch.testing.assert_close(density, sigma)
@@ -207,7 +174,7 @@ def test_stochastic_assignment_is_for_training_only(field: NeRF, generator: torc
 
 def test_the_wrapped_field_is_left_alone(field: NeRF, generator: torch.Generator) -> None:
     before = {name: p.detach().clone() for name, p in field.named_parameters()}
-    perturbed(VoronoiRouter(field, torch.randn(3, 3, generator=generator)), generator)
+    perturb(VoronoiRouter(field, torch.randn(3, 3, generator=generator)), generator)
     assert all(torch.equal(p, before[name]) for name, p in field.named_parameters())
 
 

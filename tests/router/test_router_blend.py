@@ -58,21 +58,6 @@ def test_one_sample_and_none() -> None:
     assert router(torch.zeros(0, 15)).shape == (0, 4)
 
 
-def test_rays_and_methods() -> None:
-    generator = torch.Generator().manual_seed(5)
-    router = VoronoiRouter(Heads(), nested(), coords="first3", methods=["density"], per_ray=["d"], blend=MARGIN)
-    perturb(router, generator).eval()
-    x, d = torch.randn(30, 6, 3, generator=generator), torch.randn(30, 3, generator=generator)
-    flat, spread = x.reshape(-1, 3), d.repeat_interleave(6, 0)
-    near([t.reshape(180, *t.shape[2:]) for t in router(x, d[:, None])], by_entries(router, flat, (flat, spread)))
-    found = router.density(x)
-    assert found["sigma"].shape == (30, 6) and found["features"].shape == (30, 6, 4)
-    near([t.reshape(180, *t.shape[2:]) for t in found.values()], by_entries(router, flat, (flat,), "density"))
-    at = torch.randn(30, 6, 3, generator=generator)
-    router.coords = None
-    near([router(x, coords=at).reshape(180)], by_entries(router, at.reshape(-1, 3), (flat,)))
-
-
 class Kinds(nn.Module):
     """A result of numbers, one of flags, and one that belongs to no sample."""
 
@@ -149,13 +134,6 @@ def test_nothing_jumps_across_borders() -> None:
         colour, density = router(x, d)
         jumps.append(float(torch.cat([colour, density[:, None]], 1).detach().diff(dim=0).abs().max()))
     assert jumps[0] > 0.05 and jumps[1] < 0.05 * jumps[0]
-
-
-def test_identical_cells_give_what_the_module_gives() -> None:
-    field = NeRF(width=8, depth=2, position_octaves=2, direction_octaves=1)
-    router = VoronoiRouter(field, nested(), blend=0.5).eval()
-    x, d = torch.randn(500, 3), nn.functional.normalize(torch.randn(500, 3), dim=1)
-    near(list(router(x, d)), [t.detach().double() for t in field(x, d)])
 
 
 def test_the_setting() -> None:

@@ -11,7 +11,7 @@ import torch
 import torch.utils.checkpoint
 from torch import Tensor, nn
 
-from voronerf import NeRF, VoronoiDiagram, VoronoiRouter, split_diagram
+from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
 from voronerf.backends import BackendUnavailable
 from voronerf.router import rules
 
@@ -337,14 +337,3 @@ def test_fresh_parameters_are_drawn_anew_each_time() -> None:
         router.subdivide(diagram, torch.arange(k) % router.num_cells, inherit=False)
         found.append(router.module[0].weight.detach().clone())
     assert not torch.equal(found[0], found[1][:3])
-
-
-def test_the_box_of_uniform_first_centres_is_scaled() -> None:
-    points, importance = torch.rand(200, 3), torch.ones(200)
-    near, far = (
-        split_diagram(
-            VoronoiDiagram(torch.zeros(1, 3)), points, importance, 8, init="uniform", steps=0, uniform_scale=scale
-        ).diagram.centres
-        for scale in (1.0, 2.0)
-    )
-    torch.testing.assert_close(far - far.mean(0), 2 * (near - near.mean(0)), rtol=1e-4, atol=1e-4)

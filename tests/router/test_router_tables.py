@@ -7,27 +7,28 @@ from collections.abc import Callable
 import pytest
 import torch
 from convention_rules import Corners, Planes
+from router_fields import masked_loop, perturb
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
 
 
-def _loop(router: VoronoiRouter, x: Tensor) -> Tensor:
-    """Each sample by itself."""
-    parameters = {name: p.unbind() for name, p in router.module.named_parameters()}
-    template, out = router.cell(0), []
-    for row, cell in enumerate(router.assign(x).tolist()):
-        own = {name: values[cell] for name, values in parameters.items()}
-        out.append(torch.func.functional_call(template, own, (x[row : row + 1],)))
-    return torch.cat(out)
-
-
 def _router(module: nn.Module, k: int) -> VoronoiRouter:
-    router = VoronoiRouter(module, torch.rand(k, 3) * 2 - 1, coords="first3")
-    with torch.no_grad():
-        for parameter in router.parameters():
-            parameter.add_(torch.randn(parameter.shape))
-    return router
+    return perturb(
+        VoronoiRouter(module, torch.rand(k, 3) * 2 - 1, coords="first3"), torch.Generator().manual_seed(k), 1
+    )
+
+
+def _loop(router: VoronoiRouter, x: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Results, and the parameters of each cell's module, one after the other for each name."""
+    (found,), modules = masked_loop(router, router.assign(x), [x])
+    return found, [p for name, _ in router.module.named_parameters() for p in (m.get_parameter(name) for m in modules)]
+
+
+def _gradients(out: Tensor, parameters: list[Tensor], k: int, weights: Tensor) -> list[Tensor]:
+    """Of a router, [k, ...], or of the modules of a loop."""
+    found = torch.autograd.grad(out, parameters, weights, retain_graph=True, materialize_grads=True, allow_unused=True)
+    return list(found) if k == 0 else [torch.stack(found[i : i + k]) for i in range(0, len(found), k)]
 
 
 @pytest.mark.parametrize("make", [Corners, Planes])
@@ -35,15 +36,13 @@ def _router(module: nn.Module, k: int) -> VoronoiRouter:
 def test_look_ups_give_what_one_module_for_each_cell_gives(make: Callable[[], nn.Module], n: int, k: int) -> None:
     torch.manual_seed(n + k)
     router, x = _router(make(), k), torch.rand(n, 3) * 2 - 1
-    found, expected = router(x), _loop(router, x)
+    found, (expected, leaves) = router(x), _loop(router, x)
     assert "grouped" in router.explain() or k == 1
     torch.testing.assert_close(found, expected)
     weights = torch.randn(found.shape)
-    parameters = list(router.parameters())
-    theirs = torch.autograd.grad(expected, parameters, weights)
+    theirs = _gradients(expected, leaves, k, weights)
     for _ in range(2):  # a graph that is kept gives the same gradients again
-        ours = torch.autograd.grad(found, parameters, weights, retain_graph=True)
-        for a, b in zip(ours, theirs, strict=True):
+        for a, b in zip(_gradients(found, list(router.parameters()), 0, weights), theirs, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
@@ -55,7 +54,7 @@ def test_planes_run_cell_by_cell_where_cells_have_many_samples() -> None:
     assert "cell by cell" not in router.explain()
     found = router(many)
     assert "cell by cell: it reads planes" in router.explain() and "grouped" in router.explain()
-    torch.testing.assert_close(found, _loop(router, many))
+    torch.testing.assert_close(found, _loop(router, many)[0])
     one = _router(Planes(), 1)
     one(many)
     assert "cell by cell" not in one.explain()
@@ -77,13 +76,9 @@ def test_pieces_cut_large_cells_and_join_small_ones() -> None:
     x = torch.cat([torch.rand(2500, 3) * 0.1, torch.rand(1500, 3) * 2 - 1])[torch.randperm(4000)]
     cells = router.assign(x)
     assert cells.bincount(minlength=40).max() > 2048, "one cell of three pieces"
-    found, expected = router(x), torch.zeros(4000, 2)
-    for cell in cells.unique().tolist():
-        own = {name: p[cell] for name, p in router.module.named_parameters()}
-        rows = (cells == cell).nonzero()[:, 0]
-        expected = expected.index_copy(0, rows, torch.func.functional_call(router.cell(cell), own, (x[rows],)))
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
+    found, (expected, leaves) = router(x), _loop(router, x)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * float(expected.detach().abs().max()))
     weights = torch.randn(4000, 2)
-    ours, theirs = (torch.autograd.grad(out, list(router.parameters()), weights) for out in (found, expected))
-    for a, b in zip(ours, theirs, strict=True):
+    theirs = _gradients(expected, leaves, 40, weights)
+    for a, b in zip(_gradients(found, list(router.parameters()), 0, weights), theirs, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))

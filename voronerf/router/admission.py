@@ -18,7 +18,7 @@ from voronerf.backends import BackendUnavailable
 from voronerf.router.fused import Program
 from voronerf.router.grouped import Ungroupable
 from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import RAY, SHARED, Call, Given, Layout
+from voronerf.router.layout import RAY, SHARED, Call, Given
 from voronerf.router.loop import NoRandomness, Results, check_rows, run_cells, run_part
 from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
 from voronerf.router.tracing import ROWS, Unfusable
@@ -59,7 +59,6 @@ class Choice:
 
 def admitted(trial: Trial, fuse: bool) -> Choice:
     """The fastest way that gives what the loop gives."""
-    name = f"{type(trial.original).__name__}.{trial.call.method}"
     again = False
     try:
         try:
@@ -81,7 +80,9 @@ def admitted(trial: Trial, fuse: bool) -> Choice:
             why = f"the traced network fails for other samples ({type(error).__name__}: {error})"
         if why:
             trial.check_rows()
-            raise ValueError(f"{_OP}: fuse=True needs a network that a layer table describes, but in {name} {why}")
+            raise ValueError(
+                f"{_OP}: fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
+            )
         return Choice("fused", program=program)
     why, open_ = "", False
     try:
@@ -108,25 +109,22 @@ class Trial:
     Neither the module nor the arguments nor their gradients are touched.
     """
 
-    def __init__(
-        self, module: nn.Module, call: Call, layout: Layout, grouping: Grouping, dtype: torch.dtype | None = None
-    ) -> None:
-        self.made_of, self.dtype = (module, call, layout, grouping), dtype
-        self.original, self.layout, self.again = module, layout, False
+    def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
+        self.made_of, self.dtype, self.again = (call, grouping), dtype, False
         device = grouping.device
-        picked = torch.arange(_TRIED, device=device) * layout.n // _TRIED
+        picked = torch.arange(_TRIED, device=device) * call.layout.n // _TRIED
         cells = (torch.arange(_TRIED, device=device) * 7 % 5 // 2).int()
         self.entries = Entries(picked, cells, _CELLS, grouping.backend)
         self.widest, self.most = 0, math.inf
         generator = torch.Generator().manual_seed(0)
         memo: dict[int, Any] = {}
-        for _, _, parameter in cell_parameters(module):
+        for _, _, parameter in cell_parameters(call.module):
             if id(parameter) not in memo:
                 memo[id(parameter)] = _made_different(parameter, generator)
-        self.module = clone_module(module, memo).to(dtype)
+        module = clone_module(call.module, memo).to(dtype)
         self._leaves: list[Tensor] = []
         args, kwargs = map_tree((call.args, call.kwargs), self._leaf)
-        self.call = replace(call, args=args, kwargs=kwargs)
+        self.call = replace(call, module=module, args=args, kwargs=kwargs)
 
     def _leaf(self, name: str, tensor: Tensor, nested: bool) -> Tensor:
         """An argument with a gradient of its own, where it takes one."""
@@ -137,7 +135,7 @@ class Trial:
 
     def given(self) -> Given:
         """The arguments, fresh for each run."""
-        return self.call.arranged(self.layout, self.entries)
+        return self.call.arranged(self.entries)
 
     def outcome(self, run: Run) -> tuple[Results, list[Tensor]]:
         """Results, and gradients of a weighted sum of them."""
@@ -148,7 +146,7 @@ class Trial:
             if tensor.requires_grad and tensor.is_floating_point():
                 weights = torch.randn(tensor.shape, generator=generator).to(tensor)
                 total.append((tensor * weights).sum().float())
-        leaves = [t for t in (*self.module.parameters(), *self._leaves) if t.requires_grad]
+        leaves = [t for t in (*self.call.module.parameters(), *self._leaves) if t.requires_grad]
         gradients: list[Tensor] = []
         if total and torch.is_grad_enabled():
             torch.stack(total).sum().backward()
@@ -181,18 +179,18 @@ class Trial:
 
     def by_cells(self, given: Given) -> Results:
         """The loop."""
-        return run_cells(self.module, self.call, self.layout, given, self.entries, again=self.again)
+        return run_cells(self.call, given, self.entries, again=self.again)
 
     def grouped(self, given: Given) -> Results:
         """All cells at once."""
-        results, run = run_part(self.module, self.call, self.layout, given, self.entries)
+        results, run = run_part(self.call, given, self.entries)
         self.most = run.most
         self.widest = max(run.widest, *[t.numel() * t.element_size() for t in given.rows], 1)
         return results
 
     def fused(self, program: Program) -> Run:
         """As one operation, with the parameters of the copy."""
-        here = program.with_parameters_of(self.module)
+        here = program.with_parameters_of(self.call.module)
         return lambda given: here.run(given.rows, self.entries)
 
     def is_groupable(self) -> bool:
@@ -206,10 +204,10 @@ class Trial:
 
     def traced(self) -> Program:
         """The network as a layer table."""
-        if self.layout.axis:
+        if self.call.layout.axis:
             raise Unfusable("the module sees one ray, [1, samples, f]; layout='flat' gives it [samples, f]")
         with NoRandomness():
-            return Program(self.original, self.module, self.call, self.given().part(0, ROWS, 0))
+            return Program(self.made_of[0].module, self.call, self.given().part(0, ROWS, 0))
 
     def is_fusable(self, expected: tuple[Results, list[Tensor]]) -> bool:
         """Whether ``fuse=True`` would serve."""
@@ -222,7 +220,7 @@ class Trial:
     def check_rows(self) -> None:
         """Raises TypeError where the module mixes samples."""
         with NoRandomness():
-            check_rows(self.module, self.call, self.layout, self.given(), self.entries, self.again)
+            check_rows(self.call, self.given(), self.entries, self.again)
 
 
 @torch.no_grad()
@@ -241,7 +239,7 @@ def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Paramet
 # Rays -----------------------------------------------------------------------------------------------------------------
 
 
-def flattened(module: nn.Module, call: Call, layout: Layout, device: torch.device) -> tuple[bool, ...]:
+def flattened(call: Call, device: torch.device) -> tuple[bool, ...]:
     """For each tensor that a call with rays returns, whether the module itself makes [rays * samples, ...] of it.
 
     The module runs on a few samples of two rays, as rays and as it would see them.
@@ -250,17 +248,17 @@ def flattened(module: nn.Module, call: Call, layout: Layout, device: torch.devic
         TypeError: When the samples of a ray meet in the module.
         ValueError: When the module gives other results for [n, 1, f] than for [rays, samples, f].
     """
-    *outer, rays, along = layout.lead
-    name = type(module).__name__
+    *outer, rays, along = call.layout.lead
+    name = type(call.module).__name__
     for samples in (6, along):  # a module may be made for a number of samples
         lead = (*[1] * len(outer), min(rays, 2), min(along, samples))
         n = lead[-1] * lead[-2]
         picked = torch.arange(lead[-2], device=device)[:, None] * along + torch.arange(lead[-1], device=device)
         one = Entries(picked.flatten(), picked.new_zeros(n, dtype=torch.int32), 1, "auto")
         try:
-            whole = _in_first(module, call, _on_rays(call, layout, lead, picked))
-            alone = _in_first(module, call, call.arranged(layout, one))
-            changed = _in_first(module, call, _on_rays(call, layout, lead, picked, change=True))
+            whole = _in_first(call, _on_rays(call, lead, picked))
+            alone = _in_first(call, call.arranged(one))
+            changed = _in_first(call, _on_rays(call, lead, picked, change=True))
         except Exception:
             continue
         for a, b in zip(whole, changed, strict=True):
@@ -281,8 +279,9 @@ def flattened(module: nn.Module, call: Call, layout: Layout, device: torch.devic
     return ()
 
 
-def _on_rays(call: Call, layout: Layout, lead: tuple[int, ...], picked: Tensor, change: bool = False) -> Given:
+def _on_rays(call: Call, lead: tuple[int, ...], picked: Tensor, change: bool = False) -> Given:
     """The arguments for [rays, samples] samples alone; ``change`` alters all but the first sample of each ray."""
+    layout = call.layout
 
     def pick(name: str, value: Any, nested: bool) -> Any:
         if not isinstance(value, Tensor):
@@ -303,8 +302,8 @@ def _on_rays(call: Call, layout: Layout, lead: tuple[int, ...], picked: Tensor, 
     return call.changed(pick)
 
 
-def _in_first(module: nn.Module, call: Call, given: Given) -> list[Tensor]:
+def _in_first(call: Call, given: Given) -> list[Tensor]:
     """The tensors that the module returns with the parameters of its first cell."""
-    first = {id(parameter): parameter.detach()[0] for _, _, parameter in cell_parameters(module)}
-    with torch.no_grad(), NoRandomness(), in_place_of_parameters(module, first):
-        return tensors_of(call.run(module, given))
+    first = {id(parameter): parameter.detach()[0] for _, _, parameter in cell_parameters(call.module)}
+    with torch.no_grad(), NoRandomness(), in_place_of_parameters(call.module, first):
+        return tensors_of(call.run(given))

@@ -27,7 +27,7 @@ from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.admission import Choice, Trial, admitted, flattened
 from voronerf.router.grouped import Ungroupable, is_inside
 from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import Call, Layout
+from voronerf.router.layout import Call
 from voronerf.router.loop import Results, restored, run_cells, run_grouped
 from voronerf.router.trees import rebuild, tensors_of
 
@@ -55,15 +55,20 @@ class Choices:
         self._said: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
-    def kind(self, module: nn.Module, call: Call, layout: Layout, device: torch.device, fuse: bool) -> Any:
+    def kind(self, call: Call, device: torch.device, fuse: bool) -> Any:
         """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
 
         Numbers count by what they are only where they would go into a fused network.
         """
         autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
-        modes = (call.method, module.training, torch.is_grad_enabled(), autocast, layout.one_ray, tuple(call.kwargs))
-        d = len(layout.lead)
-        return (*modes, d, *[_description(value, d, fuse) for value in (*call.args, *call.kwargs.values())])
+        modes = (call.method, call.module.training, torch.is_grad_enabled(), autocast, call.layout.one_ray)
+        d = len(call.layout.lead)
+        return (
+            *modes,
+            tuple(call.kwargs),
+            d,
+            *[_description(value, d, fuse) for value in (*call.args, *call.kwargs.values())],
+        )
 
     def note(self, call: Call, choice: Choice) -> None:
         """For :meth:`explain`: how a method was carried out."""
@@ -106,32 +111,21 @@ def _description(value: Any, d: int, fuse: bool) -> Any:
 # Carrying out ---------------------------------------------------------------------------------------------------------
 
 
-def evaluate(
-    module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, *, fuse: bool
-) -> tuple[Any, Choice]:
+def evaluate(call: Call, grouping: Grouping, choices: Choices, *, fuse: bool) -> tuple[Any, Choice]:
     """What a method of a module returns for the samples of all cells, and how that was found.
 
     Where there are no samples, ``grouping`` is of two placeholders.
     """
-    choice = _choose(module, call, layout, grouping, choices, fuse)
-    results, choice = _carry_out(module, call, layout, grouping, choices, choice)
-    given = grouping if choice.program is None or not layout.n else None
-    return restored(results, layout, given, choice.flat), choice
+    choice = _choose(call, grouping, choices, fuse)
+    results, choice = _carry_out(call, grouping, choices, choice)
+    given = grouping if choice.program is None or not call.layout.n else None
+    return restored(results, call.layout, given, choice.flat), choice
 
 
-def mixed(
-    own: Any,
-    module: nn.Module,
-    call: Call,
-    layout: Layout,
-    mixture: Mixture,
-    grouping: Grouping,
-    choices: Choices,
-    choice: Choice,
-) -> Any:
+def mixed(own: Any, call: Call, mixture: Mixture, grouping: Grouping, choices: Choices, choice: Choice) -> Any:
     """The blended results of a call that returned ``own`` for all samples in their own cells."""
     entries = Entries(mixture.rows, mixture.cells, grouping.k, grouping.backend)
-    results, _ = _carry_out(module, call, layout, entries, choices, choice)
+    results, _ = _carry_out(call, entries, choices, choice)
     tensors = tensors_of(own)
     for i, tensor in enumerate(results.tensors):
         if results.rows[i]:
@@ -139,23 +133,21 @@ def mixed(
     return rebuild(own, tensors)
 
 
-def _carry_out(
-    module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, choice: Choice
-) -> tuple[Results, Choice]:
+def _carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice) -> tuple[Results, Choice]:
     """Results sorted by cell; of a fused network in the original order, but for entries and placeholders."""
     if choice.program is not None:
         choices.note(call, choice)
-        in_order = layout.n and not isinstance(grouping, Entries)
-        given = call.arranged(layout, None if in_order else grouping)
+        in_order = call.layout.n and not isinstance(grouping, Entries)
+        given = call.arranged(None if in_order else grouping)
         return choice.program.run(given.rows, grouping), choice
     if choice.way == "grouped" and grouping.k > 1:
         if grouping.n > choice.most * grouping.k:  # no warning: nothing stands in the way
             why = f"it reads planes, which is faster so with more than {choice.most} samples a cell"
             choice = replace(choice, way="cell by cell", why=why)
             choices.note(call, choice)
-            return _by_cells(module, call, layout, grouping, choice), choice
+            return _by_cells(call, grouping, choice), choice
         try:
-            results = run_grouped(module, call, layout, grouping, choice.piece)
+            results = run_grouped(call, grouping, choice.piece)
             choices.note(call, choice)
             return results, choice
         except BackendUnavailable:
@@ -166,28 +158,26 @@ def _carry_out(
             if isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error):
                 raise
             choice = replace(choice, way="cell by cell", why=f"for some batches, since its forward fails ({error})")
-    results = _by_cells(module, call, layout, grouping, choice)
+    results = _by_cells(call, grouping, choice)
     one = Choice("the module itself", "there is one cell")
     choices.note(call, choice if grouping.k > 1 or choice.way != "grouped" else one)
-    if grouping.k > 1 and choice.why and layout.n >= _FEWEST:
-        name = f"{type(module).__name__}.{call.method}"
-        choices.say_once(f"cells {call.method}", f"{name} runs cell by cell: {choice.why}")
+    if grouping.k > 1 and choice.why and call.layout.n >= _FEWEST:
+        choices.say_once(f"cells {call.method}", f"{call.name} runs cell by cell: {choice.why}")
     return results, choice
 
 
-def _by_cells(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choice: Choice) -> Results:
+def _by_cells(call: Call, grouping: Grouping, choice: Choice) -> Results:
     """The loop over cells."""
     try:
-        given = call.arranged(layout, grouping)
-        return run_cells(module, call, layout, given, grouping, again=choice.again)
+        return run_cells(call, call.arranged(grouping), grouping, again=choice.again)
     except Exception as error:
-        if hasattr(error, "add_note") and len(layout.lead) > 1 and not layout.flat:  # since Python 3.11
+        if hasattr(error, "add_note") and len(call.layout.lead) > 1 and not call.layout.flat:  # since Python 3.11
             error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
         raise
 
 
-def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
-    kind = choices.kind(module, call, layout, grouping.device, fuse)
+def _choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
+    layout, kind = call.layout, choices.kind(call, grouping.device, fuse)
     choice = choices.kinds.get(kind)
     if choice is not None and not choice.open:
         return choice
@@ -197,8 +187,8 @@ def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, c
     with torch.random.fork_rng(devices):
         flat: tuple[bool, ...] = () if choice is None else choice.flat
         if choice is None and len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat and not layout.one_ray:
-            flat = flattened(module, call, layout, grouping.device)
-        trial = Trial(module, call, layout, grouping)
+            flat = flattened(call, grouping.device)
+        trial = Trial(call, grouping)
         if choice is not None and not trial.is_groupable():
             return choice
         found = replace(admitted(trial, fuse), flat=flat)
@@ -206,10 +196,9 @@ def _choose(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, c
         choices.kinds.clear()
     choices.kinds[kind] = found
     if found.fusable and all(known.fusable for known in choices.kinds.values()):
-        name = f"{type(module).__name__}.{call.method}"
         choices.say_once(
             f"fuse {call.method}",
-            f"{name} runs grouped; its network is a layer table, and VoronoiRouter(..., fuse=True) runs it as one "
+            f"{call.name} runs grouped; its network is a layer table, and VoronoiRouter(..., fuse=True) runs it as one "
             f"operation, {_GAIN}, if its forward does the same in every call",
         )
     return found

@@ -31,16 +31,15 @@ class Program:
 
     Args:
         original: The routed module.
-        module: The copy, which runs with the parameters of its first cell.
-        call: The method.
-        given: Its arguments, for ``ROWS`` samples.
+        call: Of the copy, which runs with the parameters of its first cell.
+        given: The arguments, for ``ROWS`` samples.
 
     Raises:
         Unfusable: For a step that is no such network, or that cannot be done again for other samples.
     """
 
-    def __init__(self, original: nn.Module, module: nn.Module, call: Call, given: Given) -> None:
-        trace = Trace(original, module, call, given)
+    def __init__(self, original: nn.Module, call: Call, given: Given) -> None:
+        trace = Trace(original, call, given)
         self._result, self._outputs = trace.result, trace.outputs
         self._before, self._weights = trace.before, trace.weights
         self._sizes, self._parameters = trace.sizes, trace.parameters

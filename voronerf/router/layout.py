@@ -185,21 +185,28 @@ class Given:
 
 @dataclasses.dataclass
 class Call:
-    """A method of the module with the arguments of one call, and their names, of positional ones first."""
+    """A method of a module with the arguments of one call, their layout, and their names, of positional ones first."""
 
+    module: nn.Module
     method: str
+    layout: Layout
     names: list[str]
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
 
-    def run(self, module: nn.Module, given: Given) -> Any:
+    def run(self, given: Given) -> Any:
         """Calls the method; ``forward`` by way of the module, whose hooks run then."""
-        method = module if self.method == "forward" else getattr(module, self.method)
+        method = self.module if self.method == "forward" else getattr(self.module, self.method)
         return method(*given.args, **given.kwargs)
 
-    def arranged(self, layout: Layout, grouping: Grouping | None) -> Given:
+    @property
+    def name(self) -> str:
+        """Of the method, for messages."""
+        return f"{type(self.module).__name__}.{self.method}"
+
+    def arranged(self, grouping: Grouping | None) -> Given:
         """The arguments as the module sees them, in the order of a grouping; None keeps the original order."""
-        order = _Order(layout, grouping)
+        order = _Order(self.layout, grouping)
         return dataclasses.replace(self.changed(order.change), rows=order.found)
 
     def changed(self, change: Change) -> Given:

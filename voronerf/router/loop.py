@@ -57,9 +57,7 @@ class Results:
     flattened: list[bool]
 
 
-def run_cells(
-    module: nn.Module, call: Call, layout: Layout, given: Given, grouping: Grouping, *, again: bool = False
-) -> Results:
+def run_cells(call: Call, given: Given, grouping: Grouping, *, again: bool = False) -> Results:
     """A module's results for sorted rows, one call for each cell that has any.
 
     Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a copy of the
@@ -68,20 +66,20 @@ def run_cells(
     Raises:
         ValueError: For a result without a row for each sample, or other results in some cells.
     """
-    occupied = grouping.occupied()
+    module, occupied = call.module, grouping.occupied()
     parameters = {id(p): p for _, _, p in cell_parameters(module)}
     pieces = {key: parameter.unbind(0) for key, parameter in parameters.items()}
     results = []
     for cell, first, last in occupied:
         own: dict[int, Any] = {key: values[cell] for key, values in pieces.items()}
-        part = given if len(occupied) == 1 else given.part(first, last, layout.axis)
+        part = given if len(occupied) == 1 else given.part(first, last, call.layout.axis)
         if again:
             kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
-            results.append(call.run(clone_module(module, kept | own), part))
+            results.append(replace(call, module=clone_module(module, kept | own)).run(part))
             continue
         with in_place_of_parameters(module, own):
-            results.append(call.run(module, part))
-    return _join(results, [last - first for _, first, last in occupied], module, layout)
+            results.append(call.run(part))
+    return _join(results, [last - first for _, first, last in occupied], module, call.layout)
 
 
 def _join(results: list[Any], counts: list[int], module: nn.Module, layout: Layout) -> Results:
@@ -106,7 +104,7 @@ def _join(results: list[Any], counts: list[int], module: nn.Module, layout: Layo
     return joined
 
 
-def check_rows(module: nn.Module, call: Call, layout: Layout, given: Given, grouping: Grouping, again: bool) -> None:
+def check_rows(call: Call, given: Given, grouping: Grouping, again: bool) -> None:
     """Finds out whether a module gives other results for samples when other samples are left out.
 
     Raises:
@@ -116,30 +114,30 @@ def check_rows(module: nn.Module, call: Call, layout: Layout, given: Given, grou
     middle = (first + last) // 2
     outcomes = []
     for a, b in ((first, last), (first, middle), (middle, last)):
-        part = given.part(a, b, layout.axis)
+        part = given.part(a, b, call.layout.axis)
         cells = torch.full((b - a,), cell, dtype=torch.int32, device=grouping.device)
         alone = Grouping(cells, b - a, grouping.k, grouping.device, grouping.backend)
-        outcomes.append(run_cells(module, call, layout, part, alone, again=again))
+        outcomes.append(run_cells(call, part, alone, again=again))
     whole, *halves = outcomes
     for i, tensor in enumerate(whole.tensors):
         if whole.rows[i] and not agree(torch.cat([half.tensors[i] for half in halves]), tensor):
             raise TypeError(
-                f"VoronoiRouter: module must treat samples one by one, but {type(module).__name__} gives other results "
-                "for a sample when other samples are left out: it mixes samples (attention or statistics over a batch)"
+                f"VoronoiRouter: module must treat samples one by one, but {type(call.module).__name__} gives other "
+                "results for a sample when other samples are left out: it mixes samples (attention or statistics over "
+                "a batch)"
             )
 
 
-def run_grouped(module: nn.Module, call: Call, layout: Layout, grouping: Grouping, piece: int) -> Results:
+def run_grouped(call: Call, grouping: Grouping, piece: int) -> Results:
     """A module's results for the samples of all cells, in one run, or on a CPU in pieces of so many rows.
 
     Raises:
         Ungroupable: Where that is not possible.
     """
     parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
-    tables, chunks = Tables(), _chunks(module, parts)
+    tables, chunks = Tables(), _chunks(call.module, parts)
     found = [
-        run_part(module, call, layout, call.arranged(layout, part), part, chunk, tables)[0]
-        for part, chunk in zip(parts, chunks, strict=True)
+        run_part(call, call.arranged(part), part, chunk, tables)[0] for part, chunk in zip(parts, chunks, strict=True)
     ]
     first = found[0]
     if len(found) == 1:
@@ -167,15 +165,14 @@ def _chunks(module: nn.Module, parts: list[Grouping]) -> list[dict[int, Tensor] 
 
 
 def run_part(
-    module: nn.Module,
     call: Call,
-    layout: Layout,
     given: Given,
     part: Grouping,
     chunk: dict[int, Tensor] | None = None,
     tables: Tables | None = None,
 ) -> tuple[Results, GroupedRun]:
     """The results for some rows, and the run that gave them; ``chunk`` is None where the part has all cells."""
+    module, layout = call.module, call.layout
     run = GroupedRun(part, layout.axis, tables)
     for tensor in given.rows:
         run.mark(tensor)
@@ -184,7 +181,7 @@ def run_part(
         for _, _, p in cell_parameters(module)
     }
     with in_place_of_parameters(module, stand_ins), run:
-        value = call.run(module, given)
+        value = call.run(given)
     if run.failed is not None:
         raise run.failed
     results = Results(value, [], [], [])

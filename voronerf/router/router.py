@@ -265,7 +265,6 @@ class VoronoiRouter(CellModules):
         if names is None:
             names = argument_names(getattr(self.module, method), len(args))
             self._argument_names[method, len(args)] = names
-        call = Call(method, [*names, *kwargs], args, kwargs)
         rule = coords if coords is not None else self.coords
         if rule is None and self._layered:
             rule = "first3"
@@ -280,17 +279,18 @@ class VoronoiRouter(CellModules):
             frozenset(map(named, self.shared)),
             self.layout == "flat",
         )
+        call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
         with self._choices.lock:  # what stands in for the module's parameters does so for one call at a time
             key = self._assignment_key()
             grouping = self._assignments.find(method, source, positions, key)
             if grouping is None:
                 grouping = self._group(positions, layout.n)
                 self._assignments.keep(method, source, positions, key, grouping)
-            result, choice = evaluate(self.module, call, layout, grouping, self._choices, fuse=self.fuse)
+            result, choice = evaluate(call, grouping, self._choices, fuse=self.fuse)
             mixture = self._mixture(positions)
             if mixture is None:
                 return result
-            return mixed(result, self.module, call, layout, mixture, grouping, self._choices, choice)
+            return mixed(result, call, mixture, grouping, self._choices, choice)
 
     def _mixture(self, positions: Tensor) -> Mixture | None:
         """The other cells that samples near borders are evaluated in too."""

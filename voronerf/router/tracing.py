@@ -158,9 +158,8 @@ class Trace(TorchFunctionMode):
 
     Args:
         original: The routed module.
-        module: A copy of it, which runs with the parameters of its first cell.
-        call: The method.
-        given: Its arguments, for ``ROWS`` samples.
+        call: Of a copy of it, which runs with the parameters of its first cell.
+        given: The arguments, for ``ROWS`` samples.
 
     Attributes:
         sizes: Of every value of rows, rows for each sample and the dimensions behind; None for one of parameters.
@@ -175,8 +174,9 @@ class Trace(TorchFunctionMode):
         Unfusable: For a step that cannot be done again for other samples, or a layer that fits no table.
     """
 
-    def __init__(self, original: nn.Module, module: nn.Module, call: Call, given: Given) -> None:
+    def __init__(self, original: nn.Module, call: Call, given: Given) -> None:
         super().__init__()
+        module = call.module
         self.sizes: list[tuple[int, ...] | None] = []
         self.stages: list[int] = []
         self.parameters: dict[int, int] = {}
@@ -196,7 +196,7 @@ class Trace(TorchFunctionMode):
         for tensor in given.rows:
             self.new(tensor)
         with in_place_of_parameters(module, single), _custom_functions(self), self:
-            result = call.run(module, given)
+            result = call.run(given)
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self.ref(tensor) for tensor in tensors_of(result)]
 
