@@ -10,7 +10,7 @@ from op_cases import need, offsets_of
 from torch import Tensor
 
 from voronerf import ops
-from voronerf.layers import MLP, POSITIONS, Layer
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 COUNTS = [4, 0, 5]
 N, K = sum(COUNTS), len(COUNTS)
@@ -38,6 +38,19 @@ def routed(backend, x, first, second):
     return ops.routed_mlp(x, [first, second], [None, None], layers=NETWORK, cells=cells, backend=backend)[0]
 
 
+SPHERICAL = MLP(
+    (Layer((DIRECTIONS, POSITIONS), 6, "sine"), Layer((0,), 2, "sigmoid")),
+    (1,),
+    direction_encoding="spherical",
+    direction_degree=4,
+)
+
+
+def seen(backend, directions, x, first, second):
+    offsets, weights = offsets_of(COUNTS, x.device), [first, second]
+    return ops.grouped_mlp(x, offsets, weights, [None, None], layers=SPHERICAL, directions=directions, backend=backend)
+
+
 def frequencies(backend, x):
     return ops.frequency_encode(x, 2, backend=backend)
 
@@ -62,6 +75,10 @@ CASES: dict[str, tuple[Call, list[Tensor]]] = {
     "grouped_linear": (linear, [draw(N, 3, seed=1), draw(K, 4, 3, seed=2), draw(K, 4, seed=3)]),
     "grouped_mlp": (network, [draw(N, 3, seed=1), draw(K, 6, 15, seed=2), draw(K, 2, 6, seed=3)]),
     "routed_mlp": (routed, [draw(N, 3, seed=1), draw(K, 6, 15, seed=2), draw(K, 2, 6, seed=3)]),
+    "directions": (
+        seen,
+        [draw(N, 3, seed=4), draw(N, 3, seed=1), draw(K, 6, 19, seed=2), draw(K, 2, 6, seed=3)],
+    ),
     "frequency_encode": (frequencies, [draw(N, 3, seed=1)]),
     "integrated_encode": (gaussians, [draw(N, 3, seed=1), draw(N, 3, seed=2)]),
     "spherical_harmonics": (harmonics, [draw(N, 3, seed=1)]),
@@ -83,7 +100,7 @@ def gradients(call, backend, values, device, dtype):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_loss_on_second_derivatives(name, device, backend):
-    need(name, backend, device, torch.float32)
+    need("grouped_mlp" if name == "directions" else name, backend, device, torch.float32)
     call, values = CASES[name]
     expected = gradients(call, "reference", values, torch.device("cpu"), torch.float64)
     found = gradients(call, backend, values, device, torch.float32)

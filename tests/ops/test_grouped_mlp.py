@@ -399,6 +399,9 @@ def test_errors():
         call(offsets=case.offsets[:1])
     with refused(ValueError, f"{op}: directions must be given for layers that read them, got None"):
         call(directions=None, direction_index=None)
+    harmonics = MLP((Layer((DIRECTIONS,), 4),), (0,), direction_encoding="spherical", direction_degree=2)
+    with refused(ValueError, f"{op}: directions must have 3 features where they are spherical, got 2"):
+        call(directions=directions[:, :2], layers=harmonics)
     with refused(ValueError, f"{op}: direction_index must come with directions, got no directions"):
         call(directions=None, layers=TABLES["plain"])
     with refused(ValueError, f"{op}: directions must have shape [n, q] with n = 5, got [4, 3]"):
