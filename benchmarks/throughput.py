@@ -33,6 +33,7 @@ os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 import torch
 from harness import Others, Peaks, Stopwatch, Timing, instruction_set, measure, metadata, threads
 from ops import cases_foreign as cases_foreign
+from ops import cases_hash as cases_hash
 from ops import cases_lookup as cases_lookup
 from ops import cases_marching as cases_marching
 from ops import cases_network as cases_network
@@ -94,6 +95,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """The cases that the options select."""
     every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases(), *cases_marching.cases()]
+    every += cases_hash.cases()
     if options.foreign:
         every = cases_foreign.cases()
     if options.filter is not None:

@@ -17,6 +17,7 @@ from ops import (
     alternatives,
     case,
     cases_foreign,
+    cases_hash,
     cases_lookup,
     cases_marching,
     cases_network,
@@ -33,7 +34,7 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 CPU = torch.device("cpu")
 OPS = {
     *("nearest_centre", "locate_cell", "draw_cell", "cell_sort", "grouped_linear", "grouped_mlp", "frequency_encode"),
-    *("integrated_encode", "spherical_harmonics", "composite", "resample", "routed_mlp"),
+    *("integrated_encode", "spherical_harmonics", "hash_encode", "composite", "resample", "routed_mlp"),
 }
 NOT_DIFFERENTIABLE = {"march_rays", "update_occupancy", "camera_rays", "balance_centres", "select_heaviest"}
 OPS |= NOT_DIFFERENTIABLE
@@ -234,6 +235,7 @@ def test_what_is_compared_is_right_in_every_small_case():
         for op in ("frequency_encode", "integrated_encode"):
             works[f"{op}, {direction}"] = sampling._encode_work(op, 64, torch.float32, direction, False, CPU)
         works[f"spherical_harmonics, {direction}"] = sampling._harmonics_work(64, direction, False, CPU)
+        works[f"hash_encode, {direction}"] = cases_hash._work(512, 12, direction, False, CPU)
         for packed in (False, True):
             work = sampling._composite_work(512, packed, direction, False, CPU)
             works[f"composite, packed {packed}, {direction}"] = work

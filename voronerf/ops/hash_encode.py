@@ -21,8 +21,8 @@ def hash_encode(
     Müller et al. 2022, section 3: for each level, the eight corners around a point name eight entries of the table, by
     the place of the corner or by its hash, and their features are interpolated. Gradients of every order to positions
     and table; with linear interpolation the gradient to the positions jumps where a point passes a corner. Sums are
-    float32 at least. Results do not depend on the number of threads; on CUDA and in Warp the gradient of the table
-    is added up in any order.
+    float32 at least. Results do not depend on the number of threads; on CUDA the gradient of the table is added up
+    in any order.
 
     Args:
         positions: [n, 3] floating point, n < 2**31, in the units of ``grid.box``. A coordinate outside of the box

@@ -1,0 +1,119 @@
+"""Cases of hash_encode. n samples along rays, L levels, e entries of all levels, f features of a level."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ops.alternatives import compile_now
+from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation
+from voronerf import HashGrid
+from voronerf.ops import hash_encode
+
+SAMPLES = 64
+"""Of a ray."""
+PRIMES = (1, 2654435761, 805459861)
+
+Encode = Callable[[Tensor, Tensor], Tensor]
+
+
+def cases() -> list[Case]:
+    """The rows of hash_encode, on one thread; backwards to the table alone, as in training."""
+    found = []
+    for n, log2_entries in ((1 << 16, 15), (1 << 18, 15), (1 << 16, 19)):
+        for direction in (FORWARD, BACKWARD):
+            name = f"8 x 2^{log2_entries} x 2 n={n}"
+            base = (n, log2_entries) == (1 << 16, 15)
+            work = functools.partial(_work, n, log2_entries, direction, base)
+            shown = ("native", "reference") if base else ("native",)
+            quick = base and direction == FORWARD
+            found.append(Case("hash_encode", name, torch.float32, direction, n, None, work, shown, quick, threads=1))
+    return found
+
+
+def _samples(n: int, seed: int, device: torch.device) -> Tensor:
+    """Positions [n, 3] ray by ray, in their order along it, in the unit cube."""
+    draw = generator(seed)
+    begin, end = torch.rand(2, n // SAMPLES, 1, 3, generator=draw)
+    depths = (torch.arange(SAMPLES)[:, None] + torch.rand(n // SAMPLES, SAMPLES, 1, generator=draw)) / SAMPLES
+    return (begin + (end - begin) * depths).reshape(n, 3).to(device)
+
+
+def _corners(x: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
+    """Entries [n, L, 8] of the corners, and their weights."""
+    scale, shift, side, entries, offset, hashed = (x.new_tensor(column) for column in zip(*grid.rows))
+    where = x[:, None, :] * scale[:, None] + shift[:, None]
+    steps = torch.tensor([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], device=x.device)
+    below = where.floor()
+    inside = (where - below)[:, :, None, :]
+    weights = torch.where(steps == 1, inside, 1 - inside).prod(dim=3)
+    corner = below.long()[:, :, None, :] + steps
+    product = corner * torch.tensor(PRIMES, device=x.device)
+    side, entries = side.long()[:, None], entries.long()[:, None]
+    by_hash = (product[..., 0] ^ product[..., 1] ^ product[..., 2]) % entries
+    dense = (corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])) % entries
+    return torch.where(hashed.bool()[:, None], by_hash, dense) + offset.long()[:, None], weights
+
+
+def _by_indexing(x: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
+    entries, weights = _corners(x, grid)
+    return (table[entries] * weights[..., None]).sum(dim=2).flatten(1)
+
+
+def _by_embedding_bag(x: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
+    entries, weights = _corners(x, grid)
+    found = F.embedding_bag(entries.view(-1, 8), table, per_sample_weights=weights.view(-1, 8), mode="sum")
+    return found.view(len(x), -1)
+
+
+def _work(n: int, log2_entries: int, direction: str, compiled: bool, device: torch.device) -> Work:
+    grid = HashGrid(levels=8, features=2, log2_entries=log2_entries, base=16, finest=256)
+    count = rotation(n * 4 * (3 + grid.out_features))
+    sets = [_samples(n, seed, device) for seed in range(count)]
+    table = torch.randn(grid.table_shape, generator=generator(7)).to(device)
+    gradient = torch.randn(n, grid.out_features, generator=generator(8)).to(device)
+
+    def results(encode: Encode, x: Tensor, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+        leaf = table.to(dtype).requires_grad_(direction == BACKWARD)
+        out = encode(x.to(dtype), leaf)
+        return [out] if direction == FORWARD else [out, *torch.autograd.grad(out, leaf, gradient.to(dtype))]
+
+    def contender(encode: Encode) -> Contender:
+        return Contender(lambda call: results(encode, sets[call % count]))
+
+    def compiling() -> Contender:
+        torch.compiler.reset()
+        made = contender(torch.compile(functools.partial(_by_indexing, grid=grid)))
+        compile_now(lambda: made.run(1))
+        return made
+
+    @functools.cache
+    def exact() -> list[Tensor]:
+        return results(lambda x, table: hash_encode(x, table, grid, backend="reference"), sets[0], torch.float64)
+
+    def error(found: Any) -> float:
+        return max(relative_error(a, b) for a, b in zip(found, exact(), strict=True))
+
+    # At the least: positions and features once each way, the table once, and its gradient once.
+    amount = float(n) * 4 * (3 + grid.out_features) + table.nbytes
+    if direction == BACKWARD:
+        amount += float(n) * 4 * (3 + grid.out_features) + table.nbytes
+    alternatives = {
+        "torch, indexing": lambda: contender(functools.partial(_by_indexing, grid=grid)),
+        "torch, F.embedding_bag": lambda: contender(functools.partial(_by_embedding_bag, grid=grid)),
+    }
+    if compiled:
+        alternatives["torch, indexing, torch.compile"] = compiling
+    return Work(
+        lambda backend: contender(lambda x, table: hash_encode(x, table, grid, backend=backend)),
+        alternatives,
+        error,
+        1e-3,
+        amount,
+        "copy",
+    )
