@@ -288,7 +288,7 @@ class Rival:
         ray = kept // s
         positions = torch.addcmul(origins[ray], directions[ray], depths.view(-1)[kept][:, None])
         if self.contraction is not None:
-            positions = (self.contraction(positions) - self.low) / self.size
+            positions = (self.contraction.points(positions) - self.low) / self.size
         colour, density = self.field(positions.clamp_(0, 1), spherical_harmonics(rays.directions), ray)
         # Padded to all strata: a cumulative sum over each ray is one operation, as exact as the ray is short.
         flat = torch.zeros(depths.numel()).scatter(0, kept, density * deltas.reshape(-1)[kept])

@@ -1,5 +1,6 @@
 """Scripts of benchmarks/ from end to end: occupancy.py on a run that is there, balance.py, centres.py and others."""
 
+import dataclasses
 import itertools
 import re
 from pathlib import Path
@@ -107,6 +108,17 @@ def test_seconds_to_a_quality():
     curve = [{"seconds": s, "psnr": p} for s, p in ((5.0, 20.0), (10.0, 24.0), (15.0, 22.0), (20.0, 30.0))]
     found = [time_to_quality.seconds_to(quality, curve) for quality in (19, 23, 24, 26, 31)]
     assert found == [5.0, 8.75, 10.0, 17.5, None]
+
+
+def test_the_rival_contracts_a_scene_without_a_box():
+    import rival_ngp
+
+    scene = dataclasses.replace(builtin_scene(8, train_views=3, test_views=1), box=None)
+    config = rival_ngp.RivalConfig(levels=2, log2_entries=10, batch=512, samples=8)
+    rival = rival_ngp.Rival(
+        config, scene, budget=3, evaluations=1, eval_views=1, seed=0, clock=itertools.count().__next__
+    )
+    assert rival.run()["psnr"] > 0 and rival.step == 3 and rival.rays == 64
 
 
 def test_the_rival_learns_and_its_encoding_is_the_published_one():
