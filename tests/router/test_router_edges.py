@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 import time
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 import torch.utils.checkpoint
+from convention_calls import Truncated
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
@@ -297,7 +299,7 @@ def test_calls_from_several_threads() -> None:
 
         def forward(self, x: Tensor) -> Tensor:
             inside.set()
-            go_on.wait(5)
+            go_on.wait(30)
             return torch.utils.checkpoint.checkpoint(self.net, x, use_reentrant=False)
 
     slow, x = Slow(), samples()
@@ -305,7 +307,7 @@ def test_calls_from_several_threads() -> None:
     found: dict[int, Tensor] = {}
     threads = [threading.Thread(target=lambda i=i: found.update({i: routers[i](x)})) for i in range(2)]
     threads[0].start()
-    assert inside.wait(5)
+    assert inside.wait(30)
     threads[1].start()
     time.sleep(0.2)  # for the second to come to where it waits, or would not
     go_on.set()
@@ -314,6 +316,26 @@ def test_calls_from_several_threads() -> None:
     for i in range(2):
         close(found[i], slow(x))
         assert all(isinstance(p, nn.Parameter) for p in routers[i].module.net[0]._parameters.values())
+
+
+def test_networks_traced_in_two_threads_leave_custom_functions_as_they_were() -> None:
+    before, routers = torch.autograd.Function.apply, [VoronoiRouter(Truncated(), centres(), coords="first3", fuse=True)]
+    routers.append(copy.deepcopy(routers[0]))
+    x, found = torch.rand(60, 7), {}
+    start = threading.Barrier(2)
+
+    def call(i: int) -> None:
+        start.wait(20)
+        found[i] = routers[i](x)["sigma"]
+
+    threads = [threading.Thread(target=call, args=(i,)) for i in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    close(found[0], found[1])
+    close(found[0], routers[0].cell(0)(x)["sigma"])
+    assert torch.autograd.Function.apply == before
 
 
 def test_centres_go_where_the_module_is(device: torch.device) -> None:
