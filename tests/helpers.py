@@ -1,4 +1,4 @@
-"""What tests of every room share: refusals, seeded generators, equal tensors, scripts, files of JSON."""
+"""What tests of every room share: refusals, seeded generators, equal tensors, threads, scripts, files of JSON."""
 
 import json
 import subprocess
@@ -26,6 +26,20 @@ def same(first, second):
     if isinstance(first, Mapping):
         return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
     return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def on_any_number_of_threads(run, counts=(1, 2, 3)):
+    """The tensors that ``run`` returns, which must be equal bit for bit for each number of threads."""
+    before, found = torch.get_num_threads(), []
+    try:
+        for count in counts:
+            torch.set_num_threads(count)
+            found.append(list(run()))
+    finally:
+        torch.set_num_threads(before)
+    for count, other in zip(counts, found):
+        assert same(found[0], other), f"{count} threads give other bits than {counts[0]}"
+    return found[0]
 
 
 def python(*args, **options):

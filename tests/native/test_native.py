@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import on_any_number_of_threads
 from torch import Tensor
 
 from voronerf import backends, cell_sort, locate_cell, nearest_centre
@@ -28,13 +28,6 @@ CELLS = (1, 2, 15, 16, 17, 255, 256, 257, 4096)
 ROWS = (0, 1, 3, 7, 8, 9, 15, 17, 31, 33, 63, 64, 65, 129)
 BLOCK = 2048
 DTYPES = (torch.float32, torch.float64)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def chosen(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -129,18 +122,12 @@ def test_nearest_of_mixed_and_half_types_and_strided_tensors(isa: str) -> None:
         chosen(points, centres.to(dtype), weights)
 
 
-def test_threads_do_not_change_a_bit(threads: None) -> None:
+def test_threads_do_not_change_a_bit() -> None:
     points, centres, cells = torch.rand(10 * BLOCK + 1, 3), torch.rand(50, 3), torch.randint(0, 50, (10 * BLOCK + 1,))
     tree = random_tree((4, 3))
-    results = []
-    for count in (1, 2, 3):
-        torch.set_num_threads(count)
-        sort = cell_sort(cells.int(), 50, backend="native")
-        results.append(
-            (nearest_centre(points, centres, backend="native"), *sort, locate_cell(points, **tree, backend="native"))
-        )
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+    on_any_number_of_threads(lambda: [nearest_centre(points, centres, backend="native")])
+    on_any_number_of_threads(lambda: cell_sort(cells.int(), 50, backend="native"))
+    on_any_number_of_threads(lambda: [locate_cell(points, **tree, backend="native")])
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 5000])
@@ -154,11 +141,6 @@ def test_sort(n: int, k: int) -> None:
     assert torch.equal(order, expected_order)
     assert torch.equal(offsets, expected_offsets)
     assert (order.dtype, offsets.dtype) == (torch.int32, torch.int32)
-
-
-def test_sort_of_a_strided_tensor() -> None:
-    cells = torch.randint(0, 9, (101, 2), dtype=torch.int32)[:, 0]
-    assert all(torch.equal(a, b) for a, b in zip(cell_sort(cells, 9, backend="native"), reference_sort(cells, 9)))
 
 
 @pytest.mark.parametrize("bad", [-1, 7, 2**31 - 1, -(2**31)])
@@ -247,30 +229,6 @@ def test_locate_on_cuda_stays_inside_unsound_tables() -> None:
         on_device = {name: value.cuda() if isinstance(value, Tensor) else value for name, value in tables.items()}
         leaves = locate_cell(points.cuda(), **on_device, backend="native").cpu()
         assert (leaves[second] < 0).all() and torch.equal(leaves[~second], sound[~second])
-
-
-def test_ops_pass_opcheck_and_compile_whole() -> None:
-    points, centres, weights = torch.rand(50, 3), torch.rand(7, 3), torch.rand(7)
-    cells, tree = torch.randint(0, 7, (50,), dtype=torch.int32), random_tree((3, 2))
-    ops = torch.ops.voronerf
-    torch.library.opcheck(ops.nearest_centre.default, (points, centres, weights))
-    torch.library.opcheck(ops.nearest_centre.default, (points[:0], centres, None))
-    torch.library.opcheck(ops.cell_sort.default, (cells, 7))
-    located = (points, tree["centres"], tree["child_offsets"], tree["child"], tree["depth"], None)
-    torch.library.opcheck(ops.locate_cell.default, located)
-
-    def run(points: Tensor, centres: Tensor) -> tuple[Tensor, ...]:
-        cells = nearest_centre(points * 2, centres, backend="native")
-        return (cells + 1, *cell_sort(cells, 7, backend="native"), locate_cell(points, **tree, backend="native"))
-
-    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
-    assert all(torch.equal(a, b) for a, b in zip(compiled(points, centres), run(points, centres)))
-
-
-def test_gradients_stop_at_the_cells() -> None:
-    points = torch.rand(5, 3, requires_grad=True)
-    cells = nearest_centre(points, torch.rand(4, 3, requires_grad=True), backend="native")
-    assert not cells.requires_grad
 
 
 def run_python(code: str, **environment: str) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from composite_cases import PARTS, dense, evaluate, leaves_of, scene
+from helpers import on_any_number_of_threads
 from tolerances import assert_as_exact
 from torch import Tensor
 
@@ -15,13 +14,6 @@ from voronerf.ops import composite
 pytestmark = pytest.mark.native
 
 INF = float("inf")
-
-
-@pytest.fixture
-def threads() -> Iterator[tuple[int, ...]]:
-    before = torch.get_num_threads()
-    yield (1, 2, 3)
-    torch.set_num_threads(before)
 
 
 def assert_close(given: dict, parts: tuple[str, ...] = PARTS) -> None:
@@ -66,16 +58,11 @@ def test_only_the_gradients_asked_for() -> None:
 
 
 @pytest.mark.parametrize("c", [3, 2])
-def test_same_bits_for_any_number_of_threads(isa: str, threads: tuple[int, ...], c: int) -> None:
-    results = []
+def test_same_bits_for_any_number_of_threads(isa: str, c: int) -> None:
     packed = scene([0, 5000, 1, 9000, *[70] * 100], c, "all", outside=(5, 9))
     many = dense(40_000, 2, c, "all")  # whose shared background has a gradient worth splitting
-    for count in threads:
-        torch.set_num_threads(count)
-        found = [evaluate(given, torch.float32, "native") for given in (packed, many)]
-        results.append([tensor for tensors in found for tensor in tensors])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+    for given in (packed, many):
+        on_any_number_of_threads(lambda given=given: evaluate(given, torch.float32, "native"))
 
 
 def test_a_long_ray_keeps_its_digits() -> None:

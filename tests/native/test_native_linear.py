@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import on_any_number_of_threads
 from torch import Tensor
 
 from voronerf.reference import grouped_linear as specification
@@ -89,18 +90,15 @@ def test_strided_and_unaligned(dtype: torch.dtype) -> None:
 def test_results_do_not_depend_on_threads(dtype: torch.dtype) -> None:
     n, k = 5000, 3
     x, weight, bias = torch.randn(n, 33).to(dtype), torch.randn(k, 40, 33).to(dtype), torch.randn(k, 40).to(dtype)
-    offsets, before = torch.tensor([0, 4000, 4100, n], dtype=torch.int32), torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            leaves = [tensor.clone().requires_grad_() for tensor in (x, weight, bias)]
-            y = native.grouped_linear(leaves[0], offsets, *leaves[1:], activation="softplus")
-            results.append([y, *torch.autograd.grad(y.float().square().sum(), leaves)])
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+    offsets = torch.tensor([0, 4000, 4100, n], dtype=torch.int32)
+    g = torch.randn(n, 40).to(dtype)
+
+    def run() -> list[Tensor]:
+        leaves = [tensor.clone().requires_grad_() for tensor in (x, weight, bias)]
+        y = native.grouped_linear(leaves[0], offsets, *leaves[1:], activation="softplus")
+        return [y, *torch.autograd.grad(y, leaves, g)]
+
+    on_any_number_of_threads(run)
 
 
 def test_only_what_is_wanted() -> None:
@@ -124,19 +122,6 @@ def test_what_is_no_number_stays_in_its_row(dtype: torch.dtype) -> None:
     assert found[50].isnan().all() and not found[51].isfinite().all()
     rest = [row for row in range(ROWS) if row not in (50, 51)]
     assert torch.equal(found[rest], clean[rest])
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
-def test_opcheck(dtype: torch.dtype) -> None:
-    x, weight, bias, g = inputs(5, 3, dtype)
-    offsets = torch.tensor(OFFSETS, dtype=torch.int32)
-    leaves = [tensor.requires_grad_() for tensor in (x, weight, bias)]
-    ops = torch.ops.voronerf
-    torch.library.opcheck(ops.grouped_linear_native, (leaves[0], offsets, *leaves[1:], "sigmoid"))
-    torch.library.opcheck(ops.grouped_linear_native, (leaves[0], offsets, leaves[1], None, "none"))
-    checks = ("test_schema", "test_faketensor", "test_autograd_registration")
-    given = (g, leaves[0], offsets, *leaves[1:], "sigmoid", [True, True])
-    torch.library.opcheck(ops.grouped_linear_native_backward, given, test_utils=checks)
 
 
 def test_large_results_ask_for_huge_pages() -> None:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import threading
 
 import pytest
 import torch
+from helpers import on_any_number_of_threads
 from torch import Tensor
 
 from voronerf.layers import MLP, Layer
-from voronerf.ops import grouped_linear, grouped_mlp
+from voronerf.ops import grouped_mlp
 
 pytestmark = pytest.mark.native
 
@@ -181,23 +181,6 @@ def test_linear_of_odd_sizes(i: int, o: int, isa: str) -> None:
     assert_close(arguments(layers, [7, 0, 25], p=i))
 
 
-@pytest.mark.parametrize("activation", ["none", "relu", "softplus", "sigmoid", "sine"])
-@pytest.mark.parametrize("bias", [True, False])
-def test_grouped_linear(activation: str, bias: bool) -> None:
-    x, weight = torch.randn(50, 9, dtype=torch.float64), torch.randn(4, 6, 9, dtype=torch.float64)
-    offsets = torch.tensor([2, 20, 20, 31, 44], dtype=torch.int32)
-    given = [x, weight, torch.randn(4, 6, dtype=torch.float64)][: 3 if bias else 2]
-    results = {}
-    for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
-        a = [tensor.to(dtype).requires_grad_() for tensor in given]
-        y = grouped_linear(a[0], offsets, *a[1:], activation=activation, backend=backend)
-        slopes = torch.linspace(-1, 1, y.numel(), dtype=dtype).view_as(y)
-        results[backend] = [y.detach(), *torch.autograd.grad(y, a, slopes)]
-    for want, got in zip(results["reference"], results["native"]):
-        torch.testing.assert_close(got.double(), want, rtol=1e-5, atol=1e-5)
-    assert (results["native"][0][:2] == 0).all() and (results["native"][0][44:] == 0).all()
-
-
 def test_without_biases_and_with_relu_off_the_kink() -> None:
     # A ReLU whose input is within rounding of 0 may differ between two correct implementations; integers are not.
     layers = chain(12, 2, activation="relu", octaves=None)
@@ -241,17 +224,10 @@ def test_relu_stops_an_infinite_gradient_and_passes_what_is_not_a_number(o: int,
         assert (bias[::2] == torch.inf).all() and (bias[1::2] == 1).all()
 
 
-def test_same_bits_for_any_number_of_threads(isa: str) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_same_bits_for_any_number_of_threads(isa: str, dtype: torch.dtype) -> None:
     given = arguments(nerf(40, 2), [5000, 3, 0, 900], rays=50)
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(evaluate(given, torch.float32, "native"))
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+    on_any_number_of_threads(lambda: evaluate(given, dtype, "native"))
 
 
 def test_several_python_threads_at_once() -> None:
@@ -318,15 +294,6 @@ def test_large_positions() -> None:
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5 * float(want[:3].abs().max()))
 
 
-def test_float16_storage() -> None:
-    given = cast(arguments(nerf(16, 2), [20, 30], rays=7), torch.float16)
-    out = grouped_mlp(**given, backend="native")
-    gradients = torch.autograd.grad(out.float().sum(), tensors(given))
-    assert out.dtype == torch.float16 and all(gradient.dtype == torch.float16 for gradient in gradients)
-    want = grouped_mlp(**cast(given, torch.float32), backend="native")
-    torch.testing.assert_close(out.float(), want, rtol=2e-3, atol=1e-6)
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_bfloat16_storage(name: str, isa: str) -> None:
     """Errors in the Euclidean norm: at most 1.5 times those of the reference with the same storage."""
@@ -348,18 +315,6 @@ def test_bfloat16_with_any_number_of_rows(rows: int) -> None:
         assert float((stored - exact).norm()) <= 0.2 * float(exact.norm())
 
 
-def test_bfloat16_same_bits_for_any_number_of_threads() -> None:
-    given, before, results = arguments(nerf(40, 2), [5000, 3, 0, 900], rays=50), torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(evaluate(given, torch.bfloat16, "native"))
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
-
-
 def test_bfloat16_keeps_what_is_not_finite_in_its_row() -> None:
     given = arguments(nerf(17, 2), [20, 30], rays=50)
     given["direction_index"] = torch.arange(50, dtype=torch.int32)
@@ -373,17 +328,6 @@ def test_bfloat16_keeps_what_is_not_finite_in_its_row() -> None:
     assert torch.equal(out[:, 0].isnan(), spoiled)
 
 
-def test_autocast() -> None:
-    given = cast(arguments(nerf(16, 2), [20, 30]), torch.float32)
-    want = grouped_mlp(**given, backend="native")
-    with torch.autocast("cpu", torch.bfloat16):
-        out = grouped_mlp(**given, backend="native")
-    assert out.dtype == torch.bfloat16
-    torch.testing.assert_close(out.float(), want, rtol=0, atol=0.02 * float(want.detach().abs().max()))
-    gradients = torch.autograd.grad(out.float().sum(), tensors(given))
-    assert all(gradient.dtype == torch.float32 for gradient in gradients)
-
-
 def test_float64_positions_are_encoded_in_float64() -> None:
     given = arguments(chain(8, 1, octaves=10), [40])
     given["positions"] += 100
@@ -391,31 +335,6 @@ def test_float64_positions_are_encoded_in_float64() -> None:
     mixed = {**cast(given, torch.float32), "positions": given["positions"]}
     got = grouped_mlp(**mixed, backend="native").detach()
     assert float((got - exact).abs().max()) <= 1e-5 * float(exact.abs().max())
-
-
-def test_non_contiguous() -> None:
-    given = cast(arguments(nerf(16, 2), [20, 30]), torch.float32)
-    want = grouped_mlp(**given, backend="native")
-    strided = {
-        **given,
-        "positions": given["positions"].t().contiguous().t(),
-        "directions": given["directions"].repeat(1, 2)[:, :3],
-        "weights": [weight.transpose(1, 2).contiguous().transpose(1, 2) for weight in given["weights"]],
-    }
-    assert torch.equal(grouped_mlp(**strided, backend="native"), want)
-
-
-def test_second_derivatives() -> None:
-    results = {}
-    given = arguments(nerf(6, 2), [5, 0, 8], rays=4)
-    for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
-        leaves = cast(given, dtype)
-        out = grouped_mlp(**leaves, backend=backend)
-        firsts = torch.autograd.grad((out * out).sum(), tensors(leaves), create_graph=True)
-        penalty = sum((first * first).sum() for first in firsts)
-        results[backend] = torch.autograd.grad(penalty, tensors(leaves))
-    for want, got in zip(results["reference"], results["native"]):
-        torch.testing.assert_close(got.double(), want, rtol=1e-3, atol=1e-5 * float(want.abs().max()))
 
 
 def test_opcheck() -> None:
@@ -451,42 +370,8 @@ def test_compiles_whole() -> None:
         torch.testing.assert_close(got, want)
 
 
-def test_compiles_for_any_size() -> None:
-    given = cast(arguments(nerf(8, 2), [9, 0, 4], rays=3), torch.float32)
-
-    @torch.compile(fullgraph=True, dynamic=True, backend="aot_eager")
-    def loss(positions: Tensor, offsets: Tensor, index: Tensor, weights: list[Tensor]) -> Tensor:
-        changed = {"positions": positions, "offsets": offsets, "direction_index": index, "weights": weights}
-        return grouped_mlp(**{**given, **changed}, backend="native").square().sum()
-
-    leaves = [given["positions"], *given["weights"]]
-    compiled = torch.autograd.grad(
-        loss(given["positions"], given["offsets"], given["direction_index"], given["weights"]), leaves
-    )
-    eager = torch.autograd.grad(grouped_mlp(**given, backend="native").square().sum(), leaves)
-    for got, want in zip(compiled, eager):
-        torch.testing.assert_close(got, want)
-
-
-def test_linear_compiles_for_any_size() -> None:
-    @torch.compile(fullgraph=True, dynamic=True, backend="aot_eager")
-    def run(x: Tensor, offsets: Tensor, weight: Tensor) -> Tensor:
-        return grouped_linear(x, offsets, weight, activation="relu", backend="native")
-
-    for n, k, o, i in ((9, 2, 5, 4), (14, 3, 7, 6)):
-        x, weight = torch.randn(n, i, requires_grad=True), torch.randn(k, o, i, requires_grad=True)
-        offsets = torch.linspace(0, n, k + 1).int()
-        got, want = (each(x, offsets, weight) for each in (run, functools.partial(grouped_linear, activation="relu")))
-        torch.testing.assert_close(got, want)
-        for a, b in zip(*(torch.autograd.grad(y.square().sum(), [x, weight]) for y in (got, want))):
-            torch.testing.assert_close(a, b)
-
-
-def test_errors() -> None:
+def test_an_index_of_no_ray_is_refused() -> None:
     given = cast(arguments(nerf(6, 2), [5, 8], rays=4), torch.float32)
-    for bad in ([0, 9, 5], [0, 5, 14], [-1, 5, 13]):
-        with pytest.raises(ValueError, match=r"^grouped_mlp: offsets must rise"):
-            grouped_mlp(**{**given, "offsets": torch.tensor(bad, dtype=torch.int32)}, backend="native")
     for bad_index in (4, -1):
         index = given["direction_index"].clone()
         index[3] = bad_index

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
+from helpers import on_any_number_of_threads
 from tolerances import assert_as_exact
 from torch import Tensor
 
@@ -17,13 +18,6 @@ pytestmark = pytest.mark.native
 HALVES = (torch.float16, torch.bfloat16)
 # Around the rows of a tile.
 ROWS = (0, 1, 2, 31, 32, 33, 100)
-
-
-@pytest.fixture
-def threads() -> Iterator[tuple[int, ...]]:
-    before = torch.get_num_threads()
-    yield (1, 2, 3)
-    torch.set_num_threads(before)
 
 
 def points(n: int, d: int = 3) -> Tensor:
@@ -113,17 +107,13 @@ def test_large_variances(isa: str) -> None:
         torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
 
 
-def test_same_bits_for_any_number_of_threads(isa: str, threads: tuple[int, ...]) -> None:
+def test_same_bits_for_any_number_of_threads(isa: str) -> None:
     cases = all_encodings(1000)
     weights, edges = torch.rand(300, 40), torch.rand(300, 41).cumsum(1)
     uniforms = torch.rand(300, 50)
-    results = []
-    for count in threads:
-        torch.set_num_threads(count)
-        found = [tensor for run, inputs in cases for tensor in evaluate(run, inputs, torch.float32, "native")]
-        results.append([*found, resample(weights, edges, 50, uniforms=uniforms, backend="native")])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+    for run, inputs in cases:
+        on_any_number_of_threads(lambda run=run, inputs=inputs: evaluate(run, inputs, torch.float32, "native"))
+    on_any_number_of_threads(lambda: [resample(weights, edges, 50, uniforms=uniforms, backend="native")])
 
 
 def test_every_output_is_written(request: pytest.FixtureRequest) -> None:
@@ -177,27 +167,6 @@ def test_second_derivatives() -> None:
             results[backend] = torch.autograd.grad(sum(first.square().sum() for first in firsts), leaves)
         for want, got in zip(results["reference"], results["native"]):
             torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-5 * float(want.abs().max()))
-
-
-@pytest.mark.parametrize("octaves", [0, 2])
-def test_opcheck(octaves: int) -> None:
-    ops = torch.ops.voronerf
-    x, variances = torch.rand(5, 3, requires_grad=True), torch.rand(5, 3, requires_grad=True)
-    # A first call loads an op.
-    frequency_encode(x, octaves, backend="native")
-    for inputs in ((x, None, octaves, True), (x, None, octaves, False), (x, variances, octaves, False)):
-        torch.library.opcheck(ops.encode_native.default, inputs)
-        gradient = torch.rand(5, 3 * (2 * octaves + inputs[3]), requires_grad=True)
-        torch.library.opcheck(ops.encode_native_backward.default, (gradient, *inputs))
-    for degree in (1, 4):
-        spherical_harmonics(x, degree, backend="native")
-        torch.library.opcheck(ops.spherical_harmonics_native.default, (x, degree))
-        gradient = torch.rand(5, degree**2, requires_grad=True)
-        torch.library.opcheck(ops.spherical_harmonics_native_backward.default, (gradient, x, degree))
-    weights, edges = torch.rand(4, 3), torch.rand(4, 4).cumsum(1)
-    resample(weights, edges, 6, backend="native")
-    for uniforms in (None, torch.rand(4, 6)):
-        torch.library.opcheck(ops.resample_native.default, (weights, edges, 6, uniforms))
 
 
 def test_compiles_whole() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import contextmanager
 
 import pytest
@@ -49,3 +50,18 @@ def refused(kind, message):
     assert type(caught.value) is kind
     found = str(caught.value)
     assert found == message or ("..." in message and found.startswith(begin) and found.endswith(end)), found
+
+
+def refusals(call, name=None, /, **good):
+    """Checks that an op takes the arguments ``good``, and what it says, after its name, where some of them are changed.
+
+    The error is a TypeError where the message speaks of a type, and else a ValueError.
+    """
+    call(**good)
+
+    def refuses(message, **changed):
+        of_types = re.search("dtype|must be an integer|must be a CentreGrid", message)
+        with refused(TypeError if of_types else ValueError, f"{name or call.__name__}: {message}"):
+            call(**{**good, **changed})
+
+    return refuses

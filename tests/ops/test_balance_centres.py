@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from op_cases import refused, strided
+from helpers import on_any_number_of_threads
+from op_cases import refusals, strided
 
 from voronerf.ops import balance_centres
 
@@ -83,38 +84,15 @@ def test_cells_and_samples_without_mass(device, backend):
 @pytest.mark.native
 def test_same_bits_for_any_number_of_threads():
     points, masses = samples(9000)
-    before = torch.get_num_threads()
-    found = []
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            found.append(balance_centres(points, masses, points[:150], steps=5, backend="native"))
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
-
-
-@pytest.mark.native
-@pytest.mark.warp
-def test_opcheck():
-    points, masses = samples(9)
-    for backend in ("native", "warp"):
-        balance_centres(points, masses, points[:3], steps=0, backend=backend)
-        op = getattr(torch.ops.voronerf, f"balance_centres_{backend}").default
-        torch.library.opcheck(op, (points, masses, points[:3], 2, 0.1, 8, False))
+    on_any_number_of_threads(lambda: balance_centres(points, masses, points[:150], steps=5, backend="native"))
 
 
 def test_refuses_what_makes_no_sense():
     points, masses = samples(5)
-    with refused(ValueError, "balance_centres: masses must have shape [m] with m = 5, got [4]"):
-        balance_centres(points, masses[:4], points[:2])
-    with refused(TypeError, "balance_centres: masses must have dtype float64, got float32"):
-        balance_centres(points, masses.float(), points[:2])
-    with refused(TypeError, "balance_centres: samples must have dtype float32, got float64"):
-        balance_centres(points.double(), masses, points[:2])
-    with refused(ValueError, "balance_centres: centres must hold at least one centre, got none"):
-        balance_centres(points, masses, points[:0])
-    with refused(ValueError, "balance_centres: steps must be at least 0, got -1"):
-        balance_centres(points, masses, points[:2], steps=-1)
-    with refused(ValueError, "balance_centres: neighbours must be at least 1, got 0"):
-        balance_centres(points, masses, points[:2], neighbours=0)
+    refuses = refusals(balance_centres, samples=points, masses=masses, centres=points[:2])
+    refuses("masses must have shape [m] with m = 5, got [4]", masses=masses[:4])
+    refuses("masses must have dtype float64, got float32", masses=masses.float())
+    refuses("samples must have dtype float32, got float64", samples=points.double())
+    refuses("centres must hold at least one centre, got none", centres=points[:0])
+    refuses("steps must be at least 0, got -1", steps=-1)
+    refuses("neighbours must be at least 1, got 0", neighbours=0)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import refused, strided
+from op_cases import refusals, strided
 
 from voronerf.ops import camera_rays
 from voronerf.rendering.cameras import Cameras, look_at
@@ -44,28 +44,12 @@ def test_rays_pass_through_their_pixels(device, backend, b, distorted):
         torch.testing.assert_close(found, want, atol=1e-6, rtol=0)
 
 
-@pytest.mark.warp
-def test_opcheck():
-    some = cameras(2, True)
-    x = torch.rand(5)
-    index = torch.tensor([0, 1, 1, 0, 1], dtype=torch.int32)
-    for camera, lens in ((index, some.distortion), (None, None)):
-        camera_rays(some.poses, some.intrinsics, x, x, camera=camera, distortion=lens, backend="warp")
-        given = (some.poses, some.intrinsics, x, x, camera, lens)
-        torch.library.opcheck(torch.ops.voronerf.camera_rays_warp.default, given)
-
-
 def test_refuses_what_makes_no_sense():
     some, x = cameras(2, True), torch.rand(5)
-    with refused(ValueError, "camera_rays: poses must have shape [c, 4, 4], got [2, 3, 4]"):
-        camera_rays(some.poses[:, :3], some.intrinsics, x, x)
-    with refused(ValueError, "camera_rays: y must have shape [b] with b = 5, got [4]"):
-        camera_rays(some.poses, some.intrinsics, x, x[1:])
-    with refused(TypeError, "camera_rays: camera must have dtype int32, got int64"):
-        camera_rays(some.poses, some.intrinsics, x, x, camera=torch.zeros(5, dtype=torch.int64))
-    with refused(ValueError, "camera_rays: distortion must have shape [c, 4] with c = 2, got [1, 4]"):
-        camera_rays(some.poses, some.intrinsics, x, x, distortion=torch.zeros(1, 4))
-    with refused(TypeError, "camera_rays: poses must have dtype float32, got float64"):
-        camera_rays(some.poses.double(), some.intrinsics, x, x)
-    with refused(ValueError, "camera_rays: poses must hold at least one camera, got none"):
-        camera_rays(some.poses[:0], some.intrinsics[:0], x, x)
+    refuses = refusals(camera_rays, poses=some.poses, intrinsics=some.intrinsics, x=x, y=x)
+    refuses("poses must have shape [c, 4, 4], got [2, 3, 4]", poses=some.poses[:, :3])
+    refuses("y must have shape [b] with b = 5, got [4]", y=x[1:])
+    refuses("camera must have dtype int32, got int64", camera=torch.zeros(5, dtype=torch.int64))
+    refuses("distortion must have shape [c, 4] with c = 2, got [1, 4]", distortion=torch.zeros(1, 4))
+    refuses("poses must have dtype float32, got float64", poses=some.poses.double())
+    refuses("poses must hold at least one camera, got none", poses=some.poses[:0], intrinsics=some.intrinsics[:0])

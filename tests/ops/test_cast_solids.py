@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import refused, strided
+from op_cases import refusals, strided
 
 from voronerf.ops import cast_solids
 
@@ -83,20 +83,10 @@ def test_by_hand(device, backend):
     assert bool((depths == inf).all()) and bool((which == -1).all())
 
 
-@pytest.mark.warp
-def test_opcheck():
-    given = [*solids(5), *rays(6)]
-    cast_solids(*given, backend="warp")
-    torch.library.opcheck(torch.ops.voronerf.cast_solids_warp.default, tuple(given))
-
-
 def test_refuses_what_makes_no_sense():
     kinds, frames, sizes, origins, directions = [*solids(3), *rays(5)]
-    with refused(ValueError, "cast_solids: frames must have shape [s, 4, 3] with s = 3, got [3, 3, 3]"):
-        cast_solids(kinds, frames[:, :3], sizes, origins, directions)
-    with refused(ValueError, "cast_solids: directions must have shape [r, 3] with r = 5, got [4, 3]"):
-        cast_solids(kinds, frames, sizes, origins, directions[1:])
-    with refused(TypeError, "cast_solids: kinds must have dtype int32, got int64"):
-        cast_solids(kinds.long(), frames, sizes, origins, directions)
-    with refused(TypeError, "cast_solids: frames must have dtype float32, got float64"):
-        cast_solids(kinds, frames.double(), sizes, origins, directions)
+    refuses = refusals(cast_solids, kinds=kinds, frames=frames, sizes=sizes, origins=origins, directions=directions)
+    refuses("frames must have shape [s, 4, 3] with s = 3, got [3, 3, 3]", frames=frames[:, :3])
+    refuses("directions must have shape [r, 3] with r = 5, got [4, 3]", directions=directions[1:])
+    refuses("kinds must have dtype int32, got int64", kinds=kinds.long())
+    refuses("frames must have dtype float32, got float64", frames=frames.double())

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from op_cases import refused
+from helpers import on_any_number_of_threads, same
+from op_cases import refusals
 from torch import Tensor
 
 from voronerf import backends
@@ -109,16 +110,16 @@ def test_instruction_sets_and_threads_build_the_same_grid(isa):
     with native.using_isa(native.SUPPORTED_ISAS[-1]):
         expected = centre_grid(centres, weights=weights)
     cells = nearest_centre(points, centres, weights=weights, backend="reference")
-    before = torch.get_num_threads()
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            grid = centre_grid(centres, weights=weights)
-            assert all(torch.equal(a, b) for a, b in zip(grid.tables[:4], expected.tables[:4]))
-            for n in (0, 1, 15, 17, len(points)):
-                assert torch.equal(nearest_centre(points[:n], centres, weights=weights, grid=grid), cells[:n])
-    finally:
-        torch.set_num_threads(before)
+    sizes = (0, 1, 15, 17, len(points))
+
+    def run():
+        grid = centre_grid(centres, weights=weights)
+        return [
+            *grid.tables[:4],
+            *(nearest_centre(points[:n], centres, weights=weights, grid=grid) for n in sizes),
+        ]
+
+    assert same(on_any_number_of_threads(run), [*expected.tables[:4], *(cells[:n] for n in sizes)])
 
 
 @native
@@ -163,27 +164,17 @@ def test_memory_is_bounded_where_no_centre_can_be_left_out(scale):
 
 def test_errors():
     points, centres, weights = torch.rand(4, 3), torch.rand(5, 3), torch.rand(5)
-    grid = centre_grid(centres)
-    with refused(ValueError, "nearest_centre: grid must be made from these centres and weights, got that of others"):
-        nearest_centre(points, centres + 1, grid=grid)
-    with refused(ValueError, "nearest_centre: grid must be made from these centres and weights, got that of others"):
-        nearest_centre(points, centres[:4], grid=grid)
-    with refused(ValueError, "nearest_centre: grid must be made from these centres and weights, got that of others"):
-        nearest_centre(points, centres, weights=weights, grid=grid)
-    with refused(TypeError, "nearest_centre: grid must be a CentreGrid, got Tensor"):
-        nearest_centre(points, centres, grid=centres)
-    with refused(ValueError, "centre_grid: centres must have shape [k, 3], got [5, 2]"):
-        centre_grid(centres[:, :2])
-    with refused(ValueError, "centre_grid: centres must hold at least one centre, got none"):
-        centre_grid(centres[:0])
-    with refused(ValueError, "centre_grid: centres must be finite, got NaN or infinity"):
-        centre_grid(torch.full((2, 3), torch.inf))
-    with refused(ValueError, "centre_grid: weights must be finite, got NaN or infinity"):
-        centre_grid(centres, weights=torch.full((5,), torch.nan))
-    with refused(TypeError, "centre_grid: centres must have dtype ... or float64, got int64"):
-        centre_grid(centres.long())
-    with refused(ValueError, "centre_grid: weights must have shape [k] with k = 5, got [4]"):
-        centre_grid(centres, weights=weights[:4])
+    refuses = refusals(nearest_centre, points=points, centres=centres, grid=centre_grid(centres))
+    for others in ({"centres": centres + 1}, {"centres": centres[:4]}, {"weights": weights}):
+        refuses("grid must be made from these centres and weights, got that of others", **others)
+    refuses("grid must be a CentreGrid, got Tensor", grid=centres)
+    refuses = refusals(centre_grid, centres=centres)
+    refuses("centres must have shape [k, 3], got [5, 2]", centres=centres[:, :2])
+    refuses("centres must hold at least one centre, got none", centres=centres[:0])
+    refuses("centres must be finite, got NaN or infinity", centres=torch.full((2, 3), torch.inf))
+    refuses("weights must be finite, got NaN or infinity", weights=torch.full((5,), torch.nan))
+    refuses("centres must have dtype ... or float64, got int64", centres=centres.long())
+    refuses("weights must have shape [k] with k = 5, got [4]", weights=weights[:4])
 
 
 @native

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from op_cases import FLOATS, need, offsets_of, refused, strided
+from op_cases import FLOATS, need, offsets_of, refusals, strided
 from tolerances import assert_as_exact
 
 from voronerf.ops import Composite, composite
@@ -209,52 +209,21 @@ def test_gradients_of_the_backend(device, backend, form):
         assert_as_exact(found, same, right)
 
 
-def test_compiles(device, backend):
-    inputs = [tensor.to(device).requires_grad_() for tensor in rays(4, 9)]
-    packed = [tensor.detach().flatten(0, 1).requires_grad_() for tensor in inputs]
-    ray_offsets = offsets_of([9, 0, 20, 7], device)
-    background = torch.ones(3, device=device)
-    dense = lambda *a: composite(*a, background=background, backend=backend)  # noqa: E731
-    sparse = lambda *a: composite(*a, ray_offsets=ray_offsets, backend=backend)  # noqa: E731
-    for run, leaves in ((dense, inputs), (sparse, packed)):
-        found = torch.compile(run, fullgraph=True, backend="aot_eager")(*leaves)
-        for part, expected in zip(found, run(*leaves)):
-            torch.testing.assert_close(part, expected, rtol=1e-5, atol=1e-6)
-        assert all(
-            gradient.isfinite().all() for gradient in torch.autograd.grad(found[0].sum(), leaves, allow_unused=False)
-        )
-
-
 def test_errors():
     sigma, rgb, depths, deltas = rays(4, 5)
-    with refused(ValueError, "composite: sigma must have shape [r, s], got [20]"):
-        composite(sigma.flatten(), rgb, depths, deltas)
-    with pytest.raises(
-        ValueError, match=r"^composite: rgb must have shape \[r, s, c\] with r = 4, s = 5, got \[4, 5\]$"
-    ):
-        composite(sigma, depths, depths, deltas)
-    with pytest.raises(
-        ValueError, match=r"^composite: depths must have shape \[r, s\] with r = 4, s = 5, got \[4, 4\]$"
-    ):
-        composite(sigma, rgb, depths[:, 1:], deltas)
-    with pytest.raises(
-        ValueError, match=r"^composite: deltas must have shape \[r, s\] with r = 4, s = 5, got \[3, 5\]$"
-    ):
-        composite(sigma, rgb, depths, deltas[1:])
-    with refused(ValueError, "composite: sigma must have shape [m], got [4, 5]"):
-        composite(sigma, rgb, depths, deltas, ray_offsets=offsets_of([5] * 4))
-    with refused(ValueError, "composite: background must have shape [c] with c = 3, got [4]"):
-        composite(sigma, rgb, depths, deltas, background=torch.zeros(4))
-    with pytest.raises(
-        ValueError, match=r"^composite: background must have shape \[r, c\] with r = 4, c = 3, got \[5, 3\]$"
-    ):
-        composite(sigma, rgb, depths, deltas, background=torch.zeros(5, 3))
-    with refused(TypeError, "composite: rgb must have the dtype of sigma, float32, got float64"):
-        composite(sigma, rgb.double(), depths, deltas)
-    with refused(TypeError, "composite: sigma must have dtype ... or float64, got int64"):
-        composite(sigma.long(), rgb, depths, deltas)
+    refuses = refusals(composite, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas)
+    refuses("sigma must have shape [r, s], got [20]", sigma=sigma.flatten())
+    refuses("rgb must have shape [r, s, c] with r = 4, s = 5, got [4, 5]", rgb=depths)
+    refuses("depths must have shape [r, s] with r = 4, s = 5, got [4, 4]", depths=depths[:, 1:])
+    refuses("deltas must have shape [r, s] with r = 4, s = 5, got [3, 5]", deltas=deltas[1:])
+    refuses("sigma must have shape [m], got [4, 5]", ray_offsets=offsets_of([5] * 4))
+    refuses("background must have shape [c] with c = 3, got [4]", background=torch.zeros(4))
+    refuses("background must have shape [r, c] with r = 4, c = 3, got [5, 3]", background=torch.zeros(5, 3))
+    refuses("rgb must have the dtype of sigma, float32, got float64", rgb=rgb.double())
+    refuses("sigma must have dtype ... or float64, got int64", sigma=sigma.long())
     packed = pack((sigma, rgb, depths, deltas), [5] * 4)
-    with refused(TypeError, "composite: ray_offsets must have dtype int32, got int64"):
-        composite(*packed, ray_offsets=offsets_of([5] * 4).long())
-    with refused(ValueError, "composite: depths must be on the device of sigma, cpu, got meta"):
-        composite(sigma, rgb, depths.to("meta"), deltas)
+    names = ("sigma", "rgb", "depths", "deltas")
+    refuses(
+        "ray_offsets must have dtype int32, got int64", **dict(zip(names, packed)), ray_offsets=offsets_of([20]).long()
+    )
+    refuses("depths must be on the device of sigma, cpu, got meta", depths=depths.to("meta"))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from op_cases import FLOATS, need, refused, strided
+from op_cases import FLOATS, need, refusals
 from tolerances import assert_as_exact
 
 from voronerf.ops import frequency_encode
@@ -50,12 +50,6 @@ def test_dtypes(device, backend, dtype):
     assert_as_exact(frequency_encode(x.to(device), 10, backend=backend), exact.to(dtype), exact)
 
 
-def test_strided(device, backend):
-    x = torch.rand(33, 3, device=device)
-    found, expected = (frequency_encode(each, 5, backend=backend) for each in (strided(x), x))
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-
-
 def test_gradient_matches_the_formula(device, backend):
     x = torch.rand(31, 3, device=device, requires_grad=True)
     g = torch.randn(31, 3 + 6 * 6, device=device)
@@ -75,20 +69,10 @@ def test_gradcheck(include_input):
     assert torch.autograd.gradgradcheck(run, x)
 
 
-def test_compiles(device, backend):
-    compiled = torch.compile(lambda x: frequency_encode(x, 4, backend=backend), fullgraph=True, backend="aot_eager")
-    for n in (5, 8):
-        x = torch.rand(n, 3, device=device)
-        torch.testing.assert_close(compiled(x), frequency_encode(x, 4, backend=backend), rtol=0, atol=1e-6)
-
-
 def test_errors():
     x = torch.rand(4, 3)
-    with refused(ValueError, "frequency_encode: x must have shape [n, d], got [3]"):
-        frequency_encode(x[0], 2)
-    with refused(ValueError, "frequency_encode: octaves must be at least 0, got -1"):
-        frequency_encode(x, -1)
-    with refused(TypeError, "frequency_encode: octaves must be an integer, got float"):
-        frequency_encode(x, 2.0)
-    with refused(TypeError, "frequency_encode: x must have dtype ... or float64, got int32"):
-        frequency_encode(x.int(), 2)
+    refuses = refusals(frequency_encode, x=x, octaves=2)
+    refuses("x must have shape [n, d], got [3]", x=x[0])
+    refuses("octaves must be at least 0, got -1", octaves=-1)
+    refuses("octaves must be an integer, got float", octaves=2.0)
+    refuses("x must have dtype ... or float64, got int32", x=x.int())

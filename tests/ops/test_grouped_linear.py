@@ -3,7 +3,7 @@ from __future__ import annotations
 import loops
 import pytest
 import torch
-from op_cases import COUNTS, FLOATS, HALVES, need, offsets_of, refused, strided
+from op_cases import COUNTS, FLOATS, HALVES, need, offsets_of, refusals, strided
 from tolerances import assert_as_exact
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -207,46 +207,21 @@ def test_autocast(device, backend):
     assert weight.grad.dtype == bias.grad.dtype == x.grad.dtype == torch.float32
 
 
-def test_compiles(device, backend):
-    counts = COUNTS["odd"]
-    leaves = [tensor.to(device).requires_grad_() for tensor in layer(counts, 7, 5)]
-    offsets = offsets_of(counts, device)
-
-    def run(x, weight, bias):
-        return grouped_linear(x, offsets, weight, bias, activation="sigmoid", backend=backend).square()
-
-    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(*leaves), run(*leaves))
-    found, expected = (torch.autograd.grad(each(*leaves).sum(), leaves) for each in (compiled, run))
-    for part, other in zip(found, expected):
-        torch.testing.assert_close(part, other)
-
-
 def test_errors():
     x, weight, bias = layer([2, 3], 4, 5)
     offsets = offsets_of([2, 3])
-    with refused(ValueError, "grouped_linear: x must have shape [n, i], got [5]"):
-        grouped_linear(x[:, 0], offsets, weight, bias)
-    with refused(ValueError, "grouped_linear: weight must have shape [k, o, i] with i = 3, got [2, 5, 4]"):
-        grouped_linear(x[:, :3], offsets, weight, bias)
-    with refused(ValueError, "grouped_linear: offsets must have shape [k+1] with k = 2, got [2]"):
-        grouped_linear(x, offsets[1:], weight, bias)
-    with refused(ValueError, "grouped_linear: bias must have shape [k, o] with k = 2, o = 5, got [2, 4]"):
-        grouped_linear(x, offsets, weight, bias[:, 1:])
-    with refused(ValueError, "grouped_linear: weight must have no empty dimension, got [2, 0, 4]"):
-        grouped_linear(x, offsets, weight[:, :0])
-    with refused(ValueError, "grouped_linear: activation must be one of none, relu, ..., sine, got 'tanh'"):
-        grouped_linear(x, offsets, weight, activation="tanh")
-    with refused(TypeError, "grouped_linear: offsets must have dtype int32, got int64"):
-        grouped_linear(x, offsets.long(), weight)
-    with refused(TypeError, "grouped_linear: weight must have the dtype of x, float32, got float64"):
-        grouped_linear(x, offsets, weight.double())
-    with refused(TypeError, "grouped_linear: bias must have the dtype of x, float32, got float16"):
-        grouped_linear(x, offsets, weight, bias.half())
-    with refused(TypeError, "grouped_linear: x must have dtype ..., got int32"):
-        grouped_linear(x.int(), offsets, weight)
-    with refused(ValueError, "grouped_linear: weight must be on the device of x, cpu, got meta"):
-        grouped_linear(x, offsets, weight.to("meta"))
+    refuses = refusals(grouped_linear, x=x, offsets=offsets, weight=weight)
+    refuses("x must have shape [n, i], got [5]", x=x[:, 0])
+    refuses("weight must have shape [k, o, i] with i = 3, got [2, 5, 4]", x=x[:, :3])
+    refuses("offsets must have shape [k+1] with k = 2, got [2]", offsets=offsets[1:])
+    refuses("bias must have shape [k, o] with k = 2, o = 5, got [2, 4]", bias=bias[:, 1:])
+    refuses("weight must have no empty dimension, got [2, 0, 4]", weight=weight[:, :0])
+    refuses("activation must be one of none, relu, ..., sine, got 'tanh'", activation="tanh")
+    refuses("offsets must have dtype int32, got int64", offsets=offsets.long())
+    refuses("weight must have the dtype of x, float32, got float64", weight=weight.double())
+    refuses("bias must have the dtype of x, float32, got float16", bias=bias.half())
+    refuses("x must have dtype ..., got int32", x=x.int())
+    refuses("weight must be on the device of x, cpu, got meta", weight=weight.to("meta"))
 
 
 @pytest.mark.parametrize("bad", [[0, 2, 6], [0, 4, 3], [-1, 2, 5]])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import loops
 import pytest
 import torch
-from op_cases import COUNTS, FLOATS, need, offsets_of, refused, strided
+from op_cases import COUNTS, FLOATS, need, offsets_of, refusals, refused
 from tolerances import assert_as_exact, error
 from torch import Tensor
 
@@ -230,16 +230,6 @@ def test_wide_positions_with_half_weights_keep_their_octaves(device, backend):
     assert error(found, exact) < 0.02
 
 
-def test_layouts(device, backend):
-    case = Case.make("nerf", COUNTS["odd"])
-    leaves = [tensor.to(device) for tensor in case.inputs]
-    expected = case.run(grouped_mlp, leaves, backend=backend)
-    case.offsets, case.direction_index = strided(case.offsets), strided(case.direction_index)
-    found = case.run(grouped_mlp, [strided(tensor).requires_grad_() for tensor in leaves], backend=backend)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
-    found.sum().backward()
-
-
 def test_rows_of_no_cell_are_zero(device, backend):
     case = Case.make("nerf", [4, 4, 4])
     case.offsets = torch.tensor([2, 5, 5, 9], dtype=torch.int32)
@@ -384,45 +374,35 @@ def test_errors():
         "direction_index": case.direction_index,
     }
 
-    def call(**changed):
-        return grouped_mlp(**{**good, **changed})
-
-    assert call().shape == (5, 4)
-    weights, op = parameters[:count], "grouped_mlp"
-    with refused(ValueError, f"{op}: positions must have shape [n, p], got [5]"):
-        call(positions=positions[:, 0])
-    with refused(TypeError, f"{op}: positions must have dtype ..., got int32"):
-        call(positions=positions.int())
-    with refused(TypeError, f"{op}: offsets must have dtype int32, got int64"):
-        call(offsets=case.offsets.long())
-    with refused(ValueError, f"{op}: offsets must have at least two entries, got [1]"):
-        call(offsets=case.offsets[:1])
-    with refused(ValueError, f"{op}: directions must be given for layers that read them, got None"):
-        call(directions=None, direction_index=None)
+    weights, refuses = parameters[:count], refusals(grouped_mlp, **good)
+    refuses("positions must have shape [n, p], got [5]", positions=positions[:, 0])
+    refuses("positions must have dtype ..., got int32", positions=positions.int())
+    refuses("offsets must have dtype int32, got int64", offsets=case.offsets.long())
+    refuses("offsets must have at least two entries, got [1]", offsets=case.offsets[:1])
+    refuses("directions must be given for layers that read them, got None", directions=None, direction_index=None)
     harmonics = MLP((Layer((DIRECTIONS,), 4),), (0,), direction_encoding="spherical", direction_degree=2)
-    with refused(ValueError, f"{op}: directions must have 3 features where they are spherical, got 2"):
-        call(directions=directions[:, :2], layers=harmonics)
-    with refused(ValueError, f"{op}: direction_index must come with directions, got no directions"):
-        call(directions=None, layers=TABLES["plain"])
-    with refused(ValueError, f"{op}: directions must have shape [n, q] with n = 5, got [4, 3]"):
-        call(directions=directions[:4], direction_index=None)
-    with refused(TypeError, f"{op}: directions must have dtype ..., got bool"):
-        call(directions=directions > 0)
-    with refused(ValueError, f"{op}: direction_index must have shape [n] with n = 5, got [4]"):
-        call(direction_index=case.direction_index[1:])
-    with refused(TypeError, f"{op}: direction_index must have dtype int32, got int64"):
-        call(direction_index=case.direction_index.long())
-    with refused(ValueError, f"{op}: weights must have one entry for each of 7 layers, got 6"):
-        call(weights=weights[1:])
-    with refused(ValueError, f"{op}: biases must have one entry for each of 7 layers, got 0"):
-        call(biases=[])
-    with refused(ValueError, f"{op}: weights[2] must have shape [k, 16, 37] with k = 2, got [2, 16, 16]"):
-        call(weights=[*weights[:2], weights[1], *weights[3:]])
-    with refused(TypeError, f"{op}: weights[1] must have dtype float32, got float64"):
-        call(weights=[weights[0], *(weight.double() for weight in weights[1:])])
-    with refused(ValueError, f"{op}: biases[0] must have shape [k, 16] with k = 2, got [2, 15]"):
-        call(biases=[torch.zeros(2, 15), *[None] * 6])
-    with refused(TypeError, f"{op}: biases[0] must have the dtype of weights[0], float32, got float16"):
-        call(biases=[torch.zeros(2, 16).half(), *[None] * 6])
-    with refused(ValueError, f"{op}: weights[0] must be on the device of positions, cpu, got meta"):
-        call(weights=[weights[0].to("meta"), *weights[1:]])
+    two = directions[:, :2]
+    refuses("directions must have 3 features where they are spherical, got 2", directions=two, layers=harmonics)
+    refuses("direction_index must come with directions, got no directions", directions=None, layers=TABLES["plain"])
+    refuses("directions must have shape [n, q] with n = 5, got [4, 3]", directions=directions[:4], direction_index=None)
+    refuses("directions must have dtype ..., got bool", directions=directions > 0)
+    refuses("direction_index must have shape [n] with n = 5, got [4]", direction_index=case.direction_index[1:])
+    refuses("direction_index must have dtype int32, got int64", direction_index=case.direction_index.long())
+    refuses("weights must have one entry for each of 7 layers, got 6", weights=weights[1:])
+    refuses("biases must have one entry for each of 7 layers, got 0", biases=[])
+    refuses(
+        "weights[2] must have shape [k, 16, 37] with k = 2, got [2, 16, 16]",
+        weights=[*weights[:2], weights[1], *weights[3:]],
+    )
+    refuses(
+        "weights[1] must have dtype float32, got float64",
+        weights=[weights[0], *(weight.double() for weight in weights[1:])],
+    )
+    refuses("biases[0] must have shape [k, 16] with k = 2, got [2, 15]", biases=[torch.zeros(2, 15), *[None] * 6])
+    refuses(
+        "biases[0] must have the dtype of weights[0], float32, got float16",
+        biases=[torch.zeros(2, 16).half(), *[None] * 6],
+    )
+    refuses(
+        "weights[0] must be on the device of positions, cpu, got meta", weights=[weights[0].to("meta"), *weights[1:]]
+    )

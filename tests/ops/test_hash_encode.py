@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from op_cases import FLOATS, need, refused, strided
+from helpers import on_any_number_of_threads
+from op_cases import FLOATS, need, refusals, refused
 from tolerances import assert_as_exact
 
 from voronerf import HashGrid
@@ -164,37 +165,21 @@ def test_outside_of_the_box_and_nan(device, backend):
     assert hash_encode(x * torch.nan, table, grid, backend=backend).isnan().all()
 
 
-def test_strided(device, backend):
-    grid = GRIDS["both"]
-    x, table = points(33, grid).to(device), features(grid).to(device)
-    found = hash_encode(strided(x), strided(table), grid, backend=backend)
-    torch.testing.assert_close(found, hash_encode(x, table, grid, backend=backend), rtol=0, atol=0)
-
-
-def test_compiles(device, backend):
-    grid = GRIDS["both"]
-    table = features(grid).to(device)
-    compiled = torch.compile(
-        lambda x: hash_encode(x, table, grid, backend=backend), fullgraph=True, backend="aot_eager"
-    )
-    for n in (5, 8):
-        x = points(n, grid).to(device)
-        torch.testing.assert_close(compiled(x), hash_encode(x, table, grid, backend=backend), rtol=0, atol=1e-6)
-
-
 def test_errors():
     grid = GRIDS["dense"]
     x, table = torch.rand(4, 3), features(grid)
-    with refused(ValueError, "hash_encode: positions must have shape [n, 3], got [4, 2]"):
-        hash_encode(x[:, :2], table, grid)
-    with refused(ValueError, f"hash_encode: table must have shape [{len(table)}, 2], got [{len(table) - 1}, 2]"):
-        hash_encode(x, table[1:], grid)
-    with refused(TypeError, "hash_encode: table must have dtype ... or float64, got int32"):
-        hash_encode(x, table.int(), grid)
-    with refused(ValueError, f"hash_encode: table must have shape [k, {len(table)}, 2], got [{len(table)}, 2]"):
-        hash_encode(x, table, grid, cells=torch.zeros(4, dtype=torch.int32))
-    with refused(ValueError, "hash_encode: cells must lie in 0 to 1, got values from 0 to 2"):
-        hash_encode(x, table.expand(2, -1, -1), grid, cells=torch.tensor([0, 2, 0, 0], dtype=torch.int32))
+    refuses = refusals(hash_encode, positions=x, table=table, grid=grid)
+    refuses("positions must have shape [n, 3], got [4, 2]", positions=x[:, :2])
+    refuses(f"table must have shape [{len(table)}, 2], got [{len(table) - 1}, 2]", table=table[1:])
+    refuses("table must have dtype ... or float64, got int32", table=table.int())
+    refuses(
+        f"table must have shape [k, {len(table)}, 2], got [{len(table)}, 2]", cells=torch.zeros(4, dtype=torch.int32)
+    )
+    refuses(
+        "cells must lie in 0 to 1, got values from 0 to 2",
+        table=table.expand(2, -1, -1),
+        cells=torch.tensor([0, 2, 0, 0], dtype=torch.int32),
+    )
 
 
 @pytest.mark.parametrize(
@@ -253,15 +238,7 @@ def test_every_instruction_set(isa, poisoned, name, dtype, several):
 def test_bits_do_not_depend_on_threads():
     grid, n = GRIDS["both"], 3000
     x, table = points(n, grid), features(grid)
-    before, found = torch.get_num_threads(), []
-    try:
-        for count in (1, 2, 5):
-            torch.set_num_threads(count)
-            found.append(derivatives(hash_encode, grid, x, table, None, torch.float32))
-    finally:
-        torch.set_num_threads(before)
-    for others in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], others, strict=True))
+    on_any_number_of_threads(lambda: derivatives(hash_encode, grid, x, table, None, torch.float32), (1, 2, 5))
 
 
 def test_third_derivatives(backend):
@@ -293,19 +270,3 @@ def test_only_what_is_asked_for_is_computed():
     x.requires_grad_(False)
     hash_encode(x, table, grid, backend="native").sum().backward()
     assert x.grad is None and torch.equal(table.grad, of_table)
-
-
-@pytest.mark.native
-def test_opcheck():
-    grid = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=20, box=BOX)
-    hash_encode(points(3, grid), features(grid), grid, backend="native")  # registers the ops
-    x, table = points(7, grid).requires_grad_(), features(grid).requires_grad_()
-    cells = torch.zeros(7, dtype=torch.int32)
-    for direction, which in ((None, None), (torch.randn(7, 3), cells)):
-        tables = table if which is None else table.detach()[None]
-        torch.library.opcheck(torch.ops.voronerf.hash_encode_native.default, (x, tables, direction, which, grid.text))
-        gradient = torch.randn(7, grid.out_features)
-        torch.library.opcheck(
-            torch.ops.voronerf.hash_encode_native_backward.default,
-            (gradient, x, tables, direction, which, grid.text, True, True),
-        )

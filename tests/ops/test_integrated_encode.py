@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import FLOATS, need, refused, strided
+from op_cases import FLOATS, need, refusals, strided
 from tolerances import assert_as_exact
 
 from voronerf.ops import frequency_encode, integrated_encode
@@ -61,24 +61,12 @@ def test_gradcheck():
     assert torch.autograd.gradcheck(lambda m, v: integrated_encode(m, v, 3), (means, variances))
 
 
-def test_compiles(device, backend):
-    means, variances = torch.rand(9, 3, device=device), torch.rand(9, 3, device=device)
-    run = lambda m, v: integrated_encode(m, v, 4, backend=backend)  # noqa: E731
-    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(means, variances), run(means, variances), rtol=0, atol=1e-6)
-
-
 def test_errors():
     means = torch.rand(4, 3)
-    with refused(ValueError, "integrated_encode: means must have shape [n, 3], got [4, 2]"):
-        integrated_encode(means[:, :2], means, 2)
-    with refused(ValueError, "integrated_encode: variances must have shape [n, 3] with n = 4, got [3, 3]"):
-        integrated_encode(means, means[:3], 2)
-    with refused(TypeError, "integrated_encode: variances must have the dtype of means, float32, got float64"):
-        integrated_encode(means, means.double(), 2)
-    with refused(TypeError, "integrated_encode: means must have dtype ... or float64, got int64"):
-        integrated_encode(means.long(), means, 2)
-    with refused(ValueError, "integrated_encode: octaves must be at least 0, got -2"):
-        integrated_encode(means, means, -2)
-    with refused(ValueError, "integrated_encode: variances must be on the device of means, cpu, got meta"):
-        integrated_encode(means, means.to("meta"), 2)
+    refuses = refusals(integrated_encode, means=means, variances=means, octaves=2)
+    refuses("means must have shape [n, 3], got [4, 2]", means=means[:, :2])
+    refuses("variances must have shape [n, 3] with n = 4, got [3, 3]", variances=means[:3])
+    refuses("variances must have the dtype of means, float32, got float64", variances=means.double())
+    refuses("means must have dtype ... or float64, got int64", means=means.long())
+    refuses("octaves must be at least 0, got -2", octaves=-2)
+    refuses("variances must be on the device of means, cpu, got meta", variances=means.to("meta"))

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import refused, strided
+from op_cases import refusals, strided
 
 from voronerf.ops import locate_cell, nearest_centre
 
@@ -73,38 +73,17 @@ def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device,
     assert leaf.tolist() == [5, 5]
 
 
-def test_compiles(device, backend):
-    points, centres = torch.rand(501, 3, device=device), torch.rand(10, 3, device=device)
-    offsets, child = CHILD_OFFSETS.to(device), CHILD.to(device)
-
-    def run(points):
-        return locate_cell(points, centres, offsets, child, depth=DEPTH, backend=backend)
-
-    assert torch.equal(torch.compile(run, fullgraph=True, backend="aot_eager")(points), run(points))
-
-
 def test_errors():
     points, centres = torch.rand(4, 3), torch.rand(10, 3)
-    tables = (CHILD_OFFSETS, CHILD)
-    with refused(ValueError, "locate_cell: points must have shape [n, 3], got [3]"):
-        locate_cell(points[0], centres, *tables, depth=3)
-    with refused(ValueError, "locate_cell: centres must have shape [m, 3], got [10, 2]"):
-        locate_cell(points, centres[:, :2], *tables, depth=3)
-    with refused(ValueError, "locate_cell: child must have shape [m] with m = 9, got [10]"):
-        locate_cell(points, centres[:9], *tables, depth=3)
-    with refused(ValueError, "locate_cell: child_offsets must have shape [g+1], got [0]"):
-        locate_cell(points, centres, CHILD_OFFSETS[:0], CHILD, depth=3)
-    with refused(ValueError, "locate_cell: weights must have shape [m] with m = 10, got [1]"):
-        locate_cell(points, centres, *tables, depth=3, weights=torch.zeros(1))
-    with refused(ValueError, "locate_cell: depth must be at least 1, got 0"):
-        locate_cell(points, centres, *tables, depth=0)
-    with refused(ValueError, "locate_cell: centres must hold ... got 0 centres in 4 diagrams"):
-        locate_cell(points, centres[:0], CHILD_OFFSETS, CHILD[:0], depth=1)
-    with refused(TypeError, "locate_cell: child must have dtype int32, got int64"):
-        locate_cell(points, centres, CHILD_OFFSETS, CHILD.long(), depth=3)
-    with refused(TypeError, "locate_cell: child_offsets must have dtype int32, got int64"):
-        locate_cell(points, centres, CHILD_OFFSETS.long(), CHILD, depth=3)
-    with refused(TypeError, "locate_cell: depth must be an integer, got float"):
-        locate_cell(points, centres, *tables, depth=1.0)
-    with refused(ValueError, "locate_cell: child must be on the device of points, cpu, got meta"):
-        locate_cell(points, centres, CHILD_OFFSETS, CHILD.to("meta"), depth=3)
+    refuses = refusals(locate_cell, points=points, centres=centres, child_offsets=CHILD_OFFSETS, child=CHILD, depth=3)
+    refuses("points must have shape [n, 3], got [3]", points=points[0])
+    refuses("centres must have shape [m, 3], got [10, 2]", centres=centres[:, :2])
+    refuses("child must have shape [m] with m = 9, got [10]", centres=centres[:9])
+    refuses("child_offsets must have shape [g+1], got [0]", child_offsets=CHILD_OFFSETS[:0])
+    refuses("weights must have shape [m] with m = 10, got [1]", weights=torch.zeros(1))
+    refuses("depth must be at least 1, got 0", depth=0)
+    refuses("centres must hold ... got 0 centres in 4 diagrams", centres=centres[:0], child=CHILD[:0], depth=1)
+    refuses("child must have dtype int32, got int64", child=CHILD.long())
+    refuses("child_offsets must have dtype int32, got int64", child_offsets=CHILD_OFFSETS.long())
+    refuses("depth must be an integer, got float", depth=1.0)
+    refuses("child must be on the device of points, cpu, got meta", child=CHILD.to("meta"))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import need, refused, strided
+from helpers import on_any_number_of_threads
+from op_cases import need, refusals
 from torch import Tensor
 
 from voronerf.ops import march_rays
@@ -119,85 +120,28 @@ def test_rays_of_no_length_and_of_no_numbers_have_no_samples(device, backend):
     assert found.stop.tolist() == [8] * 6
 
 
-def test_strided_inputs(device, backend):
-    given = case(20)
-    expected = march(given, 12, device, backend, uniforms=torch.full((20, 12), 0.25))
-    scattered = {
-        name: strided(tensor.float()) > 0 if name == "occupied" else strided(tensor) for name, tensor in given.items()
-    }
-    same(march(scattered, 12, device, backend, uniforms=strided(torch.full((20, 12), 0.25))), expected)
-
-
-def test_compiles_whole_with_a_capacity(device, backend):
-    given = case(5)
-    compiled = torch.compile(
-        lambda *tensors: march_rays(*tensors, 9, capacity=50, backend=backend), fullgraph=True, backend="aot_eager"
-    )
-    arguments = [tensor.to(device) for tensor in given.values()]
-    same(
-        type(march(given, 9, device, backend))(*(part.cpu() for part in compiled(*arguments))),
-        march(given, 9, device, backend, capacity=50),
-    )
-
-
 @pytest.mark.native
-def test_native_ops_pass_opcheck():
-    ops = torch.ops.voronerf
-
-    given = [*case(5).values(), None, None]
-    rest = (9, False, 9)
-    for options in ((given, 40), ([*given[:6], torch.rand(5, 9), torch.zeros(5, dtype=torch.int32)], 3)):
-        inputs, capacity = options
-        torch.library.opcheck(torch.ops.voronerf.march_rays_native_count.default, (*inputs, *rest, capacity))
-        tables = ops.march_rays_native_count(*inputs, *rest, capacity)
-        torch.library.opcheck(torch.ops.voronerf.march_rays_native_fill.default, (*inputs, *tables, *rest, capacity))
-
-
-@pytest.mark.native
-@pytest.mark.parametrize("threads", [1, 3])
-def test_instruction_sets_and_threads_agree(isa, threads):
+def test_instruction_sets_and_threads_agree(isa):
     given, uniforms = case(300, (9, 8, 7)), torch.rand(300, 70)
     expected = march(given, 70, torch.device("cpu"), "reference", uniforms=uniforms, most=9)
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        same(march(given, 70, torch.device("cpu"), "native", uniforms=uniforms, most=9), expected)
-    finally:
-        torch.set_num_threads(before)
+    run = lambda: march(given, 70, torch.device("cpu"), "native", uniforms=uniforms, most=9)  # noqa: E731
+    on_any_number_of_threads(run)
+    same(run(), expected)
 
 
 def test_refuses_what_makes_no_sense():
-    given = case(4)
-
-    def run(samples=8, **changes):
-        options = {name: changes.pop(name) for name in list(changes) if name not in given}
-        march_rays(*(given | changes).values(), samples, **options)
-
-    with refused(ValueError, "march_rays: directions must have shape [r, 3] with r = 4, got [5, 3]"):
-        run(directions=torch.zeros(5, 3))
-    with refused(ValueError, "march_rays: near must have shape [r] with r = 4, got [3]"):
-        run(near=torch.zeros(3))
-    with refused(TypeError, "march_rays: occupied must have dtype bool, got uint8"):
-        run(occupied=torch.ones(2, 2, 2, dtype=torch.uint8))
-    with refused(ValueError, "march_rays: occupied must have at least one cell, got [2, 0, 2]"):
-        run(occupied=torch.ones(2, 0, 2, dtype=torch.bool))
-    with refused(TypeError, "march_rays: origins must have dtype float32 or float64, got float16"):
-        run(origins=torch.zeros(4, 3).half())
-    with refused(TypeError, "march_rays: far must have the dtype of origins, float32, got float64"):
-        run(far=torch.zeros(4).double())
-    with refused(ValueError, "march_rays: box must have shape [2, 3], got [3, 2]"):
-        run(box=torch.zeros(3, 2))
-    with refused(ValueError, "march_rays: samples must be at least 1, got 0"):
-        run(0)
-    with refused(ValueError, "march_rays: samples must be at most 65535, got 65536"):
-        run(65_536)
-    with refused(ValueError, "march_rays: uniforms must have shape [r, s] with r = 4, s = 8, got [4, 7]"):
-        run(uniforms=torch.zeros(4, 7))
-    with refused(TypeError, "march_rays: start must have dtype int32, got int64"):
-        run(start=torch.zeros(4, dtype=torch.int64))
-    with refused(ValueError, "march_rays: most must be at least 1, got 0"):
-        run(most=0)
-    with refused(ValueError, "march_rays: capacity must be at least 1, got 0"):
-        run(capacity=0)
-    with refused(ValueError, "march_rays: spacing must be one of linear, disparity, got 'log'"):
-        run(spacing="log")
+    refuses = refusals(march_rays, **case(4), samples=8)
+    refuses("directions must have shape [r, 3] with r = 4, got [5, 3]", directions=torch.zeros(5, 3))
+    refuses("near must have shape [r] with r = 4, got [3]", near=torch.zeros(3))
+    refuses("occupied must have dtype bool, got uint8", occupied=torch.ones(2, 2, 2, dtype=torch.uint8))
+    refuses("occupied must have at least one cell, got [2, 0, 2]", occupied=torch.ones(2, 0, 2, dtype=torch.bool))
+    refuses("origins must have dtype float32 or float64, got float16", origins=torch.zeros(4, 3).half())
+    refuses("far must have the dtype of origins, float32, got float64", far=torch.zeros(4).double())
+    refuses("box must have shape [2, 3], got [3, 2]", box=torch.zeros(3, 2))
+    refuses("samples must be at least 1, got 0", samples=0)
+    refuses("samples must be at most 65535, got 65536", samples=65_536)
+    refuses("uniforms must have shape [r, s] with r = 4, s = 8, got [4, 7]", uniforms=torch.zeros(4, 7))
+    refuses("start must have dtype int32, got int64", start=torch.zeros(4, dtype=torch.int64))
+    refuses("most must be at least 1, got 0", most=0)
+    refuses("capacity must be at least 1, got 0", capacity=0)
+    refuses("spacing must be one of linear, disparity, got 'log'", spacing="log")

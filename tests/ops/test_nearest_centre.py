@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import FLOATS, HALVES, need, refused, strided
+from op_cases import FLOATS, HALVES, need, refusals, strided
 
 from voronerf.backends import BackendUnavailable
 from voronerf.ops import nearest_centre
@@ -91,31 +91,16 @@ def test_is_not_differentiable(device, backend):
     assert not nearest_centre(points, centres, backend=backend).requires_grad
 
 
-def test_compiles(device, backend):
-    points, centres = torch.rand(20000, 3, device=device), torch.rand(16, 3, device=device)
-    compiled = torch.compile(
-        lambda p, c: nearest_centre(p, c, backend=backend) + 1, fullgraph=True, backend="aot_eager"
-    )
-    assert torch.equal(compiled(points, centres), nearest_centre(points, centres, backend=backend) + 1)
-
-
 def test_errors():
     points, centres = torch.rand(4, 3), torch.rand(2, 3)
-    with refused(ValueError, "nearest_centre: points must have shape [n, 3], got [4, 2]"):
-        nearest_centre(points[:, :2], centres)
-    with refused(ValueError, "nearest_centre: centres must have shape [k, 3], got [3]"):
-        nearest_centre(points, centres[0])
-    with refused(ValueError, "nearest_centre: centres must hold at least one centre, got none"):
-        nearest_centre(points, centres[:0])
-    with refused(ValueError, "nearest_centre: weights must have shape [k] with k = 2, got [3]"):
-        nearest_centre(points, centres, weights=torch.zeros(3))
-    with refused(TypeError, "nearest_centre: points must have dtype ... or float64, got int64"):
-        nearest_centre(points.long(), centres)
-    with refused(TypeError, "nearest_centre: centres must have dtype ... or float64, got int64"):
-        nearest_centre(points, centres.long())
-    with refused(TypeError, "nearest_centre: weights must have dtype ... or float64, got bool"):
-        nearest_centre(points, centres, weights=torch.zeros(2, dtype=torch.bool))
-    with refused(ValueError, "nearest_centre: centres must be on the device of points, cpu, got meta"):
-        nearest_centre(points, centres.to("meta"))
+    refuses = refusals(nearest_centre, points=points, centres=centres)
+    refuses("points must have shape [n, 3], got [4, 2]", points=points[:, :2])
+    refuses("centres must have shape [k, 3], got [3]", centres=centres[0])
+    refuses("centres must hold at least one centre, got none", centres=centres[:0])
+    refuses("weights must have shape [k] with k = 2, got [3]", weights=torch.zeros(3))
+    refuses("points must have dtype ... or float64, got int64", points=points.long())
+    refuses("centres must have dtype ... or float64, got int64", centres=centres.long())
+    refuses("weights must have dtype ... or float64, got bool", weights=torch.zeros(2, dtype=torch.bool))
+    refuses("centres must be on the device of points, cpu, got meta", centres=centres.to("meta"))
     with pytest.raises((ValueError, BackendUnavailable), match="nearest_centre: backend"):
         nearest_centre(points, centres, backend="fastest")

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from op_cases import FLOATS, need, refused, strided
+from op_cases import FLOATS, need, refusals, strided
 
 from voronerf.ops import resample
 
@@ -99,32 +99,14 @@ def test_carries_no_gradient(device, backend):
     assert not resample(weights, edges, 3, backend=backend).requires_grad
 
 
-def test_compiles(device, backend):
-    weights, edges = (tensor.to(device) for tensor in rays(6, 5))
-    run = lambda w, e: resample(w, e, 8, backend=backend)  # noqa: E731
-    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(weights, edges), run(weights, edges))
-
-
 def test_errors():
     weights, edges = rays(4, 5)
-    with refused(ValueError, "resample: weights must have shape [r, s], got [5]"):
-        resample(weights[0], edges, 3)
-    with pytest.raises(
-        ValueError, match=r"^resample: edges must have shape \[r, s\+1\] with r = 4, s = 5, got \[4, 5\]$"
-    ):
-        resample(weights, edges[:, 1:], 3)
-    with pytest.raises(
-        ValueError, match=r"^resample: uniforms must have shape \[r, count\] with r = 4, count = 3, got"
-    ):
-        resample(weights, edges, 3, uniforms=torch.rand(4, 2))
-    with refused(ValueError, "resample: count must be at least 1, got 0"):
-        resample(weights, edges, 0)
-    with refused(ValueError, "resample: weights must have at least one bin, got none"):
-        resample(weights[:, :0], edges[:, :1], 3)
-    with refused(TypeError, "resample: edges must have the dtype of weights, float32, got float64"):
-        resample(weights, edges.double(), 3)
-    with refused(TypeError, "resample: weights must have dtype ... or float64, got int64"):
-        resample(weights.long(), edges, 3)
-    with refused(ValueError, "resample: edges must be on the device of weights, cpu, got meta"):
-        resample(weights, edges.to("meta"), 3)
+    refuses = refusals(resample, weights=weights, edges=edges, count=3)
+    refuses("weights must have shape [r, s], got [5]", weights=weights[0])
+    refuses("edges must have shape [r, s+1] with r = 4, s = 5, got [4, 5]", edges=edges[:, 1:])
+    refuses("uniforms must have shape [r, count] with r = 4, count = 3, got...", uniforms=torch.rand(4, 2))
+    refuses("count must be at least 1, got 0", count=0)
+    refuses("weights must have at least one bin, got none", weights=weights[:, :0], edges=edges[:, :1])
+    refuses("edges must have the dtype of weights, float32, got float64", edges=edges.double())
+    refuses("weights must have dtype ... or float64, got int64", weights=weights.long())
+    refuses("edges must be on the device of weights, cpu, got meta", edges=edges.to("meta"))

@@ -7,7 +7,8 @@ from typing import Any
 import loops
 import pytest
 import torch
-from op_cases import need, refused, strided
+from helpers import on_any_number_of_threads, same
+from op_cases import need, refusals, refused, strided
 from tolerances import assert_as_exact
 from torch import Tensor
 
@@ -131,8 +132,8 @@ class Case:
         exact = self.results(self.specified, torch.float64)
         plain = self.results(self.specified, dtype)
         found = self.results(lambda leaves: self.run(leaves, backend=backend)[0], dtype, device)
-        for part, same, right in zip(found, plain, exact):
-            assert_as_exact(part, same, right)
+        for part, usual, right in zip(found, plain, exact):
+            assert_as_exact(part, usual, right)
 
 
 @pytest.mark.parametrize("source", ["flat", "tree", "cells", "one"])
@@ -263,25 +264,8 @@ def test_second_derivatives(device, backend, rays):
     exact = penalty(case.specified, torch.float64, CPU)
     plain = penalty(case.specified, torch.float32, CPU)
     found = penalty(lambda leaves: case.run(leaves, backend=backend)[0], torch.float32, device)
-    for part, same, right in zip(found, plain, exact):
-        assert_as_exact(part, same, right)
-
-
-@pytest.mark.parametrize("source", ["tree", "cells", "one"])
-def test_compiles(device, backend, source):
-    case = Case.make("nerf", source)
-    leaves = case.given(torch.float32, device)
-
-    def run(*leaves):
-        out, cells = case.run(list(leaves), backend=backend)
-        return out.square(), cells
-
-    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
-    (found, cells), (expected, _) = compiled(*leaves), run(*leaves)
-    assert torch.equal(cells.cpu(), case.expected_cells)
-    found, expected = ([y, *torch.autograd.grad(y.sum(), leaves)] for y in (found, expected))
-    for part, other in zip(found, expected):
-        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
+    for part, usual, right in zip(found, plain, exact):
+        assert_as_exact(part, usual, right)
 
 
 def test_auto_composes_where_nothing_is_fused():
@@ -301,40 +285,29 @@ def test_cells_outside_are_refused(backend):
 def test_errors():
     case, op = Case.make("nerf", "flat"), "routed_mlp"
     centres, cells = case.options["centres"], case.expected_cells
-    call = functools.partial(case.run, case.leaves)
-    assert call()[0].shape == (61, 4)
-    with refused(ValueError, f"{op}: positions must have shape [n, p], got [3]"):
-        call(positions=case.leaves[0][0])
-    with refused(ValueError, f"{op}: centres must be None where cells are given, got both"):
-        call(cells=cells)
-    with refused(ValueError, f"{op}: centres or cells must be given for 6 cells, got neither"):
-        call(centres=None)
-    with refused(ValueError, f"{op}: child must come with centres, got no centres"):
-        call(centres=None, cells=cells, child=TREE["child"])
-    with refused(ValueError, f"{op}: child_offsets and child must come together, got no child_offsets"):
-        call(child=TREE["child"])
-    with refused(ValueError, f"{op}: depth must be 1 for a flat diagram, got 2"):
-        call(depth=2)
-    with refused(ValueError, f"{op}: centres must have shape [k, 3] with k = 6, got [5, 3]"):
-        call(centres=centres[1:])
-    with refused(TypeError, f"{op}: centres must have dtype ..., got int32"):
-        call(centres=centres.int())
-    with refused(ValueError, f"{op}: cells must have shape [n] with n = 61, got [60]"):
-        call(centres=None, cells=cells[1:])
-    with refused(TypeError, f"{op}: cells must have dtype int32, got int64"):
-        call(centres=None, cells=cells.long())
-    with refused(ValueError, f"{op}: coords must come with centres, got none to compare them with"):
-        call(centres=None, cells=cells, coords=case.leaves[0])
-    with refused(ValueError, f"{op}: coords must have shape [n, 3] with n = 61, got [61, 2]"):
-        call(coords=case.leaves[0][:, :2])
-    with refused(ValueError, f"{op}: directions must be given for layers that read them, got None"):
-        call(directions=None, direction_index=None)
-    with refused(ValueError, f"{op}: weights must have one entry for each of 5 layers, got 0"):
-        call(weights=[])
-    with refused(ValueError, f"{op}: weights[0] must hold at least one cell, got [0, 16, 21]"):
-        call(weights=[tensor[:0] for tensor in case.leaves[2:7]], biases=[None] * 5)
-    with refused(ValueError, f"{op}: centres must be on the device of positions, cpu, got meta"):
-        call(centres=centres.to("meta"))
+    refuses = refusals(functools.partial(case.run, case.leaves), op)
+    refuses("positions must have shape [n, p], got [3]", positions=case.leaves[0][0])
+    refuses("centres must be None where cells are given, got both", cells=cells)
+    refuses("centres or cells must be given for 6 cells, got neither", centres=None)
+    refuses("child must come with centres, got no centres", centres=None, cells=cells, child=TREE["child"])
+    refuses("child_offsets and child must come together, got no child_offsets", child=TREE["child"])
+    refuses("depth must be 1 for a flat diagram, got 2", depth=2)
+    refuses("centres must have shape [k, 3] with k = 6, got [5, 3]", centres=centres[1:])
+    refuses("centres must have dtype ..., got int32", centres=centres.int())
+    refuses("cells must have shape [n] with n = 61, got [60]", centres=None, cells=cells[1:])
+    refuses("cells must have dtype int32, got int64", centres=None, cells=cells.long())
+    refuses(
+        "coords must come with centres, got none to compare them with", centres=None, cells=cells, coords=case.leaves[0]
+    )
+    refuses("coords must have shape [n, 3] with n = 61, got [61, 2]", coords=case.leaves[0][:, :2])
+    refuses("directions must be given for layers that read them, got None", directions=None, direction_index=None)
+    refuses("weights must have one entry for each of 5 layers, got 0", weights=[])
+    refuses(
+        "weights[0] must hold at least one cell, got [0, 16, 21]",
+        weights=[tensor[:0] for tensor in case.leaves[2:7]],
+        biases=[None] * 5,
+    )
+    refuses("centres must be on the device of positions, cpu, got meta", centres=centres.to("meta"))
     narrow = Case.make("raw")
     narrow.leaves[0], narrow.leaves[2] = narrow.leaves[0][:, :2], narrow.leaves[2][:, :, :2]
     with refused(ValueError, f"{op}: coords must be given for positions of less than 3 features, got 2"):
@@ -356,17 +329,16 @@ def test_errors():
 
 @pytest.mark.native
 def test_errors_of_the_kernel():
-    tree, op = Case.make("nerf", "tree"), "routed_mlp"
-    call = functools.partial(tree.run, tree.leaves, backend="native")
-    with refused(ValueError, f"{op}: child must name a diagram (below the number of diagrams) or a leaf (negative)"):
-        call(child=TREE["child"] + 9)
-    with refused(ValueError, f"{op}: depth must be the number of levels of the tree, got 1, which is too few"):
-        call(depth=1)
+    tree = Case.make("nerf", "tree")
+    refuses = refusals(functools.partial(tree.run, tree.leaves, backend="native"), "routed_mlp")
+    refuses("child must name a diagram (below the number of diagrams) or a leaf (negative)", child=TREE["child"] + 9)
+    refuses("depth must be the number of levels of the tree, got 1, which is too few", depth=1)
     # A leaf that no network has.
-    with refused(ValueError, f"{op}: cells must lie in 0 to 5, got values from ..."):
-        call(child=torch.where(TREE["child"] == -6, -7, TREE["child"]))
-    with refused(ValueError, f"{op}: direction_index must be 0 to 4, got 5"):
-        call(direction_index=tree.options["direction_index"] + 1 + (tree.options["direction_index"] == 3).int())
+    refuses("cells must lie in 0 to 5, got values from ...", child=torch.where(TREE["child"] == -6, -7, TREE["child"]))
+    refuses(
+        "direction_index must be 0 to 4, got 5",
+        direction_index=tree.options["direction_index"] + 1 + (tree.options["direction_index"] == 3).int(),
+    )
 
 
 def test_an_index_of_no_ray_is_refused_where_the_operations_are_separate():
@@ -413,31 +385,5 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name, dty
         g = torch.linspace(-1, 2, y.numel()).view_as(y).to(y.dtype)
         return [y, *torch.autograd.grad(y, leaves, g, allow_unused=True, materialize_grads=True)]
 
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            found.append(results(lambda leaves: case.run(leaves, backend="native")[0]))
-        found.append(results(separate))
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other))
-
-
-@pytest.mark.native
-@pytest.mark.parametrize("source", ["flat", "tree", "cells", "one"])
-def test_opcheck(source):
-    layer_table = pytest.importorskip("voronerf.native.layer_table")
-    case = Case.make("integrated", source, n=7)
-    given = case.given()
-    count = len(case.bias)
-    parameters = iter(given[2 + count :])
-    biases = [next(parameters) if has else torch.empty(0) for has in case.bias]
-    network = layer_table.network(given[0], given[2 : 2 + count], biases, case.table, given[1], "routed_mlp")
-    options = {} if source == "one" else case.options
-    names = ("direction_index", "cells", "coords", "centres", "child_offsets", "child", "centre_weights")
-    options = {"coords": given[0][:, :3].detach() if "centres" in options else None, **options}
-    values = [case.options["direction_index"], *(options.get(name) for name in names[1:])]
-    arguments = (network.positions, network.weights, network.biases, network.table, network.directions)
-    torch.library.opcheck(torch.ops.voronerf.routed_mlp_native.default, (*arguments, *values, options.get("depth", 1)))
+    found = on_any_number_of_threads(lambda: results(lambda leaves: case.run(leaves, backend="native")[0]))
+    assert same(found, results(separate))

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import refused, strided
+from op_cases import refusals, strided
 
 from voronerf.ops import select_heaviest
 
@@ -27,18 +27,9 @@ def test_what_does_not_count_is_left_out(device, backend):
     assert torch.equal(found[0].cpu(), torch.cat([points[[7, 0]], torch.zeros(3, 3)]))
 
 
-@pytest.mark.warp
-def test_opcheck():
-    given = torch.rand(9, 3), torch.rand(9)
-    select_heaviest(*given, 4, backend="warp")
-    torch.library.opcheck(torch.ops.voronerf.select_heaviest_warp.default, (*given, 4))
-
-
 def test_refuses_what_makes_no_sense():
     points = torch.rand(4, 3)
-    with refused(ValueError, "select_heaviest: importance must have shape [n] with n = 4, got [3]"):
-        select_heaviest(points, torch.rand(3), 2)
-    with refused(TypeError, "select_heaviest: importance must have dtype float32, got float64"):
-        select_heaviest(points, torch.rand(4).double(), 2)
-    with refused(ValueError, "select_heaviest: count must be at least 1, got 0"):
-        select_heaviest(points, torch.rand(4), 0)
+    refuses = refusals(select_heaviest, points=points, importance=torch.rand(4), count=2)
+    refuses("importance must have shape [n] with n = 4, got [3]", importance=torch.rand(3))
+    refuses("importance must have dtype float32, got float64", importance=torch.rand(4).double())
+    refuses("count must be at least 1, got 0", count=0)
