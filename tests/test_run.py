@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers import refuses
 
 from voronerf import open_run
 from voronerf.data import builtin_scene
@@ -66,11 +67,9 @@ def test_how_a_run_is_rendered_may_differ(trained, scene) -> None:
 
 def test_what_cannot_be_opened(trained, scene, tmp_path) -> None:
     folder = trained[0].out
-    with pytest.raises(CheckpointError, match=r"last.safetensors: there is no checkpoint"):
-        open_run(tmp_path, scene=scene)
+    refuses("last.safetensors: there is no checkpoint", open_run, tmp_path, scene=scene, error=CheckpointError)
     with pytest.raises(ConfigError, match="--blend must be a distance of 0 or more, got -1"):
         open_run(folder, scene=scene, blend=-1)
-    with pytest.raises(ConfigError, match="--device must be cpu or cuda, got 'meta'"):
-        open_run(folder, scene=scene, device="meta")
+    refuses("--device must be cpu or cuda, got 'meta'", open_run, folder, scene=scene, device="meta", error=ConfigError)
     with pytest.raises(ConfigError, match="--occupancy needs a scene with a box around everything"):
         open_run(folder, scene=replace(scene, box=None), occupancy=True)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import turns
-from helpers import read_json
+from helpers import read_json, refuses
 from paper import claims, looks, runs
 from paper import main as paper
 from paper.experiments import EXPERIMENTS
@@ -45,8 +45,7 @@ def test_turns():
     assert log[6:9] == [("a", 2.0), ("look", 2.0, 2.0), ("a", 2.0)]
     assert log[-5:] == [("after", "a"), ("b", 3.0), ("after", "b"), ("c", 3.0), ("after", "c")]
     assert all(fake.seconds >= 3.0 for fake in fakes)
-    with pytest.raises(ConfigError, match="--turn must be positive, got 0"):
-        turns.take_turns(fakes, budget=1, turn=0)
+    refuses("--turn must be positive, got 0", turns.take_turns, fakes, budget=1, turn=0, error=ConfigError)
 
     # resumed in the midst of a turn, after a stop that a long step had passed: it is due all the same
     log.clear()
@@ -110,8 +109,7 @@ def test_an_experiment_writes_its_files_and_is_not_run_again(settings, out, monk
         assert all(row["run"] == other["run"] for row, other in same)
         assert (out / f"{name}-pictures.png").is_file()
     for other in (replace(settings, again=True), replace(settings, budget=0.3), replace(settings, seeds=2)):
-        with pytest.raises(AssertionError, match="trained again"):
-            paper.experiment("initialisation", other)
+        refuses("trained again", paper.experiment, "initialisation", other, error=AssertionError)
 
 
 def one(settings, seed=0, **changes):
@@ -268,8 +266,7 @@ def test_every_variant_has_the_best_of_the_same_rates(settings, tmp_path):
     assert judge(claims.Rows(runs.results(made)), searched)[0].verdict == "holds for every seed"
     assert fail(1.0) == rest
     assert judge(claims.Rows(runs.results(made)), searched)[0].verdict == "not measured"
-    with pytest.raises(ConfigError, match="--rates must be positive factors, got"):
-        runs.Settings(rates=(0.0,))
+    refuses("--rates must be positive factors, got", runs.Settings, rates=(0.0,), error=ConfigError)
 
 
 def test_sizes_and_scenes(tmp_path, monkeypatch):

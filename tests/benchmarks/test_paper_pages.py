@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import read_json
+from helpers import read_json, refuses
 from paper import balance, figures, nested, report
 from paper import main as paper
 from paper.experiments import EXPERIMENTS
@@ -154,8 +154,7 @@ def test_the_page_shows_what_came_out_and_keeps_notes(settings, out, tmp_path):
     text = page.read_text()
     assert "| changed | 30 | 3 | 20 x 20 |" in text and "; failed: random parameters on builtin: nan." in text
     assert text.endswith(f"{report.NOTES}\nWhat was seen.\n")
-    with pytest.raises(ValueError, match="--out must hold results of experiments"):
-        report.write_report(tmp_path / "nothing", page)
+    refuses("--out must hold results of experiments", report.write_report, tmp_path / "nothing", page)
 
 
 def test_the_command_line(settings, out, capsys):
@@ -166,8 +165,7 @@ def test_the_command_line(settings, out, capsys):
     paper.main(["all", *options, "--out", str(out), "--page", str(page), "--only", "density", "ghosting"])
     printed = capsys.readouterr().out
     assert "  2 trainings, 2 of them made already" in printed and "## Figure: ghosting" in page.read_text()
-    with pytest.raises(ValueError, match="--only must name experiments"):
-        paper.everything(settings, page, ("nothing",))
+    refuses("--only must name experiments", paper.everything, settings, page, ("nothing",))
     for name in (*paper.Table.__args__, *paper.Figure.__args__):
         assert name in paper.ORDER
     assert len(paper.ORDER) == len(paper.Table.__args__) + len(paper.Figure.__args__)

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers import read_json
+from helpers import read_json, refuses
 from paper import balance, claims, records, runs
 from paper import main as paper
 from paper.experiments import EXPERIMENTS
@@ -119,10 +119,8 @@ def test_a_table_is_made_in_parts(settings, tmp_path, trained, capsys):
 
 def test_what_is_asked_for_now_is_checked():
     settings = runs.Settings
-    with pytest.raises(ConfigError, match=r"--variants must be a regular expression, got '\(':"):
-        settings(variants="(")
-    with pytest.raises(ConfigError, match=r"--only-seeds must be below --seeds 2, got \(2,\)"):
-        settings(seeds=2, only_seeds=(2,))
+    refuses("--variants must be a regular expression, got '(':", settings, variants="(", error=ConfigError)
+    refuses("--only-seeds must be below --seeds 2, got (2,)", settings, seeds=2, only_seeds=(2,), error=ConfigError)
 
 
 def test_options_are_those_of_all_variants(settings):
@@ -171,8 +169,7 @@ def test_blended_scores_are_other_results(settings):
 
 def test_a_record_holds_results_and_nothing_of_the_machine_s_folders(settings, tmp_path, capsys):
     made = EXPERIMENTS["initialisation"].runs(settings)
-    with pytest.raises(ValueError, match="--out must hold finished trainings in runs/, got"):
-        paper.export(tmp_path / "none.json", settings.out)
+    refuses("--out must hold finished trainings in runs/, got", paper.export, tmp_path / "none.json", settings.out)
     finish(made[0], 20.0)
     finish(made[2], 19.0, made_on=elsewhere(), looks=[{"look": "end", "at": 1.0, "seam": 3.0}])
     made[1].folder.mkdir(parents=True)  # not finished

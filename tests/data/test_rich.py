@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import refuses
 
 from voronerf.backends import BackendUnavailable
 from voronerf.data import load_scene, rich_scene
@@ -56,10 +57,8 @@ def test_the_scene_is_of_the_usual_form():
     assert scene.box is not None and bool((scene.box[1] > scene.box[0]).all())
     same = rich_scene(24, train_views=2, test_views=1, backend="numpy")
     assert float((scene.test.images.int() - same.test.images.int()).abs().float().mean()) < 0.5
-    with pytest.raises(ValueError, match="rich_scene: size must be >= 1, got 0"):
-        rich_scene(0)
-    with pytest.raises(BackendUnavailable, match="no native implementation of cast_solids"):
-        rich_scene(8, backend="native")
+    refuses("rich_scene: size must be >= 1, got 0", rich_scene, 0)
+    refuses("no native implementation of cast_solids", rich_scene, 8, backend="native", error=BackendUnavailable)
 
 
 def test_it_is_named_on_the_command_line(monkeypatch):

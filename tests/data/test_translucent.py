@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from helpers import refuses
 
 from voronerf.data import load_scene, translucent_scene
 from voronerf.data.builtin.translucent import MEDIA, Medium, bounds, integrate, layered_block, striped_shell
@@ -91,5 +92,4 @@ def test_shape_and_name(scene):
     assert (scene.name, scene.near, scene.far, scene.background) == ("builtin-translucent", 2, 6, "white")
     loaded = load_scene("builtin-translucent", downscale=4)
     assert torch.equal(loaded.train.images, scene.train.images)
-    with pytest.raises(ValueError, match="translucent_scene: size must be >= 1, got 0"):
-        translucent_scene(0)
+    refuses("translucent_scene: size must be >= 1, got 0", translucent_scene, 0)

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 import torch.nn.functional as F
+from helpers import refuses
 from torch import Tensor, nn
 
 from voronerf import MLP, Layer, open_run
@@ -195,19 +196,16 @@ def test_settings_that_a_field_has_no_option_for(settings: dict[str, Any], messa
 
 
 def test_what_cannot_be_built(scene: Scene) -> None:
-    with pytest.raises(ValueError, match="field foreign: hidden must be given"):
-        FIELDS["foreign"].build({})
+    refuses("field foreign: hidden must be given", FIELDS["foreign"].build, {})
     with pytest.raises(ValueError, match=r"field table: .*unexpected keyword argument 'depth'"):
         FIELDS["table"].build({"depth": 2})
-    with pytest.raises(ValueError, match="NeRF: width must be at least 2, got 1"):
-        FIELDS["nerf"].build({"width": 1})
+    refuses("NeRF: width must be at least 2, got 1", FIELDS["nerf"].build, {"width": 1})
     with pytest.raises(ConfigError, match="--parameters needs a field with an option width, foreign has none"):
         resolve_config(TrainConfig(field="foreign", field_options=("hidden=8",), parameters=100), scene)
 
 
 def test_what_cannot_be_registered() -> None:
-    with pytest.raises(ValueError, match="name must be a word, got 'my field'"):
-        register_field("my field")
+    refuses("name must be a word, got 'my field'", register_field, "my field")
     with pytest.raises(ValueError, match="inputs of rays must be 'points' or 'gaussians', got 'rays'"):
         register_field("rays")(type("Rays", (nn.Module,), {"inputs": "rays"}))
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import refuses
 
 import voronerf
 from voronerf.layers import ACTIVATIONS
@@ -36,8 +37,7 @@ def test_what_does_not_fit_a_signature_is_refused() -> None:
     sizes = {"n": 4, "d": 3, "octaves": 1, "include_input": True, "width": 9}
     with pytest.raises(TypeError, match=r"^Encoding: x is no const float32\*$"):
         compiled.encode(compiled.Encoding(points.double(), None, **sizes), torch.empty(4, 9), torch.empty(999), cpu)
-    with pytest.raises(TypeError, match="unexpected keyword argument 'y'"):
-        compiled.Encoding(y=points, variances=None, **sizes)
+    refuses("unexpected keyword argument 'y'", compiled.Encoding, y=points, variances=None, **sizes, error=TypeError)
 
 
 def test_an_instruction_set_that_is_not_there_is_refused() -> None:

@@ -44,8 +44,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, failing):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, failing, full)
-    with pytest.raises(OSError, match="No space left"):
-        save_checkpoint(path, example())
+    refuses("No space left", save_checkpoint, path, example(), error=OSError)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["last.safetensors"]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from helpers import same
+from helpers import refuses, same
 from tiny_runs import assert_resumes, scores, small, stopping, tensors
 
 import voronerf.training.trainer as trainer_module
@@ -61,8 +61,7 @@ def test_a_loaded_run_renders_the_same(tmp_path, scene):
         Trainer(replace(config, width=16, lr=1e-4, resume=True), scene)
     checkpoint = load_checkpoint(checkpoint_path(tmp_path))
     del checkpoint.tensors["router.module.density.weight"]
-    with pytest.raises(CheckpointError, match="another architecture"):
-        restore_routers(make_routers(config, "cpu"), checkpoint)
+    refuses("another architecture", restore_routers, make_routers(config, "cpu"), checkpoint, error=CheckpointError)
 
 
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch):
