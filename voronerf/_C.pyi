@@ -193,6 +193,25 @@ class MlpTable(NamedTuple):
 
 Peak: tuple[str, ...]  # float32 bfloat16 copy
 
+class RenderLossInputs(NamedTuple):
+    raw: Tensor | None  # const float32*
+    deltas: Tensor | None  # const float32*
+    offsets: Tensor | None  # const int32*
+    target: Tensor | None  # const float32*
+    background: Tensor | None  # const float32*
+    background_per_ray: bool
+    density_scale: float  # float32
+    r: int  # int64
+    m: int  # int64
+
+class RenderLossOutputs(NamedTuple):
+    loss: Tensor | None  # float32*
+    colour: Tensor | None  # float32*
+    weights: Tensor | None  # float32*
+    density: Tensor | None  # float32*
+    error: Tensor | None  # float32*
+    gradient: Tensor | None  # float32*
+
 TableType: tuple[str, ...]  # float32 bfloat16 float16
 
 # any*, int64
@@ -350,6 +369,9 @@ def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: 
 # const float32*, const float32*, const float32*, CentreGrid, int32*, int64, int64, Cpu
 def nearest_centre_grid(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: CentreGrid, _4: Tensor | None, _5: int, _6: int, _7: Cpu) -> None: ...
 # const float64*, const float64*, const float64*, CentreGrid, int32*, int64, int64, Cpu
+
+# RenderLossInputs, RenderLossOutputs, Cpu
+def render_loss(_0: RenderLossInputs, _1: RenderLossOutputs, _2: Cpu) -> None: ...
 
 # const float32*, const float32*, const float32*, float32*, int64, int64, int64, Cpu
 @overload

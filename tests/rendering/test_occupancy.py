@@ -4,9 +4,11 @@ import pytest
 import torch
 from helpers import refuses, seeded
 
+from voronerf import HashGridField, NeRF, VoronoiRouter
 from voronerf.rendering import (
     OccupancyGrid,
     Rays,
+    Renderer,
     intersect_box,
     orbit_cameras,
     render_image,
@@ -215,3 +217,24 @@ def test_refuses_what_is_no_grid():
     for cell in (-1, 64, 2**32):
         refuses("cells must lie in 0 to 63, got", update, Ball(), torch.tensor([cell]))
     refuses("decay must lie in 0..1, got 2", update, Ball(), decay=2)
+
+
+@pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
+def test_a_comparison_is_the_rendering_and_its_loss(field):
+    grid = tight_grid()
+    router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
+    rays = cameras().image_rays(0)
+    target, background = torch.rand(len(rays), 3), torch.rand(len(rays), 3)
+    renderer = Renderer({"field": router}, samples=24, occupancy=grid)
+
+    def compare(renderer):
+        given = {"background": background, "generator": torch.Generator().manual_seed(3)}
+        found = renderer.compare(rays, 1.0, 5.0, target, **given)
+        return found, torch.autograd.grad(found.loss, list(router.parameters()))
+
+    found, gradients = compare(renderer)
+    plain = Renderer({"field": lambda *given: router(*given)}, samples=24, occupancy=grid)  # a field without a table
+    expected, same = compare(plain)
+    assert len(found.positions) > 0 and torch.equal(found.positions, expected.positions)
+    for part, other in zip((*found, found.importance(), *gradients), (*expected, expected.importance(), *same)):
+        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-6)

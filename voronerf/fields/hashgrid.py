@@ -6,11 +6,11 @@ import math
 from typing import Any, ClassVar
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from voronerf.checks import physical_memory
 from voronerf.fields.nerf import INITIAL_DENSITY
+from voronerf.fields.radiance import activate_radiance
 from voronerf.fields.single import run_network
 from voronerf.grids import UNIT_CUBE, HashGrid
 from voronerf.layers import MLP, Layer
@@ -130,11 +130,7 @@ class HashGridField(nn.Module):
         trunk = [layer for layer in self.trunk if isinstance(layer, nn.Linear)]
         return [*trunk, self.density, self.view, self.colour]
 
-    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Raw [n, 4] to (colour [n, 3] in 0..1, density [n] >= 0 per scene unit), float32 or wider."""
-        raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-        colour, density = (part.contiguous() for part in raw.split([3, 1], dim=-1))
-        return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
+    activate = activate_radiance
 
     def forward(
         self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None

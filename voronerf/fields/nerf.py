@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
+from voronerf.fields.radiance import activate_radiance
 from voronerf.fields.single import run_network
 from voronerf.layers import MLP, Layer
 
@@ -180,20 +180,7 @@ class NeRF(nn.Module):
         linears = [*self.trunk, self.density, self.feature, self.view, self.colour]
         return [layer for layer in linears if isinstance(layer, nn.Linear)]
 
-    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Turns the network's outputs into what a renderer needs.
-
-        Args:
-            raw: [n, 4]: colour before its sigmoid, density before its softplus.
-
-        Returns:
-            (colour [n, 3] in 0..1, density [n] >= 0 per scene unit), float32 or wider.
-        """
-        raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-        # `split`, because its gradient is one concatenation, and that of two slices two padded arrays and their sum.
-        # `contiguous`, because torch vectorises activations for contiguous values only. Together a third of the time.
-        colour, density = (part.contiguous() for part in raw.split([3, 1], dim=-1))
-        return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
+    activate = activate_radiance
 
     def forward(
         self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None

@@ -22,6 +22,7 @@ from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
+from voronerf.ops.render_loss import RenderLoss, render_loss
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.select_heaviest import select_heaviest
@@ -35,6 +36,7 @@ __all__ = [
     "HashGrid",
     "Layer",
     "March",
+    "RenderLoss",
     "balance_centres",
     "camera_rays",
     "cast_solids",
@@ -50,6 +52,7 @@ __all__ = [
     "locate_cell",
     "march_rays",
     "nearest_centre",
+    "render_loss",
     "resample",
     "routed_mlp",
     "select_heaviest",

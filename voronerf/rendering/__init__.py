@@ -1,6 +1,7 @@
 """From cameras to rays, and from rays to colours. This package does not read or write files."""
 
 from voronerf.rendering.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
+from voronerf.rendering.comparison import Comparison
 from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
@@ -12,6 +13,7 @@ from voronerf.rendering.volume import Rendered, render_rays
 
 __all__ = [
     "Cameras",
+    "Comparison",
     "Contraction",
     "Field",
     "Marched",

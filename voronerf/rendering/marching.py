@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops.composite import composite
+from voronerf.ops.march_rays import March
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.occupancy import OccupancyGrid
@@ -109,11 +110,7 @@ def render_marched(
         >>> len(result.positions) < 20, result.opacity.round(decimals=2)
         (True, tensor([1.]))
     """
-    uniforms = None
-    if jitter:
-        device = near.device if generator is None else generator.device
-        uniforms = torch.rand(len(rays), samples, device=device, dtype=near.dtype, generator=generator).to(near.device)
-    march = grid.march(rays, near, far, samples, uniforms=uniforms, spacing=spacing, backend=backend)
+    march = march_grid(rays, near, far, grid, samples, jitter, generator, spacing, backend)
     index = march.ray_index
     rgb, sigma = field(march.positions, rays.directions, index)
     # a field under autocast answers in a half type: the sums along a ray are float32's
@@ -138,6 +135,25 @@ def render_marched(
         sigma,
         march.deltas,
     )
+
+
+def march_grid(
+    rays: Rays,
+    near: Tensor,
+    far: Tensor,
+    grid: OccupancyGrid,
+    samples: int,
+    jitter: bool,
+    generator: torch.Generator | None,
+    spacing: str,
+    backend: str,
+) -> March:
+    """The samples of `render_marched`, whose arguments these are."""
+    uniforms = None
+    if jitter:
+        device = near.device if generator is None else generator.device
+        uniforms = torch.rand(len(rays), samples, device=device, dtype=near.dtype, generator=generator).to(near.device)
+    return grid.march(rays, near, far, samples, uniforms=uniforms, spacing=spacing, backend=backend)
 
 
 @torch.no_grad()

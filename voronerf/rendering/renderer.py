@@ -6,13 +6,14 @@ r rays, h x w pixels. Units as in `voronerf.rendering.volume`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.ops.resample import resample
 from voronerf.rendering.cameras import Cameras, Rays
+from voronerf.rendering.comparison import Comparison, compare_marched, compared
 from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
@@ -272,6 +273,34 @@ class Renderer:
                 share = 1.0 if "coarse" in self.fields else COARSE_SHARE
                 loss = loss + share * (first.colour - target).square().mean()
         return loss
+
+    def compare(
+        self,
+        rays: Rays,
+        near: Tensor | float,
+        far: Tensor | float,
+        target: Tensor,
+        *,
+        background: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Comparison:
+        """Renders rays at random samples and computes the :meth:`loss`: what a training step needs.
+
+        Args:
+            rays: as in :meth:`render`, like the next two.
+            near: [r] or one for all.
+            far: [r] or one for all.
+            target: [r, 3].
+            background: as in :meth:`render`.
+            generator: of the samples.
+        """
+        near, far = per_ray(near, rays), per_ray(far, rays)
+        given: dict[str, Any] = {"background": background, "generator": generator}
+        found = compare_marched(self, rays, near, far, target, **given)
+        if found is not None:
+            return found
+        passes = self.render(rays, near, far, jitter=True, **given)
+        return compared(self.loss(passes, target), passes[-1], target)
 
     @torch.no_grad()
     def image(

@@ -281,7 +281,8 @@ def evaluate_table(
     ray_index: Tensor | None = None,
     *,
     coords: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+    raw: bool = False,
+) -> Any:
     """What a field with stacked parameters and a layer table gives: colour [n, 3] and density [n].
 
     Args:
@@ -294,6 +295,7 @@ def evaluate_table(
         directions: unit vectors, [n, 3], or [r, 3] together with ``ray_index``.
         ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
         coords: [n, 3] or None, positions that decide the cells in the place of ``positions`` (of Gaussians, the means).
+        raw: Gives the outputs of the network, [n, out], in the place of what ``activate`` makes of them.
 
     Raises:
         ValueError: For shapes that disagree, or directions that the field needs and did not get.
@@ -323,11 +325,14 @@ def evaluate_table(
     biases = [b if b is None or b.dim() == 2 else b.expand(k, -1) for b in [layer.bias for layer in linears]]
     hashed = {} if table.grid is None else {"features": field.features}  # type: ignore[attr-defined]
 
-    def run(x: Tensor, d: Tensor | None, index: Tensor | None, cells: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    def run(x: Tensor, d: Tensor | None, index: Tensor | None, cells: dict[str, Any]) -> Any:
         given = {"directions": d, "direction_index": index, "backend": backend, **hashed, **cells}
-        return field.activate(ops.routed_mlp(x, weights, biases, layers=table, **given)[0])
+        outputs = ops.routed_mlp(x, weights, biases, layers=table, **given)[0]
+        return outputs if raw else field.activate(outputs)
 
     own = run(positions, directions, ray_index, where(positions, coords))
+    if raw:
+        return own
     mixture = mixture_at(positions[:, :3] if coords is None else coords)
     if mixture is None:
         return own

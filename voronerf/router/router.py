@@ -223,6 +223,22 @@ class VoronoiRouter(CellModules):
             args, kwargs = each_direction(args, kwargs)
         return self._call_method("forward", *args, coords=coords, **kwargs)
 
+    @property
+    def by_table(self) -> bool:
+        """Whether a layer table describes all that the module computes: then :meth:`raw` gives its outputs."""
+        return self._layered and described_by_table(self.module)
+
+    def raw(self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> Tensor:
+        """What the networks of a field with a layer table give before its ``activate``: [n, out], never blended.
+
+        Arguments are those of ``forward``.
+        """
+        given = positions, directions, ray_index
+        coords = coords_by_rule(self.coords, given, {})
+        at, k = self._mixture, self.num_cells
+        found: Tensor = evaluate_table(self.field, self._where, k, self.backend, at, *given, coords=coords, raw=True)
+        return found
+
     def explain(self) -> str:
         """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
 

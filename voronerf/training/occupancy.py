@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from voronerf.data import Scene
+from voronerf.rendering.comparison import Comparison
 from voronerf.rendering.field import Field
-from voronerf.rendering.marching import Marched
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.training.config import ConfigError, TrainConfig
 
@@ -66,10 +66,10 @@ def make_picture_grid(config: TrainConfig, scene: Scene, field: Field, *, backen
     return grid
 
 
-def observe_samples(grid: OccupancyGrid, marched: Marched, *, backend: str) -> None:
+def observe_samples(grid: OccupancyGrid, found: Comparison, *, backend: str) -> None:
     """Teaches a grid what the samples of a training step found."""
-    found = (marched.positions, marched.density, marched.deltas, marched.weights)
-    grid.observe(*(tensor.detach() for tensor in found), decay=OCCUPANCY_DECAY, backend=backend)
+    assert found.density is not None and found.deltas is not None
+    grid.observe(found.positions, found.density, found.deltas, found.weights, decay=OCCUPANCY_DECAY, backend=backend)
 
 
 def revisit_cells(grid: OccupancyGrid, field: Field, generator: torch.Generator, *, backend: str) -> None:

@@ -22,8 +22,6 @@ from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
 from voronerf.files import read_json_lines, write_text
-from voronerf.rendering.marching import Marched
-from voronerf.rendering.volume import Rendered
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
@@ -267,16 +265,15 @@ class Trainer:
         if batch.alpha is not None and config.background == "random":
             drawn = torch.rand(config.rays, 3, generator=self.draws, device=self.draws.device)
             background = drawn.to(self.device)
+        target = batch.target(background)
         half = HALVES.get(config.precision)
         with torch.autocast(self.device.type, half, enabled=half is not None, cache_enabled=False):
-            passes = self.renderer.render(
-                batch.rays, batch.near, batch.far, background=background, jitter=True, generator=self.draws
+            found = self.renderer.compare(
+                batch.rays, batch.near, batch.far, target, background=background, generator=self.draws
             )
-        if isinstance(passes[0], Marched):
-            assert self.occupancy is not None
-            observe_samples(self.occupancy, passes[0], backend=config.backend)
-        target = batch.target(background)
-        loss = self.renderer.loss(passes, target)
+        if self.occupancy is not None:
+            observe_samples(self.occupancy, found, backend=config.backend)
+        loss = found.loss
         self.optimizer.zero_grad(set_to_none=True)
         # Nothing is read on the host: the fused optimiser skips a step whose gradients have overflowed by itself.
         self.scaler.scale(loss).backward()
@@ -284,12 +281,7 @@ class Trainer:
         self.scaler.update()
         if self.level >= len(self.plan):
             return loss.detach(), None, None
-        # Importance of a sample: its weight in the image times its ray's error (section 3.1 of the paper).
-        rendered = passes[-1]
-        error = (rendered.colour.detach() - target).square().sum(-1)
-        error = error[:, None] if isinstance(rendered, Rendered) else error[rendered.ray_index]
-        importance = rendered.weights.detach() * error
-        return loss.detach(), rendered.positions.detach().reshape(-1, 3), importance.reshape(-1)
+        return loss.detach(), found.positions, found.importance()
 
     def split_is_due(self) -> bool:
         """Whether :meth:`advance` splits before the next step."""

@@ -1,0 +1,14 @@
+#include "rays/render_loss.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_STRUCT(RenderLossInputs, raw, deltas, offsets, target, background, background_per_ray, density_scale, r, m);
+VN_STRUCT(RenderLossOutputs, loss, colour, weights, density, error, gradient);
+
+VN_BINDINGS(module) {
+  module.cpu("render_loss", VN_CPU(render_loss_cpu));
+}
+
+}  // namespace voronerf

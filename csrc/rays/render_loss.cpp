@@ -1,0 +1,48 @@
+// Blocks of rays over threads. Each ray depends on itself alone, and one thread sums their errors, so results do not
+// depend on the number of threads.
+#include "rays/render_loss.h"
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+#include "common/parallel.h"
+#include "rays/render_loss_isa.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int64_t kRays = 64;  // of a task
+
+void rays_of(Isa isa, const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {
+  VN_FOR_ISA(isa, render_loss_rays(in, out, begin, end))
+}
+
+void strays_of(Isa isa, const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {
+  VN_FOR_ISA(isa, render_loss_strays(in, out, begin, end))
+}
+
+}  // namespace
+
+void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, Isa isa, int threads) {
+  int64_t before = 0;
+  for (int64_t i = 0; i <= in.r; ++i) {
+    if (in.offsets[i] < before || in.offsets[i] > in.m) {
+      throw std::invalid_argument(
+          "render_loss: ray_offsets must rise from 0 or more to at most the number of samples, " +
+          std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " + std::to_string(i));
+    }
+    before = in.offsets[i];
+  }
+  strays_of(isa, in, out, 0, in.offsets[0]);
+  strays_of(isa, in, out, in.offsets[in.r], in.m);
+  const int64_t blocks = (in.r + kRays - 1) / kRays;
+  parallel_for(blocks, 1, threads,
+               [&](int64_t block) { rays_of(isa, in, out, block * kRays, std::min(in.r, (block + 1) * kRays)); });
+  double sum = 0.0;
+  for (int64_t i = 0; i < in.r; ++i) sum += static_cast<double>(out.error[i]);
+  *out.loss = static_cast<float>(sum / (3.0 * static_cast<double>(in.r)));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,34 @@
+// The loss of rendered rays and its gradient, from the outputs of the networks: r rays, m samples. Ray i owns samples
+// offsets[i] : offsets[i + 1]. What it computes is said in voronerf/ops/render_loss.py.
+#pragma once
+
+#include <cstdint>
+
+#include "common/isa.h"
+
+namespace voronerf {
+
+struct RenderLossInputs {
+  const float* raw;         // [m,4]: colour before its sigmoid, density before its softplus
+  const float* deltas;      // [m]
+  const int32_t* offsets;   // [r+1]
+  const float* target;      // [r,3]
+  const float* background;  // [r,3], or [3], or null
+  bool background_per_ray;
+  float density_scale;
+  int64_t r, m;
+};
+
+struct RenderLossOutputs {
+  float* loss;      // [1]
+  float* colour;    // [r,3]
+  float* weights;   // [m]
+  float* density;   // [m]
+  float* error;     // [r]
+  float* gradient;  // [m,4], of the loss to raw
+};
+
+// Throws std::invalid_argument for offsets that fall or exceed m.
+void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, Isa isa, int threads);
+
+}  // namespace voronerf

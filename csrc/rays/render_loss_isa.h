@@ -1,0 +1,15 @@
+// The kernels of render_loss, once for each instruction set. The loss itself, the mean of the errors, is left to the
+// caller.
+#pragma once
+
+#include "rays/render_loss.h"
+
+namespace voronerf {
+
+VN_DECLARE_FOR_ISA(void render_loss_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin,
+                                         int64_t end))
+// Samples of no ray: only their density is of interest.
+VN_DECLARE_FOR_ISA(void render_loss_strays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin,
+                                           int64_t end))
+
+}  // namespace voronerf

@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import FLOATS, need, offsets_of, refused, strided
+from tolerances import assert_as_exact
+
+from voronerf.ops import RenderLoss, composite, render_loss
+
+pytestmark = pytest.mark.op("render_loss")
+
+SCALE = 10.0
+
+
+def rays(counts, dtype=torch.float64, outside=(0, 0)):
+    """Raw outputs, lengths and offsets of packed samples, targets and backgrounds of their rays."""
+    m, r = sum(counts) + sum(outside), len(counts)
+    raw, deltas = 3 * torch.randn(m, 4, dtype=dtype), torch.rand(m, dtype=dtype) / 10
+    offsets = offsets_of(counts) + outside[0]
+    return raw, deltas, offsets, torch.rand(r, 3, dtype=dtype), torch.rand(r, 3, dtype=dtype)
+
+
+def step_by_step(raw, deltas, offsets, target, background):
+    """Activations, composite and loss as three steps."""
+    colour, density = torch.sigmoid(raw[:, :3]), SCALE * torch.nn.functional.softplus(raw[:, 3])
+    seen = composite(density, colour, deltas, deltas, ray_offsets=offsets, background=background, backend="reference")
+    off = (seen.colour - target).square()
+    return RenderLoss(off.mean(), seen.colour, seen.weights, density, off.sum(-1))
+
+
+def evaluate(device, given, dtype, backend):
+    """All results, and the gradient of three times the loss."""
+    raw, deltas, offsets, target, background = (t.to(device) for t in given)
+    wide = torch.promote_types(dtype, torch.float32)
+    leaf = raw.to(dtype).requires_grad_()
+    rest = deltas.to(wide), offsets, target.to(wide)
+    background = background.to(wide)
+    if backend is None:
+        found = step_by_step(leaf, *rest, background)
+    else:
+        found = render_loss(leaf, *rest, background=background, density_scale=SCALE, backend=backend)
+    (gradient,) = torch.autograd.grad(3 * found.loss, leaf)
+    return [*(part.detach() for part in found), gradient]
+
+
+@pytest.mark.parametrize(
+    "counts", [[0], [1], [3, 0, 17, 1, 0], [15], [16], [33], [127], [128], [129], [300, 0, 1000], [7] * 150]
+)
+@pytest.mark.parametrize("outside", [(0, 0), (3, 2)])
+def test_is_activations_composite_and_squared_error(device, backend, counts, outside):
+    given = rays(counts, outside=outside)
+    exact = evaluate(device, given, torch.float64, None)
+    plain = evaluate(device, given, torch.float32, "reference")
+    for found, same, right in zip(evaluate(device, given, torch.float32, backend), plain, exact):
+        assert_as_exact(found, same, right)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_dtypes(device, backend, dtype):
+    need("render_loss", backend, device, dtype)
+    given = rays([5, 0, 40])
+    given = (given[0].to(dtype).double(), *given[1:])
+    wide = torch.promote_types(dtype, torch.float32)
+    *found, gradient = evaluate(device, given, dtype, backend)
+    *exact, right = evaluate(device, given, torch.float64, None)
+    assert all(part.dtype == wide for part in found) and gradient.dtype == dtype
+    for part, expected in zip(found, exact):
+        assert_as_exact(part, expected.to(wide), expected)
+    assert_as_exact(gradient, right.to(dtype), right)
+
+
+def test_backgrounds(device, backend):
+    raw, deltas, offsets, target, _ = (t.to(device) for t in rays([4, 0, 9], torch.float32))
+    rest = {"density_scale": SCALE, "backend": backend}
+    one = torch.rand(3, device=device)
+    shared = render_loss(raw, deltas, offsets, target, background=one, **rest)
+    each = render_loss(raw, deltas, offsets, target, background=one.expand(3, 3), **rest)
+    assert all(torch.equal(a, b) for a, b in zip(shared, each))
+    assert torch.equal(shared.colour[1], one)
+    black = render_loss(raw, deltas, offsets, target, **rest)
+    assert torch.equal(black.colour[1], torch.zeros(3, device=device))
+
+
+def test_rows_apart_in_memory(device, backend):
+    raw, deltas, offsets, target, background = (t.to(device) for t in rays([4, 0, 9], torch.float32))
+    rest = {"density_scale": SCALE, "backend": backend}
+    plain = render_loss(raw, deltas, offsets, target, background=background, **rest)
+    apart = render_loss(strided(raw), strided(deltas), offsets, strided(target), background=strided(background), **rest)
+    assert all(torch.equal(a, b) for a, b in zip(plain, apart))
+
+
+def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend):
+    raw, deltas, offsets, target, background = (t.to(device) for t in rays([4, 5, 3], torch.float32))
+    spoiled = raw.clone()
+    spoiled[6, 3] = torch.nan
+    rest = {"background": background, "density_scale": SCALE, "backend": backend}
+    clean = render_loss(raw, deltas, offsets, target, **rest)
+    found = render_loss(spoiled, deltas, offsets, target, **rest)
+    assert found.colour[1].isnan().all() and found.loss.isnan()
+    for ray in (0, 2):
+        assert torch.equal(found.colour[ray], clean.colour[ray])
+
+
+def test_infinite_density_is_opaque_and_has_no_gradient(device, backend):
+    raw, deltas, offsets, target, background = (t.to(device) for t in rays([4], torch.float32))
+    raw[1, 3] = torch.inf
+    leaf = raw.requires_grad_()
+    found = render_loss(leaf, deltas, offsets, target, background=background, density_scale=SCALE, backend=backend)
+    found.loss.backward()
+    assert found.weights[2:].tolist() == [0, 0]
+    assert leaf.grad.isfinite().all() and leaf.grad[1:, 3].tolist() == [0, 0, 0]
+
+
+def test_only_the_loss_has_gradients(device, backend):
+    raw, deltas, offsets, target, _ = (t.to(device).requires_grad_(t.is_floating_point()) for t in rays([4]))
+    found = render_loss(raw.float(), deltas.float(), offsets, target.float(), density_scale=SCALE, backend=backend)
+    assert found.loss.requires_grad and not any(part.requires_grad for part in found[1:])
+    found.loss.backward()
+    assert raw.grad is not None and deltas.grad is None and target.grad is None
+
+
+def test_the_gradient_has_a_gradient(device, backend):
+    given = rays([4, 0, 9])
+    exact = None
+    for dtype, chosen in ((torch.float64, "reference"), (torch.float32, "reference"), (torch.float32, backend)):
+        raw, deltas, target, background = (given[i].to(device, dtype) for i in (0, 1, 3, 4))
+        raw.requires_grad_()
+        found = render_loss(
+            raw, deltas, given[2].to(device), target, background=background, density_scale=SCALE, backend=chosen
+        )
+        (gradient,) = torch.autograd.grad(found.loss, raw, create_graph=True)
+        (second,) = torch.autograd.grad(gradient.square().sum(), raw)
+        if dtype == torch.float64:
+            exact = second
+        elif chosen == "reference":
+            plain = second
+    assert_as_exact(second, plain, exact)
+
+
+def test_checked_gradient_of_the_reference():
+    raw, deltas, offsets, target, background = rays([3, 0, 2])
+    raw.requires_grad_()
+
+    def loss(raw):
+        rest = {"background": background, "density_scale": SCALE, "backend": "reference"}
+        return render_loss(raw, deltas, offsets, target, **rest).loss
+
+    assert torch.autograd.gradcheck(loss, raw)
+
+
+@pytest.mark.native
+def test_native_does_not_depend_on_threads_and_passes_opcheck(isa):
+    raw, deltas, offsets, target, background = rays([5, 0, 200, 17] * 70, torch.float32)
+    results, before = [], torch.get_num_threads()
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(evaluate("cpu", (raw, deltas, offsets, target, background), torch.float32, "native"))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
+    few = rays([2, 0, 3], torch.float32)
+    arguments = (few[0].requires_grad_(), *few[1:], SCALE)
+    torch.library.opcheck(torch.ops.voronerf.render_loss_native.default, arguments)
+
+
+def test_in_a_compiled_function(device, backend):
+    raw, deltas, offsets, target, background = (t.to(device) for t in rays([4, 0, 9], torch.float32))
+    raw.requires_grad_()
+
+    def loss(raw):
+        rest = {"background": background, "density_scale": SCALE, "backend": backend}
+        return render_loss(raw, deltas, offsets, target, **rest).loss
+
+    found = torch.compile(loss, fullgraph=True, backend="aot_eager")(raw)
+    torch.testing.assert_close(found, loss(raw), rtol=1e-6, atol=1e-7)
+
+
+def test_bad_arguments():
+    raw, deltas, offsets, target, background = rays([4, 2], torch.float32)
+    rest = {"background": background, "density_scale": SCALE}
+    with refused(ValueError, "render_loss: raw must have shape [m, 4], got [6, 3]"):
+        render_loss(raw[:, :3], deltas, offsets, target, **rest)
+    with refused(ValueError, "render_loss: deltas must have shape [m] with m = 6, got [5]"):
+        render_loss(raw, deltas[:5], offsets, target, **rest)
+    with refused(TypeError, "render_loss: target must have dtype float32, got float64"):
+        render_loss(raw, deltas, offsets, target.double(), **rest)
+    with refused(ValueError, "render_loss: density_scale must be positive, got 0.0"):
+        render_loss(raw, deltas, offsets, target, density_scale=0.0)
+
+
+@pytest.mark.native
+def test_native_refuses_offsets_that_fall():
+    raw, deltas, _, target, _ = rays([4, 2], torch.float32)
+    offsets = torch.tensor([0, 4, 3], dtype=torch.int32)
+    with refused(
+        ValueError,
+        "render_loss: ray_offsets must rise from 0 or more to at most the number of samples, 6, got 3 for ray 2",
+    ):
+        render_loss(raw, deltas, offsets, target, density_scale=SCALE, backend="native")

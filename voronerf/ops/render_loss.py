@@ -1,0 +1,85 @@
+"""The loss of rendered rays, from the outputs of the networks. r rays, m samples of all rays (packed)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import FLOATS, Implementation
+from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
+from voronerf.reference.render_loss import RenderLoss
+
+_OP = backends.declare("render_loss", native=Implementation(("cpu",), FLOATS))
+
+
+def render_loss(
+    raw: Tensor,
+    deltas: Tensor,
+    ray_offsets: Tensor,
+    target: Tensor,
+    *,
+    background: Tensor | None = None,
+    density_scale: float,
+    backend: str = "auto",
+) -> RenderLoss:
+    """The mean squared error of rendered rays, from what the networks put out for their samples.
+
+    The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. `composite`
+    makes the colours of the rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020,
+    equations 3 and 6). The native backend computes loss and gradient in one pass over each ray.
+
+    Args:
+        raw: [m, 4], colour and density before their activations: float16, bfloat16, float32 or float64.
+        deltas: [m], length of the part of its ray that a sample stands for, at least 0.
+        ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none.
+            Other samples have weight 0.
+        target: [r, 3], the colours to learn.
+        background: [3] or [r, 3], added with weight 1 - opacity, or None.
+        density_scale: factor on the density, > 0.
+        backend: "auto", "reference" or "native".
+
+    ``deltas``, ``target`` and ``background`` are float32, or float64 where ``raw`` is; so are the results. The loss is
+    differentiable in ``raw``, any number of times. Nothing else has gradients.
+
+    Returns:
+        RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
+
+    Raises:
+        ValueError: shapes, devices, a density_scale that is not positive, an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import render_loss
+        >>> raw = torch.tensor([[0.0, 0, 0, 50.0]], requires_grad=True)  # a grey wall
+        >>> offsets = torch.tensor([0, 1], dtype=torch.int32)
+        >>> result = render_loss(raw, torch.ones(1), offsets, torch.ones(1, 3), density_scale=1.0)
+        >>> result.colour, float(result.loss)
+        (tensor([[0.5000, 0.5000, 0.5000]]), 0.25)
+        >>> result.loss.backward()
+        >>> raw.grad[:, :3].round(decimals=4)  # lighter
+        tensor([[-0.0833, -0.0833, -0.0833]])
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "raw", raw, ("m", 4), sizes)
+    check_shape(_OP, "deltas", deltas, ("m",), sizes)
+    check_shape(_OP, "ray_offsets", ray_offsets, ("r+1",), sizes)
+    check_shape(_OP, "target", target, ("r", 3), sizes)
+    check_dtype(_OP, "raw", raw)
+    check_dtype(_OP, "ray_offsets", ray_offsets, INDEX)
+    wide = (torch.promote_types(raw.dtype, torch.float32),)
+    check_dtype(_OP, "deltas", deltas, wide)
+    check_dtype(_OP, "target", target, wide)
+    if background is not None:
+        check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
+        check_dtype(_OP, "background", background, wide)
+    check_same_device(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
+    check_count(_OP, "raw", raw.numel())
+    if not density_scale > 0:
+        raise ValueError(f"{_OP}: density_scale must be positive, got {density_scale}")
+    run = backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)
+    constant = (deltas.detach(), ray_offsets, target.detach())
+    background = None if background is None else background.detach()
+    return RenderLoss(*run(raw, *constant, background=background, density_scale=float(density_scale)))

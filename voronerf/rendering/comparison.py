@@ -1,0 +1,120 @@
+"""Rays rendered and compared with the colours they should have: what a training step needs of its networks.
+
+r rays, m samples of all rays.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from voronerf.fields.radiance import activate_radiance
+from voronerf.ops.render_loss import render_loss
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.field import Field
+from voronerf.rendering.marching import Marched, march_grid
+from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.volume import Rendered
+from voronerf.router import VoronoiRouter
+
+
+class Comparison(NamedTuple):
+    """The result of `Renderer.compare`. Only the loss has gradients.
+
+    Attributes:
+        loss: [].
+        error: [r], the squared error of the colour of each ray, summed over the channels.
+        positions: [m, 3] of the samples of the last pass.
+        weights: [m], their contributions to their rays.
+        ray_index: int32 [m], the ray of each sample; None where all rays have as many, one ray after the other.
+        density: [m], or None without an occupancy grid.
+        deltas: [m], the lengths of their strata, or None likewise.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF
+        >>> from voronerf.rendering import Rays, Renderer
+        >>> renderer = Renderer({"field": NeRF(width=16, depth=2)}, samples=8)
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> found = renderer.compare(rays, 1.0, 3.0, torch.rand(5, 3))
+        >>> found.loss.requires_grad, found.error.shape, found.importance().shape
+        (True, torch.Size([5]), torch.Size([40]))
+    """
+
+    loss: Tensor
+    error: Tensor
+    positions: Tensor
+    weights: Tensor
+    ray_index: Tensor | None = None
+    density: Tensor | None = None
+    deltas: Tensor | None = None
+
+    def importance(self) -> Tensor:
+        """[m]: the weight of each sample times the error of its ray (Elsner et al. 2023, section 3.1)."""
+        if self.ray_index is None:
+            return (self.weights.reshape(len(self.error), -1) * self.error[:, None]).reshape(-1)
+        return self.weights * self.error.index_select(0, self.ray_index)
+
+
+def compared(loss: Tensor, last: Rendered | Marched, target: Tensor) -> Comparison:
+    """The comparison of a last pass with the colours [r, 3] that it should have."""
+    error = (last.colour.detach() - target).square().sum(-1)
+    positions, weights = last.positions.detach().reshape(-1, 3), last.weights.detach().reshape(-1)
+    if isinstance(last, Rendered):
+        return Comparison(loss, error, positions, weights)
+    return Comparison(loss, error, positions, weights, last.ray_index, last.density.detach(), last.deltas)
+
+
+class Marching(Protocol):
+    """What `compare_marched` reads of a renderer."""
+
+    samples: int
+    spacing: str
+    backend: str
+    occupancy: OccupancyGrid | None
+
+    @property
+    def field(self) -> Field:
+        """The field of its last pass."""
+        ...
+
+
+def compare_marched(
+    renderer: Marching,
+    rays: Rays,
+    near: Tensor,
+    far: Tensor,
+    target: Tensor,
+    *,
+    background: Tensor | None,
+    generator: torch.Generator | None,
+) -> Comparison | None:
+    """`render_marched` and its loss in one pass from the outputs of the networks.
+
+    None where that is not to be had: without a grid, for fields that do not declare what their outputs mean
+    (`activate_radiance`), and where `render_loss` is not native.
+    """
+    field, grid, backend = renderer.field, renderer.occupancy, renderer.backend
+    if grid is None or near.device.type != "cpu" or backend not in ("auto", "native"):
+        return None
+    if not isinstance(field, VoronoiRouter) or getattr(type(field.module), "activate", None) is not activate_radiance:
+        return None
+    if not field.by_table:
+        return None
+    module: Any = field.module
+    march = march_grid(rays, near, far, grid, renderer.samples, True, generator, renderer.spacing, backend)
+    raw = field.raw(march.positions, rays.directions, march.ray_index)
+    found = render_loss(
+        raw,
+        march.deltas,
+        march.ray_offsets,
+        target,
+        background=background,
+        density_scale=float(module.density_scale),
+        backend=backend,
+    )
+    return Comparison(
+        found.loss, found.error, march.positions, found.weights, march.ray_index, found.density, march.deltas
+    )
