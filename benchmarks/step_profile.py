@@ -34,7 +34,9 @@ from voronerf.training.trainer import Trainer
 PARTS = {
     "route": ("routed_mlp", "grouped_mlp", "grouped_linear"),
     "cells": ("nearest_centre", "locate_cell", "cell_sort"),
-    "composite": ("composite",),
+    "composite": ("composite", "render_loss"),
+    "march and occupancy": ("march_rays", "update_occupancy"),
+    "encoding": ("hash_encode",),
     "optimiser": ("_fused_adam", "_foreach"),
     "other operators": ("",),
 }
@@ -54,6 +56,10 @@ class Options:
     """The networks, as for `voronerf train`."""
     sampling: SamplingName = "stratified"
     """Samples along a ray, likewise."""
+    field_options: tuple[str, ...] = ()
+    """Further options of the networks, each as NAME=VALUE."""
+    occupancy: bool = False
+    """Whether samples in empty space are left out; times are then also given for each sample that is kept."""
     width: int | None = None
     """Channels of the networks' hidden layers; default that of the field."""
     rays: int = TrainConfig.rays
@@ -62,6 +68,8 @@ class Options:
     """Samples per ray; default that of the sampling."""
     bfloat16: bool = False
     """Networks under autocast to bfloat16."""
+    warm: int = 20
+    """Steps before, the split in their middle; an occupancy grid needs some 150 to find what is empty."""
     steps: int = 60
     """Steps to time, and as many to profile."""
     backend: str = "auto"
@@ -87,7 +95,7 @@ def main() -> None:
 
 def measure(options: Options) -> dict[str, Any]:
     """Metadata, and rows {part, ms, share} and {operator, ms, calls} of a step."""
-    warm, every = 20, 2 * options.steps
+    warm, every = options.warm, 2 * options.steps
     with tempfile.TemporaryDirectory() as folder:
         config = TrainConfig(
             data=options.data,
@@ -99,6 +107,8 @@ def measure(options: Options) -> dict[str, Any]:
             split_at=(warm / 2 / (warm + every + 1),) if options.cells > 1 else None,
             evaluations=1,
             field=options.field,
+            field_options=options.field_options,
+            occupancy=options.occupancy,
             sampling=options.sampling,
             width=options.width,
             rays=options.rays,
@@ -117,11 +127,24 @@ def measure(options: Options) -> dict[str, Any]:
 
         for _ in range(warm):
             step()
+        kept: list[int] = []
+        if trainer.occupancy is not None:
+            march = trainer.occupancy.march
+
+            def counted(*given: Any, **named: Any) -> Any:
+                found = march(*given, **named)
+                kept.append(len(found.positions))
+                return found
+
+            trainer.occupancy.march = counted  # type: ignore[method-assign]
         times = []
+        used = time.process_time()
         for _ in range(options.steps):
             start = time.perf_counter()
             step()
             times.append(1e3 * (time.perf_counter() - start))
+        used = time.process_time() - used
+        samples = sum(kept) or options.steps * options.rays * int(trainer.config.samples or 0)
         with profile(activities=[ProfilerActivity.CPU]) as profiled:
             start = time.perf_counter()
             for _ in range(options.steps):
@@ -157,6 +180,9 @@ def measure(options: Options) -> dict[str, Any]:
             samples=trainer.config.samples,
             bfloat16=options.bfloat16,
             steps=options.steps,
+            occupancy=options.occupancy,
+            samples_a_step=samples / options.steps,
+            ns_a_sample=1e9 * used / samples,
             step_ms=median,
             step_iqr_ms=_spread(times),
             profiled_step_ms=profiled_ms,
@@ -175,7 +201,8 @@ def show(result: dict[str, Any], top: int) -> None:
         f"{about['data']}, {about['field']}, {about['sampling']}, {about['cells']} cells of width {about['width']}, "
         f"{about['rays']} rays x "
         f"{about['samples']} samples, {about['threads']} threads: {about['step_ms']:.2f} ms a step "
-        f"(spread {about['step_iqr_ms']:.2f}; profiled {about['profiled_step_ms']:.2f})"
+        f"(spread {about['step_iqr_ms']:.2f}; profiled {about['profiled_step_ms']:.2f}); {about['ns_a_sample']:.0f} ns "
+        f"of processor time for each of {about['samples_a_step']:.0f} samples"
     )
     rows = result["results"]
     for row in rows:
