@@ -10,7 +10,11 @@ from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
 from voronerf.grids import HashGrid
 
-_OP = backends.declare("hash_encode", native=Implementation(EVERYWHERE, FLOATS))
+_OP = backends.declare(
+    "hash_encode",
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+)
 
 
 def hash_encode(

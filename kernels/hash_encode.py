@@ -1,0 +1,310 @@
+"""The hash encoding as Warp kernels. n points, k tables, e entries of all levels, f features of a level.
+
+Forward, a thread takes one level of one point; for the gradient of the table as well, which is added up by atomics, so
+that on a GPU its last bits depend on the order. For the gradient to the positions a thread takes a point. With
+directions, the weights of the corners are replaced by their derivatives along them.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from voronerf.derivatives import HashDerivatives
+from voronerf.grids import HashGrid
+from voronerf.kernels._launch import array, launch
+
+wp.set_module_options({"enable_backward": False})
+
+_PRIME_Y, _PRIME_Z = wp.constant(wp.uint32(2654435761)), wp.constant(wp.uint32(805459861))
+
+
+@wp.struct
+class Grid:
+    """Of all levels: the box, the interpolation, the features, the entries of one table, and whether there are several.
+
+    ``numbers`` [levels, 2] holds scale and shift, ``sizes`` [levels, 4] side, entries, offset and whether it is hashed.
+    """
+
+    low: wp.vec3
+    inverse: wp.vec3
+    smooth: wp.bool
+    along: wp.bool
+    features: wp.int32
+    entries: wp.int32
+    several: wp.bool
+    numbers: wp.array2d(dtype=wp.float32)
+    sizes: wp.array2d(dtype=wp.int32)
+
+
+@wp.struct
+class Place:
+    """Of a point in a level: the lower corner; the weight of the upper one on each axis, and its two derivatives."""
+
+    x: wp.int32
+    y: wp.int32
+    z: wp.int32
+    upper: wp.vec3
+    slope: wp.vec3
+    bend: wp.vec3
+
+
+@wp.func
+def _place(positions: wp.array2d(dtype=wp.float32), i: wp.int32, level: wp.int32, grid: Grid) -> Place:
+    found = Place()
+    corners = wp.vec3i(0, 0, 0)
+    for axis in range(3):
+        place = (positions[i, axis] - grid.low[axis]) * grid.inverse[axis]
+        slope = wp.float32(0.0)
+        if place >= 0.0 and place <= 1.0:
+            slope = grid.inverse[axis] * grid.numbers[level, 0]
+        if place < 0.0:
+            place = wp.float32(0.0)
+        if place > 1.0:
+            place = wp.float32(1.0)
+        where = place * grid.numbers[level, 0] + grid.numbers[level, 1]
+        corner = wp.int32(0)
+        if where > 0.0:  # not NaN
+            corner = wp.int32(wp.floor(where))
+        t = where - wp.float32(corner)
+        corners[axis] = corner
+        if grid.smooth:
+            found.upper[axis] = t * t * (3.0 - 2.0 * t)
+            found.slope[axis] = slope * 6.0 * t * (1.0 - t)
+            found.bend[axis] = slope * slope * (6.0 - 12.0 * t)
+        else:
+            found.upper[axis] = t
+            found.slope[axis] = slope
+            found.bend[axis] = wp.float32(0.0)
+    found.x = corners[0]
+    found.y = corners[1]
+    found.z = corners[2]
+    return found
+
+
+@wp.func
+def _entry(place: Place, corner: wp.int32, level: wp.int32, grid: Grid) -> wp.int32:
+    x = place.x + (corner & 1)
+    y = place.y + ((corner >> 1) & 1)
+    z = place.z + (corner >> 2)
+    side = grid.sizes[level, 0]
+    entries = grid.sizes[level, 1]
+    if grid.sizes[level, 3] != 0:
+        hashed = wp.uint32(x) ^ (wp.uint32(y) * _PRIME_Y) ^ (wp.uint32(z) * _PRIME_Z)
+        return grid.sizes[level, 2] + wp.int32(hashed & wp.uint32(entries - 1))
+    entry = x + side * (y + side * z)
+    if entry >= entries:
+        entry -= entries
+    return grid.sizes[level, 2] + entry
+
+
+@wp.func
+def _of_corner(upper: wp.vec3, corner: wp.int32, one: wp.float32) -> wp.vec3:
+    """Weights of a corner on each axis, from those of the upper one: 1 - w for a lower one, or -w for derivatives."""
+    found = upper
+    for axis in range(3):
+        if ((corner >> axis) & 1) == 0:
+            found[axis] = one - upper[axis]
+    return found
+
+
+@wp.func
+def _start(cells: wp.array(dtype=wp.int32), i: wp.int32, grid: Grid) -> wp.int64:
+    if grid.several:
+        return wp.int64(cells[i]) * wp.int64(grid.entries)
+    return wp.int64(0)
+
+
+@wp.func
+def _weight(
+    place: Place, corner: wp.int32, direction: wp.array2d(dtype=wp.float32), i: wp.int32, grid: Grid
+) -> wp.float32:
+    at = _of_corner(place.upper, corner, wp.float32(1.0))
+    if not grid.along:
+        return at[0] * at[1] * at[2]
+    slope = _of_corner(place.slope, corner, wp.float32(0.0))
+    return (
+        direction[i, 0] * slope[0] * at[1] * at[2]
+        + direction[i, 1] * slope[1] * at[0] * at[2]
+        + direction[i, 2] * slope[2] * at[0] * at[1]
+    )
+
+
+@wp.kernel
+def _encode_kernel(
+    positions: wp.array2d(dtype=wp.float32),
+    direction: wp.array2d(dtype=wp.float32),
+    table: wp.array2d(dtype=wp.float32),
+    cells: wp.array(dtype=wp.int32),
+    grid: Grid,
+    out: wp.array2d(dtype=wp.float32),
+) -> None:
+    i, level = wp.tid()
+    place = _place(positions, i, level, grid)
+    start = _start(cells, i, grid)
+    for f in range(grid.features):
+        out[i, level * grid.features + f] = wp.float32(0.0)
+    for corner in range(8):
+        row = start + wp.int64(_entry(place, corner, level, grid))
+        weight = _weight(place, corner, direction, i, grid)
+        for f in range(grid.features):
+            out[i, level * grid.features + f] = out[i, level * grid.features + f] + weight * table[row, f]
+
+
+@wp.kernel
+def _table_kernel(
+    gradient: wp.array2d(dtype=wp.float32),
+    positions: wp.array2d(dtype=wp.float32),
+    direction: wp.array2d(dtype=wp.float32),
+    cells: wp.array(dtype=wp.int32),
+    grid: Grid,
+    of_table: wp.array2d(dtype=wp.float32),
+) -> None:
+    i, level = wp.tid()
+    place = _place(positions, i, level, grid)
+    start = _start(cells, i, grid)
+    for corner in range(8):
+        row = start + wp.int64(_entry(place, corner, level, grid))
+        weight = _weight(place, corner, direction, i, grid)
+        for f in range(grid.features):
+            wp.atomic_add(of_table, row, wp.int64(f), weight * gradient[i, level * grid.features + f])
+
+
+@wp.kernel
+def _positions_kernel(
+    gradient: wp.array2d(dtype=wp.float32),
+    positions: wp.array2d(dtype=wp.float32),
+    direction: wp.array2d(dtype=wp.float32),
+    table: wp.array2d(dtype=wp.float32),
+    cells: wp.array(dtype=wp.int32),
+    grid: Grid,
+    of_positions: wp.array2d(dtype=wp.float32),
+) -> None:
+    i = wp.tid()
+    start = _start(cells, i, grid)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for level in range(grid.numbers.shape[0]):
+        place = _place(positions, i, level, grid)
+        for corner in range(8):
+            row = start + wp.int64(_entry(place, corner, level, grid))
+            product = wp.float32(0.0)
+            for f in range(grid.features):
+                product += gradient[i, level * grid.features + f] * table[row, f]
+            at = _of_corner(place.upper, corner, wp.float32(1.0))
+            slope = _of_corner(place.slope, corner, wp.float32(0.0))
+            bend = _of_corner(place.bend, corner, wp.float32(0.0))
+            for axis in range(3):
+                b = (axis + 1) % 3
+                c = (axis + 2) % 3
+                change = slope[axis] * at[b] * at[c]
+                if grid.along:
+                    change = direction[i, axis] * bend[axis] * at[b] * at[c] + slope[axis] * (
+                        direction[i, b] * slope[b] * at[c] + direction[i, c] * slope[c] * at[b]
+                    )
+                # Outside of the box there is no gradient, not even of NaN.
+                if place.slope[axis] != 0.0 or place.bend[axis] != 0.0:
+                    total[axis] = total[axis] + change * product
+    for axis in range(3):
+        of_positions[i, axis] = total[axis]
+
+
+def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, *, cells: Tensor | None = None) -> Tensor:
+    """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
+    encoded: Tensor = _encode(positions.float(), table.float(), None, cells, grid.text)
+    return encoded
+
+
+@torch.library.custom_op("voronerf::hash_encode_warp", mutates_args=())
+def _encode(positions: Tensor, table: Tensor, direction: Tensor | None, cells: Tensor | None, grid: str) -> Tensor:
+    """The features or, with directions [n, 3], their derivatives along them."""
+    out = _new_features(positions, grid)
+    levels = HashGrid.parse(grid)
+    rows = array(table.reshape(-1, levels.features), table)
+    given = [array(positions, table), _direction(direction, positions), rows, array(cells, table, torch.int32)]
+    inputs = [*given, _grid(grid, table, direction, cells), array(out, table)]
+    launch(_encode_kernel, (len(positions), levels.levels), inputs, table)
+    return out
+
+
+@torch.library.custom_op("voronerf::hash_encode_warp_backward", mutates_args=())
+def _backward(
+    gradient: Tensor,
+    positions: Tensor,
+    table: Tensor,
+    direction: Tensor | None,
+    cells: Tensor | None,
+    grid: str,
+    to_positions: bool,
+    to_table: bool,
+) -> list[Tensor]:
+    """Gradients to positions and table, empty where not wanted."""
+    results = of_positions, of_table = _new_gradients(positions, table, to_positions, to_table)
+    levels = HashGrid.parse(grid)
+    given = [array(gradient, table), array(positions, table), _direction(direction, positions)]
+    more = [array(cells, table, torch.int32), _grid(grid, table, direction, cells)]
+    if to_table:
+        rows = array(of_table.zero_().reshape(-1, levels.features), table)
+        launch(_table_kernel, (len(positions), levels.levels), [*given, *more, rows], table)
+    if to_positions:
+        rows = array(table.reshape(-1, levels.features), table)
+        launch(_positions_kernel, len(positions), [*given, rows, *more, array(of_positions, table)], table)
+    return list(results)
+
+
+def _direction(direction: Tensor | None, positions: Tensor) -> object:
+    return array(positions[:0] if direction is None else direction, positions)
+
+
+def _grid(text: str, table: Tensor, direction: Tensor | None, cells: Tensor | None) -> Grid:
+    levels, found = HashGrid.parse(text), Grid()
+    low, high = levels.box
+    found.low, found.inverse = wp.vec3(*low), wp.vec3(*(1 / (b - a) for a, b in zip(low, high)))
+    found.smooth, found.along = levels.interpolation == "smoothstep", direction is not None
+    found.features, found.entries, found.several = levels.features, table.shape[-2], cells is not None
+    numbers, sizes = _levels(text, table.device)
+    found.numbers, found.sizes = array(numbers, table), array(sizes, table)
+    return found
+
+
+@functools.lru_cache(maxsize=64)
+def _levels(text: str, device: torch.device) -> tuple[Tensor, Tensor]:
+    rows = HashGrid.parse(text).rows
+    numbers = torch.tensor([[row.scale, row.shift] for row in rows], device=device)
+    sizes = [[row.side, row.entries, row.offset, row.hashed] for row in rows]
+    return numbers, torch.tensor(sizes, dtype=torch.int32, device=device)
+
+
+def _new_features(positions: Tensor, grid: str) -> Tensor:
+    return positions.new_empty(positions.shape[0], HashGrid.parse(grid).out_features)
+
+
+def _new_gradients(positions: Tensor, table: Tensor, to_positions: bool, to_table: bool) -> tuple[Tensor, Tensor]:
+    of_positions = positions.new_empty(positions.shape if to_positions else 0)
+    return of_positions, positions.new_empty(table.shape if to_table else 0)
+
+
+@_encode.register_fake
+def _(positions: Tensor, table: Tensor, direction: Tensor | None, cells: Tensor | None, grid: str) -> Tensor:
+    return _new_features(positions, grid)
+
+
+@_backward.register_fake
+def _(
+    gradient: Tensor,
+    positions: Tensor,
+    table: Tensor,
+    direction: Tensor | None,
+    cells: Tensor | None,
+    grid: str,
+    to_positions: bool,
+    to_table: bool,
+) -> list[Tensor]:
+    return list(_new_gradients(positions, table, to_positions, to_table))
+
+
+_derivatives = HashDerivatives(_encode, _backward)
+_encode.register_autograd(_derivatives.encode, setup_context=_derivatives.encode_setup)
+_backward.register_autograd(_derivatives.backward, setup_context=_derivatives.backward_setup)
