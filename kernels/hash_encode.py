@@ -55,7 +55,7 @@ class Place:
 @wp.func
 def _place(positions: wp.array2d(dtype=wp.float32), i: wp.int32, level: wp.int32, grid: Grid) -> Place:
     found = Place()
-    corners = wp.vec3i(0, 0, 0)
+    corners = wp.vec3(0.0, 0.0, 0.0)  # whole numbers below 2^24
     for axis in range(3):
         place = (positions[i, axis] - grid.low[axis]) * grid.inverse[axis]
         slope = wp.float32(0.0)
@@ -66,10 +66,10 @@ def _place(positions: wp.array2d(dtype=wp.float32), i: wp.int32, level: wp.int32
         if place > 1.0:
             place = wp.float32(1.0)
         where = place * grid.numbers[level, 0] + grid.numbers[level, 1]
-        corner = wp.int32(0)
+        corner = wp.float32(0.0)
         if where > 0.0:  # not NaN
-            corner = wp.int32(wp.floor(where))
-        t = where - wp.float32(corner)
+            corner = wp.floor(where)
+        t = where - corner
         corners[axis] = corner
         if grid.smooth:
             found.upper[axis] = t * t * (3.0 - 2.0 * t)
@@ -79,9 +79,9 @@ def _place(positions: wp.array2d(dtype=wp.float32), i: wp.int32, level: wp.int32
             found.upper[axis] = t
             found.slope[axis] = slope
             found.bend[axis] = wp.float32(0.0)
-    found.x = corners[0]
-    found.y = corners[1]
-    found.z = corners[2]
+    found.x = wp.int32(corners[0])
+    found.y = wp.int32(corners[1])
+    found.z = wp.int32(corners[2])
     return found
 
 
