@@ -64,6 +64,7 @@ class HashGrid:
             resolution N has N corners along an axis. "torch-ngp" (its gridencoder, with ``align_corners=False``): as
             before, with one more corner. "nerfstudio" (``HashEncoding`` in PyTorch, and HashNeRF): no shift, whole
             resolutions, and hashes on every level.
+        text: the grid as JSON, which :meth:`parse` reads.
 
     Raises:
         ValueError: a number out of its range, a box without a volume, or another word.
@@ -85,6 +86,7 @@ class HashGrid:
     box: tuple[tuple[float, float, float], tuple[float, float, float]] = UNIT_CUBE
     interpolation: str = "linear"
     convention: str = "tiny-cuda-nn"
+    text: str = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name, least, most in (("levels", 1, 24), ("log2_entries", 10, 24)):
@@ -106,6 +108,9 @@ class HashGrid:
         for name, words in (("interpolation", INTERPOLATIONS), ("convention", CONVENTIONS)):
             if getattr(self, name) not in words:
                 raise ValueError(f"HashGrid: {name} must be one of {', '.join(words)}, got {getattr(self, name)!r}")
+        said = {own.name: getattr(self, own.name) for own in dataclasses.fields(self) if own.init}
+        # Not by a cached property, whose lock torch.compile does not enter.
+        object.__setattr__(self, "text", json.dumps(said))
 
     @functools.cached_property
     def rows(self) -> tuple[GridLevel, ...]:
@@ -137,11 +142,6 @@ class HashGrid:
         """Shape [entries of all levels, features] of the table."""
         last = self.rows[-1]
         return last.offset + last.entries, self.features
-
-    @functools.cached_property
-    def text(self) -> str:
-        """The grid as JSON, which :meth:`parse` reads."""
-        return json.dumps(dataclasses.asdict(self))
 
     @staticmethod
     @functools.lru_cache(maxsize=256)
