@@ -26,6 +26,7 @@ from voronerf.ops.render_loss import RenderLoss, render_loss
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.select_heaviest import select_heaviest
+from voronerf.ops.sparse_adam import sparse_adam
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 from voronerf.ops.update_occupancy import update_occupancy
 
@@ -56,6 +57,7 @@ __all__ = [
     "resample",
     "routed_mlp",
     "select_heaviest",
+    "sparse_adam",
     "spherical_harmonics",
     "update_occupancy",
 ]

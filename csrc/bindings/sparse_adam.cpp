@@ -1,0 +1,13 @@
+#include "encoding/sparse_adam.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_STRUCT(SparseAdam, step_size, correction, decay, decay_sq, epsilon);
+
+VN_BINDINGS(module) {
+  module.cpu("sparse_adam", VN_CPU(sparse_adam_cpu));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,21 @@
+// Adam on the entries that have a gradient. n entries; the formula is in voronerf/ops/sparse_adam.py.
+#pragma once
+
+#include <cstdint>
+
+#include "common/isa.h"
+
+namespace voronerf {
+
+struct SparseAdam {
+  float step_size;        // the learning rate, corrected for the first moment's start at zero
+  float correction;       // the root of the second moment's correction
+  float decay, decay_sq;  // of the moments
+  float epsilon;
+};
+
+// gradient: [n] -> parameter, mean, square: [n], updated in place where the gradient is not zero.
+void sparse_adam_cpu(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
+                     int64_t n, Isa isa, int threads);
+
+}  // namespace voronerf

@@ -1,0 +1,99 @@
+"""The optimiser of tables: few entries have a gradient, moments are inherited and saved."""
+
+from typing import ClassVar
+
+import pytest
+import torch
+from tiny_runs import assert_resumes, small
+
+from voronerf.fields import FIELDS, register_field
+from voronerf.training.adam import Adam
+from voronerf.training.trainer import Trainer
+
+
+@pytest.fixture
+def embedded():
+    @register_field("embedded")
+    class Embedded(torch.nn.Module):
+        """A feature for each slab of the box; a step meets few of the slabs."""
+
+        router_options: ClassVar = {"share": ["table"]}
+        sparse_parameters = ("tab*",)
+
+        def __init__(self, width: int = 8):
+            super().__init__()
+            self.table = torch.nn.Parameter(torch.randn(5000, 4))
+            self.out = torch.nn.Linear(4, 4)
+
+        def forward(self, positions, directions):
+            slab = (positions[:, 0] * 800 + 2500).long().clamp(0, 4999)
+            raw = self.out(torch.nn.functional.embedding(slab, self.table))
+            return torch.sigmoid(raw[:, :3]), torch.nn.functional.softplus(raw[:, 3])
+
+    yield "embedded"
+    del FIELDS["embedded"]
+
+
+def test_dense_groups_are_torchs():
+    results = []
+    for make in (Adam, torch.optim.Adam):
+        torch.manual_seed(0)
+        parameters = [torch.nn.Parameter(torch.randn(5, 3)), torch.nn.Parameter(torch.randn(7))]
+        optimizer = make(parameters, lr=0.1, fused=True)
+        for _ in range(3):
+            optimizer.zero_grad()
+            sum((p.square() * torch.randn_like(p)).sum() for p in parameters).backward()
+            optimizer.step()
+        results.append([*parameters, *(t for p in parameters for t in optimizer.state[p].values())])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_tables_move_where_they_have_a_gradient_and_keep_it():
+    table, other = torch.nn.Parameter(torch.ones(6, 2)), torch.nn.Parameter(torch.ones(2))
+    optimizer = Adam([{"params": [other]}, {"params": [table], "sparse": True}], lr=0.5, fused=True)
+    for row in (1, 4):
+        optimizer.zero_grad()
+        (table[row].sum() + other.sum()).backward()
+        before, moments = table.detach().clone(), optimizer.state[table].get("exp_avg", torch.zeros(6, 2)).clone()
+        optimizer.step()
+        rest = torch.arange(6) != row
+        assert torch.equal(table[rest], before[rest]) and bool((table[row] < before[row]).all())
+        assert torch.equal(optimizer.state[table]["exp_avg"][rest], moments[rest])
+        assert table.grad is not None and bool((table.grad[row] == 1).all())
+    assert float(optimizer.state[table]["step"]) == 2 and bool((other < 1).all())
+
+
+def test_a_scaled_gradient_is_unscaled_and_an_overflow_skipped():
+    results = []
+    for enabled in (False, True):
+        table = torch.nn.Parameter(torch.ones(40, 2))
+        optimizer = Adam([{"params": [table], "sparse": True}], lr=0.5, fused=True, eps=1e-3)
+        scaler = torch.amp.GradScaler("cpu", enabled=enabled)
+        for factor in (1.0, 2.0) if not enabled else (1.0, torch.inf, 2.0):
+            optimizer.zero_grad()
+            scaler.scale(table[3].sum() * factor).backward()
+            scaler.step(optimizer)
+            scaler.update()
+        results.append(table.detach())
+    assert torch.equal(*results)
+
+
+def test_a_field_names_its_tables(tmp_path, scene, embedded):
+    trainer = Trainer(small(tmp_path, field=embedded, depth=None), scene)
+    dense, tables = trainer.optimizer.param_groups
+    assert tables["sparse"] and not dense["sparse"] and len(dense["params"]) == 2
+    (table,) = tables["params"]
+    before = table.detach().clone()
+    trainer.on_step = lambda progress: trainer.request_stop() if progress.step == 2 else None
+    trainer.advance()
+    moved = (table != before).any(1)
+    assert bool(moved.any()) and not bool(moved.all())
+    assert torch.equal(optimizer_moved(trainer, table), moved)
+
+
+def optimizer_moved(trainer, table):
+    return (trainer.optimizer.state[table]["exp_avg"] != 0).any(1)
+
+
+def test_tables_resume_bit_for_bit(tmp_path, scene, embedded):
+    assert_resumes(tmp_path, scene, 15, field=embedded, depth=None)
