@@ -11,13 +11,23 @@ namespace VN_ISA_NAMESPACE {
 namespace {
 
 constexpr int kLine = 16;
+constexpr int kLines = 256;  // of which those with a gradient are listed first, so that no branch is guessed wrong
+constexpr int kAhead = 8;    // lines whose memory is asked for ahead
 
 // Any bit but the sign: a gradient of -0 is none, NaN is one.
-VN_INLINE bool any(const float* gradient) {
+VN_INLINE int any(const float* gradient) {
+#if VN_ISA == 2
+  return _mm512_test_epi32_mask(_mm512_loadu_si512(gradient), _mm512_set1_epi32(0x7fffffff)) != 0;
+#elif VN_ISA == 1
+  const __m256i a = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(gradient));
+  const __m256i b = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(gradient + 8));
+  return !_mm256_testz_si256(_mm256_or_si256(a, b), _mm256_set1_epi32(0x7fffffff));
+#else
   uint32_t bits[kLine], found = 0;
   __builtin_memcpy(bits, gradient, sizeof(bits));
   for (int i = 0; i < kLine; ++i) found |= bits[i];
   return (found & 0x7fffffffu) != 0;
+#endif
 }
 
 VN_INLINE F32 square_root(F32 a) {
@@ -53,19 +63,32 @@ VN_INLINE void update(const SparseAdam& rule, const float* gradient, float* para
   store(parameter, present ? moved : p);
 }
 
-VN_INLINE void update_line(const SparseAdam& rule, const float* gradient, float* parameter, float* mean,
-                           float* square) {
-  if (!any(gradient)) return;
-  for (int i = 0; i < kLine; i += kLanes) update(rule, gradient + i, parameter + i, mean + i, square + i);
-}
-
 }  // namespace
 
 void sparse_adam_block(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
                        int64_t begin, int64_t end) {
   int64_t line = begin;
-  for (; line + kLine <= end; line += kLine) {
-    update_line(rule, gradient + line, parameter + line, mean + line, square + line);
+  int32_t found[kLines];
+  while (line + kLine <= end) {
+    const int64_t lines = (end - line) / kLine < kLines ? (end - line) / kLine : kLines;
+    int count = 0;
+    for (int64_t i = 0; i < lines; ++i) {
+      found[count] = static_cast<int32_t>(i * kLine);
+      count += any(gradient + line + i * kLine);
+    }
+    for (int i = 0; i < count; ++i) {
+      if (i + kAhead < count) {
+        const int64_t later = line + found[i + kAhead];
+        __builtin_prefetch(parameter + later, 1);
+        __builtin_prefetch(mean + later, 1);
+        __builtin_prefetch(square + later, 1);
+      }
+      const int64_t at = line + found[i];
+      for (int j = 0; j < kLine; j += kLanes) {
+        update(rule, gradient + at + j, parameter + at + j, mean + at + j, square + at + j);
+      }
+    }
+    line += lines * kLine;
   }
   if (line == end) return;
   float rest[4][kLine] = {};  // gradient, parameter, mean, square
@@ -74,7 +97,7 @@ void sparse_adam_block(const SparseAdam& rule, const float* gradient, float* par
   __builtin_memcpy(rest[1], parameter + line, bytes);
   __builtin_memcpy(rest[2], mean + line, bytes);
   __builtin_memcpy(rest[3], square + line, bytes);
-  update_line(rule, rest[0], rest[1], rest[2], rest[3]);
+  for (int j = 0; j < kLine; j += kLanes) update(rule, rest[0] + j, rest[1] + j, rest[2] + j, rest[3] + j);
   __builtin_memcpy(parameter + line, rest[1], bytes);
   __builtin_memcpy(mean + line, rest[2], bytes);
   __builtin_memcpy(square + line, rest[3], bytes);
