@@ -211,6 +211,7 @@ class RenderLossOutputs(NamedTuple):
     density: Tensor | None  # float32*
     error: Tensor | None  # float32*
     gradient: Tensor | None  # float32*
+
 class SparseAdam(NamedTuple):
     step_size: float  # float32
     correction: float  # float32
@@ -386,6 +387,9 @@ def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor
 @overload
 def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: int, _8: Cuda) -> None: ...
 
+# SparseAdam, const float32*, float32*, float32*, float32*, int64, Cpu
+def sparse_adam(_0: SparseAdam, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: Cpu) -> None: ...
+
 # const float32*, float32*, int64, int64, Cpu
 @overload
 def spherical_harmonics(_0: Tensor | None, _1: Tensor | None, _2: int, _3: int, _4: Cpu) -> None: ...
@@ -399,8 +403,6 @@ def spherical_harmonics_backward(_0: Tensor | None, _1: Tensor | None, _2: Tenso
 # const float32*, const float32*, float32*, int64, int64, Cuda
 @overload
 def spherical_harmonics_backward(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: int, _4: int, _5: Cuda) -> None: ...
-# SparseAdam, const float32*, float32*, float32*, float32*, int64, Cpu
-def sparse_adam(_0: SparseAdam, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: Cpu) -> None: ...
 
 # const float32*, const int32*, const float32*, float32*, uint8*, int64, int64, float32, float32, Cpu
 def update_occupancy(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: float, _8: float, _9: Cpu) -> bool: ...
