@@ -123,7 +123,7 @@ def target_markdown(rows: list[Row]) -> list[str]:
 
 def foreign_markdown(rows: list[Row]) -> list[str]:
     """Rows of fields of other codebases: how many times faster than the loop over masks each way is."""
-    known = ("fused", "torch.compile of masks", "one module")
+    known = ("fused", "masks behind one encoding", "torch.compile of masks", "one module")
     ways = [way for way in known if any(row["alternatives"].get(way) is not None for row in rows)]
     head = ("", "n", "k", "", "masks, ms", "grouped", *ways)
     found = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]

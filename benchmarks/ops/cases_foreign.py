@@ -8,10 +8,12 @@ the loop as the library's own.
 
 from __future__ import annotations
 
+import fnmatch
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -87,6 +89,7 @@ class Field:
         evaluate: what is computed of a call.
         most: largest number of samples; second derivatives and splines keep several GiB beyond.
         most_cells: largest number of cells; larger tables would not fit.
+        share: names of the parameters of its ``encode``, which all cells have in common; its ``decode`` is the rest.
     """
 
     make: Callable[[], nn.Module]
@@ -94,6 +97,7 @@ class Field:
     evaluate: Callable[[Call, Arguments], list[Tensor]] = values
     most: int = LARGE
     most_cells: int = 256
+    share: tuple[str, ...] = ()
 
 
 FIELDS = {
@@ -110,6 +114,11 @@ FIELDS = {
     "tensorf": Field(fields.TensorField),
     "k-planes": Field(fields.KPlanes),
     "kan": Field(fields.KAN, most=MIDDLE),
+    "torch-ngp shared": Field(fields.NeRFNetwork, with_directions, most_cells=16, share=("encoder.*",)),
+    "nerfacto shared": Field(fields.HashTable, most_cells=16, share=("hash_table",)),
+    "hashnerf shared": Field(fields.HashEmbedder, most_cells=16, share=("embeddings.*",)),
+    "tensorf shared": Field(fields.TensorField, most_cells=16, share=("plane.*", "line.*")),
+    "k-planes shared": Field(fields.KPlanes, most_cells=16, share=("grids.*",)),
 }
 
 
@@ -144,6 +153,14 @@ def cases() -> list[Case]:
     return found
 
 
+def _sharing(module: nn.Module, first: nn.Module, names: set[str]) -> nn.Module:
+    """A module that has some of its parameters in common with the first."""
+    for name in names:
+        path, _, last = name.rpartition(".")
+        module.get_submodule(path).register_parameter(last, first.get_parameter(name))
+    return module
+
+
 class Batch:
     """Modules, samples and gradients of a case, and what the loop over masks makes of the first samples.
 
@@ -158,7 +175,13 @@ class Batch:
         self.field, self.n, self.k, self.training = field, n, k, direction == BACKWARD
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            self.modules = [field.make() for _ in range(k)]
+            first = field.make()
+            names = [name for name, _ in first.named_parameters()]
+            shared = {name for pattern in field.share for name in fnmatch.filter(names, pattern)}
+            self.modules = [first, *[_sharing(field.make(), first, shared) for _ in range(k - 1)]]
+        self.leaves = [
+            [m.get_parameter(name) for m in self.modules[: None if name not in shared else 1]] for name in names
+        ]
         self.centres = uniform_points(k, 1000, torch.device("cpu"))
         points = [uniform_points(n, seed, torch.device("cpu")) for seed in range(2)]
         self.arguments = [field.arguments(x) for x in points]
@@ -184,19 +207,30 @@ class Batch:
         """Results and gradients of leaves of each cell -> results and gradients [k, ...]."""
         if not self.training:
             return found
-        each = len(list(self.modules[0].parameters()))
-        results, leaves = found[: len(found) - each * self.k], found[len(found) - each * self.k :]
-        return [*results, *[torch.stack(leaves[i::each]) for i in range(each)]]
+        counts = [len(leaves) for leaves in self.leaves]
+        split = len(found) - sum(counts)
+        results, gradients = found[:split], iter(found[split:])
+        parts = [list(itertools.islice(gradients, count)) for count in counts]
+        return [*results, *[part[0] if len(part) < self.k else torch.stack(part) for part in parts]]
 
-    def masks(self, compiled: bool = False) -> Contender:
-        """The loop that one would write: each cell's module on its samples, results put back where they belong."""
-        parameters = [parameter for module in self.modules for parameter in module.parameters()]
+    def masks(self, compiled: bool = False, encoded: bool = False) -> Contender:
+        """The loop that one would write: each cell's module on its samples, results put back where they belong.
+
+        Where cells share their encoding, it can also be computed before the loop, for all samples at once.
+        """
+        parameters = [leaf for leaves in self.leaves for leaf in leaves]
         calls: Sequence[Call] = self.modules
         if compiled:
             calls = self._compiled()
+        if encoded and not self.field.share:
+            raise NotApplicable("cells do not share an encoding")
+        if encoded:
+            calls = [cast(Call, module.decode) for module in self.modules]
 
         def call(*arguments: Tensor) -> Tensor:
             cells = ops.nearest_centre(arguments[0][:, :3].detach().contiguous(), self.centres)
+            if encoded:
+                arguments = cast(Call, self.modules[0].encode)(arguments[0]), *arguments[1:]
             parts, rows = [], []
             for cell, module in enumerate(calls):
                 mask = cells == cell
@@ -230,7 +264,9 @@ class Batch:
 
     def routed(self, **options: Any) -> Contender:
         """The router."""
-        router = VoronoiRouter.from_modules(self.modules, self.centres, coords="first3", **options)
+        router = VoronoiRouter.from_modules(
+            self.modules, self.centres, coords="first3", share=self.field.share, **options
+        )
         parameters = list(router.parameters())
         return Contender(lambda number: self.step(router, parameters, number))
 
@@ -262,6 +298,7 @@ def foreign_work(field: Field, n: int, k: int, direction: str, device: torch.dev
         alternatives={
             "fused": lambda: batch.routed(fuse=True),
             "masks": batch.masks,
+            "masks behind one encoding": lambda: batch.masks(encoded=True),
             "torch.compile of masks": batch.compiled,
             "one module": batch.single,
         },

@@ -171,9 +171,11 @@ class HashTable(nn.Module):
         corner = corner * torch.tensor([1, 2654435761, 805459861], device=corner.device)
         x = torch.bitwise_xor(corner[..., 0], corner[..., 1])
         x = torch.bitwise_xor(x, corner[..., 2])
-        return x % self.entries + self.offsets
+        x %= self.entries
+        x += self.offsets
+        return x
 
-    def forward(self, positions: Tensor) -> Tensor:
+    def encode(self, positions: Tensor) -> Tensor:
         positions = (positions + 1) / 2
         scaled = positions[..., None, :] * self.scalings.view(-1, 1)
         c, f = torch.ceil(scaled).type(torch.int32), torch.floor(scaled).type(torch.int32)
@@ -185,7 +187,13 @@ class HashTable(nn.Module):
         for axis in range(3):
             w = offset[..., axis : axis + 1]
             corners = [a * (1 - w) + b * w for a, b in zip(corners[::2], corners[1::2])]
-        return cast(Tensor, self.head(torch.flatten(corners[0], start_dim=-2, end_dim=-1)))
+        return torch.flatten(corners[0], start_dim=-2, end_dim=-1)
+
+    def decode(self, features: Tensor) -> Tensor:
+        return cast(Tensor, self.head(features))
+
+    def forward(self, positions: Tensor) -> Tensor:
+        return self.decode(self.encode(positions))
 
 
 class HashEmbedder(nn.Module):
@@ -204,7 +212,7 @@ class HashEmbedder(nn.Module):
         xor = coords[..., 0] * 1 ^ coords[..., 1] * 2654435761 ^ coords[..., 2] * 805459861
         return torch.tensor(self.entries - 1, device=coords.device) & xor
 
-    def forward(self, x: Tensor) -> Tensor:
+    def encode(self, x: Tensor) -> Tensor:
         x, levels = (x + 1) / 2, []
         box = torch.tensor([[[i, j, k] for i in [0, 1] for j in [0, 1] for k in [0, 1]]], device=x.device)
         for i in range(self.levels):
@@ -216,7 +224,70 @@ class HashEmbedder(nn.Module):
                 half, w = voxel.shape[1] // 2, weights[:, axis][:, None, None]
                 voxel = voxel[:, :half] * (1 - w) + voxel[:, half:] * w
             levels.append(voxel[:, 0])
-        return cast(Tensor, self.head(torch.cat(levels, dim=-1)))
+        return torch.cat(levels, dim=-1)
+
+    def decode(self, features: Tensor) -> Tensor:
+        return cast(Tensor, self.head(features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.decode(self.encode(x))
+
+
+class GridEncoder(nn.Module):
+    """torch-ngp's hash grid: levels of (resolution + 1)^3 entries where they fit, in one table."""
+
+    def __init__(self, entries: int = 1 << 19, levels: int = 16, finest: int = 2048) -> None:
+        super().__init__()
+        self.growth = (finest / 16) ** (1 / (levels - 1))
+        sizes = [min(entries, (math.ceil(16 * self.growth**level) + 1) ** 3) for level in range(levels)]
+        self.offsets = [sum(sizes[:level]) for level in range(levels + 1)]
+        self.embeddings = nn.Parameter(torch.rand(self.offsets[-1], 2) * 0.2 - 0.1)
+
+    def forward(self, inputs: Tensor, bound: float = 1.0) -> Tensor:
+        inputs = (inputs + bound) / (2 * bound)
+        box = torch.tensor([[i, j, k] for i in [0, 1] for j in [0, 1] for k in [0, 1]], device=inputs.device)
+        places, shares = [], []
+        for level, (start, stop) in enumerate(zip(self.offsets, self.offsets[1:])):
+            scale = 16 * self.growth**level - 1
+            side, scaled = math.ceil(scale) + 2, inputs * scale + 0.5
+            corner = torch.floor(scaled)
+            x, y, z = (corner.long()[:, None] + box).unbind(-1)
+            hashed = (x ^ y * 2654435761 ^ z * 805459861) & 0xFFFFFFFF
+            dense = side**3 <= stop - start
+            places.append(start + (x + side * (y + side * z) if dense else hashed) % (stop - start))
+            shares.append(torch.where(box.bool(), (scaled - corner)[:, None], 1 - (scaled - corner)[:, None]).prod(-1))
+        found = self.embeddings[torch.stack(places, 1)] * torch.stack(shares, 1)[..., None]
+        return found.sum(2).flatten(1)
+
+
+class NeRFNetwork(nn.Module):
+    """torch-ngp's network: a hash grid, a density network of two layers, a colour network of three, no biases."""
+
+    def __init__(self, entries: int = 1 << 19, levels: int = 16, width: int = 64) -> None:
+        super().__init__()
+        self.encoder = GridEncoder(entries, levels)
+        sizes = [(2 * levels, width), (width, 16)]
+        self.sigma_net = nn.ModuleList([nn.Linear(i, o, bias=False) for i, o in sizes])
+        sizes = [(27 + 15, width), (width, width), (width, 3)]
+        self.color_net = nn.ModuleList([nn.Linear(i, o, bias=False) for i, o in sizes])
+
+    def encode(self, x: Tensor) -> Tensor:
+        return cast(Tensor, self.encoder(x))
+
+    def decode(self, h: Tensor, d: Tensor) -> Tensor:
+        for i, layer in enumerate(self.sigma_net):
+            h = layer(h)
+            if i == 0:
+                h = F.relu(h, inplace=True)
+        sigma, h = torch.exp(h[..., :1]), torch.cat([frequencies(d, 4), h[..., 1:]], dim=-1)
+        for i, layer in enumerate(self.color_net):
+            h = layer(h)
+            if i < 2:
+                h = F.relu(h, inplace=True)
+        return torch.cat([torch.sigmoid(h), sigma], dim=-1)
+
+    def forward(self, x: Tensor, d: Tensor) -> Tensor:
+        return self.decode(self.encode(x), d)
 
 
 class TensorField(nn.Module):
@@ -230,7 +301,7 @@ class TensorField(nn.Module):
         self.basis_mat = nn.Linear(3 * components, 27, bias=False)
         self.render = nn.Sequential(nn.Linear(27, width), nn.ReLU(), nn.Linear(width, 4))
 
-    def forward(self, xyz: Tensor) -> Tensor:
+    def encode(self, xyz: Tensor) -> Tensor:
         plane = torch.stack([xyz[..., mode] for mode in self.mat_mode]).detach().view(3, -1, 1, 2)
         line = torch.stack([xyz[..., mode] for mode in self.vec_mode])
         line = torch.stack((torch.zeros_like(line), line), dim=-1).detach().view(3, -1, 1, 2)
@@ -238,8 +309,13 @@ class TensorField(nn.Module):
         for i in range(3):
             planes.append(F.grid_sample(self.plane[i], plane[[i]], align_corners=True).view(-1, *xyz.shape[:1]))
             lines.append(F.grid_sample(self.line[i], line[[i]], align_corners=True).view(-1, *xyz.shape[:1]))
-        features = self.basis_mat((torch.cat(planes) * torch.cat(lines)).T)
-        return cast(Tensor, self.render(features))
+        return (torch.cat(planes) * torch.cat(lines)).T
+
+    def decode(self, features: Tensor) -> Tensor:
+        return cast(Tensor, self.render(self.basis_mat(features)))
+
+    def forward(self, xyz: Tensor) -> Tensor:
+        return self.decode(self.encode(xyz))
 
 
 class KPlanes(nn.Module):
@@ -253,7 +329,7 @@ class KPlanes(nn.Module):
         )
         self.sigma_net = nn.Sequential(nn.Linear(len(sizes) * components, width), nn.ReLU(), nn.Linear(width, 4))
 
-    def forward(self, pts: Tensor) -> Tensor:
+    def encode(self, pts: Tensor) -> Tensor:
         features = []
         for grids in self.grids:
             product: Tensor | float = 1.0
@@ -262,7 +338,13 @@ class KPlanes(nn.Module):
                 found = F.grid_sample(plane, coords, align_corners=True, mode="bilinear", padding_mode="border")
                 product = product * found.view(1, plane.shape[1], -1).transpose(-1, -2).squeeze(0)
             features.append(product)
-        return cast(Tensor, self.sigma_net(torch.cat(features, dim=-1)))
+        return torch.cat(features, dim=-1)
+
+    def decode(self, features: Tensor) -> Tensor:
+        return cast(Tensor, self.sigma_net(features))
+
+    def forward(self, pts: Tensor) -> Tensor:
+        return self.decode(self.encode(pts))
 
 
 class SplineLayer(nn.Module):

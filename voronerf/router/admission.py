@@ -20,7 +20,7 @@ from voronerf.router.grouped import Ungroupable
 from voronerf.router.grouping import Entries, Grouping
 from voronerf.router.layout import RAY, SHARED, Call, Given
 from voronerf.router.loop import NoRandomness, Results, check_rows, run_cells, run_part
-from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
+from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters, owned_parameters
 from voronerf.router.tracing import ROWS, Unfusable
 from voronerf.router.trees import map_tree, tensors_of
 from voronerf.tolerances import agree, agree_gradients
@@ -206,8 +206,17 @@ class Trial:
         """The network as a layer table."""
         if self.call.layout.axis:
             raise Unfusable("the module sees one ray, [1, samples, f]; layout='flat' gives it [samples, f]")
+        module = self.made_of[0].module
         with NoRandomness():
-            return Program(self.made_of[0].module, self.call, self.given().part(0, ROWS, 0))
+            try:
+                return Program(module, self.call, self.given().part(0, ROWS, 0))
+            except Unfusable as error:
+                if len(cell_parameters(module)) == len(owned_parameters(module)):
+                    raise
+                try:  # layers that all cells share may be part of an encoding
+                    return Program(module, self.call, self.given().part(0, ROWS, 0), shared_layers=False)
+                except Unfusable:
+                    raise error from None
 
     def is_fusable(self, expected: tuple[Results, list[Tensor]]) -> bool:
         """Whether ``fuse=True`` would serve."""

@@ -21,7 +21,7 @@ from voronerf.router.grouped import PerCell, for_all_cells
 from voronerf.router.grouping import Entries, Grouping
 from voronerf.router.layout import Call, Given
 from voronerf.router.loop import Results
-from voronerf.router.parameters import is_shared, owned_parameters
+from voronerf.router.parameters import owned_parameters
 from voronerf.router.tracing import TABLE, Linear, Ref, Segment, Step, Trace, Unfusable, map_arguments
 from voronerf.router.trees import tensors_of
 
@@ -33,17 +33,21 @@ class Program:
         original: The routed module.
         call: Of the copy, which runs with the parameters of its first cell.
         given: The arguments, for ``ROWS`` samples.
+        shared_layers: Whether layers that all cells share are in the table, and not among the steps.
 
     Raises:
         Unfusable: For a step that is no such network, or that cannot be done again for other samples.
     """
 
-    def __init__(self, original: nn.Module, call: Call, given: Given) -> None:
-        trace = Trace(original, call, given)
+    def __init__(self, original: nn.Module, call: Call, given: Given, shared_layers: bool = True) -> None:
+        trace = Trace(original, call, given, shared_layers)
         self._result, self._outputs = trace.result, trace.outputs
         self._before, self._weights = trace.before, trace.weights
-        self._sizes, self._parameters = trace.sizes, trace.parameters
+        self._sizes, self._parameters, self._shared = trace.sizes, trace.parameters, trace.shared
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(original)]
+        made = {value for step in trace.weights for value in step.values}
+        of_layers = {value for layer in trace.layers for value in (layer.weight, layer.bias) if value is not None}
+        self._used = of_layers.union(*[step.refs() for step in trace.weights]) - made
         needed = [item.value for item in self._outputs if isinstance(item, Ref)]
         if not trace.layers:
             raise Unfusable("there is no linear layer")
@@ -112,14 +116,15 @@ class Program:
         The samples need not have been located yet.
         """
         n, chosen = inputs[0].shape[0], isinstance(grouping, Entries)
-        values: dict[int, Any] = dict(enumerate(inputs))
+        parameters = {value: self._parameter(place) for value, place in self._parameters.items()}
+        values: dict[int, Any] = {**dict(enumerate(inputs)), **parameters}
         for step in self._before:
             step.run(values, n)
         blocks = [
             _joined([(values[s.value].reshape(n, -1), s.start, s.stop) for s in block]).contiguous()
             for block in self._blocks
         ]
-        weights, biases = self._stacked(grouping.k)
+        weights, biases = self._stacked(values, grouping.k)
         if chosen:
             where: dict[str, Any] = {"cells": grouping.sorted_cells.int()}
         else:
@@ -144,14 +149,15 @@ class Program:
         tensors = [values[item.value] if isinstance(item, Ref) else item for item in self._outputs]
         return Results(self._result, tensors, [isinstance(item, Ref) for item in self._outputs], [False] * len(tensors))
 
-    def _stacked(self, k: int) -> tuple[list[Tensor], list[Tensor | None]]:
+    def _parameter(self, place: int) -> nn.Parameter:
+        owner, name = self._owned[place]
+        parameter = owner._parameters[name]
+        assert parameter is not None
+        return parameter
+
+    def _stacked(self, values: dict[int, Any], k: int) -> tuple[list[Tensor], list[Tensor | None]]:
         """Weights [k, o, i] and biases [k, o] of the table, in its order."""
-        known: dict[int, Any] = {}
-        for value, place in self._parameters.items():
-            owner, name = self._owned[place]
-            parameter = owner._parameters[name]
-            assert parameter is not None
-            known[value] = parameter.expand(k, *parameter.shape) if is_shared(owner, name) else parameter
+        known = {v: values[v].expand(k, *values[v].shape) if v in self._shared else values[v] for v in self._used}
         for step in self._weights:
             args, kwargs = map_arguments(
                 (step.args, step.kwargs), lambda v: PerCell(known[v.value]) if isinstance(v, Ref) else v

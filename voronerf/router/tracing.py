@@ -2,7 +2,7 @@
 
 The call has a number of samples that no other size is a multiple of. Every function is put in its place on the way:
 before the first layer (encodings), among the layers (activations, and what moves columns), or behind them (activations
-of heads, dicts).
+of heads, dicts). Before and behind, samples may meet parameters that all cells share: tables of features, planes.
 
 Letters: n samples, d features. A segment is a range of columns of a value from before the layers, or of a layer.
 """
@@ -27,7 +27,7 @@ from torch.overrides import TorchFunctionMode
 from voronerf.router.grouped import METADATA, name_of, user_line, writes_in_place
 from voronerf.router.layout import Call, Given
 from voronerf.router.loop import RANDOM
-from voronerf.router.parameters import cell_parameters, in_place_of_parameters, owned_parameters
+from voronerf.router.parameters import cell_parameters, in_place_of_parameters, is_shared, owned_parameters
 from voronerf.router.trees import rebuild, tensors_of
 
 ROWS = 37  # in a trace
@@ -160,12 +160,15 @@ class Trace(TorchFunctionMode):
         original: The routed module.
         call: Of a copy of it, which runs with the parameters of its first cell.
         given: The arguments, for ``ROWS`` samples.
+        shared_layers: Whether linear layers with weights that all cells share are layers of the table, and no steps.
 
     Attributes:
-        sizes: Of every value of rows, rows for each sample and the dimensions behind; None for one of parameters.
+        sizes: Of every value of rows, rows for each sample and the dimensions behind, 0 rows where their dimension is
+            not the first; None for one of parameters.
         stages: Where every value comes from.
         parameters: Values that are parameters, with their place among ``owned_parameters``.
-        before, behind, weights: Steps before and behind the table, and of parameters alone.
+        shared: Values that are parameters of all cells in common, or made of such alone.
+        before, behind, weights: Steps before and behind the table, and of parameters of cells alone.
         layers: In order.
         result: What the module returned, for its structure.
         outputs: For each tensor of the result a Ref, or the tensor where it depends on no sample.
@@ -174,9 +177,11 @@ class Trace(TorchFunctionMode):
         Unfusable: For a step that cannot be done again for other samples, or a layer that fits no table.
     """
 
-    def __init__(self, original: nn.Module, call: Call, given: Given) -> None:
+    def __init__(self, original: nn.Module, call: Call, given: Given, shared_layers: bool) -> None:
         super().__init__()
         module = call.module
+        self._shared_layers = shared_layers
+        self.shared: set[int] = set()
         self.sizes: list[tuple[int, ...] | None] = []
         self.stages: list[int] = []
         self.parameters: dict[int, int] = {}
@@ -185,14 +190,17 @@ class Trace(TorchFunctionMode):
         self.weights: list[Step] = []
         self.layers: list[Linear] = []
         single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for _, _, p in cell_parameters(module)}
-        owned = enumerate(owned_parameters(module))
-        self._places = {id(single.get(id(parameter), parameter)): i for i, (_, _, parameter) in owned}
+        owned = owned_parameters(module)
+        self._places = {id(single.get(id(parameter), parameter)): i for i, (_, _, parameter) in enumerate(owned)}
+        self._in_common = {i for i, (owner, name, _) in enumerate(owned) if is_shared(owner, name)}
         self._buffers = {id(own): other for own, other in zip(module.buffers(), original.buffers(), strict=True)}
         self._grad, self._running = torch.is_grad_enabled(), False
         self._known: dict[int, tuple[Tensor, int]] = {}
         self._codes: dict[int, Tensor] = {}  # like each value, with the number of its column in each entry
         self._columns: list[tuple[int, int, tuple[str, float], int]] = []  # as in a segment
         self._scaled: dict[int, tuple[int, float]] = {}
+        kept = (*given.rows, *module.buffers(), *module.parameters())
+        self._given = {tensor.untyped_storage().data_ptr() for tensor in kept}
         for tensor in given.rows:
             self.new(tensor)
         with in_place_of_parameters(module, single), _custom_functions(self), self:
@@ -204,11 +212,12 @@ class Trace(TorchFunctionMode):
         """Numbers a value."""
         number = len(self.sizes)
         self._known[id(tensor)] = (tensor, number)  # kept, so that no other tensor gets its id
-        if rows and (not tensor.dim() or not tensor.shape[0] or tensor.shape[0] % ROWS):
+        if rows and not any(size and size % ROWS == 0 for size in tensor.shape):
             raise Unfusable(
                 f"a tensor of shape {list(tensor.shape)} has no row for each of {ROWS} samples{user_line()}"
             )
-        self.sizes.append((tensor.shape[0] // ROWS, *tensor.shape[1:]) if rows else None)
+        first = rows and tensor.shape[0] % ROWS == 0
+        self.sizes.append((tensor.shape[0] // ROWS if first else 0, *tensor.shape[1:]) if rows else None)
         self.stages.append(BEFORE)
         return number
 
@@ -219,7 +228,9 @@ class Trace(TorchFunctionMode):
         if not isinstance(value, Tensor):
             return value
         if id(value) in self._places and id(value) not in self._known:
-            self.parameters[self.new(value, rows=False)] = self._places[id(value)]
+            number, place = self.new(value, rows=False), self._places[id(value)]
+            self.parameters[number] = place
+            self.shared |= {number} if place in self._in_common else set()
         if id(value) in self._known:
             return Ref(self._known[id(value)][1])
         if id(value) in self._buffers:
@@ -268,23 +279,32 @@ class Trace(TorchFunctionMode):
     def _place(self, step: Step, rows: bool) -> None:
         refs = step.refs()
         stage = max((self.stages[ref] for ref in refs), default=BEFORE)
-        if any(self.sizes[ref] is None for ref in refs):
-            if step.function is F.linear:
-                self._add_layer(step)
-            elif rows:
+        parameters = {ref for ref in refs if self.sizes[ref] is None}
+        in_common = parameters <= self.shared
+        if rows and step.function is F.linear and parameters and (self._shared_layers or not in_common):
+            self._add_layer(step)
+        elif not in_common:
+            if rows:
                 raise Unfusable(f"parameters meet samples in {name_of(step.function)}{step.line}")
-            else:
-                self.weights.append(step)
+            self.weights.append(step)
         elif stage == BEFORE:
-            if step.inplace:  # in the original order, which may be what the caller gave
-                raise Unfusable(f"{name_of(step.function)} changes a tensor before the first layer{step.line}")
+            if step.inplace and not self._made(step):
+                raise Unfusable(f"{name_of(step.function)} changes an argument of the call{step.line}")
             self.before.append(step)
-        elif not (self._activate(step, refs) or (stage == TABLE and self._move(step, refs))):
+            self.shared.update(() if rows else step.values)
+        elif parameters or not (self._activate(step, refs) or (stage == TABLE and self._move(step, refs))):
             self.stages[step.values[0] : step.values[-1] + 1] = [BEHIND] * len(step.values)
             self.behind.append(step)
             factor = next((item for item in step.args if type(item) in (int, float)), None)
             if step.function in _PRODUCTS and factor is not None and stage == TABLE:
                 self._scaled[step.values[0]] = (refs[0], factor)
+
+    def _made(self, step: Step) -> bool:
+        """Whether an earlier step has made the tensor that a step writes to: rows are what the caller gave."""
+        if not step.args or not isinstance(step.args[0], Ref):
+            return False
+        written = next(tensor for tensor, number in self._known.values() if number == step.values[0])
+        return written.untyped_storage().data_ptr() not in self._given
 
     def _add_layer(self, step: Step) -> None:
         given = {**dict(zip(("input", "weight", "bias"), step.args)), **step.kwargs}
@@ -300,7 +320,7 @@ class Trace(TorchFunctionMode):
             name = f"{name_of(earlier.function)}{earlier.line}"
             raise Unfusable(f"a layer reads the result of {name}, which is no activation or arrangement of a table")
         if math.prod(own[:-1]) != 1:
-            raise Unfusable(f"a layer runs on more than one row for each sample{step.line}")
+            raise Unfusable(f"a layer runs on other than one row for each sample{step.line}")
         out = self.sizes[step.values[0]]
         assert out is not None
         self.layers.append(Linear(weight, bias, self.segments(source), out[-1]))
