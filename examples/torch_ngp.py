@@ -1,10 +1,12 @@
 """ashawkey/torch-ngp: `NeRFNetwork.forward(x, d)` -> sigma [n], rgb [n, 3]; `density(x)` -> a dict; `color(x, d, ...)`.
 
-The renderer asks `density` to update its occupancy grid, so that is routed as well. The hash grid of the original is a
-compiled extension; a frequency encoding stands in its place, as its `encoding="frequency"` does.
+The renderer asks `density` to update its occupancy grid, so that is routed as well. All cells share the hash grid,
+and each has networks of its own behind it. The original's hash grid is a compiled extension; the same in PyTorch stands
+in its place, and a frequency encoding in the place of its spherical harmonics.
 """
 
 import itertools
+import math
 
 import torch
 import torch.nn.functional as F
@@ -33,19 +35,49 @@ class TruncExp(torch.autograd.Function):
         return gradient * torch.exp(x.clamp(-15, 15))
 
 
-class NeRFNetwork(nn.Module):
-    """Stands for `nerf.network_ff`/`nerf.network.NeRFNetwork`: two small networks without biases."""
+class GridEncoder(nn.Module):
+    """Stands for `gridencoder.GridEncoder`: features at eight corners of each level, hashed where they do not fit."""
 
-    def __init__(self, hidden_dim=64, geo_feat_dim=15, num_layers=2, num_layers_color=3):
+    def __init__(self, num_levels=8, level_dim=2, base_resolution=16, log2_hashmap_size=14, desired_resolution=512):
         super().__init__()
-        self.num_layers, self.num_layers_color = num_layers, num_layers_color
-        sizes = [3 + 3 * 2 * 6] + [hidden_dim] * (num_layers - 1) + [1 + geo_feat_dim]
+        self.base_resolution, self.output_dim = base_resolution, num_levels * level_dim
+        self.per_level_scale = (desired_resolution / base_resolution) ** (1 / (num_levels - 1))
+        sides = [math.ceil(base_resolution * self.per_level_scale**level) + 1 for level in range(num_levels)]
+        sizes = [min(2**log2_hashmap_size, side**3) for side in sides]
+        self.register_buffer("offsets", torch.tensor([0, *itertools.accumulate(sizes)], dtype=torch.int32))
+        self.sides, self.sizes = sides, sizes
+        self.embeddings = nn.Parameter(torch.empty(sum(sizes), level_dim).uniform_(-1e-4, 1e-4))
+
+    def forward(self, inputs: Tensor, bound: float = 1) -> Tensor:
+        inputs, outputs = (inputs + bound) / (2 * bound), []
+        corners = torch.tensor(list(itertools.product((0, 1), repeat=3)), device=inputs.device)
+        for level, (side, size) in enumerate(zip(self.sides, self.sizes)):
+            scaled = inputs * (self.base_resolution * self.per_level_scale**level - 1) + 0.5
+            lower = torch.floor(scaled)
+            x, y, z = (lower.long()[:, None] + corners).unbind(-1)
+            index = x + side * (y + side * z)
+            if side**3 > size:
+                index = (x ^ y * 2654435761 ^ z * 805459861) & 0xFFFFFFFF
+            part = (scaled - lower)[:, None]
+            weights = torch.where(corners.bool(), part, 1 - part).prod(-1, keepdim=True)
+            outputs.append((self.embeddings[self.offsets[level] + index % size] * weights).sum(1))
+        return torch.cat(outputs, dim=-1)
+
+
+class NeRFNetwork(nn.Module):
+    """Stands for `nerf.network.NeRFNetwork`: a hash grid and two small networks without biases."""
+
+    def __init__(self, hidden_dim=64, geo_feat_dim=15, num_layers=2, num_layers_color=3, bound=1):
+        super().__init__()
+        self.num_layers, self.num_layers_color, self.bound = num_layers, num_layers_color, bound
+        self.encoder = GridEncoder(desired_resolution=512 * bound)
+        sizes = [self.encoder.output_dim] + [hidden_dim] * (num_layers - 1) + [1 + geo_feat_dim]
         self.sigma_net = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in itertools.pairwise(sizes))
         sizes = [3 + 3 * 2 * 4 + geo_feat_dim] + [hidden_dim] * (num_layers_color - 1) + [3]
         self.color_net = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in itertools.pairwise(sizes))
 
     def density(self, x: Tensor) -> dict[str, Tensor]:
-        h = encode(x, 6)
+        h = self.encoder(x, bound=self.bound)
         for l in range(self.num_layers):
             h = self.sigma_net[l](h)
             if l != self.num_layers - 1:
@@ -84,11 +116,15 @@ def main() -> None:
     density = model.density(x)
 
     # after
-    model = VoronoiRouter(model, torch.rand(16, 3) * 2 - 1, coords="first3", methods=["density"], fuse=True)
+    centres = torch.rand(16, 3) * 2 - 1
+    model = VoronoiRouter(model, centres, coords="first3", methods=["density"], share=["encoder.*"], fuse=True)
     routed_sigma, routed_rgb = model(x, d)
     routed_density = model.density(x)
 
     torch.testing.assert_close((routed_sigma, routed_rgb, routed_density), (sigma, rgb, density))
+    assert model.explain() == "forward: fused\ndensity: fused"
+    shapes = [list(model.module.get_parameter(name).shape) for name in ("encoder.embeddings", "sigma_net.0.weight")]
+    print(f"one hash grid {shapes[0]} for all cells, sigma_net {shapes[1]}")
     print(f"torch-ngp: {model.num_cells} cells, sigma {list(routed_sigma.shape)}, rgb {list(routed_rgb.shape)}")
 
 

@@ -98,7 +98,9 @@ def nerfacc_field() -> nn.Module:
 
 
 def ngp_field() -> nn.Module:
-    return ngp.NeRFNetwork(8, 4)
+    field = ngp.NeRFNetwork(8, 4)
+    field.encoder = ngp.GridEncoder(log2_hashmap_size=8)
+    return field
 
 
 def studio_case(method: str, arguments: Any) -> Case:
@@ -106,9 +108,9 @@ def studio_case(method: str, arguments: Any) -> Case:
     return Case(name, appearance_field, arguments, studio.positions_of, RAYS, STUDIO, method=method)
 
 
-def other(method: str, options: Any, make: Any, arguments: Any, **more: Any) -> Case:
+def other(method: str, options: Any, make: Any, arguments: Any, fuses: bool = True, **more: Any) -> Case:
     """A method beside forward."""
-    return Case(f"{make.__name__} {method}", make, arguments, options=options, method=method, fuses=True, **more)
+    return Case(f"{make.__name__} {method}", make, arguments, options=options, method=method, fuses=fuses, **more)
 
 
 SLICE = {"coords": slice(0, 3)}
@@ -137,8 +139,8 @@ LISTED = [
     studio_case("get_density", lambda lead: ((ray_samples(lead),), {})),
     studio_case("get_outputs", outputs_arguments),
     studio_case("density_fn", one(3)),
-    Case("torch-ngp", ngp_field, pair, options=NGP, fuses=True),
-    other("density", NGP, ngp_field, one(3)),
+    Case("torch-ngp", ngp_field, pair, options=NGP),  # a table for each cell; test_router_shared.py fuses a shared one
+    other("density", NGP, ngp_field, one(3), fuses=False),
     other("color", NGP, ngp_field, lambda lead: (pair(lead)[0], {"geo_feat": uniform(lead, 4)})),
     PART,
     Case("mega-nerf", mega_field(), mega_arguments(False)),

@@ -76,7 +76,8 @@ class VoronoiRouter(CellModules):
         methods: Names of further methods to route, ``router.density(x)``. Methods that are called with the same
             positions share one assignment to cells.
         share: Names of parameters that all cells have in common, with wildcards: ``["encoder.*"]``. There is one copy
-            of them, with ordinary gradients; the others are per cell.
+            of them, with ordinary gradients; the others are per cell. Steps with shared parameters run once for all
+            samples, also with ``fuse``.
         fuse: Promises that ``forward`` does the same in every call. Its network is traced once and runs as one
             operation, or is refused with the line that stands in the way.
         layout: How the module sees samples ``[rays, samples, f]``: "rays" as ``[n, 1, f]``, with what is per ray as
