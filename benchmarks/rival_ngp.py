@@ -257,11 +257,8 @@ class Rival:
         if self.contraction is None and self.step % GRID_EVERY == 0:
             self.update_grid()
         batch = self.batches.draw(self.rays, self.generator)
-        background = self.scene.background_colour()
-        if batch.alpha is not None:
-            background = torch.rand(self.rays, 3, generator=self.generator)
-        colour, kept = self.render(batch.rays, batch.near, batch.far, background, jitter=True)
-        loss = F.mse_loss(colour, batch.target(background))
+        colour, kept = self.render(batch.rays, batch.near, batch.far, batch.background, jitter=True)
+        loss = F.mse_loss(colour, batch.target)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()

@@ -193,6 +193,30 @@ class MlpTable(NamedTuple):
 
 Peak: tuple[str, ...]  # float32 bfloat16 copy
 
+class PixelRaysInputs(NamedTuple):
+    poses: Tensor | None  # const float32*
+    intrinsics: Tensor | None  # const float32*
+    distortion: Tensor | None  # const float32*
+    images: Tensor | None  # const uint8*
+    pixels: Tensor | None  # const int64*
+    box: Tensor | None  # const float32*
+    background: Tensor | None  # const float32*
+    background_per_ray: bool
+    c: int  # int64
+    h: int  # int64
+    w: int  # int64
+    channels: int  # int64
+    b: int  # int64
+    near: float  # float32
+    far: float  # float32
+
+class PixelRaysOutputs(NamedTuple):
+    origins: Tensor | None  # float32*
+    directions: Tensor | None  # float32*
+    near: Tensor | None  # float32*
+    far: Tensor | None  # float32*
+    colour: Tensor | None  # float32*
+
 class RenderLossInputs(NamedTuple):
     raw: Tensor | None  # const float32*
     deltas: Tensor | None  # const float32*
@@ -376,6 +400,9 @@ def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: 
 # const float32*, const float32*, const float32*, CentreGrid, int32*, int64, int64, Cpu
 def nearest_centre_grid(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: CentreGrid, _4: Tensor | None, _5: int, _6: int, _7: Cpu) -> None: ...
 # const float64*, const float64*, const float64*, CentreGrid, int32*, int64, int64, Cpu
+
+# PixelRaysInputs, PixelRaysOutputs, Cpu
+def pixel_rays(_0: PixelRaysInputs, _1: PixelRaysOutputs, _2: Cpu) -> bool: ...
 
 # RenderLossInputs, RenderLossOutputs, Cpu
 def render_loss(_0: RenderLossInputs, _1: RenderLossOutputs, _2: Cpu) -> None: ...

@@ -61,6 +61,15 @@ def cameras(n):
     return {**some, "x": 64 * torch.rand(n), "y": 48 * torch.rand(n), "distortion": 0.01 * torch.randn(3, 4)}
 
 
+def pixels(n):
+    """n pixels of three images."""
+    some = cameras(n)
+    given = {"poses": some["poses"], "intrinsics": some["intrinsics"], "distortion": some["distortion"]}
+    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    images = torch.randint(256, (3, 5, 7, 4), dtype=torch.uint8)
+    return {**given, "images": images, "index": torch.randint(105, (n,)), "background": torch.rand(n, 3), "box": box}
+
+
 def solids(n):
     frames = torch.cat([torch.eye(3).expand(4, 3, 3), torch.randn(4, 1, 3) / 2], dim=1)
     tables = {"kinds": torch.arange(4, dtype=torch.int32), "frames": frames, "sizes": 0.2 + 0.2 * torch.rand(4, 3)}
@@ -86,6 +95,7 @@ CASES = {
         {"steps": 2},
     ),
     "camera_rays": (cameras, {}),
+    "pixel_rays": (pixels, {"near": 0.2, "far": 3.0}),
     "cast_solids": (solids, {}),
     "march_rays": (march, {"samples": 7, "capacity": 40, "most": 5}),
     "update_occupancy": (

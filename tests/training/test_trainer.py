@@ -19,7 +19,7 @@ from voronerf.files import read_json_lines
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
-from voronerf.training.batches import Batch
+from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.networks import count_parameters, octaves_for, resolve_config, solve_width
@@ -198,13 +198,13 @@ def test_the_reference_backend_trains_to_the_same_curve(tmp_path, scene):
 def test_kept_samples_are_weight_times_ray_error(tmp_path, scene, monkeypatch):
     """Importance w * E(r), E the squared error of the ray's colour summed over its channels."""
     rendered, targets = [], []
-    whole, target = Renderer.render, Batch.target
+    whole, draw = Renderer.render, RayBatches.draw
     monkeypatch.setattr(Renderer, "render", lambda *a, **k: rendered.extend(whole(*a, **k)) or tuple(rendered[-1:]))
-    monkeypatch.setattr(Batch, "target", lambda *a: targets.append(target(*a)) or targets[-1])
+    monkeypatch.setattr(RayBatches, "draw", lambda *a, **k: targets.append(draw(*a, **k)) or targets[-1])
     trainer = stopping(small(tmp_path, reservoir=40, reservoir_batches=1, split_at=(0.9,)), scene, 1)
     trainer.advance()
     points, importance = trainer.reservoir.samples()
-    error = (rendered[0].colour - targets[0]).square().sum(1)
+    error = (rendered[0].colour - targets[0].target).square().sum(1)
     expected = (rendered[0].weights * error[:, None]).detach().reshape(-1)
     heaviest = expected.topk(40)
     torch.testing.assert_close(importance.sort(descending=True).values, heaviest.values)

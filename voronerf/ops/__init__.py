@@ -22,6 +22,7 @@ from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
+from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.render_loss import RenderLoss, render_loss
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
@@ -37,6 +38,7 @@ __all__ = [
     "HashGrid",
     "Layer",
     "March",
+    "PixelRays",
     "RenderLoss",
     "balance_centres",
     "camera_rays",
@@ -53,6 +55,7 @@ __all__ = [
     "locate_cell",
     "march_rays",
     "nearest_centre",
+    "pixel_rays",
     "render_loss",
     "resample",
     "routed_mlp",

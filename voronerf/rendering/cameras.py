@@ -174,11 +174,14 @@ class Cameras:
         )
         if not cones:
             return Rays(origins, directions)
-        widths = chosen.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12))
-        axes = -chosen.poses[:, :3, 2]
+        return Rays(origins, directions, chosen.radii(directions, camera))
+
+    def radii(self, directions: Tensor, camera: Tensor | None) -> Tensor:
+        """The radii [b] of cones along `directions` [b, 3] of the cameras int [b]; None for the first camera."""
+        widths, axes = self.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12)), self.forward
         if camera is not None:
             widths, axes = widths[camera], axes[camera]
-        return Rays(origins, directions, widths * (directions * axes).sum(-1))
+        return widths * (directions * axes).sum(-1)
 
     def image_rays(self, index: int, *, cones: bool = False) -> Rays:
         """Rays through all pixel centres of one camera, row by row: [height * width]."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from voronerf.reference.pixel_rays import meet_box
+
 
 def intersect_box(
     origins: Tensor, directions: Tensor, box: Tensor | None, near: float, far: float
@@ -44,15 +46,5 @@ def intersect_box(
         return first, torch.full_like(first, far), torch.ones_like(first, dtype=torch.bool)
     if box.shape != (2, 3):
         raise ValueError(f"intersect_box: box must have shape [2, 3], got {list(box.shape)}")
-    low, high = (box[0] - origins) / directions, (box[1] - origins) / directions
-    first, last = torch.minimum(low, high), torch.maximum(low, high)
-    # 0 / 0 and +-inf: a ray parallel to a slab is inside it at all distances or at none
-    parallel = directions == 0
-    inside = (origins >= box[0]) & (origins <= box[1])
-    infinity = torch.full_like(first, float("inf"))
-    first = torch.where(parallel, torch.where(inside, -infinity, infinity), first)
-    last = torch.where(parallel, torch.where(inside, infinity, -infinity), last)
-    enter = first.amax(-1).clamp(near, far)
-    leave = last.amin(-1).clamp(near, far)
-    hit = leave > enter
-    return enter, torch.where(hit, leave, enter), hit
+    enter, leave = meet_box(origins, directions, box, near, far)
+    return enter, leave, leave > enter

@@ -1,6 +1,6 @@
 """Random batches of training rays with the colours of their pixels.
 
-Letters: r rays of a batch. Colours are in 0..1, straight (not premultiplied) where there is an alpha channel.
+Letters: r rays of a batch. Colours are in 0..1.
 """
 
 from __future__ import annotations
@@ -11,33 +11,28 @@ import torch
 from torch import Tensor
 
 from voronerf.data import Scene
+from voronerf.ops.pixel_rays import pixel_rays
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.rays import intersect_box
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays [r], where they enter and leave the scene, and the colours of their pixels.
+    """Rays [r], where they enter and leave the scene, and the colours to learn.
 
     Attributes:
         rays: Origins and unit directions.
         near: [r] depth at which each ray enters the scene.
         far: [r] depth at which it leaves the scene.
-        colour: [r, 3], straight.
-        alpha: [r, 1], or None for opaque images.
+        target: [r, 3], the colour of each ray's pixel over the background.
+        background: [3], or [r, 3] where it was drawn; None for none.
     """
 
     rays: Rays
     near: Tensor
     far: Tensor
-    colour: Tensor
-    alpha: Tensor | None
-
-    def target(self, background: Tensor | None) -> Tensor:
-        """The colour to learn: that of the images over ``background`` ([3] or [r, 3])."""
-        if self.alpha is None or background is None:
-            return self.colour
-        return self.colour * self.alpha + background * (1 - self.alpha)
+    target: Tensor
+    background: Tensor | None
 
 
 class RayBatches:
@@ -56,8 +51,8 @@ class RayBatches:
         self.cones = cones
         self.device = device
         self.cameras = scene.train.cameras.to(device)
-        images = scene.train.images.to(device)
-        self.pixels = images.reshape(-1, images.shape[-1])
+        self.images = scene.train.images.to(device)
+        self.background = scene.background_colour(device)
         self.box = None if scene.box is None else scene.box.to(device)
         self.useful = None if self.box is None else self._rays_that_meet(self.box)
 
@@ -70,26 +65,38 @@ class RayBatches:
             _, _, hit = intersect_box(rays.origins, rays.directions, box, self.scene.near, self.scene.far)
             found.append(hit.nonzero()[:, 0] + image * per_image)
         useful = torch.cat(found)
-        if not 0 < useful.numel() < self.pixels.shape[0]:
+        if not 0 < useful.numel() < self.images[..., 0].numel():
             return None
         return useful
 
     def __len__(self) -> int:
         """Number of rays to draw from."""
-        return self.pixels.shape[0] if self.useful is None else self.useful.shape[0]
+        return self.images[..., 0].numel() if self.useful is None else self.useful.shape[0]
 
-    def draw(self, count: int, generator: torch.Generator) -> Batch:
-        """A batch of ``count`` rays, drawn with replacement."""
+    def draw(self, count: int, generator: torch.Generator, *, random_background: bool = True) -> Batch:
+        """A batch of ``count`` rays, drawn with replacement.
+
+        Images with an alpha channel lie over a colour that is drawn for each ray, or over that of the scene.
+        """
         index = torch.randint(len(self), (count,), generator=generator, device=generator.device).to(self.device)
         if self.useful is not None:
             index = self.useful[index]
-        width = self.cameras.width
-        per_image = width * self.cameras.height
-        pixel = index % per_image
-        rays = self.cameras.rays(index // per_image, pixel % width, pixel // width, cones=self.cones)
-        near = torch.full((count,), float(self.scene.near), device=self.device)
-        far = torch.full((count,), float(self.scene.far), device=self.device)
-        if self.box is not None:
-            near, far, _ = intersect_box(rays.origins, rays.directions, self.box, self.scene.near, self.scene.far)
-        values = self.pixels[index].float() / 255
-        return Batch(rays, near, far, values[:, :3], values[:, 3:] if values.shape[1] == 4 else None)
+        background = self.background
+        if random_background and self.images.shape[-1] == 4:
+            background = torch.rand(count, 3, generator=generator, device=generator.device).to(self.device)
+        cameras = self.cameras
+        found = pixel_rays(
+            cameras.poses,
+            cameras.intrinsics,
+            self.images,
+            index,
+            near=float(self.scene.near),
+            far=float(self.scene.far),
+            box=self.box,
+            distortion=cameras.distortion,
+            background=background,
+        )
+        radii = None
+        if self.cones:
+            radii = cameras.radii(found.directions, index // (cameras.width * cameras.height))
+        return Batch(Rays(found.origins, found.directions, radii), found.near, found.far, found.colour, background)

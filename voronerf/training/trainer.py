@@ -99,7 +99,6 @@ class Trainer:
         size = (scene.test.cameras.height, scene.test.cameras.width)
         self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, size)
         self.batches = RayBatches(scene, self.device, cones=config.field_type.cones)
-        self.background = scene.background_colour(self.device)
         self.routers = make_routers(config, self.device)
         for router in self.routers.values():
             router.generator = self.draws
@@ -260,16 +259,11 @@ class Trainer:
     def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Updates the parameters; returns the loss, and until the last split positions [n, 3] and importance [n]."""
         config = self.config
-        batch = self.batches.draw(config.rays, self.draws)
-        background = self.background
-        if batch.alpha is not None and config.background == "random":
-            drawn = torch.rand(config.rays, 3, generator=self.draws, device=self.draws.device)
-            background = drawn.to(self.device)
-        target = batch.target(background)
+        batch = self.batches.draw(config.rays, self.draws, random_background=config.background == "random")
         half = HALVES.get(config.precision)
         with torch.autocast(self.device.type, half, enabled=half is not None, cache_enabled=False):
             found = self.renderer.compare(
-                batch.rays, batch.near, batch.far, target, background=background, generator=self.draws
+                batch.rays, batch.near, batch.far, batch.target, background=batch.background, generator=self.draws
             )
         if self.occupancy is not None:
             observe_samples(self.occupancy, found, backend=config.backend)

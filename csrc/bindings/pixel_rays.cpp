@@ -1,0 +1,15 @@
+#include "rays/pixel_rays.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_STRUCT(PixelRaysInputs, poses, intrinsics, distortion, images, pixels, box, background, background_per_ray, c, h, w,
+          channels, b, near, far);
+VN_STRUCT(PixelRaysOutputs, origins, directions, near, far, colour);
+
+VN_BINDINGS(module) {
+  module.cpu("pixel_rays", VN_CPU(pixel_rays_cpu));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,31 @@
+// Rays through the pixels of images, where they meet a box, and the colours of the pixels: c images of h x w pixels, b
+// rays. What it computes is said in voronerf/ops/pixel_rays.py.
+#pragma once
+
+#include <cstdint>
+
+namespace voronerf {
+
+struct PixelRaysInputs {
+  const float* poses;       // [c,4,4], camera to world
+  const float* intrinsics;  // [c,4]: fx, fy, cx, cy
+  const float* distortion;  // [c,4]: k1, k2, p1, p2; or null
+  const uint8_t* images;    // [c,h,w,channels]
+  const int64_t* pixels;    // [b], numbered through all images
+  const float* box;         // [2,3], or null for all of space
+  const float* background;  // [b,3], or [3], or null
+  bool background_per_ray;
+  int64_t c, h, w, channels, b;
+  float near, far;
+};
+
+struct PixelRaysOutputs {
+  float *origins, *directions;  // [b,3]
+  float *near, *far;            // [b]
+  float* colour;                // [b,3]
+};
+
+// Returns false, with undefined results, if an index is not that of a pixel.
+bool pixel_rays_cpu(const PixelRaysInputs& in, const PixelRaysOutputs& out, int threads);
+
+}  // namespace voronerf

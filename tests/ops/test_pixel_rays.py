@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import refusals, refused
+
+from voronerf.ops import pixel_rays
+from voronerf.rendering import intersect_box
+from voronerf.rendering.cameras import Cameras, look_at
+
+pytestmark = pytest.mark.op("pixel_rays")
+HEIGHT, WIDTH = 12, 17
+BOX = torch.tensor([[-1.0, -0.8, -0.5], [0.9, 1.0, 0.7]])
+
+
+def scene(channels, distorted):
+    poses = look_at(3 * torch.nn.functional.normalize(torch.randn(4, 3), dim=1), torch.zeros(3), torch.eye(3)[2])
+    intrinsics = torch.tensor([[15.0, 16.0, 8.2, 6.1]]) + torch.rand(4, 4)
+    lens = torch.randn(4, 4) * torch.tensor([0.05, 0.02, 0.005, 0.005]) if distorted else None
+    images = torch.randint(0, 256, (4, HEIGHT, WIDTH, channels), dtype=torch.uint8)
+    return Cameras(poses, intrinsics, WIDTH, HEIGHT, lens), images
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("b", [0, 1, 63, 300])
+@pytest.mark.parametrize("background", [None, "one", "per ray"])
+@pytest.mark.parametrize(("distorted", "boxed"), [(False, True), (True, True), (True, False)])
+def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, channels, b, background, distorted, boxed):
+    cameras, images = scene(channels, distorted)
+    index = torch.randint(0, images[..., 0].numel(), (b,))
+    behind = {None: None, "one": torch.rand(3), "per ray": torch.rand(b, 3)}[background]
+    box = BOX if boxed else None
+    on = lambda tensor: None if tensor is None else tensor.to(device)  # noqa: E731
+    found = pixel_rays(
+        on(cameras.poses),
+        on(cameras.intrinsics),
+        on(images),
+        on(index),
+        near=2.5,
+        far=4.0,
+        box=on(box),
+        distortion=on(cameras.distortion),
+        background=on(behind),
+        backend=backend,
+    )
+    pixel = index % (HEIGHT * WIDTH)
+    rays = cameras.rays(index // (HEIGHT * WIDTH), pixel % WIDTH, pixel // WIDTH)
+    near, far, hit = intersect_box(rays.origins, rays.directions, box, 2.5, 4.0)
+    colour = images.reshape(-1, channels)[index] / 255
+    if channels == 4 and behind is not None:
+        colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
+    assert b < 300 or not boxed or 0 < int(hit.sum()) < b
+    for part, expected in zip(found, (rays.origins, rays.directions, near, far, colour[:, :3]), strict=True):
+        torch.testing.assert_close(part.cpu(), expected, atol=2e-6, rtol=2e-6)
+
+
+def test_rays_along_an_axis_are_in_a_slab_or_not(device, backend):
+    """Where a component of the direction is zero."""
+    poses = torch.eye(4).repeat(3, 1, 1)
+    poses[:, :3, 3] = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [-1.0, 1.0, 9.0]])
+    lens, images = torch.tensor([[1.0, 1.0, 0.5, 0.5]]).repeat(3, 1), torch.zeros(3, 1, 1, 3, dtype=torch.uint8)
+    box = torch.tensor([[-1.0, -1.0, -3.0], [1.0, 1.0, -2.0]])
+    tensors = (tensor.to(device) for tensor in (poses, lens, images, torch.arange(3)))
+    found = pixel_rays(*tensors, near=1.0, far=20.0, box=box.to(device), backend=backend)
+    assert found.near.tolist()[::2] == [2.0, 11.0] and found.far.tolist()[::2] == [3.0, 12.0]
+    assert found.near[1] == found.far[1]
+
+
+def test_refuses_what_makes_no_sense():
+    cameras, images = scene(4, True)
+    index = torch.tensor([3, 0, 5])
+    good = {"poses": cameras.poses, "intrinsics": cameras.intrinsics, "images": images, "index": index}
+    last = images[..., 0].numel() - 1
+    for backend in ("reference", "native"):
+        for bad in (-1, last + 1):
+            low, high = min(bad, 0), max(bad, 5)
+            with refused(ValueError, f"pixel_rays: index must lie in 0 to {last}, got values from {low} to {high}"):
+                pixel_rays(**{**good, "index": torch.tensor([0, bad, 5])}, near=0.0, far=1.0, backend=backend)
+    refuses = refusals(pixel_rays, **good, near=0.0, far=1.0)
+    refuses("poses must have shape [c, 4, 4], got [4, 3, 4]", poses=cameras.poses[:, :3])
+    refuses("images must have shape [c, h, w, channels] with c = 4, got [3, 12, 17, 4]", images=images[1:])
+    refuses("images must have 3 or 4 channels, got 2", images=images[..., :2])
+    refuses("images must have dtype uint8, got float32", images=images.float())
+    refuses("index must have dtype int64, got int32", index=index.int())
+    refuses("box must have shape [2, 3], got [3, 2]", box=BOX.T)
+    refuses("background must have shape [b, 3] with b = 3, got [2, 3]", background=torch.rand(2, 3))
+    refuses("distortion must have shape [c, 4] with c = 4, got [1, 4]", distortion=torch.zeros(1, 4))
+    refuses("near and far must satisfy 0 <= near < far, got 1.0 and 1.0", near=1.0)
