@@ -233,6 +233,22 @@ def test_when_and_into_what_is_split(tmp_path, scene, settings, started, cells):
     assert all(stage.split_cells == 1 for stage in trainer.stages[1:])
 
 
+def test_a_long_run_warms_up_in_a_hundred_steps(tmp_path, scene):
+    trainer = Trainer(small(tmp_path, steps=100_000, lr_final=1.0, lr=0.5), scene)
+    for step, rate in ((0, 0.005), (50, 0.5 * 0.505), (100, 0.5), (2_000, 0.5)):
+        trainer.step = step
+        assert trainer.learning_rate() == pytest.approx(rate)
+
+
+def test_the_occupancy_grid_of_a_long_run_keeps_the_scene(tmp_path, scene):
+    """A warm-up of thousands of steps keeps densities so low that the grid empties itself."""
+    settings = {"field": "hashgrid", "width": None, "depth": None, "rays": 512, "samples": 32}
+    config = small(tmp_path, steps=100_000, occupancy=True, occupancy_resolution=32, **settings)
+    trainer = stopping(config, scene, 200)
+    trainer.advance()
+    assert trainer.occupancy.share > 0.05
+
+
 def test_the_learning_rate_changes_at_each_split(tmp_path, scene):
     rates = []
     for factor in (1.0, 0.5):

@@ -154,7 +154,7 @@ class TrainConfig:
     """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. It is smaller in the first
     steps. Training goes on with the weights themselves."""
     warmup: float = 0.02
-    """Fraction of the run over which the learning rate rises from a hundredth of --lr."""
+    """Fraction of the run over which the learning rate rises from a hundredth of --lr, 100 steps at most."""
     background: Literal["random", "white"] = "random"
     """Colour behind images with an alpha channel while training: random for every ray, or white as in evaluation."""
 

@@ -36,6 +36,9 @@ from voronerf.training.resume import resume_training, training_state
 from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.splitting import median, save_samples, split_by_samples
 
+#: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
+#: which forgets in some thirty steps, would empty itself for good.
+WARMUP_STEPS = 100
 #: Steps between evaluations of random cells of the occupancy grid.
 OCCUPANCY_EVERY = 16
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
@@ -144,11 +147,13 @@ class Trainer:
         return len(self.stages) - 1
 
     def learning_rate(self) -> float:
-        """Exponential decay from ``lr`` to ``lr * lr_final``, after a linear rise over the warm-up; ``lr_split`` of it
-        for each split that was made."""
+        """Exponential decay from ``lr`` to ``lr * lr_final``, after a linear rise over the warm-up, `WARMUP_STEPS` at
+        most; ``lr_split`` of it for each split that was made."""
         config, done = self.config, self.fraction
         assert config.lr is not None
-        rise = 1.0 if done >= config.warmup else 0.01 + 0.99 * done / config.warmup
+        rise = 1.0
+        if done < config.warmup and self.step < WARMUP_STEPS:
+            rise = 0.01 + 0.99 * max(done / config.warmup, self.step / WARMUP_STEPS)
         return config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**self.level
 
     def temperature(self) -> float:
