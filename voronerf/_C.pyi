@@ -191,6 +191,20 @@ class MlpTable(NamedTuple):
     half: bool
     caller: str  # MlpCaller
 
+class ObservedSamples(NamedTuple):
+    positions: Tensor | None  # const float32*
+    sigma: Tensor | None  # const float32*
+    deltas: Tensor | None  # const float32*
+    weights: Tensor | None  # const float32*
+    box: Tensor | None  # const float32*
+    x: int  # int64
+    y: int  # int64
+    z: int  # int64
+    m: int  # int64
+    decay: float  # float32
+    threshold: float  # float32
+    hidden: float  # float32
+
 Peak: tuple[str, ...]  # float32 bfloat16 copy
 
 class PixelRaysInputs(NamedTuple):
@@ -400,6 +414,9 @@ def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: 
 # const float32*, const float32*, const float32*, CentreGrid, int32*, int64, int64, Cpu
 def nearest_centre_grid(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: CentreGrid, _4: Tensor | None, _5: int, _6: int, _7: Cpu) -> None: ...
 # const float64*, const float64*, const float64*, CentreGrid, int32*, int64, int64, Cpu
+
+# ObservedSamples, float32*, uint8*, int32*, float32*, Cpu
+def observe_occupancy(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
 
 # PixelRaysInputs, PixelRaysOutputs, Cpu
 def pixel_rays(_0: PixelRaysInputs, _1: PixelRaysOutputs, _2: Cpu) -> bool: ...

@@ -195,6 +195,11 @@ def test_state_goes_round():
     other = OccupancyGrid.from_state(grid.state_dict())
     for name, value in grid.state_dict().items():
         assert torch.equal(value, other.state_dict()[name])
+    # A grid's own tensors change in place, and leave those that it was made of.
+    given = grid.state_dict()
+    other = OccupancyGrid.from_state(given)
+    other.observe(torch.zeros(1, 3), *(torch.ones(1) for _ in range(3)), decay=0.5)
+    assert torch.equal(given["density"], grid.density) and not torch.equal(other.density, grid.density)
     state = grid.state_dict()
     del state["density"]
     rule = "OccupancyGrid: state must hold density, got box, occupied, threshold"

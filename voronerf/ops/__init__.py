@@ -22,6 +22,7 @@ from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
+from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.render_loss import RenderLoss, render_loss
 from voronerf.ops.resample import resample
@@ -55,6 +56,7 @@ __all__ = [
     "locate_cell",
     "march_rays",
     "nearest_centre",
+    "observe_occupancy",
     "pixel_rays",
     "render_loss",
     "resample",

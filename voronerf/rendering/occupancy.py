@@ -14,7 +14,9 @@ from torch import Tensor
 
 from voronerf.checks import MAX_COUNT
 from voronerf.ops.march_rays import March, march_rays
+from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.update_occupancy import update_occupancy
+from voronerf.reference.observe_occupancy import cells_of
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 
@@ -154,7 +156,7 @@ class OccupancyGrid:
         decay: float,
         backend: str = "auto",
     ) -> None:
-        """Updates cells from samples that were rendered anyway.
+        """Updates cells, in place, from samples that were rendered anyway.
 
         A sample that receives less than the share `HIDDEN` of the light counts as density 0. So the inside of an opaque
         object becomes empty like the space around it, which changes no picture. A surface that only few of the rays
@@ -166,31 +168,30 @@ class OccupancyGrid:
             deltas: [m], lengths of the strata of the samples.
             weights: [m], contributions of the samples to their rays, from `composite`.
             decay: factor on the old densities of the cells of these samples, 0..1.
-            backend: of the op.
+            backend: "auto", "reference" or "native".
 
         Raises:
             ValueError: a decay out of range.
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
-        density = density.float().nan_to_num(nan=float("inf"), posinf=float("inf"))
-        # weight = light that arrives * share of it that is taken
-        seen = weights > HIDDEN * -torch.expm1(-density * deltas)
-        self.density, self.occupied = update_occupancy(
+        observe_occupancy(
             self.density,
-            self.cells(positions),
-            torch.where(seen, density, 0),
+            self.occupied,
+            self.box,
+            positions,
+            density.float(),
+            deltas,
+            weights.float(),
             decay=decay,
             threshold=self.threshold,
+            hidden=HIDDEN,
             backend=backend,
         )
 
     def cells(self, points: Tensor) -> Tensor:
         """Flat numbers int32 [n] of the cells that points [n, 3] lie in; outside the box the nearest at its border."""
-        shape = self.occupied.shape
-        places = (points - self.box[0]) / (self.box[1] - self.box[0])
-        x, y, z = ((places[:, i] * size).nan_to_num(0).clamp(0, size - 1).int() for i, size in enumerate(shape))
-        return (x * shape[1] + y) * shape[2] + z
+        return cells_of(points, self.box, self.occupied.shape)
 
     def march(
         self,
@@ -249,7 +250,8 @@ class OccupancyGrid:
                 f"{list(density.shape)} and {list(occupied.shape)}"
             )
         grid = OccupancyGrid(state["box"], density.shape, threshold=float(state["threshold"]), device=device)
-        grid.density, grid.occupied = density.to(device, torch.float32), occupied.to(device, torch.bool)
+        grid.density.copy_(density)
+        grid.occupied.copy_(occupied)
         return grid
 
 

@@ -69,6 +69,7 @@ def make_picture_grid(config: TrainConfig, scene: Scene, field: Field, *, backen
 def observe_samples(grid: OccupancyGrid, found: Comparison, *, backend: str) -> None:
     """Teaches a grid what the samples of a training step found."""
     assert found.density is not None and found.deltas is not None
+    backend = "auto" if backend == "warp" else backend  # there is no Warp kernel of it
     grid.observe(found.positions, found.density, found.deltas, found.weights, decay=OCCUPANCY_DECAY, backend=backend)
 
 

@@ -1,0 +1,13 @@
+#include "rays/observe_occupancy.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_STRUCT(ObservedSamples, positions, sigma, deltas, weights, box, x, y, z, m, decay, threshold, hidden);
+
+VN_BINDINGS(module) {
+  module.cpu("observe_occupancy", VN_CPU(observe_occupancy_cpu));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,20 @@
+// Updates an occupancy grid from rendered samples, in place: x, y, z cells, m samples. The formula is in
+// voronerf/ops/observe_occupancy.py.
+#pragma once
+
+#include <cstdint>
+
+namespace voronerf {
+
+struct ObservedSamples {
+  const float *positions, *sigma, *deltas, *weights;  // [m,3], [m], [m], [m]
+  const float* box;                                   // [2,3]
+  int64_t x, y, z, m;
+  float decay, threshold, hidden;
+};
+
+// density, occupied: [x,y,z]. cells, before: [m], working memory.
+void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* occupied, int32_t* cells, float* before,
+                           int threads);
+
+}  // namespace voronerf

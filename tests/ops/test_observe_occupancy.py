@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from op_cases import refusals, strided
+
+from voronerf.ops import observe_occupancy
+
+pytestmark = pytest.mark.op("observe_occupancy")
+BOX = torch.tensor([[-1.0, 0.0, 2.0], [1.0, 3.0, 4.0]])
+
+
+def slow(density, positions, sigma, deltas, weights, decay, hidden):
+    """One sample at a time, in a dictionary of the cells that have some."""
+    found = {}
+    for place, *sample in zip(positions.tolist(), sigma.tolist(), deltas.tolist(), weights.tolist()):
+        cell = []
+        for axis, size in enumerate(density.shape):
+            low, high = BOX[:, axis].tolist()
+            share = (place[axis] - low) / (high - low)
+            cell.append(0 if math.isnan(share) else int(min(max(share * size, 0), size - 1)))
+        value = math.inf if math.isnan(sample[0]) else sample[0]
+        seen = sample[2] > hidden * -math.expm1(-value * sample[1])
+        found.setdefault(tuple(cell), []).append(value if seen else 0.0)
+    result = density.clone()
+    for cell, values in found.items():
+        result[cell] = max(float(density[cell] * decay), *values)
+    return result
+
+
+@pytest.mark.parametrize(("shape", "m"), [((3, 4, 5), 0), ((3, 4, 5), 1), ((1, 1, 1), 9), ((5, 6, 7), 2001)])
+@pytest.mark.parametrize("decay", [0.0, 0.75, 1.0])
+def test_equals_a_slow_loop(device, backend, shape, m, decay):
+    density = 2 * torch.rand(shape)
+    # Binary fractions within the cells, and some positions outside the box.
+    positions = BOX[0] + (BOX[1] - BOX[0]) * (torch.randint(-9, 137, (m, 3)) / 128 + 1 / 1024)
+    sigma, deltas = 3 * torch.rand(m) * (torch.rand(m) < 0.7), torch.rand(m)
+    weights = 0.02 * torch.rand(m) * (torch.rand(m) < 0.8)
+    sigma[::50], positions[3::50, 1] = torch.nan, torch.nan
+    expected = slow(density, positions, sigma, deltas, weights, decay, 0.01)
+    found, occupied = density.to(device, copy=True), (density >= 0.9).to(device)
+    samples = [strided(tensor.to(device)) for tensor in (positions, sigma, deltas, weights)]
+    given = [tensor.clone() for tensor in samples]
+    observe_occupancy(
+        found, occupied, BOX.to(device), *samples, decay=decay, threshold=0.9, hidden=0.01, backend=backend
+    )
+    assert torch.equal(found.cpu(), expected)
+    assert torch.equal(occupied.cpu(), expected >= 0.9)
+    for before, after in zip(given, samples):
+        torch.testing.assert_close(after, before, rtol=0, atol=0, equal_nan=True)
+
+
+def test_refuses_what_makes_no_sense():
+    density, occupied = torch.rand(2, 3, 4), torch.ones(2, 3, 4, dtype=torch.bool)
+    samples = {"positions": torch.rand(5, 3), "sigma": torch.rand(5), "deltas": torch.rand(5), "weights": torch.rand(5)}
+    numbers = {"decay": 0.5, "threshold": 1.0, "hidden": 0.01}
+    refuses = refusals(observe_occupancy, density=density, occupied=occupied, box=BOX, **samples, **numbers)
+    refuses("occupied must have shape [x, y, z] with x = 2, y = 3, z = 4, got [2, 3, 3]", occupied=occupied[..., 1:])
+    refuses("sigma must have shape [m] with m = 5, got [4]", sigma=torch.rand(4))
+    refuses("occupied must have dtype bool, got uint8", occupied=occupied.byte())
+    refuses("density must have dtype float32, got float64", density=density.double())
+    refuses("box must have shape [2, 3], got [3, 2]", box=BOX.T)
+    refuses("density must be contiguous, got strides (1, 2, 6)", density=torch.rand(4, 3, 2).permute(2, 1, 0))
+    refuses("decay must lie in 0 to 1, got -1", decay=-1)
+    none = {"density": torch.rand(0, 3, 4), "occupied": torch.ones(0, 3, 4, dtype=torch.bool)}
+    refuses("density must have at least one cell, got [0, 3, 4]", **none)

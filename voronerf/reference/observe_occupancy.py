@@ -1,0 +1,38 @@
+"""Updating an occupancy grid from rendered samples. x, y, z cells along each axis, m samples."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+@torch.no_grad()
+def observe_occupancy(
+    density: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    positions: Tensor,
+    sigma: Tensor,
+    deltas: Tensor,
+    weights: Tensor,
+    decay: float,
+    threshold: float,
+    hidden: float,
+) -> None:
+    """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
+    found = sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
+    # weight = light that arrives * share of it that is taken
+    seen = weights > hidden * -torch.expm1(-found * deltas)
+    rows = cells_of(positions, box, density.shape).long()
+    flat = density.view(-1)
+    # A cell decays once, however often it occurs.
+    faded = flat.scatter(0, rows, flat[rows] * decay)
+    flat.copy_(faded.scatter_reduce(0, rows, torch.where(seen, found, 0), "amax"))
+    occupied.view(-1)[rows] = flat[rows] >= threshold
+
+
+def cells_of(points: Tensor, box: Tensor, shape: torch.Size) -> Tensor:
+    """Flat numbers int32 [n] of the cells that points [n, 3] lie in; outside the box the nearest at its border."""
+    places = (points - box[0]) / (box[1] - box[0])
+    x, y, z = ((places[:, i] * size).nan_to_num(0).clamp(0, size - 1).int() for i, size in enumerate(shape))
+    return (x * shape[1] + y) * shape[2] + z
