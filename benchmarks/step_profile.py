@@ -35,6 +35,7 @@ PARTS = {
     "route": ("routed_mlp", "grouped_mlp", "grouped_linear"),
     "cells": ("nearest_centre", "locate_cell", "cell_sort"),
     "composite": ("composite", "render_loss"),
+    "batch": ("pixel_rays",),
     "march and occupancy": ("march_rays", "update_occupancy"),
     "encoding": ("hash_encode",),
     "optimiser": ("_fused_adam", "_foreach"),
