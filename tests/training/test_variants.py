@@ -124,7 +124,9 @@ def test_widths_count_all_networks(scene):
 
 def test_the_occupancy_grid_says_what_it_works_with():
     for settings in (HIERARCHICAL, CONES, CONTRACTION):
-        with pytest.raises(ConfigError, match="--occupancy must come with --field nerf or kilonerf, --sampling strat"):
+        with pytest.raises(
+            ConfigError, match="--occupancy must come with --field nerf, kilonerf or hashgrid, --sampling strat"
+        ):
             TrainConfig(occupancy=True, **settings)
     assert TrainConfig(occupancy=True, **KILO).occupancy
 
@@ -155,7 +157,7 @@ def test_the_command_line(tmp_path, capsys):
     assert main(["eval", run, "--views", "1", "--panels", "1", "--fine-samples", "6"]) == 0
     assert main(["render", run, "--frames", "2", "--samples", "6"]) == 0
     for options, message in (
-        (["--views", "1", "--occupancy"], "--occupancy must come with --field nerf or kilonerf"),
+        (["--views", "1", "--occupancy"], "--occupancy must come with --field nerf, kilonerf or hashgrid"),
         (["--fine-samples", "0"], "--fine-samples must be at least 1, got 0"),
     ):
         capsys.readouterr()
