@@ -69,6 +69,7 @@ def train(options: Options, folder: Path) -> dict[str, Trainer]:
         config = TrainConfig(
             out=folder / name,
             budget=options.budget * share,
+            field="nerf",
             occupancy=name == "occupancy",
             evaluations=4,
             eval_views=options.eval_views,

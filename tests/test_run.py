@@ -15,7 +15,17 @@ from voronerf.training.checkpoint import CheckpointError
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.trainer import Trainer
 
-SIZE = {"width": 8, "depth": 1, "rays": 64, "samples": 8, "evaluations": 1, "reservoir": 400, "reservoir_batches": 10}
+SIZE = {
+    "field": "nerf",
+    "occupancy": False,
+    "width": 8,
+    "depth": 1,
+    "rays": 64,
+    "samples": 8,
+    "evaluations": 1,
+    "reservoir": 400,
+    "reservoir_batches": 10,
+}
 
 
 @pytest.fixture(scope="module")

@@ -398,7 +398,7 @@ def training(out: Path, data: str, device: str = "cuda", seconds: float = 12.0) 
     journal = Journal(out, "training")
     scene, failed = load_scene(data, downscale=1 if data == "builtin" else 2), 0
     common: dict[str, Any] = {"data": data, "device": device, "budget": seconds, "cells": (12,), "rays": 4096}
-    common |= {"evaluations": 1, "eval_views": 2, "final_views": 5, "panels": 0}
+    common |= {"field": "nerf", "occupancy": False, "evaluations": 1, "eval_views": 2, "final_views": 5, "panels": 0}
     for name, options in TRAININGS.items():
         if device == "cpu" and options.get("cuda_graph"):
             continue

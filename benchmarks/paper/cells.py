@@ -40,7 +40,7 @@ def cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
     levels: list[tuple[int, ...]] = [(), *((count,) for count in COUNTS), (4, 4)]
     levels += [(16, 16)] if settings.large else []
     further = {name: value for name, value in settings.further.items() if name not in ("cells", "parameters")}
-    reference = TrainConfig(data=scene, cells=(12,), **further)
+    reference = TrainConfig(**{"data": scene, "field": "nerf", "occupancy": False, "cells": (12,), **further})
     total = count_parameters(resolve_config(reference, open_scene(scene, replace(settings, seeds=1))))
     own = [Variant(levels_name(cells), {"cells": cells}) for cells in levels]
     # 12 cells are what the others are matched with: one training is both

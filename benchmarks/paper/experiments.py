@@ -97,7 +97,7 @@ def one_or_cells(settings: Settings) -> list[Variant]:
 
 def rendered(field: str, sampling: str, settings: Settings) -> dict[str, Any]:
     """The settings of a field and a sampling; two passes share the samples of one."""
-    changes: dict[str, Any] = {} if field == TrainConfig.field else {"field": field}
+    changes: dict[str, Any] = {} if field == "nerf" else {"field": field}
     if sampling == "hierarchical":
         half = settings.samples // 2
         changes |= {"sampling": sampling, "samples": half, "fine_samples": settings.samples - half}

@@ -65,7 +65,9 @@ def machine_name(made: Mapping[str, Any]) -> str:
 
 def changed_settings(config: Mapping[str, Any]) -> Row:
     """The settings of a configuration, as in its JSON, that differ from their defaults."""
-    usual = json.loads(TrainConfig(average=0.0).to_json())  # as in every training of the paper
+    usual = json.loads(
+        TrainConfig(field="nerf", occupancy=False, contraction="none", average=0.0).to_json()
+    )  # as in every training of the paper
     return {name: value for name, value in config.items() if name not in NOT_TOLD and value != usual.get(name)}
 
 

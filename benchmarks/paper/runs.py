@@ -146,7 +146,11 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: 
         "samples": settings.samples,
         "backend": settings.backend,
         "checkpoint_every": 1e9,
-        "average": 0.0,  # the method as published
+        # The method as published.
+        "field": "nerf",
+        "occupancy": False,
+        "contraction": "none",
+        "average": 0.0,
         **settings.further,
         **variant.changes,
     }

@@ -26,7 +26,18 @@ def outcome(script, folder, options):
 
 
 def test_pictures_of_a_trained_run(tmp_path):
-    config = TrainConfig(out=tmp_path / "run", steps=4, cells=(), width=8, depth=2, rays=64, samples=8, final_views=1)
+    config = TrainConfig(
+        out=tmp_path / "run",
+        steps=4,
+        field="nerf",
+        occupancy=False,
+        cells=(),
+        width=8,
+        depth=2,
+        rays=64,
+        samples=8,
+        final_views=1,
+    )
     Trainer(config, builtin_scene(16, train_views=4, test_views=1)).run()
     options = f"--trained {config.out} --size 12 --views 1 --repeats 1"
     _, results, said = outcome("occupancy", tmp_path, options)

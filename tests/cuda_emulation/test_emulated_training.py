@@ -15,7 +15,8 @@ STEPS = 16
 def losses(out, precision, *, on_device):
     """Of the steps of a run that splits in the middle."""
     config = TrainConfig(
-        out=out, steps=STEPS, cells=(4,), split_at=(0.5,), width=16, depth=2, rays=32, samples=8, lr=0.005,
+        out=out, field="nerf", occupancy=False, steps=STEPS,
+        cells=(4,), split_at=(0.5,), width=16, depth=2, rays=32, samples=8, lr=0.005,
         warmup=0.0, reservoir=200, reservoir_batches=8, evaluations=1, precision=precision,
     )  # fmt: skip
     found = []

@@ -79,14 +79,14 @@ def test_bad_settings():
     refuses("HashGridField: width must be at least 2 and depth 1, got 1 and 1", HashGridField, width=1)
     refuses("HashGrid: log2_entries must be an integer from 10 to 24, got 30", HashGridField, log2_entries=30)
     with pytest.raises(ConfigError, match="--cell-tables must come with a field whose cells share parameters"):
-        TrainConfig(cell_tables=True)
+        TrainConfig(field="nerf", cell_tables=True)
     with pytest.raises(ConfigError, match=r"--field hashgrid with 4096 cells needs .* GiB for parameters, gradients"):
         check_memory(TrainConfig(field="hashgrid", cells=(4096,), cell_tables=True))
     refuses("HashGridField: directions must be given", HashGridField(log2_entries=10), torch.rand(2, 3))
     capture = load_scene("builtin", downscale=10)
     object.__setattr__(capture, "box", None)
-    with pytest.raises(ConfigError, match="--field hashgrid needs --contraction sphere for builtin, a scene without"):
-        resolve_config(TrainConfig(field="hashgrid"), capture)
+    with pytest.raises(ConfigError, match="--field hashgrid needs --contraction sphere or auto for builtin, a sc"):
+        resolve_config(TrainConfig(contraction="none"), capture)
 
 
 def test_a_table_that_does_not_fit_into_memory(monkeypatch):

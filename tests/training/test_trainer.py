@@ -350,8 +350,6 @@ def test_more_cells_than_samples(tmp_path, scene):
 def test_refused_before_anything_is_written(tmp_path, scene):
     with pytest.raises(BackendUnavailable):
         Trainer(small(tmp_path, backend="warp"), scene)
-    with pytest.raises(ConfigError, match="--occupancy needs a scene with a box around everything, builtin has none"):
-        Trainer(small(tmp_path, occupancy=True), replace(scene, box=None))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -122,13 +122,20 @@ def test_widths_count_all_networks(scene):
     assert solved(**PROPOSAL, split_proposal=True) < solved(**PROPOSAL) <= solved()
 
 
-def test_the_occupancy_grid_says_what_it_works_with():
-    for settings in (HIERARCHICAL, CONES, CONTRACTION):
-        with pytest.raises(
-            ConfigError, match="--occupancy must come with --field nerf, kilonerf or hashgrid, --sampling strat"
-        ):
-            TrainConfig(occupancy=True, **settings)
-    assert TrainConfig(occupancy=True, **KILO).occupancy
+def test_empty_space_is_skipped_wherever_that_works(scene):
+    for settings in (HIERARCHICAL, CONES, CONTRACTION, {"distortion": 0.01}, {"cuda_graph": True, "device": "cuda"}):
+        assert not resolve_config(TrainConfig(**settings), scene).occupancy
+    for settings in ({}, KILO, {"field": "nerf"}):
+        assert resolve_config(TrainConfig(**settings), scene).occupancy
+        assert not resolve_config(TrainConfig(occupancy=False, **settings), scene).occupancy
+        assert not resolve_config(TrainConfig(**settings), replace(scene, box=None)).occupancy
+
+
+def test_a_hash_grid_in_a_scene_without_bounds_is_contracted(scene):
+    unbounded = replace(scene, box=None)
+    assert resolve_config(TrainConfig(), unbounded).contraction == "sphere"
+    assert resolve_config(TrainConfig(), scene).contraction == "none"
+    assert resolve_config(TrainConfig(field="nerf"), unbounded).contraction == "none"
 
 
 def test_the_sphere_of_a_contraction(tmp_path, scene):
@@ -157,7 +164,7 @@ def test_the_command_line(tmp_path, capsys):
     assert main(["eval", run, "--views", "1", "--panels", "1", "--fine-samples", "6"]) == 0
     assert main(["render", run, "--frames", "2", "--samples", "6"]) == 0
     for options, message in (
-        (["--views", "1", "--occupancy"], "--occupancy must come with --field nerf, kilonerf or hashgrid"),
+        (["--views", "1", "--occupancy"], "--occupancy does not work with --field mipnerf, which takes cones"),
         (["--fine-samples", "0"], "--fine-samples must be at least 1, got 0"),
     ):
         capsys.readouterr()

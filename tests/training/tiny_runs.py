@@ -12,6 +12,8 @@ from voronerf.training.trainer import Trainer
 
 SMALL = {
     "steps": 24,
+    "field": "nerf",
+    "occupancy": False,
     "cells": (4,),
     "width": 8,
     "depth": 2,

@@ -50,15 +50,16 @@ class TrainConfig:
     steps: int | None = None
     """Number of training steps, instead of a time."""
 
-    field: str = "nerf"
-    """Kind of network: nerf, mipnerf (cones instead of rays), kilonerf (nerf in the size of KiloNeRF's networks),
-    hashgrid (small networks on a hash grid that the cells share), or another name in `voronerf.fields.FIELDS`."""
+    field: str = "hashgrid"
+    """Kind of network: hashgrid (small networks on a hash grid that the cells share), nerf (as published), mipnerf
+    (cones instead of rays), kilonerf (nerf in the size of KiloNeRF's networks), or another name in
+    `voronerf.fields.FIELDS`."""
     field_options: tuple[str, ...] = ()
     """Further options of the field, each as NAME=VALUE, such as density_scale=20."""
     width: int | None = None
-    """Channels of the networks' hidden layers; default 64, kilonerf and hashgrid 32."""
+    """Channels of the networks' hidden layers; default 32, nerf and mipnerf 64."""
     depth: int | None = None
-    """Hidden layers before the heads; default 4, kilonerf 2, hashgrid 1."""
+    """Hidden layers before the heads; default 1, nerf and mipnerf 4, kilonerf 2."""
     parameters: int | None = None
     """Upper limit for the number of parameters of all final cells together; --width becomes the largest that fits."""
     skips: tuple[int, ...] | None = None
@@ -132,11 +133,12 @@ class TrainConfig:
     the proposal's weights to the power of b t / ((b - 1) t + 1), so evenly at first; 0 is off."""
     distortion: float = 0.0
     """Factor of a loss on weights that are spread along a ray (mip-NeRF 360; published: 0.01); 0 is off."""
-    contraction: Literal["none", "sphere"] = "none"
+    contraction: Literal["auto", "none", "sphere"] = "auto"
     """Space as the networks see it: unchanged, or with all points outside a sphere mapped into a shell of twice its
-    radius."""
-    occupancy: bool = False
-    """Skip samples in empty space, in training and in pictures; needs a scene with a box."""
+    radius; auto is the sphere for a hash grid in a scene without a box, else none."""
+    occupancy: bool = True
+    """Skip samples in empty space, in training and in pictures, wherever that works: for points in a single pass, in a
+    scene with a box, without contraction, --distortion and --cuda-graph."""
     occupancy_resolution: int = 64
     """Cells of the occupancy grid along each axis."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
@@ -145,7 +147,8 @@ class TrainConfig:
     cuda_graph: bool = False
     """On CUDA: capture a whole step in a graph and replay it; captured again after each split. Not with --occupancy."""
     lr: float | None = None
-    """Learning rate of Adam at the start; default: 0.02 up to width 64, in inverse proportion to the width beyond."""
+    """Learning rate of Adam at the start; default: 0.01 for hashgrid; for the others 0.02 up to
+    width 64, in inverse proportion to the width beyond."""
     lr_final: float = 0.05
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
     lr_split: float = 1.0

@@ -15,8 +15,6 @@ from voronerf.fields import FIELDS
 if TYPE_CHECKING:
     from voronerf.training.config import TrainConfig
 
-#: The occupancy grid works for points in a single pass.
-OCCUPANCY_RULE = "come with --field {}, --sampling stratified and --contraction none"
 #: Settings that are options of a field where its class has an option of that name.
 NETWORK_SETTINGS = ("width", "depth", "skips", "position_octaves", "direction_octaves", "view_directions")
 
@@ -113,15 +111,11 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     largest = max(config.cells, default=0)
     need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
     need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
-    graphed = config.device.startswith("cuda") and not config.occupancy
-    need(graphed or not config.cuda_graph, "cuda_graph", "come with --device cuda and without --occupancy")
+    need(config.device.startswith("cuda") or not config.cuda_graph, "cuda_graph", "come with --device cuda")
     need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
     _check_splits(config, need)
     shares = "share" in config.field_type.router_options
     need(shares or not config.cell_tables, "cell_tables", "come with a field whose cells share parameters, as hashgrid")
-    plain = not config.field_type.cones and config.sampling == "stratified" and config.contraction == "none"
-    points = [name for name, kind in FIELDS.items() if not kind.cones]
-    need(plain or not config.occupancy, "occupancy", OCCUPANCY_RULE.format(either(points)))
     proposes = config.sampling == "proposal"
     need(proposes or not config.split_proposal, "split_proposal", "come with --sampling proposal")
     need(proposes or config.proposal_rounds == 1, "proposal_rounds", "be 1 without --sampling proposal")
@@ -130,7 +124,18 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(anneal == 0 or 1 <= anneal < float("inf"), "proposal_anneal", "be 0, or a slope of at least 1")
     need(anneal == 0 or not config.cuda_graph, "proposal_anneal", "be 0 with --cuda-graph")
     need(0 <= config.distortion < float("inf"), "distortion", "be a factor of 0 or more")
-    need(not (config.distortion and config.occupancy), "distortion", "be 0 with --occupancy")
+
+
+def why_no_occupancy(config: TrainConfig) -> str | None:
+    """What keeps a run from skipping samples in empty space, whatever its scene; None if nothing does."""
+    obstacles = {
+        f"--field {config.field}, which takes cones": config.field_type.cones,
+        f"--sampling {config.sampling}": config.sampling != "stratified",
+        f"--contraction {config.contraction}": config.contraction == "sphere",
+        "--distortion": config.distortion > 0,
+        "--cuda-graph": config.cuda_graph,
+    }
+    return next((name for name, there in obstacles.items() if there), None)
 
 
 def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -> None:

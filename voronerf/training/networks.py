@@ -19,6 +19,7 @@ from voronerf.router import VoronoiRouter
 from voronerf.training.adam import Adam
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
 from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.config_checks import why_no_occupancy
 from voronerf.training.renderers import make_contraction
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
@@ -54,19 +55,28 @@ def space_of(config: TrainConfig, scene: Scene) -> tuple[tuple[float, ...], ...]
     elif scene.box is not None:
         box = scene.box
     else:
-        raise ConfigError(f"--field {config.field} needs --contraction sphere for {scene.name}, a scene without a box")
+        raise ConfigError(
+            f"--field {config.field} needs --contraction sphere or auto for {scene.name}, a scene without a box"
+        )
     low, high = (tuple(round(x, 6) for x in corner) for corner in box.tolist())
     return low, high
 
 
 def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
-    """Fills in the settings that depend on the scene: octaves, options of the field, and with ``parameters`` the width
-    and learning rate.
+    """Fills in the settings that depend on the scene.
+
+    They are the contraction, whether empty space is skipped, octaves, options of the field, and with ``parameters`` the
+    width and learning rate.
 
     Raises:
         ConfigError: When the smallest networks have more parameters than asked for.
     """
     kind = config.field_type
+    if config.contraction == "auto":
+        unbounded = kind.scene_options is not None and scene.box is None
+        config = replace(config, contraction="sphere" if unbounded else "none")
+    if config.occupancy and (scene.box is None or why_no_occupancy(config) is not None):
+        config = replace(config, occupancy=False)
     if config.position_octaves is None and "position_octaves" in kind.options:
         config = replace(config, position_octaves=kind.octaves(octaves_for(scene)))
     if kind.scene_options is not None:

@@ -13,6 +13,7 @@ from voronerf.rendering.comparison import Comparison
 from voronerf.rendering.field import Field
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.config_checks import why_no_occupancy
 
 #: A cell is empty if a sample in it would take less of the light than this, were the cell that dense throughout: for
 #: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
@@ -57,7 +58,9 @@ def make_picture_grid(config: TrainConfig, scene: Scene, field: Field, *, backen
     Raises:
         ConfigError: When the scene has no box, or the run's sampling has no use for a grid.
     """
-    replace(config, occupancy=True, cuda_graph=False)  # checks that the run can use one
+    obstacle = why_no_occupancy(replace(config, cuda_graph=False))
+    if obstacle is not None:
+        raise ConfigError(f"--occupancy does not work with {obstacle}")
     device = next(field.parameters()).device if isinstance(field, nn.Module) else "cpu"
     grid = make_grid(config, scene, device, PICTURE_RESOLUTION, LEAST_OPACITY)
     generator = torch.Generator().manual_seed(0)

@@ -46,7 +46,7 @@ def make_renderer(
         samples=int(config.samples or 0) if samples is None else samples,
         fine_samples=0 if config.sampling == "stratified" else fine_samples or config.fine_samples,
         cones=config.field_type.cones,
-        contraction=None if config.contraction == "none" else make_contraction(scene, device),
+        contraction=make_contraction(scene, device) if config.contraction == "sphere" else None,
         spacing=scene.spacing,
         occupancy=occupancy,
         rounds=config.proposal_rounds,
