@@ -53,7 +53,9 @@ def test_every_option_of_every_command_is_on_the_page(monkeypatch: pytest.Monkey
 def test_options_on_a_page_exist(name: str) -> None:
     from voronerf.training.config import TrainConfig
 
-    known = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(TrainConfig)}
+    fields = dataclasses.fields(TrainConfig)
+    known = {f"--{field.name.replace('_', '-')}" for field in fields}
+    known |= {f"--no-{field.name.replace('_', '-')}" for field in fields if isinstance(field.default, bool)}
     for line in re.findall(r"voronerf train( [^`\n|]*)", (ROOT / name).read_text()):
         for option in re.findall(r"(?<!\w)--[a-z-]+", line):
             assert option in known, f"{name}: voronerf train has no {option}"
