@@ -145,7 +145,8 @@ class TrainConfig:
     """Products of the networks while training: float32, bfloat16, or float16 with a scaled loss. Sums, parameters and
     moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
     cuda_graph: bool = False
-    """On CUDA: capture a whole step in a graph and replay it; captured again after each split. Not with --occupancy."""
+    """On CUDA: capture a whole step in a graph and replay it; captured again after each split. Empty
+    space is not skipped then."""
     lr: float | None = None
     """Learning rate of Adam at the start; default: 0.01 for hashgrid; for the others 0.02 up to
     width 64, in inverse proportion to the width beyond."""
