@@ -149,6 +149,7 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
         summary, curve = training.run(), training.metrics
         config = training.config
         settings = json.loads(config.to_json()) if isinstance(config, TrainConfig) else dataclasses.asdict(config)
+        settings |= {"data": Path(options.data).name, "out": None}  # paths of a machine mean nothing elsewhere
         results.append(
             {
                 "side": name,
