@@ -160,6 +160,7 @@ def test_the_command_line(tmp_path, capsys):
     tiny = "--downscale 6 --steps 12 --cells 3 --split-at-steps 5 --width 8 --rays 64 --samples 8 --fine-samples 4"
     tiny += " --eval-views 1 --final-views 1 --panels 1 --field mipnerf --sampling hierarchical"
     assert main(["train", "--out", run, *tiny.split()]) == 0
+    assert "no occupancy grid with --field mipnerf, which takes cones" in " ".join(capsys.readouterr().out.split())
     assert read_json(tmp_path / "run" / "summary.json")["width"] == 8
     assert main(["eval", run, "--views", "1", "--panels", "1", "--fine-samples", "6"]) == 0
     assert main(["render", run, "--frames", "2", "--samples", "6"]) == 0
@@ -169,7 +170,9 @@ def test_the_command_line(tmp_path, capsys):
     ):
         capsys.readouterr()
         assert main(["eval", run, *options]) == 1 and message in capsys.readouterr().err
+    capsys.readouterr()
     assert main(["train", "--out", run, "--resume", "--steps", "14"]) == 0
+    assert "no occupancy grid" not in capsys.readouterr().out  # the run in --out says --no-occupancy by now
 
 
 @pytest.mark.parametrize("field", [{}, CONES])

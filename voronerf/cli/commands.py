@@ -25,7 +25,7 @@ from voronerf.files import write_text
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.run import open_run
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.config_checks import check_device
+from voronerf.training.config_checks import check_device, why_no_occupancy
 from voronerf.training.run_directory import choose_directory, held, write_curve
 from voronerf.training.trainer import Trainer
 
@@ -64,6 +64,9 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene) -> dict[str, A
         trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
         if trainer.lpips is None:
             display.on_event(trainer.lpips_source)
+        if config.occupancy and trainer.occupancy is None:
+            obstacle = why_no_occupancy(trainer.config) or "a scene without a box"
+            display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
         before = signal.getsignal(signal.SIGINT)
 
         def stop(number: int, frame: FrameType | None) -> None:
