@@ -10,8 +10,11 @@ checks makes a letter mean the same number in all of them.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -133,3 +136,15 @@ def _short(dtype: torch.dtype) -> str:
 def physical_memory() -> int:
     """Bytes of memory of this machine."""
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def available_memory() -> int:
+    """Bytes of memory that this process can still take: what is free, or the rest of its container's limit."""
+    free = physical_memory()
+    with contextlib.suppress(OSError, ValueError):
+        found = re.search(r"^MemAvailable: +(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)
+        free = int(found[1]) * 1024 if found else free
+    with contextlib.suppress(OSError, ValueError):
+        group = Path("/sys/fs/cgroup")  # version 2, as a container sees its own; its limit may be the word max
+        free = min(free, int((group / "memory.max").read_text()) - int((group / "memory.current").read_text()))
+    return max(free, 0)

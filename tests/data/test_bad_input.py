@@ -2,7 +2,9 @@
 
 import json
 import math
+import struct
 import sys
+import zlib
 
 import numpy as np
 import pytest
@@ -25,6 +27,21 @@ def write_noise(folder, count=3, **entries):
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 9.0, **entries, "frames": frames}))
 
 
+def deep_png(width, height, colour):
+    """A PNG of 16 bits a channel: 0 grey, 2 RGB, 4 grey and alpha, 6 RGBA."""
+    rows = bytes(1 + width * 2 * {0: 1, 2: 3, 4: 2, 6: 4}[colour]) * height
+    chunks = {
+        b"IHDR": struct.pack(">IIBBBBB", width, height, 16, colour, 0, 0, 0),
+        b"IDAT": zlib.compress(rows),
+        b"IEND": b"",
+    }
+    parts = [
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks.items()
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
 def fails(folder, *parts, downscale=1):
     for part in parts:
         refuses(part, load_scene, folder, downscale=downscale, error=SceneError)
@@ -42,7 +59,7 @@ def test_downscale(tmp_path):
         fails("builtin", f"downscale must be >= 1, got {downscale}", downscale=downscale)
     fails("builtin", "leaves no pixel of 100 x 100", downscale=101)
     write_noise(tmp_path)
-    fails(tmp_path, "0.png", "downscaling by 7 leaves no pixel of 8 x 6", downscale=7)
+    fails(tmp_path, "1.png", "downscaling by 7 leaves no pixel of 8 x 6", downscale=7)
 
 
 @pytest.mark.parametrize(
@@ -114,9 +131,14 @@ def test_images(tmp_path):
         path.write_bytes(broken)
         fails(tmp_path, f"2.png: {reason}")
     Image.fromarray(np.zeros((5, 8, 3), dtype=np.uint8)).save(path)
-    fails(tmp_path, "2.png: is 8 x 5 pixels", "0.png is 8 x 6", "same size")
-    Image.fromarray(np.zeros((6, 8), dtype=np.uint16)).save(path)
-    fails(tmp_path, "2.png: has more than 8 bits a channel")
+    fails(tmp_path, "2.png: is 8 x 5 pixels", "1.png is 8 x 6", "same size")
+    for colour in (0, 2, 4, 6):  # grey, RGB, and both with alpha
+        path.write_bytes(deep_png(8, 6, colour))
+        fails(tmp_path, "2.png: has more than 8 bits a channel")
+    for kind in ("EPS", "GIF", "TIFF", "PPM"):  # for EPS, Pillow starts Ghostscript
+        with open(path, "wb") as file:
+            Image.fromarray(NOISE).save(file, kind)
+        fails(tmp_path, "2.png: is not an image in PNG or JPEG format")
     for index in range(3):
         (tmp_path / f"{index}.png").unlink()
     fails(tmp_path, "transforms.json: none of its 3 images exists, the first is", "0.png")

@@ -1,9 +1,13 @@
 """Decoding and downscaling, against slow averages."""
 
+import sys
+
 import numpy as np
 import pytest
+from helpers import python, refuses
 from PIL import Image
 
+from voronerf.data import SceneError, images
 from voronerf.data.images import area_average, read_image, read_images
 
 
@@ -45,8 +49,7 @@ def test_jpeg_reduction_is_the_area_average(tmp_path, factor, size):
     smooth = np.stack((127 + 100 * np.sin(x / 9), 127 + 100 * np.cos(y / 7), x + y), axis=-1).astype(np.uint8)
     path = tmp_path / "a.jpg"
     Image.fromarray(smooth).save(path, quality=97, subsampling=0)
-    found, original = read_image(path, factor)
-    assert original == (width, height)
+    found = read_image(path, factor)
     expected = area_average(smooth, factor)
     assert found.shape == expected.shape == (height // factor, width // factor, 3)
     assert np.abs(found.astype(int) - expected.astype(int)).mean() < 2
@@ -56,7 +59,7 @@ def test_jpeg_reduction_is_the_area_average(tmp_path, factor, size):
 def test_modes(tmp_path, mode, channels):
     path = tmp_path / "a.png"
     Image.new("RGB", (5, 4), (255, 255, 255)).convert(mode).save(path)
-    pixels, _ = read_image(path, 1)
+    pixels = read_image(path, 1)
     assert pixels.shape == (4, 5, channels)
     assert (pixels == 255).all()
 
@@ -68,3 +71,43 @@ def test_one_image_with_alpha_gives_all_alpha(tmp_path):
     images, size = read_images(paths, 1)
     assert size == (3, 2)
     assert images[:, 0, 0].tolist() == [[1, 2, 3, 255], [4, 5, 6, 7]]
+
+
+@pytest.mark.parametrize("factor", [1, 3])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_bands_of_rows_are_parts_of_the_whole(tmp_path, monkeypatch, mode, factor):
+    whole = np.random.default_rng(0).integers(0, 256, (53, 37, len(mode)), dtype=np.uint8)
+    Image.fromarray(whole).save(tmp_path / "a.png")
+    monkeypatch.setattr(images, "BAND", 200)
+    assert np.array_equal(read_image(tmp_path / "a.png", factor), area_average(whole, factor))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="units of ru_maxrss")
+def test_large_images_are_reduced_one_after_another(tmp_path):
+    """81 million grey pixels each, which are 243 MB in colour and 972 MB as float32."""
+    for index in range(3):
+        Image.new("L", (9000, 9000), index).save(tmp_path / f"{index}.png")
+    code = (
+        "import resource, sys; from pathlib import Path; from voronerf.data.images import read_images; "
+        "most = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; before = most(); "
+        "read_images(sorted(Path(sys.argv[1]).glob('*.png')), 100); print(most() - before)"
+    )
+    assert int(python("-c", code, tmp_path)) < 200_000
+
+
+def test_what_does_not_fit_into_memory_is_not_decoded(tmp_path, monkeypatch):
+    paths = [tmp_path / f"{index}.png" for index in range(4)]
+    for path in paths:
+        Image.new("RGB", (100, 50)).save(path)
+    pixels = 4 * 100 * 50 * 3 + 100 * 50 * 4  # of the scene, and of one image as Pillow keeps it
+    monkeypatch.setattr(images, "available_memory", lambda: 2 * pixels)
+    assert read_images(paths, 1)[0].shape == (4, 50, 100, 3)
+    monkeypatch.setattr(images, "available_memory", lambda: 2 * pixels - 1)
+    refuses(
+        "0.png: loading 4 images of 100 x 50 needs 0.00 GiB with --downscale 1, more than 50% of",
+        read_images,
+        paths,
+        1,
+        error=SceneError,
+    )
+    assert read_images(paths, 2)[0].shape == (4, 25, 50, 3)

@@ -62,6 +62,8 @@ def test_panel_file(tmp_path):
     width, height = Image.open(path).size
     zoom = -(-panels.PICTURE_HEIGHT // 7)
     assert (width, height) == (5 * (9 * zoom + 6) + 6, 7 * zoom + 6 + 18 + 6)
+    strip = torch.zeros(1, 5000, 3, dtype=torch.uint8)  # enlarged to 240 rows it would take 288 million pixels
+    assert panels.contact_sheet({"truth": strip}).shape == (6 + 18 + 1 + 6, 5000 + 6 + 6, 3)
     pixels = np.asarray(Image.open(path))
     truth = panels.picture_of_colour(colour)
     assert pixels[6 + 18, 6].tolist() == truth[0, 0].tolist()

@@ -81,7 +81,10 @@ def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, down
         SceneError: as :func:`load_capture`.
     """
     frames = [entry.frame for entry in listed]
-    images, size = read_images([frame.path for frame in frames], downscale)
+    # Training views first, so that the images of either part are a slice and no copy.
+    order = torch.cat(((~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0])).tolist()
+    images, size = read_images([frames[index].path for index in order], downscale)
+    parts = images.split([int((~held_out).sum()), int(held_out.sum())])
 
     intrinsics, distortion = [], []
     for path, entries, frame in listed:
@@ -106,15 +109,15 @@ def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, down
     if images.shape[-1] == 4 and bool((images[..., 3] < 255).any()):
         spacing, background = "linear", "white"
         near, far = 0.05 * nearest, 2.0
-        box = carve_box(cameras[~held_out], images[~held_out, ..., 3], near, far)
+        box = carve_box(cameras[~held_out], parts[0][..., 3], near, far)
     else:
-        images = images[..., :3]
+        parts = tuple(part[..., :3].contiguous() for part in parts)
 
     names = distinct_names([frame.path for frame in frames], folder)
     return Scene(
         folder.resolve().name,
-        _split(cameras, images, names, ~held_out),
-        _split(cameras, images, names, held_out),
+        _split(cameras, parts[0], names, ~held_out),
+        _split(cameras, parts[1], names, held_out),
         near,
         far,
         box,
@@ -151,7 +154,7 @@ def normalise_poses(poses: Tensor) -> Tensor:
 
 def _split(cameras: Cameras, images: Tensor, names: list[str], chosen: Tensor) -> Split:
     kept = tuple(name for name, wanted in zip(names, chosen.tolist()) if wanted)
-    return Split(cameras[chosen], images[chosen].contiguous(), kept)
+    return Split(cameras[chosen], images, kept)
 
 
 def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> list[float]:

@@ -19,7 +19,7 @@ from voronerf.rendering.cameras import Cameras, focus_point
 Array = NDArray[np.float32]
 
 RESOLUTIONS = (24, 32, 48)
-MASK_PIXELS = 100
+MASK_PIXELS, MOST_MASK_PIXELS = 100, 1000  # of the shorter side, and at most of the longer one
 VIEWS = 100
 GROWTHS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # widths by which masks are widened, pixels
 MARGIN = GROWTHS[-1] + 1
@@ -50,7 +50,7 @@ def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tenso
     focus = focus_point(cameras)
     if focus is None or cameras.distortion is not None or not visible.any() or visible.all():
         return None
-    shrink = max(1, min(visible.shape[1:]) // MASK_PIXELS)
+    shrink = max(1, min(visible.shape[1:]) // MASK_PIXELS, max(visible.shape[1:]) // MOST_MASK_PIXELS)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         views = list(pool.map(lambda index: _View(cameras, index, visible[index], shrink), range(len(cameras))))
         centre, half = focus.numpy(), np.float32((far - near) / 2)

@@ -1,12 +1,15 @@
-"""Reads image files as uint8 tensors and reduces them on the way."""
+"""Reads image files as uint8 tensors and reduces them on the way, in little more memory than the scene will take."""
 
 from __future__ import annotations
 
+import contextlib
+import math
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,11 +17,28 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from voronerf.checks import available_memory
 from voronerf.data.scene import SceneError
 
+#: Decided by the content of a file. Pillow would read others too, some of them by starting another program.
+FORMATS = ("PNG", "JPEG")
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
-DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
-THREADS = 4
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_DEPTH = 24  # offset of the bits a channel
+#: Share of the free memory that loading may take; the rest is for training.
+SHARE = 0.5
+#: Images are decoded by up to four threads while those in hand take at most this many bytes.
+THREADS, IN_HAND = 4, 2**26
+#: Pixels that are converted and averaged at a time.
+BAND = 2**20
+
+
+class Header(NamedTuple):
+    """What an image file says of itself: (width, height), an alpha channel, bytes of memory to decode it."""
+
+    size: tuple[int, int]
+    alpha: bool
+    decoded: int
 
 
 def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
@@ -46,7 +66,26 @@ def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     return np.rint(values).clip(0, 255).astype(np.uint8)
 
 
-def read_image(path: Path, factor: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
+def read_header(path: Path, factor: int) -> Header:
+    """Reads the header of an image file, without its pixels.
+
+    Args:
+        path: the file.
+        factor: of the reduction, >= 1.
+
+    Raises:
+        SceneError: the file is neither PNG nor JPEG, has more than 8 bits a channel or too few pixels.
+    """
+    with _opened(path) as file:
+        size, alpha = file.size, _has_alpha(file)
+        if factor > min(size):
+            raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {size[0]} x {size[1]}")
+        _reduce_while_decoding(file, factor)
+        # Pillow keeps colours in four bytes a pixel.
+        return Header(size, alpha, file.width * file.height * (1 if len(file.getbands()) == 1 else 4))
+
+
+def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
     """Decodes one image file.
 
     Orientation tags are ignored: poses and intrinsics belong to the pixels as stored. JPEG files are reduced by up to 8
@@ -54,39 +93,29 @@ def read_image(path: Path, factor: int) -> tuple[NDArray[np.uint8], tuple[int, i
 
     Args:
         path: the file.
-        factor: of the reduction, >= 1.
+        factor: of the reduction, from 1 to the number of pixels of the shorter side.
 
     Returns:
-        (pixels [h, w, 3 or 4], (width, height) of the file before the reduction).
+        [h, w, 3], or [h, w, 4] with an alpha channel.
 
     Raises:
-        SceneError: the file is not an image, is truncated, has more than 8 bits a channel or too few pixels.
+        SceneError: the file is no image that can be read, or is truncated.
     """
-    try:
-        with Image.open(path) as file:
-            size = file.size
-            if file.mode in DEEP_MODES:
-                raise SceneError(f"{path}: has more than 8 bits a channel, which is not supported")
-            if factor > min(size):
-                raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {size[0]} x {size[1]}")
-            rest = factor
-            if file.format == "JPEG" and factor % 2 == 0:
-                step = next(step for step in (8, 4, 2) if factor % step == 0)
-                file.draft("RGB", (size[0] // step, size[1] // step))
-                rest = factor if file.size == size else factor // step
-            alpha = "A" in file.getbands() or "transparency" in file.info
-            pixels = np.asarray(file.convert("RGBA" if alpha else "RGB"))
-    except SceneError:
-        raise
-    except UNREADABLE as error:
-        reason = "is not an image" if isinstance(error, Image.UnidentifiedImageError) else f"cannot be read: {error}"
-        raise SceneError(f"{path}: {reason}") from None
-    pixels = area_average(pixels, rest)
-    return pixels[: size[1] // factor, : size[0] // factor], size
+    with _opened(path) as file:
+        width, height = (side // factor for side in file.size)
+        mode = "RGBA" if _has_alpha(file) else "RGB"
+        rest = _reduce_while_decoding(file, factor)
+        pixels = np.empty((height, width, len(mode)), dtype=np.uint8)
+        rows = max(1, BAND // (width * rest**2))
+        for top in range(0, height, rows):
+            bottom = min(top + rows, height)
+            band = file.crop((0, top * rest, width * rest, bottom * rest)).convert(mode)
+            pixels[top:bottom] = area_average(np.asarray(band), rest)
+        return pixels
 
 
 def read_images(paths: Sequence[Path], factor: int) -> tuple[Tensor, tuple[int, int]]:
-    """Decodes images of one size, in parallel.
+    """Decodes images of one size; memory holds the result and one image, or several small ones.
 
     Args:
         paths: at least one file.
@@ -96,20 +125,66 @@ def read_images(paths: Sequence[Path], factor: int) -> tuple[Tensor, tuple[int, 
         (uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel; (width, height) of the files).
 
     Raises:
-        SceneError: as `read_image`, or images of different sizes.
+        SceneError: as `read_header` and `read_image`, images of different sizes, or more than fit into memory.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
-        decoded = list(pool.map(lambda path: read_image(path, factor), paths))
-    size = decoded[0][1]
-    for path, (_, other) in zip(paths, decoded):
+    headers = [read_header(path, factor) for path in paths]
+    size = headers[0].size
+    for path, (other, _, _) in zip(paths, headers):
         if other != size:
             raise SceneError(
                 f"{path}: is {other[0]} x {other[1]} pixels but {paths[0]} is {size[0]} x {size[1]}; "
                 "all images of a scene must have the same size"
             )
-    channels = max(pixels.shape[2] for pixels, _ in decoded)
-    height, width = decoded[0][0].shape[:2]
-    images = np.full((len(decoded), height, width, channels), 255, dtype=np.uint8)
-    for target, (pixels, _) in zip(images, decoded):
-        target[..., : pixels.shape[2]] = pixels
+    channels = 4 if any(header.alpha for header in headers) else 3
+    shape = (len(paths), size[1] // factor, size[0] // factor, channels)
+    decoded = max(header.decoded for header in headers)
+    needed, free = math.prod(shape) + decoded, available_memory()
+    if needed > SHARE * free:
+        raise SceneError(
+            f"{paths[0]}: loading {len(paths)} images of {size[0]} x {size[1]} needs {needed / 2**30:.2f} GiB with "
+            f"--downscale {factor}, more than {SHARE:.0%} of the {free / 2**30:.2f} GiB that are free; "
+            "use a larger --downscale, fewer or smaller images"
+        )
+    images = np.full(shape, 255, dtype=np.uint8)
+
+    def fill(index: int) -> None:
+        pixels = read_image(paths[index], factor)
+        images[index, ..., : pixels.shape[2]] = pixels
+
+    with ThreadPoolExecutor(max(1, min(THREADS, IN_HAND // decoded))) as pool:
+        list(pool.map(fill, range(len(paths))))
     return torch.from_numpy(images), size
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image file whose pixels are not decoded yet."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(PNG_DEPTH + 1)
+            stream.seek(0)
+            # Pillow rounds most of these to 8 bits without a word.
+            if start.startswith(PNG_SIGNATURE) and start[PNG_DEPTH:] == b"\x10":
+                raise SceneError(f"{path}: has more than 8 bits a channel, which is not supported")
+            with Image.open(stream, formats=FORMATS) as file:
+                yield file
+    except SceneError:
+        raise
+    except UNREADABLE as error:
+        unknown = isinstance(error, Image.UnidentifiedImageError)
+        reason = f"is not an image in {' or '.join(FORMATS)} format" if unknown else f"cannot be read: {error}"
+        raise SceneError(f"{path}: {reason}") from None
+
+
+def _has_alpha(file: Image.Image) -> bool:
+    return "A" in file.getbands() or "transparency" in file.info
+
+
+def _reduce_while_decoding(file: Image.Image, factor: int) -> int:
+    """Lets a JPEG file be decoded in a part of its size; returns the factor that is left."""
+    if file.format != "JPEG" or factor % 2:
+        return factor
+    size = file.size
+    step = next(step for step in (8, 4, 2) if factor % step == 0)
+    file.draft("RGB", (size[0] // step, size[1] // step))
+    return factor if file.size == size else factor // step

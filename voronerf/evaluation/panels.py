@@ -26,7 +26,7 @@ from voronerf.rendering.renderer import Renderer
 HUE_STEP, SATURATION_STEP, VALUE_STEP = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
 ERROR_SCALE = 0.3  # mean absolute error over the channels that gets the last colour of the map
 SOLID = 0.5  # opacity above which the depth of a pixel counts for the scale
-PICTURE_HEIGHT = 240
+PICTURE_HEIGHT, PICTURE_WIDTH = 240, 1200  # pictures are enlarged to about this height, and never beyond this width
 CAPTION, GAP = 18, 6
 
 
@@ -93,7 +93,7 @@ def contact_sheet(pictures: Mapping[str, Tensor]) -> Tensor:
     if len(sizes) != 1:
         raise ValueError(f"contact_sheet: pictures must have one size [h, w, 3], got {sorted(sizes)}")
     height, width, _ = sizes.pop()
-    zoom = max(1, -(-PICTURE_HEIGHT // height)) if height < PICTURE_HEIGHT else 1
+    zoom = max(1, min(-(-PICTURE_HEIGHT // height), PICTURE_WIDTH // width))
     step = width * zoom + GAP
     sheet = Image.new("RGB", (len(pictures) * step + GAP, GAP + CAPTION + height * zoom + GAP), "white")
     draw = ImageDraw.Draw(sheet)
