@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,39 @@ def write_bytes(path: Path, data: bytes) -> None:
     """Writes a file atomically: a reader, or a crash at any moment, leaves the old content or the new, never a part.
 
     Raises:
-        OSError: When the disk is full or the folder cannot be written; the old file is then untouched.
+        OSError: When the disk is full or the folder cannot be written; it names the file, whose old content is then
+            untouched.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    # A short name, since that of the file may be as long as the file system takes; each thread has its own.
+    partial = path.with_name(f".{os.getpid()}-{threading.get_native_id()}.partial")
     try:
-        with open(partial, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with open(partial, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            rename(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+def rename(old: Path, new: Path) -> None:
+    """Renames a file, in the place of another where there is one, so that a power failure does not undo it."""
+    os.replace(old, new)
+    if os.name == "posix":  # elsewhere a folder cannot be opened
+        folder = os.open(new.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def remove_partial(folder: Path) -> None:
+    """Removes what processes that died left of files that they wrote below a folder."""
+    for partial in folder.rglob(".*.partial"):
         partial.unlink(missing_ok=True)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,13 +16,13 @@ from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import load_averages
-from voronerf.training.checkpoint import load_checkpoint
+from voronerf.training.checkpoint import last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
 from voronerf.training.networks import make_routers, parameter_groups, restore_routers
 from voronerf.training.occupancy import make_picture_grid
 from voronerf.training.renderers import make_renderer
-from voronerf.training.run_directory import checkpoint_path
+from voronerf.training.resume import stored_values
 
 
 @dataclass(frozen=True)
@@ -164,9 +163,8 @@ def open_run(
     check_device(device)
     if blend is not None and not 0 <= blend < math.inf:
         raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
-    file = checkpoint_path(path)
-    checkpoint = load_checkpoint(file)
-    config = TrainConfig.from_json(json.dumps(checkpoint.values["config"]), str(file))
+    checkpoint = last_checkpoint(path)
+    config, _ = stored_values(checkpoint)
     routers = make_routers(config, device)
     restore_routers(routers, checkpoint)
     load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)

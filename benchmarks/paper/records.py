@@ -25,7 +25,7 @@ from voronerf.training.config import ConfigError, TrainConfig
 Row = dict[str, Any]
 BENCHMARK = "paper trainings"
 #: Of a configuration, what says nothing about the training or names a place of the machine.
-NOT_TOLD = {"data", "out", "resume", "lpips", "checkpoint_every", "panels"}
+NOT_TOLD = {"data", "out", "resume", "lpips", "checkpoint_every", "keep_checkpoints", "panels"}
 
 
 def made_on() -> dict[str, Any]:

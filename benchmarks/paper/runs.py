@@ -30,9 +30,10 @@ from paper.settings import Settings
 from voronerf.data import BUILTIN, BUILTIN_SIZE, Scene, load_scene
 from voronerf.evaluation.scores import evaluate, mean_scores
 from voronerf.files import write_text
+from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import RESUMABLE, ConfigError, TrainConfig
 from voronerf.training.networks import resolve_config
-from voronerf.training.run_directory import checkpoint_path, read_metrics
+from voronerf.training.run_directory import read_metrics
 from voronerf.training.trainer import Trainer, TrainingError
 
 Row = dict[str, Any]
@@ -205,8 +206,8 @@ def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], 
 
 
 def clear(folder: Path) -> None:
-    """Deletes what a training left: its result, its checkpoint, its evaluations and its looks."""
-    files = [folder / "result.json", checkpoint_path(folder), folder / "metrics.jsonl"]
+    """Deletes what a training left: its result, its checkpoints, its evaluations and its looks."""
+    files = [folder / "result.json", *checkpoint_paths(folder), folder / "metrics.jsonl"]
     for file in (*files, *(folder / "looks").glob("*.npz")):
         file.unlink(missing_ok=True)
 
@@ -216,7 +217,7 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
     trainers: dict[Path, Trainer] = {}
     names = {run.folder: f"{run.variant.name:28}" for run in group}
     for run in group:
-        resume = checkpoint_path(run.folder).is_file()
+        resume = bool(checkpoint_paths(run.folder))
         if not resume:
             clear(run.folder)
         config = replace(run.config, resume=resume)

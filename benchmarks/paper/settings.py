@@ -13,7 +13,7 @@ from voronerf.training.config import ConfigError, TrainConfig
 #: Settings that follow from those of an experiment.
 TAKEN = frozenset(
     {"data", "downscale", "seed", "budget", "steps", "evaluations", "eval_views", "final_views", "rays", "samples"}
-    | {"backend", "checkpoint_every", "out", "resume", "panels", "lr"}
+    | {"backend", "checkpoint_every", "keep_checkpoints", "out", "resume", "panels", "lr"}
 )
 
 

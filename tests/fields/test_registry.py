@@ -17,10 +17,9 @@ from voronerf import MLP, Layer, open_run
 from voronerf.cli import main
 from voronerf.data import Scene, builtin_scene
 from voronerf.fields import FIELDS, NeRF, register_field
-from voronerf.training.checkpoint import load_checkpoint
+from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.networks import count_parameters, resolve_config
-from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.trainer import Trainer
 
 

@@ -8,8 +8,7 @@ from helpers import same
 from tiny_runs import assert_resumes, small, stopping, tensors
 
 from voronerf import open_run
-from voronerf.training.checkpoint import load_checkpoint, save_checkpoint
-from voronerf.training.run_directory import checkpoint_path
+from voronerf.training.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from voronerf.training.trainer import Trainer
 
 

@@ -13,6 +13,10 @@ from voronerf.files import read_json_lines, write_text
 from voronerf.training.checkpoint import (
     Checkpoint,
     CheckpointError,
+    checkpoint_path,
+    checkpoint_paths,
+    keep_checkpoint,
+    last_checkpoint,
     load_checkpoint,
     load_optimizer_tensors,
     optimizer_tensors,
@@ -44,7 +48,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, failing):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, failing, full)
-    refuses("No space left", save_checkpoint, path, example(), error=OSError)
+    refuses(f"No space left on device: '{path}'", save_checkpoint, path, example(), error=OSError)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["last.safetensors"]
 
@@ -58,8 +62,47 @@ def test_broken_files_are_named(tmp_path):
         path.write_bytes(broken)
         refuses("last.safetensors: not a readable checkpoint", load_checkpoint, path, error=CheckpointError)
     save_file({"x": torch.zeros(1)}, path, {"format": "pt"})
-    other = "not a voronerf-checkpoint-1 file, its format is 'pt'"
+    other = "not a voronerf-checkpoint-2 file, its format is 'pt'"
     refuses(other, load_checkpoint, path, error=CheckpointError)
+
+
+def test_a_single_changed_bit_is_found(tmp_path):
+    path = tmp_path / "last.safetensors"
+    save_checkpoint(path, example())
+    whole = path.read_bytes()
+    for bit in range(0, 8 * len(whole), 7):
+        path.write_bytes(whole[: bit // 8] + bytes([whole[bit // 8] ^ 1 << bit % 8]) + whole[bit // 8 + 1 :])
+        refuses("last.safetensors: ", load_checkpoint, path, error=CheckpointError)
+    refuses("a damaged checkpoint, a.y has another checksum", load_checkpoint, path, error=CheckpointError)
+
+
+def test_as_many_checkpoints_are_kept_as_asked_for(tmp_path):
+    saved = [Checkpoint({"x": torch.tensor(number)}, {}) for number in range(6)]
+    names = {1: ["last"], 3: ["last", "last-1", "last-2"], 2: ["last", "last-1"]}
+    for number, (keep, count) in enumerate(((1, 1), (3, 2), (3, 3), (3, 3), (2, 2))):
+        keep_checkpoint(tmp_path, saved[number], keep)
+        paths = checkpoint_paths(tmp_path)
+        assert [path.stem for path in paths] == names[count]
+        assert [int(load_checkpoint(path).tensors["x"]) for path in paths] == [number - i for i in range(count)]
+    keep_checkpoint(tmp_path, saved[5], 3)
+    # A crash while they are renamed leaves a gap.
+    checkpoint_path(tmp_path).unlink()
+    assert int(last_checkpoint(tmp_path).tensors["x"]) == 4
+    keep_checkpoint(tmp_path, saved[5], 3)
+    assert len(checkpoint_paths(tmp_path)) == 3
+
+
+def test_an_older_checkpoint_takes_the_place_of_a_damaged_one(tmp_path):
+    for number in range(3):
+        keep_checkpoint(tmp_path, Checkpoint({"x": torch.tensor(number)}, {}), 3)
+    for damaged, taken in (("last", 1), ("last-1", 0)):
+        path = tmp_path / "checkpoints" / f"{damaged}.safetensors"
+        path.write_bytes(path.read_bytes()[:-1] + b"\x7f")
+        place = rf"last.safetensors: a damaged checkpoint, x has another checksum; last-{2 - taken}.* takes its place"
+        with pytest.warns(UserWarning, match=place):
+            assert int(last_checkpoint(tmp_path).tensors["x"]) == taken
+    (tmp_path / "checkpoints" / "last-2.safetensors").write_bytes(b"")
+    refuses("last.safetensors: a damaged", last_checkpoint, tmp_path, error=CheckpointError)
 
 
 def test_optimizer_state_round_trips():

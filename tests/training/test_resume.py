@@ -11,10 +11,19 @@ from tiny_runs import assert_resumes, scores, small, stopping, tensors
 import voronerf.training.trainer as trainer_module
 from voronerf import open_run
 from voronerf.evaluation.scores import evaluate
-from voronerf.training.checkpoint import CheckpointError, load_checkpoint
+from voronerf.training.checkpoint import CheckpointError, checkpoint_path, load_checkpoint, save_checkpoint
+from voronerf.training.config import ConfigError
 from voronerf.training.networks import make_routers, restore_routers
-from voronerf.training.run_directory import checkpoint_path
+from voronerf.training.run_directory import held
 from voronerf.training.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory, scene):
+    """The settings of a run that was stopped after 14 steps."""
+    config = small(tmp_path_factory.mktemp("stopped"))
+    stopping(config, scene, 14).run()
+    return config
 
 
 @pytest.mark.parametrize("stop_at", [5, 11, 17])
@@ -62,6 +71,51 @@ def test_a_loaded_run_renders_the_same(tmp_path, scene):
     checkpoint = load_checkpoint(checkpoint_path(tmp_path))
     del checkpoint.tensors["router.module.density.weight"]
     refuses("another architecture", restore_routers, make_routers(config, "cpu"), checkpoint, error=CheckpointError)
+
+
+def without(prefix):
+    return lambda c: [c.tensors.pop(name) for name in list(c.tensors) if name.startswith(prefix)]
+
+
+@pytest.mark.parametrize(
+    ("message", "damage"),
+    [
+        ("no moments of the optimiser after 14 steps", without("optimizer.")),
+        ("optimizer.0.exp_avg_sq must have shape [", without("optimizer.0.exp_avg_sq")),
+        ("SampleReservoir: state must hold points", without("reservoir.")),
+        ("'draws'", without("generator.draws")),
+        ("another architecture", without("router.module.density")),
+        ("step must be an integer, got 'x'", lambda c: c.values.update(step="x")),
+        ("step, seconds and stages must be counts, got -1", lambda c: c.values.update(step=-1)),
+        ("stage 1: cells must be an integer, got 4.5", lambda c: c.values["stages"][1].update(cells=4.5)),
+        ("stage 0: split_cells missing", lambda c: c.values["stages"][0].pop("split_cells")),
+        ("seconds missing", lambda c: c.values.pop("seconds")),
+        ("settings: width must be an integer or null, got '8'", lambda c: c.values["config"].update(width="8")),
+        ("settings: cells must be a list, each entry an integer", lambda c: c.values["config"].update(cells=[True])),
+    ],
+)
+def test_what_a_checkpoint_lacks_is_named(tmp_path, scene, stopped, message, damage):
+    path = checkpoint_path(tmp_path)
+    checkpoint = load_checkpoint(checkpoint_path(stopped.out))
+    damage(checkpoint)
+    save_checkpoint(path, checkpoint)
+    with pytest.raises((CheckpointError, ConfigError)) as caught:
+        Trainer(replace(stopped, out=tmp_path, resume=True), scene)
+    assert str(caught.value).startswith(f"{path}: ") and message in str(caught.value)
+
+
+def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
+    config = small(tmp_path / "part", checkpoint_every=1e-9)
+    stopping(config, scene, 14).run()
+    (partial := config.out / "checkpoints" / ".1-1.partial").write_bytes(b"of a process that died")
+    path = checkpoint_path(config.out)
+    path.write_bytes(path.read_bytes()[:-1] + b"\x7f")
+    with held(config.out), pytest.warns(UserWarning, match="takes its place"):
+        trainer = Trainer(replace(config, resume=True, checkpoint_every=60), scene)
+    assert trainer.step in (13, 14) and not partial.exists()
+    trainer.run()
+    Trainer(small(tmp_path / "whole"), scene).run()
+    assert same(tensors(config.out), tensors(tmp_path / "whole"))
 
 
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch):

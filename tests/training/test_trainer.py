@@ -20,10 +20,10 @@ from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
 from voronerf.training.batches import RayBatches
-from voronerf.training.checkpoint import load_checkpoint
+from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.networks import count_parameters, octaves_for, resolve_config, solve_width
-from voronerf.training.run_directory import checkpoint_path, choose_directory, held
+from voronerf.training.run_directory import choose_directory, held
 from voronerf.training.trainer import Trainer, TrainingError
 
 

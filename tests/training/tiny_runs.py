@@ -5,9 +5,8 @@ from dataclasses import replace
 from helpers import same
 
 from voronerf.files import read_json_lines
-from voronerf.training.checkpoint import load_checkpoint
+from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.training.config import TrainConfig
-from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.trainer import Trainer
 
 SMALL = {

@@ -1,12 +1,15 @@
-"""Checkpoints: one safetensors file, written atomically, read without pickle.
+"""Checkpoints: safetensors files, written atomically, read without pickle, and refused where a bit of them changed.
 
 The tensors are those of the routers with their diagrams, of the optimiser, of the sample reservoir and of the random
-generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file.
+generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file, beside a checksum for
+each tensor and one for the JSON.
 """
 
 from __future__ import annotations
 
 import json
+import warnings
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +19,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from voronerf.files import write_bytes
+from voronerf.files import rename, write_bytes
 
-FORMAT = "voronerf-checkpoint-1"
+FORMAT = "voronerf-checkpoint-2"
+#: The name of the checksum of the JSON, beside those of the tensors.
+_VALUES = "values"
 
 
 class CheckpointError(ValueError):
@@ -27,14 +32,65 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The contents of a checkpoint: tensors by name, and everything else as JSON values."""
+    """The contents of a checkpoint: tensors by name, everything else as JSON values, and the file that errors name."""
 
     tensors: dict[str, Tensor]
     values: dict[str, Any]
+    source: str = "checkpoint"
 
     def group(self, prefix: str) -> dict[str, Tensor]:
         """The tensors below ``prefix.``, without it."""
         return {name[len(prefix) + 1 :]: t for name, t in self.tensors.items() if name.startswith(prefix + ".")}
+
+
+def checkpoint_path(run: Path) -> Path:
+    """Where a run directory keeps its last checkpoint."""
+    return run / "checkpoints" / "last.safetensors"
+
+
+def checkpoint_paths(run: Path) -> list[Path]:
+    """The checkpoints that a run directory has, the last first: last, last-1, last-2..."""
+    last = checkpoint_path(run)
+    earlier = [p for p in last.parent.glob("last-*.safetensors") if p.stem[5:].isdecimal()]
+    return [last] * last.is_file() + sorted(earlier, key=lambda path: int(path.stem[5:]))
+
+
+def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
+    """Writes the last checkpoint of a run; the one before becomes ``last-1``, and ``keep`` of them stay.
+
+    Raises:
+        OSError: When it cannot be written; the older ones are then untouched.
+    """
+    last = checkpoint_path(run)
+    written = last.with_name("new.safetensors")
+    save_checkpoint(written, checkpoint)
+    # From the oldest on, so that a crash at any moment leaves a gap in the numbers and no fewer checkpoints.
+    for number, path in reversed(list(enumerate(checkpoint_paths(run), 1))):
+        if number < keep:
+            rename(path, last.with_name(f"last-{number}.safetensors"))
+        else:
+            path.unlink()
+    rename(written, last)
+
+
+def last_checkpoint(run: Path) -> Checkpoint:
+    """The last checkpoint of a run that can be read; a warning tells of those passed over.
+
+    Raises:
+        CheckpointError: When there is none.
+    """
+    paths = checkpoint_paths(run) or [checkpoint_path(run)]
+    errors = []
+    for path in paths:
+        try:
+            found = load_checkpoint(path)
+        except CheckpointError as error:
+            errors.append(error)
+            continue
+        if errors:
+            warnings.warn(f"{errors[0]}; {path.name} takes its place", stacklevel=2)
+        return found
+    raise errors[0]
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
@@ -43,27 +99,45 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         OSError: When it cannot be written; an older checkpoint at ``path`` is then untouched.
     """
-    tensors = {name: t.detach().cpu().contiguous().clone() for name, t in checkpoint.tensors.items()}
-    write_bytes(path, save(tensors, {"format": FORMAT, "values": json.dumps(checkpoint.values)}))
+    values = json.dumps(checkpoint.values)
+    sums = {name: _checksum(tensor) for name, tensor in checkpoint.tensors.items()}
+    sums[_VALUES] = zlib.crc32(values.encode())
+    metadata = {"format": FORMAT, "values": values, "checksums": json.dumps(sums)}
+    write_bytes(path, save(checkpoint.tensors, metadata))
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
     """Reads a checkpoint onto the CPU.
 
     Raises:
-        CheckpointError: When the file is missing, truncated or no checkpoint of this version.
+        CheckpointError: When the file is missing, truncated, damaged or no checkpoint of this version.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise CheckpointError(f"{path}: not a {FORMAT} file, its format is {metadata.get('format')!r}")
+            sums = json.loads(metadata["checksums"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        if metadata.get("format") != FORMAT:
-            raise CheckpointError(f"{path}: not a {FORMAT} file, its format is {metadata.get('format')!r}")
-        return Checkpoint(tensors, json.loads(metadata["values"]))
-    except (SafetensorError, json.JSONDecodeError, KeyError, OSError) as error:
+        found = {name: _checksum(tensor) for name, tensor in tensors.items()}
+        found[_VALUES] = zlib.crc32(metadata["values"].encode())
+        for name in sorted(sums.keys() | found.keys()):
+            if sums.get(name) != found.get(name):
+                what = "has another checksum" if name in found else "is missing"
+                raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
+        return Checkpoint(tensors, json.loads(metadata["values"]), str(path))
+    except CheckpointError:
+        raise
+    except (SafetensorError, ValueError, KeyError, AttributeError, OSError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint: {error}") from None
+
+
+def _checksum(tensor: Tensor) -> int:
+    """Of the elements, the shape and the dtype; it differs wherever a single bit does."""
+    kind = zlib.crc32(f"{tensor.dtype} {list(tensor.shape)}".encode())
+    return zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, kind)
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -73,9 +147,20 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """The inverse of :func:`optimizer_tensors`; groups and learning rates stay the optimiser's own."""
+    """The inverse of :func:`optimizer_tensors`; groups and learning rates stay the optimiser's own.
+
+    Raises:
+        ValueError: When a parameter's moments are missing or have another shape.
+    """
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         index, key = name.split(".", 1)
         state.setdefault(int(index), {})[key] = tensor.clone()  # the optimiser updates its state in place
+    for number, entries in state.items():
+        for key in ("exp_avg", "exp_avg_sq", *entries):
+            wanted = [] if key == "step" else list(parameters[number].shape)
+            came = list(entries[key].shape) if key in entries else None
+            if came != wanted:
+                raise ValueError(f"optimizer.{number}.{key} must have shape {wanted}, got {came or 'nothing'}")
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from voronerf.fields import FIELDS, FieldType
 from voronerf.training.config_checks import NETWORK_SETTINGS, ConfigError, check_config, check_field, parse_option
 from voronerf.training.schedule import PlannedSplit, TimeUnit, default_times, final_cells, plan_splits
+from voronerf.training.schema import check_types
 
 SamplingName = Literal["stratified", "hierarchical", "proposal"]
 
@@ -170,6 +171,8 @@ class TrainConfig:
     """Test views of the final evaluation; default all."""
     checkpoint_every: float = 60.0
     """Seconds between checkpoints."""
+    keep_checkpoints: int = 3
+    """How many checkpoints are kept. If the last one is damaged, the one before takes its place."""
     panels: int = 4
     """Test views drawn as panels at the end: truth, render, error, depth, cells."""
     lpips: Path | None = None
@@ -248,15 +251,16 @@ class TrainConfig:
             ConfigError: For text that is not a configuration, or one of another version; names ``source``.
         """
         try:
-            values: dict[str, Any] = json.loads(text)
-            known = {f.name for f in dataclasses.fields(TrainConfig)}
-            unknown = sorted(set(values) - known)
-            if unknown:
-                raise ConfigError(f"unknown settings {', '.join(unknown)}")
-            values = {key: tuple(v) if key in LISTS and v is not None else v for key, v in values.items()}
-            values |= {name: Path(values[name]) for name in PATHS if values[name] is not None}
+            values = json.loads(text)
+            if isinstance(values, dict):
+                values = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+                paths = {name: values.get(name) for name in PATHS}
+                values |= {name: Path(text) for name, text in paths.items() if isinstance(text, str)}
+            check_types("settings", TrainConfig, values, optional=True)
+            if not values:
+                raise ValueError("no settings")
             return TrainConfig(**values)
-        except (json.JSONDecodeError, TypeError, AttributeError, KeyError, ConfigError) as error:
+        except (ValueError, ConfigError) as error:
             raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
 
 
@@ -264,8 +268,7 @@ class TrainConfig:
 CHOICES: dict[str, tuple[str, ...]] = {
     name: get_args(kind) for name, kind in get_type_hints(TrainConfig).items() if get_origin(kind) is Literal
 }
-#: Settings that are lists in JSON, and settings that are text there.
-LISTS = frozenset({"cells", "split_at", "split_at_seconds", "split_at_steps", "skips", "field_options"})
+#: Settings that are text in JSON.
 PATHS = ("out", "lpips")
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
@@ -282,7 +285,7 @@ RESUMABLE = frozenset(
         "eval_views",
         "final_views",
     }
-    | {"checkpoint_every", "panels", "blend", "lpips"}
+    | {"checkpoint_every", "keep_checkpoints", "panels", "blend", "lpips"}
 )
 
 

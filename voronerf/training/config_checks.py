@@ -83,6 +83,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
         "reservoir",
         "reservoir_batches",
         "evaluations",
+        "keep_checkpoints",
         "occupancy_resolution",
     ):
         need(getattr(config, name) >= 1, name, "be at least 1")

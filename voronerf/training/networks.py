@@ -222,7 +222,7 @@ def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint
             router.load_state_dict(checkpoint.group(_group(name)))
         except RuntimeError as error:
             line = str(error).splitlines()[-1]
-            raise CheckpointError(f"the checkpoint is of another architecture: {line}") from None
+            raise CheckpointError(f"{checkpoint.source}: the checkpoint is of another architecture: {line}") from None
 
 
 def _group(name: str) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+import math
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -14,16 +15,49 @@ from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.training.checkpoint import (
     Checkpoint,
     CheckpointError,
-    load_checkpoint,
+    last_checkpoint,
     load_optimizer_tensors,
     optimizer_tensors,
 )
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.networks import make_optimizer, restore_routers, router_states
 from voronerf.training.progress import Stage
+from voronerf.training.schema import check_types
 
 if TYPE_CHECKING:
     from voronerf.training.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a checkpoint keeps beside its tensors."""
+
+    config: dict[str, Any]
+    step: int
+    seconds: float
+    stages: tuple[dict[str, Any], ...]
+
+
+def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
+    """The settings of a checkpoint's training, and how far it is.
+
+    Raises:
+        CheckpointError: When a value is missing or of another type.
+    """
+    source, values = checkpoint.source, dict(checkpoint.values)
+    try:
+        if isinstance(values.get("stages"), list):
+            values["stages"] = tuple(values["stages"])
+        check_types(source, Stored, values)
+        for number, stage in enumerate(values["stages"]):
+            check_types(f"{source}: stage {number}", Stage, stage)
+        if not (values["step"] >= 0 and 0 <= values["seconds"] < math.inf and values["stages"]):
+            step, seconds, count = values["step"], values["seconds"], len(values["stages"])
+            raise ValueError(f"{source}: step, seconds and stages must be counts, got {step}, {seconds} and {count}")
+    except ValueError as error:
+        raise CheckpointError(str(error)) from None
+    stored = Stored(**values)
+    return TrainConfig.from_json(json.dumps(stored.config), source), stored
 
 
 def training_state(trainer: Trainer) -> Checkpoint:
@@ -40,7 +74,8 @@ def training_state(trainer: Trainer) -> Checkpoint:
     if trainer.scaler.is_enabled():
         parts["scaler"] = trainer.scaler.state_dict()
     for prefix, group in parts.items():
-        tensors |= {f"{prefix}.{name}": torch.as_tensor(value) for name, value in group.items()}
+        for name, value in group.items():  # copies, since training goes on while they are written
+            tensors[f"{prefix}.{name}"] = torch.as_tensor(value).detach().to("cpu", copy=True).contiguous()
     values = {
         "config": json.loads(trainer.config.to_json()),
         "step": trainer.step,
@@ -50,31 +85,36 @@ def training_state(trainer: Trainer) -> Checkpoint:
     return Checkpoint(tensors, values)
 
 
-def resume_training(trainer: Trainer, path: Path) -> None:
-    """Puts a trainer where the training was that wrote a checkpoint; it gets a new optimiser.
+def resume_training(trainer: Trainer, run: Path) -> None:
+    """Puts a trainer where the training was that wrote the last checkpoint of a run; it gets a new optimiser.
 
     Raises:
         CheckpointError: When there is no checkpoint, or one of another configuration.
     """
-    checkpoint = load_checkpoint(path)
-    stored = TrainConfig.from_json(json.dumps(checkpoint.values["config"]), str(path))
-    different = differences(stored, trainer.config)
+    checkpoint = last_checkpoint(run)
+    path = checkpoint.source
+    config, stored = stored_values(checkpoint)
+    different = differences(config, trainer.config)
     if different:
         raise CheckpointError(f"{path}: a checkpoint of another configuration: {'; '.join(different)}")
     restore_routers(trainer.routers, checkpoint)
     trainer.optimizer = make_optimizer(trainer.routers, trainer.config)
-    load_optimizer_tensors(trainer.optimizer, checkpoint.group("optimizer"))
-    trainer.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
-    trainer.reservoir.load_state_dict(checkpoint.group("reservoir"))
-    occupancy = checkpoint.group("occupancy")
-    if occupancy:
-        trainer.occupancy = OccupancyGrid.from_state(occupancy, device=trainer.device)
-        trainer.renderer.occupancy = trainer.occupancy
-    generators = checkpoint.group("generator")
-    trainer.generator.set_state(generators["state"])
-    drawn = generators.get("draws", generators["state"])
-    if trainer.draws is not trainer.generator and drawn.shape == trainer.draws.get_state().shape:
-        trainer.draws.set_state(drawn)  # else the run began on another kind of device
-    trainer.step = checkpoint.values["step"]
-    trainer.seconds = checkpoint.values["seconds"]
-    trainer.stages = [Stage(**stage) for stage in checkpoint.values["stages"]]
+    try:
+        if stored.step and not checkpoint.group("optimizer"):
+            raise ValueError(f"no moments of the optimiser after {stored.step} steps")
+        load_optimizer_tensors(trainer.optimizer, checkpoint.group("optimizer"))
+        trainer.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
+        trainer.reservoir.load_state_dict(checkpoint.group("reservoir"))
+        if trainer.occupancy is not None:
+            trainer.occupancy = OccupancyGrid.from_state(checkpoint.group("occupancy"), device=trainer.device)
+            trainer.renderer.occupancy = trainer.occupancy
+        generators = checkpoint.group("generator")
+        trainer.generator.set_state(generators["state"])
+        drawn = generators["draws"]
+        if trainer.draws is not trainer.generator and drawn.shape == trainer.draws.get_state().shape:
+            trainer.draws.set_state(drawn)  # else the run began on another kind of device
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise CheckpointError(f"{path}: not a checkpoint of a training: {error}") from None
+    trainer.step = stored.step
+    trainer.seconds = stored.seconds
+    trainer.stages = [Stage(**stage) for stage in stored.stages]

@@ -12,13 +12,9 @@ from typing import Any
 
 from voronerf.data import Scene
 from voronerf.evaluation.plots import plot_curves
-from voronerf.files import read_json_lines
+from voronerf.files import read_json_lines, remove_partial
+from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
-
-
-def checkpoint_path(run: Path) -> Path:
-    """Where a run directory keeps its last checkpoint."""
-    return run / "checkpoints" / "last.safetensors"
 
 
 def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
@@ -33,9 +29,9 @@ def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
             raise ConfigError("--resume needs --out, the run directory to continue")
         names = (scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000)))
         out = next(folder for name in names if _made(folder := Path("runs") / name))
-    elif not config.resume and checkpoint_path(out).exists():
+    elif not config.resume and checkpoint_paths(out):
         raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
-    elif config.resume and not checkpoint_path(out).is_file():
+    elif config.resume and not checkpoint_paths(out):
         raise ConfigError(f"--resume needs a checkpoint in --out, got {out}")
     return replace(config, out=out)
 
@@ -70,6 +66,7 @@ def held(folder: Path) -> Iterator[None]:
             raise ConfigError(f"--out must not be in use by another run, got {folder}") from None
         except OSError:
             pass  # no locks here
+        remove_partial(folder)
         try:
             yield
         finally:

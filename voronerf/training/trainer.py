@@ -25,7 +25,7 @@ from voronerf.files import read_json_lines, write_text
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
-from voronerf.training.checkpoint import save_checkpoint
+from voronerf.training.checkpoint import checkpoint_paths, keep_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.networks import check_memory, make_optimizer, make_routers, resolve_config
@@ -33,7 +33,6 @@ from voronerf.training.occupancy import make_grid, observe_samples, revisit_cell
 from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.renderers import make_renderer
 from voronerf.training.resume import resume_training, training_state
-from voronerf.training.run_directory import checkpoint_path
 from voronerf.training.splitting import median, save_samples, split_by_samples
 
 #: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
@@ -237,7 +236,7 @@ class Trainer:
         self.loss = float(loss)
         self.seconds += self.clock() - started
         if not math.isfinite(self.loss):
-            kept = "the checkpoint is as it was" if checkpoint_path(self.out).exists() else "there is no checkpoint"
+            kept = "the checkpoint is as it was" if checkpoint_paths(self.out) else "there is no checkpoint"
             raise TrainingError(f"{self.out}: the loss is {self.loss} at step {self.step}, try a smaller --lr; {kept}")
 
     def _make_step(self) -> Callable[[], tuple[Tensor, Tensor | None, Tensor | None]]:
@@ -372,12 +371,12 @@ class Trainer:
 
     def save(self) -> None:
         """Writes ``checkpoints/last.safetensors``."""
-        save_checkpoint(checkpoint_path(self.out), training_state(self))
+        keep_checkpoint(self.out, training_state(self), self.config.keep_checkpoints)
         self.saved_at = self.seconds
 
     def _resume(self) -> None:
         """Goes on from the last checkpoint."""
-        resume_training(self, checkpoint_path(self.out))
+        resume_training(self, self.out)
         self.evaluated = self._due()
         # Evaluations made after the checkpoint will be made again.
         self.metrics = [m for m in read_json_lines(self.out / "metrics.jsonl") if m["step"] <= self.step]
