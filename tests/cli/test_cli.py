@@ -15,6 +15,8 @@ from helpers import python, read_json
 from PIL import Image
 
 from voronerf.cli import main
+from voronerf.training.checkpoint import load_checkpoint
+from voronerf.training.trainer import Trainer
 
 TINY = (
     "--downscale 6 --steps 16 --cells 3 --split-at 0.5 --width 8 --depth 2 --rays 64 --samples 8 --evaluations 2 "
@@ -208,18 +210,38 @@ def test_a_full_disk_is_one_line(monkeypatch, tmp_path, fails):
     succeeds(*command)
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGINT") or sys.platform == "win32", reason="needs POSIX signals")
-def test_ctrl_c_leaves_a_usable_checkpoint(tmp_path):
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_signals_leave_a_usable_checkpoint(tmp_path):
+    last = tmp_path / "checkpoints" / "last.safetensors"
     endless = TINY.replace("--steps 16", "--steps 100000 --checkpoint-every 0.2")
     command = [sys.executable, "-m", "voronerf.cli.main", *words("train --data builtin --out", tmp_path, endless)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    deadline = time.monotonic() + 600
-    while not (tmp_path / "checkpoints" / "last.safetensors").exists():
-        assert time.monotonic() < deadline and process.poll() is None, process.stdout and process.stdout.read()
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    output = process.communicate(timeout=600)[0].decode()
-    assert process.returncode == 130, output
-    assert "Traceback" not in output and "--resume" in output
-    assert not read_json(tmp_path / "summary.json")["complete"]
+    steps = [0]
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+        before = last.stat().st_mtime_ns if last.exists() else None
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        deadline = time.monotonic() + 600
+        while not last.exists() or last.stat().st_mtime_ns == before:
+            assert time.monotonic() < deadline and process.poll() is None, process.stdout and process.stdout.read()
+            time.sleep(0.05)
+        process.send_signal(number)
+        output = process.communicate(timeout=600)[0].decode()
+        assert process.returncode == 130, output
+        assert "Traceback" not in output and "--resume" in output
+        summary = read_json(tmp_path / "summary.json")
+        assert not summary["complete"] and load_checkpoint(last).values["step"] == summary["steps"] > steps[-1]
+        steps.append(summary["steps"])
+        command = [sys.executable, "-m", "voronerf.cli.main", *words("train --resume --out", tmp_path)]
     succeeds("eval", tmp_path, "--views 1 --panels 0")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_a_second_signal_ends_at_once(tmp_path, monkeypatch, capsys):
+    def interrupted(trainer):
+        signal.raise_signal(signal.SIGUSR1)
+        assert trainer.stopped
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "train_step", interrupted)
+    assert main(words("train --data builtin --out", tmp_path, TINY)) == 130
+    assert "voronerf: interrupted" in capsys.readouterr().err
+    assert not (tmp_path / "checkpoints").exists()

@@ -1,6 +1,8 @@
 """Runs that are stopped, loaded and resumed: bit for bit, and refused where they are another's."""
 
 import json
+import os
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,10 +10,17 @@ import pytest
 from helpers import refuses, same
 from tiny_runs import assert_resumes, scores, small, stopping, tensors
 
+import voronerf.evaluation.scores as scores_module
 import voronerf.training.trainer as trainer_module
 from voronerf import open_run
 from voronerf.evaluation.scores import evaluate
-from voronerf.training.checkpoint import CheckpointError, checkpoint_path, load_checkpoint, save_checkpoint
+from voronerf.training.checkpoint import (
+    CheckpointError,
+    checkpoint_path,
+    checkpoint_paths,
+    load_checkpoint,
+    save_checkpoint,
+)
 from voronerf.training.config import ConfigError
 from voronerf.training.networks import make_routers, restore_routers
 from voronerf.training.run_directory import held
@@ -38,6 +47,25 @@ def test_resume_drops_evaluations_made_after_the_checkpoint(tmp_path, scene):
         file.write(json.dumps({"step": 20, "psnr": 99.0}) + "\n")
     Trainer(replace(config, resume=True), scene).run()
     assert [step for step, _ in scores(tmp_path)] == [12, 24]
+
+
+def test_an_evaluation_that_was_stopped_is_made_again(tmp_path, scene, monkeypatch):
+    whole, part = (small(tmp_path / name) for name in ("whole", "part"))
+    Trainer(whole, scene).run()
+    rendered = scores_module.render_view
+
+    def stopping_view(*args, **options):
+        if trainer.step == stop_at:
+            trainer.request_stop()
+        return rendered(*args, **options)
+
+    monkeypatch.setattr(scores_module, "render_view", stopping_view)
+    for stop_at, steps, evaluated in ((12, 12, []), (24, 24, [12]), (None, 24, [12, 24])):
+        trainer = Trainer(replace(part, resume=stop_at != 12), scene)
+        summary = trainer.run()
+        assert (summary["steps"], summary["complete"]) == (steps, stop_at is None)
+        assert [step for step, _ in scores(part.out)] == evaluated
+    assert scores(whole.out) == scores(part.out) and same(tensors(whole.out), tensors(part.out))
 
 
 def test_longer_resumed_runs_are_evaluated(tmp_path, scene):
@@ -122,6 +150,26 @@ def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch):
     monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
     found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8)
     assert len(found["occupancy.density"].unique()) > 1
+
+
+def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, scene, monkeypatch):
+    written, whole = threading.Event(), os.fsync
+
+    def slow(descriptor):
+        assert threading.current_thread() is threading.main_thread() or written.wait(600)
+        whole(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    trainer = Trainer(small(tmp_path, checkpoint_every=1e-9), scene)
+
+    def on_step(progress):
+        if progress.step == 20:
+            assert checkpoint_paths(tmp_path) == []
+            written.set()
+
+    trainer.on_step = on_step
+    trainer.advance()
+    assert load_checkpoint(checkpoint_path(tmp_path)).values["step"] >= 1
 
 
 def test_turns_leave_checkpoints(tmp_path, scene, monkeypatch):

@@ -31,6 +31,9 @@ from voronerf.training.trainer import Trainer
 
 console = Console(soft_wrap=True)
 
+#: What ends a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
+STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
+
 
 def say(line: str) -> None:
     """Prints a line as it is."""
@@ -51,8 +54,8 @@ def train(config: TrainConfig) -> int:
 def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
-    Ctrl-C ends training after the step in hand: the checkpoint and the summary are written, the pictures are not. A
-    second Ctrl-C ends the process at once.
+    Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the step in hand: the checkpoint and the summary are written,
+    the pictures are not. A second one ends the process at once.
     """
     assert config.out is not None
     with held(config.out):
@@ -67,18 +70,24 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene) -> dict[str, A
         if config.occupancy and trainer.occupancy is None:
             obstacle = why_no_occupancy(trainer.config) or "a scene without a box"
             display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
-        before = signal.getsignal(signal.SIGINT)
+        # One that is ignored stays so, as under nohup or where a shell started it in the background.
+        before = {number: signal.getsignal(number) for number in STOPPING}
+        before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+
+        def restore() -> None:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
         def stop(number: int, frame: FrameType | None) -> None:
             trainer.request_stop()
-            signal.signal(signal.SIGINT, before)
+            restore()
 
-        if before is not signal.SIG_IGN:  # as where a shell started it in the background
-            signal.signal(signal.SIGINT, stop)
+        for number in before:
+            signal.signal(number, stop)
         try:
             summary = trainer.run()
         finally:
-            signal.signal(signal.SIGINT, before)
+            restore()
     if not summary["complete"]:
         say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}")
         return summary

@@ -44,7 +44,7 @@ def main(args: list[str] | None = None) -> int:
         args: The command line without the program's name; default ``sys.argv[1:]``.
 
     Returns:
-        0 when all went well, 1 for an error, 130 when training was interrupted. Errors are one line on stderr;
+        0 when all went well, 1 for an error, 130 when training was stopped. Errors are one line on stderr;
         with VORONERF_TRACEBACK=1 they are shown whole.
     """
     warnings.showwarning = _show_warning

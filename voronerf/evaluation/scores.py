@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -58,9 +59,14 @@ def render_camera(
 
 
 def evaluate(
-    renderer: Renderer, scene: Scene, *, views: int | None = None, lpips: Lpips | None = None
+    renderer: Renderer,
+    scene: Scene,
+    *,
+    views: int | None = None,
+    lpips: Lpips | None = None,
+    stop: Callable[[], bool] | None = None,
 ) -> list[ViewScore]:
-    """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all).
+    """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all), until ``stop`` is true.
 
     Examples:
         >>> from voronerf import NeRF
@@ -74,6 +80,8 @@ def evaluate(
     """
     scores = []
     for view in view_numbers(len(scene.test.names), views):
+        if stop is not None and stop():
+            break
         image = render_view(renderer, scene, view, heaviest=False)
         target = scene.test.truth(view, scene.background_colour()).to(renderer.device)
         colour = image.colour.clamp(0, 1)

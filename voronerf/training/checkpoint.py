@@ -8,6 +8,7 @@ each tensor and one for the JSON.
 from __future__ import annotations
 
 import json
+import threading
 import warnings
 import zlib
 from dataclasses import dataclass
@@ -71,6 +72,55 @@ def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
         else:
             path.unlink()
     rename(written, last)
+
+
+class CheckpointWriter:
+    """Writes the checkpoints of a run one after the other, beside what the caller does.
+
+    Args:
+        run: The run directory.
+        keep: How many checkpoints stay.
+    """
+
+    def __init__(self, run: Path, keep: int) -> None:
+        self.run, self.keep = run, keep
+        self._thread: threading.Thread | None = None
+        self._error: OSError | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a checkpoint is being written."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def write(self, checkpoint: Checkpoint) -> None:
+        """Begins to write a checkpoint, after the one before; its tensors must not change.
+
+        Raises:
+            OSError: When the one before could not be written.
+        """
+        self.wait()
+        # The end of the process does not wait for it: a second Ctrl-C is to end it at once.
+        self._thread = threading.Thread(target=self._write, args=(checkpoint,), daemon=True)
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Returns when the checkpoint is written.
+
+        Raises:
+            OSError: When it could not be.
+        """
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _write(self, checkpoint: Checkpoint) -> None:
+        try:
+            keep_checkpoint(self.run, checkpoint, self.keep)
+        except OSError as error:
+            self._error = error
 
 
 def last_checkpoint(run: Path) -> Checkpoint:

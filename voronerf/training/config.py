@@ -169,8 +169,8 @@ class TrainConfig:
     """Test views of an evaluation during training, evenly spread; the final evaluation uses --final-views."""
     final_views: int | None = None
     """Test views of the final evaluation; default all."""
-    checkpoint_every: float = 60.0
-    """Seconds between checkpoints."""
+    checkpoint_every: float = 30.0
+    """Seconds of training between checkpoints, which are written while it goes on."""
     keep_checkpoints: int = 3
     """How many checkpoints are kept. If the last one is damaged, the one before takes its place."""
     panels: int = 4

@@ -36,6 +36,7 @@ class Stored:
     step: int
     seconds: float
     stages: tuple[dict[str, Any], ...]
+    evaluated: int
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
@@ -81,6 +82,7 @@ def training_state(trainer: Trainer) -> Checkpoint:
         "step": trainer.step,
         "seconds": trainer.seconds,
         "stages": [asdict(stage) for stage in trainer.stages],
+        "evaluated": trainer.evaluated,
     }
     return Checkpoint(tensors, values)
 
@@ -118,3 +120,4 @@ def resume_training(trainer: Trainer, run: Path) -> None:
     trainer.step = stored.step
     trainer.seconds = stored.seconds
     trainer.stages = [Stage(**stage) for stage in stored.stages]
+    trainer.evaluated = stored.evaluated

@@ -20,12 +20,12 @@ from voronerf import backends
 from voronerf.data import Scene
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.evaluation.lpips import Lpips, find_lpips
-from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
+from voronerf.evaluation.scores import evaluate, mean_scores
 from voronerf.files import read_json_lines, write_text
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
-from voronerf.training.checkpoint import checkpoint_paths, keep_checkpoint
+from voronerf.training.checkpoint import CheckpointWriter, checkpoint_paths
 from voronerf.training.config import TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.networks import check_memory, make_optimizer, make_routers, resolve_config
@@ -116,6 +116,7 @@ class Trainer:
         self.metrics: list[dict[str, Any]] = []
         self.stopped = False
         self.loss = math.nan
+        self.writer = CheckpointWriter(self.out, config.keep_checkpoints)
         if config.resume:
             self._resume()
         self.saved_at = self.seconds
@@ -169,7 +170,7 @@ class Trainer:
         return averages_in_place(self.optimizer)
 
     def request_stop(self) -> None:
-        """Ends training after the step in hand, with a checkpoint; what Ctrl-C does."""
+        """Ends training after the step or the view in hand, with a checkpoint; what Ctrl-C does."""
         self.stopped = True
 
     # --- the loop ------------------------------------------------------------------------------------------------
@@ -183,7 +184,8 @@ class Trainer:
         """
         self.advance()
         self.save()
-        if not self.stopped or self.fraction >= 1:
+        if self.fraction >= 1:
+            self.stopped = False  # a stop that came in the last step has nothing to end
             left = len(self.plan) - self.level
             if left:
                 self._say(f"{left} of {len(self.plan)} planned splits not made: the run ended before")
@@ -203,6 +205,9 @@ class Trainer:
         """
         loss = None
         while self.fraction < 1 and self.seconds < until and not self.stopped:
+            if self._due() > self.evaluated:
+                self._evaluate(self.config.eval_views)
+                continue
             started = self.clock()
             if self.split_is_due():
                 self.split()
@@ -217,14 +222,14 @@ class Trainer:
                 self.on_step(
                     Progress(self.step, self.seconds, self.fraction, self.loss, speed, self.router.num_cells, psnr)
                 )
-            if self._due() > self.evaluated and self.fraction < 1:
+            saving = self.seconds - self.saved_at >= self.config.checkpoint_every and not self.writer.busy
+            if saving or self._due() > self.evaluated:
                 self._read(loss)
-                self._evaluate(self.config.eval_views)
-            if self.seconds - self.saved_at >= self.config.checkpoint_every:
-                self._read(loss)
-                self.save()
+            if saving:
+                self.save(wait=False)
         if loss is not None:
             self._read(loss)
+        self.writer.wait()
 
     def _read(self, loss: Tensor) -> None:
         """Waits for a step's loss; the wait is training time.
@@ -333,10 +338,13 @@ class Trainer:
         """Number of evaluations that are due by now."""
         return int(self.fraction * self.config.evaluations + 1e-9)
 
-    def _evaluate(self, views: int | None, lpips: Lpips | None = None) -> list[ViewScore]:
-        self.evaluated = self._due()
+    def _evaluate(self, views: int | None, lpips: Lpips | None = None) -> None:
+        """Scores test views; where a stop is asked for meanwhile, not all of them, and without a trace."""
         with self.averaged():
-            scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips)
+            scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, stop=lambda: self.stopped)
+        if self.stopped:
+            return
+        self.evaluated = self._due()
         now = {
             "step": self.step,
             "seconds": round(self.seconds, 3),
@@ -351,12 +359,11 @@ class Trainer:
             f"{self.seconds:7.1f} s  step {self.step:6d}  {self.router.num_cells:4d} cells  "
             f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
         )
-        return scores
 
     def _summarise(self) -> dict[str, Any]:
         summary = {
             **{key: self.metrics[-1][key] if self.metrics else None for key in FIGURES},
-            "complete": self.fraction >= 1,
+            "complete": self.fraction >= 1 and not self.stopped,
             "seconds": self.seconds,
             "steps": self.step,
             "rays_per_second": self.step * self.config.rays / max(self.seconds, 1e-9),
@@ -369,15 +376,17 @@ class Trainer:
         write_text(self.out / "summary.json", json.dumps(summary, indent=2) + "\n")
         return summary
 
-    def save(self) -> None:
-        """Writes ``checkpoints/last.safetensors``."""
-        keep_checkpoint(self.out, training_state(self), self.config.keep_checkpoints)
+    def save(self, *, wait: bool = True) -> None:
+        """Writes ``checkpoints/last.safetensors``; without ``wait`` it is begun, and :attr:`writer` ends it."""
+        self.writer.write(training_state(self))
         self.saved_at = self.seconds
+        if wait:
+            self.writer.wait()
 
     def _resume(self) -> None:
         """Goes on from the last checkpoint."""
         resume_training(self, self.out)
-        self.evaluated = self._due()
+        self.evaluated = min(self.evaluated, self._due())  # fewer where the run was made longer
         # Evaluations made after the checkpoint will be made again.
         self.metrics = [m for m in read_json_lines(self.out / "metrics.jsonl") if m["step"] <= self.step]
 
