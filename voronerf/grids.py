@@ -118,7 +118,7 @@ class HashGrid:
         most, found, offset = 2**self.log2_entries, [], 0
         # In float32, as their libraries compute them: a rounding may decide how many corners there are.
         growth = math.exp((math.log(self.finest) - math.log(self.base)) / max(self.levels - 1, 1))
-        index = torch.arange(self.levels)
+        index = torch.arange(self.levels, device="cpu")  # also where networks are made on the meta device
         if self.convention == "nerfstudio":
             scales, shift, extra = torch.floor(self.base * growth**index), 0.0, None
         else:

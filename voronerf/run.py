@@ -19,7 +19,7 @@ from voronerf.training.average import load_averages
 from voronerf.training.checkpoint import last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
-from voronerf.training.networks import make_routers, parameter_groups, restore_routers
+from voronerf.training.networks import check_shapes, make_routers, parameter_groups, restore_routers
 from voronerf.training.occupancy import make_picture_grid
 from voronerf.training.renderers import make_renderer
 from voronerf.training.resume import stored_values
@@ -165,6 +165,7 @@ def open_run(
         raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
     checkpoint = last_checkpoint(path)
     config, _ = stored_values(checkpoint)
+    check_shapes(config, checkpoint)
     routers = make_routers(config, device)
     restore_routers(routers, checkpoint)
     load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)

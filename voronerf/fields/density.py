@@ -75,7 +75,9 @@ class DensityField(nn.Module):
             nn.init.zeros_(layer.bias)
         head = self.linears()[-1]
         nn.init.xavier_uniform_(head.weight, gain=0.1)
-        nn.init.constant_(head.bias, float(torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale)).log()))
+        nn.init.constant_(
+            head.bias, float(torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale, device="cpu")).log())
+        )
 
     def linears(self) -> list[nn.Linear]:
         """The linear layers in the order of ``layers``."""

@@ -122,7 +122,7 @@ class HashGridField(nn.Module):
             nn.init.zeros_(layer.bias)
         for head in (self.density, self.colour):
             nn.init.xavier_uniform_(head.weight, gain=0.1)
-        start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale)).log()
+        start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale, device="cpu")).log()
         nn.init.constant_(self.density.bias, float(start))
 
     def linears(self) -> list[nn.Linear]:

@@ -172,7 +172,7 @@ class NeRF(nn.Module):
         for head in (self.density, self.colour):
             nn.init.xavier_uniform_(head.weight, gain=0.1)
         # The inverse of softplus, so that the untrained density is INITIAL_DENSITY wherever the head's weights say 0.
-        start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale)).log()
+        start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale, device="cpu")).log()
         nn.init.constant_(self.density.bias, float(start))
 
     def linears(self) -> list[nn.Linear]:

@@ -90,7 +90,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.occupancy_resolution <= 512, "occupancy_resolution", "be at most 512")
     need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
     need(config.width is None or config.width >= 2, "width", "be at least 2")
-    need(config.depth is None or config.depth >= 1, "depth", "be at least 1")
+    need(config.depth is None or 1 <= config.depth <= 1000, "depth", "be at least 1 and at most 1000")
     need(config.parameters is None or config.parameters >= 1, "parameters", "be at least 1")
     need(0 <= config.blend < float("inf"), "blend", "be a distance of 0 or more")
     for name in ("position_octaves", "direction_octaves", "panels", "min_cell_samples"):

@@ -104,18 +104,30 @@ def make_network(config: TrainConfig, name: str = "field") -> nn.Module:
     return config.field_type.build(config.network_options)
 
 
+def parameter_shapes(config: TrainConfig, name: str) -> dict[str, tuple[torch.Size, bool]]:
+    """The shape of each parameter of one network, and whether all cells share it; without memory for any of them."""
+    try:
+        with torch.device("meta"):
+            network = make_network(config, name)
+    except RuntimeError:  # a field that computes numbers where it is made
+        with torch.random.fork_rng(devices=[]):  # draws nothing from the caller's random numbers
+            network = make_network(config, name)
+    share = config.router_options.get("share", ()) if name != "proposal" else ()
+    return {
+        key: (parameter.shape, any(fnmatch.fnmatchcase(key, pattern) for pattern in share))
+        for key, parameter in network.named_parameters()
+    }
+
+
 def count_parameters(config: TrainConfig, width: int | None = None) -> int:
     """Parameters of all networks of all final cells, with another width than the configured one where given."""
     if width is not None:
         config = replace(config, width=width)
     total = 0
-    with torch.random.fork_rng(devices=[]):  # counting draws nothing from the caller's random numbers
-        for name in network_names(config):
-            cells = 1 if name == "proposal" and not config.split_proposal else config.final_cells
-            share = config.router_options.get("share", ()) if name != "proposal" else ()
-            for parameter_name, parameter in make_network(config, name).named_parameters():
-                shared = any(fnmatch.fnmatchcase(parameter_name, pattern) for pattern in share)
-                total += (1 if shared else cells) * parameter.numel()
+    for name in network_names(config):
+        cells = 1 if name == "proposal" and not config.split_proposal else config.final_cells
+        for shape, shared in parameter_shapes(config, name).values():
+            total += (1 if shared else cells) * shape.numel()
     return total
 
 
@@ -204,6 +216,29 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) ->
     if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=dense[0].device), "capturable": True}
     return Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True, **options)
+
+
+def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
+    """Compares the networks of a configuration with those in a checkpoint, before memory is taken for either.
+
+    Raises:
+        CheckpointError: for a parameter that is missing, of another shape, or not for as many cells as there are.
+    """
+    for name in network_names(config):
+        state = checkpoint.group(_group(name))
+        try:
+            diagram = VoronoiDiagram.from_state(state, "diagram.")
+        except (ValueError, TypeError) as error:
+            raise CheckpointError(f"{checkpoint.source}: {error}") from None
+        for key, (shape, shared) in parameter_shapes(config, name).items():
+            wanted = [*([] if shared else [diagram.num_cells]), *shape]
+            found = state.get(f"module.{key}")
+            if found is None or list(found.shape) != wanted:
+                came = "nothing" if found is None else list(found.shape)
+                raise CheckpointError(
+                    f"{checkpoint.source}: the checkpoint is of another architecture: {_group(name)}.module.{key} "
+                    f"must have shape {wanted}, got {came}"
+                )
 
 
 def router_states(routers: Mapping[str, VoronoiRouter]) -> dict[str, dict[str, Any]]:

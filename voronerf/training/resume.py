@@ -20,7 +20,7 @@ from voronerf.training.checkpoint import (
     optimizer_tensors,
 )
 from voronerf.training.config import TrainConfig, differences
-from voronerf.training.networks import make_optimizer, restore_routers, router_states
+from voronerf.training.networks import check_shapes, make_optimizer, restore_routers, router_states
 from voronerf.training.progress import Stage
 from voronerf.training.schema import check_types
 
@@ -87,18 +87,29 @@ def training_state(trainer: Trainer) -> Checkpoint:
     return Checkpoint(tensors, values)
 
 
-def resume_training(trainer: Trainer, run: Path) -> None:
-    """Puts a trainer where the training was that wrote the last checkpoint of a run; it gets a new optimiser.
+def resumed_checkpoint(config: TrainConfig, run: Path) -> Checkpoint:
+    """The last checkpoint of a run, whose networks are those of the settings to continue it with.
 
     Raises:
         CheckpointError: When there is no checkpoint, or one of another configuration.
     """
     checkpoint = last_checkpoint(run)
-    path = checkpoint.source
-    config, stored = stored_values(checkpoint)
-    different = differences(config, trainer.config)
+    stored, _ = stored_values(checkpoint)
+    different = differences(stored, config)
     if different:
-        raise CheckpointError(f"{path}: a checkpoint of another configuration: {'; '.join(different)}")
+        raise CheckpointError(f"{checkpoint.source}: a checkpoint of another configuration: {'; '.join(different)}")
+    check_shapes(stored, checkpoint)
+    return checkpoint
+
+
+def resume_training(trainer: Trainer, checkpoint: Checkpoint) -> None:
+    """Puts a trainer where the training was that wrote a checkpoint of its settings; it gets a new optimiser.
+
+    Raises:
+        CheckpointError: When something is missing or does not fit.
+    """
+    path = checkpoint.source
+    _, stored = stored_values(checkpoint)
     restore_routers(trainer.routers, checkpoint)
     trainer.optimizer = make_optimizer(trainer.routers, trainer.config)
     try:

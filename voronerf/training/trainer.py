@@ -25,14 +25,14 @@ from voronerf.files import read_json_lines, write_text
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
-from voronerf.training.checkpoint import CheckpointWriter, checkpoint_paths
+from voronerf.training.checkpoint import Checkpoint, CheckpointWriter, checkpoint_paths
 from voronerf.training.config import TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.networks import check_memory, make_optimizer, make_routers, resolve_config
 from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.renderers import make_renderer
-from voronerf.training.resume import resume_training, training_state
+from voronerf.training.resume import resume_training, resumed_checkpoint, training_state
 from voronerf.training.splitting import median, save_samples, split_by_samples
 
 #: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
@@ -78,6 +78,7 @@ class Trainer:
         self.out = config.out
         config = resolve_config(config, scene)
         check_memory(config)
+        checkpoint = resumed_checkpoint(config, self.out) if config.resume else None
         self.config = config
         self.plan = config.planned_splits
         self.scene = scene
@@ -117,8 +118,8 @@ class Trainer:
         self.stopped = False
         self.loss = math.nan
         self.writer = CheckpointWriter(self.out, config.keep_checkpoints)
-        if config.resume:
-            self._resume()
+        if checkpoint is not None:
+            self._resume(checkpoint)
         self.saved_at = self.seconds
         self._compute = self._make_step()
         write_text(self.out / "config.json", config.to_json())
@@ -383,9 +384,9 @@ class Trainer:
         if wait:
             self.writer.wait()
 
-    def _resume(self) -> None:
-        """Goes on from the last checkpoint."""
-        resume_training(self, self.out)
+    def _resume(self, checkpoint: Checkpoint) -> None:
+        """Goes on from a checkpoint of this run."""
+        resume_training(self, checkpoint)
         self.evaluated = min(self.evaluated, self._due())  # fewer where the run was made longer
         # Evaluations made after the checkpoint will be made again.
         self.metrics = [m for m in read_json_lines(self.out / "metrics.jsonl") if m["step"] <= self.step]
