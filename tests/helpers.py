@@ -8,6 +8,8 @@ from collections.abc import Mapping
 import pytest
 import torch
 
+from voronerf.rendering import Renderer
+
 
 def refuses(message, call, *args, error=ValueError, **options):
     """Fails unless the call raises an error of one line that contains ``message``, which is no pattern."""
@@ -52,3 +54,8 @@ def python(*args, **options):
 
 def read_json(path):
     return json.loads(path.read_text())
+
+
+def render_image(field, cameras, index, *, samples, occupancy=None, **given):
+    """The image of one field."""
+    return Renderer({"field": field}, samples=samples, occupancy=occupancy).image(cameras, index, **given)

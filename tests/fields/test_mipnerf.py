@@ -7,7 +7,7 @@ from helpers import refuses, seeded
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import DensityField, MipNeRF
-from voronerf.fields.nerf import INITIAL_DENSITY
+from voronerf.fields.radiance import INITIAL_DENSITY
 from voronerf.ops import integrated_encode
 from voronerf.router import VoronoiRouter
 

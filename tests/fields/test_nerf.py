@@ -7,7 +7,7 @@ from helpers import refuses, seeded
 from torch import nn
 
 from voronerf.fields import KiloNeRF, NeRF
-from voronerf.fields.nerf import INITIAL_DENSITY
+from voronerf.fields.radiance import INITIAL_DENSITY
 from voronerf.ops import frequency_encode
 
 

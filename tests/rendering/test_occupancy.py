@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import refuses, seeded
+from helpers import refuses, render_image, seeded
 
 from voronerf import HashGridField, NeRF, VoronoiRouter
 from voronerf.rendering import (
@@ -11,7 +11,6 @@ from voronerf.rendering import (
     Renderer,
     intersect_box,
     orbit_cameras,
-    render_image,
     render_marched,
     render_rays,
     render_until_opaque,

@@ -4,10 +4,9 @@ import math
 
 import pytest
 import torch
-from helpers import refuses, seeded
+from helpers import refuses, render_image, seeded
 
 from voronerf.rendering.cameras import Rays, orbit_cameras
-from voronerf.rendering.renderer import render_image
 from voronerf.rendering.volume import render_rays
 
 BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])

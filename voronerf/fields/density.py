@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from voronerf.fields.nerf import INITIAL_DENSITY
+from voronerf.fields.radiance import reset_layers
 from voronerf.fields.single import run_network
 from voronerf.layers import MLP, Layer
 
@@ -69,15 +69,8 @@ class DensityField(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """He initialisation, a small head, and a density that can grow; as in :class:`voronerf.fields.NeRF`."""
-        for layer in self.linears():
-            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
-            nn.init.zeros_(layer.bias)
-        head = self.linears()[-1]
-        nn.init.xavier_uniform_(head.weight, gain=0.1)
-        nn.init.constant_(
-            head.bias, float(torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale, device="cpu")).log())
-        )
+        """See :func:`voronerf.fields.radiance.reset_layers`."""
+        reset_layers(self.linears(), self.linears()[-1:], self.density_scale)
 
     def linears(self) -> list[nn.Linear]:
         """The linear layers in the order of ``layers``."""

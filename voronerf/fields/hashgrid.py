@@ -6,19 +6,17 @@ import math
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from voronerf.checks import physical_memory
-from voronerf.fields.nerf import INITIAL_DENSITY
-from voronerf.fields.radiance import activate_radiance
-from voronerf.fields.single import run_network
+from voronerf.fields.radiance import RadianceField, reset_layers
 from voronerf.grids import UNIT_CUBE, HashGrid
 from voronerf.layers import MLP, Layer
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
-class HashGridField(nn.Module):
+class HashGridField(RadianceField):
     """A hash grid with a small network behind it (Müller et al. 2022, section 5.4).
 
     A layer of ``width`` channels reads the features of the position. A linear head gives the density. A second layer,
@@ -115,40 +113,11 @@ class HashGridField(nn.Module):
         return {"box": box, "finest": max(round(2 * extent / pixel), 32)}
 
     def reset_parameters(self) -> None:
-        """Features near zero, as published; He initialisation, small heads and a density that can grow, as NeRF."""
+        """Features near zero, as published; the layers as in :func:`voronerf.fields.radiance.reset_layers`."""
         nn.init.uniform_(self.features, -1e-4, 1e-4)
-        for layer in self.linears():
-            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
-            nn.init.zeros_(layer.bias)
-        for head in (self.density, self.colour):
-            nn.init.xavier_uniform_(head.weight, gain=0.1)
-        start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale, device="cpu")).log()
-        nn.init.constant_(self.density.bias, float(start))
+        reset_layers(self.linears(), [self.density, self.colour], self.density_scale)
 
     def linears(self) -> list[nn.Linear]:
         """The linear layers in the order of ``layers``."""
         trunk = [layer for layer in self.trunk if isinstance(layer, nn.Linear)]
         return [*trunk, self.density, self.view, self.colour]
-
-    activate = activate_radiance
-
-    def forward(
-        self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Evaluates the field.
-
-        Args:
-            positions: [n, 3] in scene units; outside of the box, the features are those of the nearest point inside.
-            directions: Unit vectors [n, 3], or [r, 3] together with ``ray_index``; not needed without view directions.
-            ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
-
-        Returns:
-            (colour [n, 3] in 0..1, density [n] per scene unit).
-
-        Raises:
-            ValueError: When view directions are needed and missing, or shapes disagree.
-        """
-        if self.view_directions and directions is None:
-            raise ValueError("HashGridField: directions must be given, since the colour depends on the view direction")
-        seen = (directions, ray_index) if self.view_directions else (None, None)
-        return self.activate(run_network(self.layers, self.linears(), positions, *seen, features=self.features))

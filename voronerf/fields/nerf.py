@@ -7,16 +7,10 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
-from voronerf.fields.radiance import activate_radiance
-from voronerf.fields.single import run_network
+from voronerf.fields.radiance import RadianceField, reset_layers
 from voronerf.layers import MLP, Layer
-
-#: Density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2:
-#: translucent enough that every sample of a ray receives a gradient, opaque enough that the colours do as well.
-INITIAL_DENSITY = 0.1
 
 
 def nerf_table(
@@ -73,7 +67,7 @@ def nerf_table(
     )
 
 
-class NeRF(nn.Module):
+class NeRF(RadianceField):
     """The architecture of NeRF (Mildenhall et al. 2020, figure 7), of any width and depth.
 
     The trunk is ``depth`` ReLU layers on the encoded position, which is concatenated again after each layer listed in
@@ -165,40 +159,10 @@ class NeRF(nn.Module):
         return 0.02 * 64 / max(width, 64)
 
     def reset_parameters(self) -> None:
-        """He initialisation of the ReLU layers (He et al. 2015), small heads, and a density that can grow."""
-        for layer in self.linears():
-            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
-            nn.init.zeros_(layer.bias)
-        for head in (self.density, self.colour):
-            nn.init.xavier_uniform_(head.weight, gain=0.1)
-        # The inverse of softplus, so that the untrained density is INITIAL_DENSITY wherever the head's weights say 0.
-        start = torch.expm1(torch.tensor(INITIAL_DENSITY / self.density_scale, device="cpu")).log()
-        nn.init.constant_(self.density.bias, float(start))
+        """See :func:`voronerf.fields.radiance.reset_layers`."""
+        reset_layers(self.linears(), [self.density, self.colour], self.density_scale)
 
     def linears(self) -> list[nn.Linear]:
         """The linear layers in the order of ``layers``."""
         linears = [*self.trunk, self.density, self.feature, self.view, self.colour]
         return [layer for layer in linears if isinstance(layer, nn.Linear)]
-
-    activate = activate_radiance
-
-    def forward(
-        self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Evaluates the field.
-
-        Args:
-            positions: [n, 3] in scene units; with the integrated encoding Gaussians [n, 6].
-            directions: Unit vectors [n, 3], or [r, 3] together with ``ray_index``; not needed without view directions.
-            ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
-
-        Returns:
-            (colour [n, 3] in 0..1, density [n] per scene unit).
-
-        Raises:
-            ValueError: When view directions are needed and missing, or shapes disagree.
-        """
-        if self.view_directions and directions is None:
-            raise ValueError("NeRF: directions must be given, since the colour depends on the view direction")
-        seen = (directions, ray_index) if self.view_directions else (None, None)
-        return self.activate(run_network(self.layers, self.linears(), positions, *seen))

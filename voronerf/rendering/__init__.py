@@ -7,7 +7,7 @@ from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.rays import intersect_box
-from voronerf.rendering.renderer import RenderedImage, Renderer, render_image
+from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.rendering.sampling import stratified_depths
 from voronerf.rendering.volume import Rendered, render_rays
 
@@ -25,7 +25,6 @@ __all__ = [
     "focus_point",
     "intersect_box",
     "orbit_cameras",
-    "render_image",
     "render_marched",
     "render_rays",
     "render_until_opaque",

@@ -36,7 +36,7 @@ COARSE_SHARE = 0.1
 
 
 class RenderedImage(NamedTuple):
-    """What `render_image` returns.
+    """What `Renderer.image` returns.
 
     Attributes:
         colour: [h, w, 3], the background included.
@@ -315,12 +315,24 @@ class Renderer:
         heaviest: bool = True,
         chunk: int | None = None,
     ) -> RenderedImage:
-        """The whole image of one camera, without gradients and without randomness; see `render_image`."""
+        """The whole image of one camera, without gradients and without randomness.
+
+        Args:
+            cameras: on the fields' device.
+            index: the camera.
+            near: nearest distance of interest.
+            far: farthest.
+            box: [2, 3] outside of which nothing is; rays that miss it show the background without asking the field.
+            background: [3], None is black.
+            heaviest: whether to look for each ray's heaviest sample; without it the result has every ray's far end.
+            chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples
+                of a ray, 131,072.
+        """
         grid = self.occupancy
         if chunk is None:
             chunk = 4096 if grid is None else 131_072
         if chunk < 1:
-            raise ValueError(f"render_image: chunk must be >= 1, got {chunk}")
+            raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
         rays = cameras.image_rays(index, cones=self.cones)
         first, last, hit = intersect_box(rays.origins, rays.directions, box, near, far)
         colour = torch.zeros_like(rays.origins)
@@ -354,54 +366,3 @@ class Renderer:
         return RenderedImage(
             colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3)
         )
-
-
-def render_image(
-    field: Field,
-    cameras: Cameras,
-    index: int,
-    *,
-    near: float,
-    far: float,
-    box: Tensor | None = None,
-    samples: int,
-    background: Tensor | None = None,
-    spacing: str = "linear",
-    occupancy: OccupancyGrid | None = None,
-    heaviest: bool = True,
-    chunk: int | None = None,
-    backend: str = "auto",
-) -> RenderedImage:
-    """One camera's whole image, without gradients and without randomness.
-
-    Args:
-        field: as for `render_rays`.
-        cameras: on the field's device.
-        index: the camera.
-        near: nearest distance of interest.
-        far: farthest.
-        box: [2, 3] outside of which nothing is; rays that miss it show the background without asking the field.
-        samples: s, per ray, inside the box.
-        background: [3], None is black.
-        spacing: of the strata.
-        occupancy: which cells of the box are empty; the field is evaluated in the others alone, up to where a ray is
-            opaque. None asks about every sample.
-        heaviest: whether to look for each ray's heaviest sample; without it the result has every ray's far end instead.
-        chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples of
-            a ray, 131,072.
-        backend: of the ops.
-
-    Examples:
-        >>> import torch
-        >>> from voronerf.rendering import orbit_cameras, render_image
-        >>> def fog(positions, directions, ray_index):
-        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
-        >>> cameras = orbit_cameras(1, radius=2.0, elevation=0.0, width=4, height=3, focal=4.0)
-        >>> image = render_image(fog, cameras, 0, near=1.0, far=3.0, samples=8)
-        >>> image.opacity[0, 0].round(decimals=4)  # 1 - exp(-0.5 * 2)
-        tensor(0.6321)
-    """
-    renderer = Renderer({"field": field}, samples=samples, spacing=spacing, occupancy=occupancy, backend=backend)
-    return renderer.image(
-        cameras, index, near=near, far=far, box=box, background=background, heaviest=heaviest, chunk=chunk
-    )
