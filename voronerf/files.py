@@ -54,6 +54,40 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
+#: Bytes of a JSON file; parsed, it takes some twenty times its size. A frame of a capture takes about a kilobyte.
+JSON_LIMIT = 2**25
+
+
+def read_json(path: Path) -> Any:
+    """The contents of a JSON file.
+
+    Raises:
+        ValueError: When it is too large or no JSON; names the file.
+        OSError: When it cannot be read.
+    """
+    with open(path, "rb") as file:
+        data = file.read(JSON_LIMIT + 1)
+    if len(data) > JSON_LIMIT:
+        size = path.stat().st_size
+        raise ValueError(f"{path}: must be at most {JSON_LIMIT / 2**20:g} MiB of JSON, got {size / 2**20:.1f}")
+    try:
+        return parse_json(data.decode("utf-8-sig"))
+    except ValueError as error:
+        raise ValueError(f"{path}: is not JSON: {error}") from None
+
+
+def parse_json(text: str) -> Any:
+    """The value of JSON text.
+
+    Raises:
+        ValueError: When it is no JSON, or is nested deeper than Python reads.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
     """The objects of a file with one JSON object a line; [] when there is no file.
 
@@ -65,8 +99,8 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     values = []
     for number, line in enumerate(path.read_text().splitlines(), 1):
         try:
-            value = json.loads(line)
-        except json.JSONDecodeError as error:
+            value = parse_json(line)
+        except ValueError as error:
             raise ValueError(f"{path}: line {number} is not JSON: {error}") from None
         values.append(value)
     return values

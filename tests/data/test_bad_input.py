@@ -12,6 +12,7 @@ from helpers import refuses
 from PIL import Image
 from scene_files import rewrite
 
+from voronerf import files
 from voronerf.data import SceneError, load_scene
 
 POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1]]
@@ -75,11 +76,21 @@ def test_downscale(tmp_path):
         ('{"frames": [{"file_path": 3}]}', "frame 0 has no file_path"),
         ('{"frames": [{"file_path": "a\\u0000"}]}', "frame 0 has no file_path"),
         ('{"frames": [{"file_path": "x.png"}]}', "frame 0 (x.png): transform_matrix"),
+        ('{"frames": [{"file_path": "x.png", "mask_path": "y.png"}]}', "frame 0 (x.png): mask_path is not supported"),
+        ("[" * 100_000, "is not JSON: it is nested too deeply"),
     ],
 )
 def test_json(tmp_path, text, reason):
     (tmp_path / "transforms.json").write_bytes(text if isinstance(text, bytes) else text.encode())
     fails(tmp_path, "transforms.json", reason)
+
+
+def test_json_of_any_size(tmp_path, monkeypatch):
+    write_noise(tmp_path)
+    monkeypatch.setattr(files, "JSON_LIMIT", (tmp_path / "transforms.json").stat().st_size)
+    assert len(load_scene(tmp_path).train) == 2
+    rewrite(tmp_path, lambda contents: contents.update(more=[0]))
+    fails(tmp_path, "transforms.json: must be at most", "MiB of JSON, got")
 
 
 def edited(row, column, value):
@@ -100,11 +111,13 @@ def edited(row, column, value):
         (edited(0, 0, "one"), "not a matrix of numbers"),
         (POSE[:2], "must be 4 x 4, got shape [2, 4]"),
         ([[1, 2], [3]], "not a matrix of numbers"),
-        (None, "must be 4 x 4"),
+        (None, "not a matrix of numbers"),
+        *[(edited(0, 0, value), "not a matrix of numbers") for value in ("1.0", True)],
+        (edited(2, 3, 1e30), "are not finite, or above 1e+09"),
         *[(edited(*at, 10**400), "is not a matrix of numbers") for at in ((0, 0), (1, 3))],
         *[(edited(*at, 1e300), "are not finite") for at in ((0, 0), (1, 3))],
     ],
-    ids=range(14),
+    ids=range(17),
 )
 def test_pose(tmp_path, matrix, reason):
     write_noise(tmp_path)
@@ -151,9 +164,9 @@ def test_images(tmp_path):
     [
         ({"fl_x": None}, "has no focal length (fl_x or camera_angle_x)"),
         ({"fl_x": 0}, "fl_x must be positive, got 0"),
-        ({"fl_x": "9"}, "fl_x must be a finite number, got '9'"),
-        ({"fl_x": math.nan}, "fl_x must be a finite number, got nan"),
-        ({"cx": True}, "cx must be a finite number, got True"),
+        ({"fl_x": "9"}, "fl_x must be a finite number up to 1e+09, got '9'"),
+        ({"fl_x": math.nan}, "fl_x must be a finite number up to 1e+09, got nan"),
+        ({"cx": True}, "cx must be a finite number up to 1e+09, got True"),
         ({"fl_x": None, "camera_angle_x": 3.5}, "camera_angle_x must be an angle between 0 and pi, got 3.5"),
         ({"w": 16}, "says w = 16"),
         ({"h": 8}, "says h = 8"),
@@ -161,10 +174,25 @@ def test_images(tmp_path):
         ({"camera_model": "OPENCV_FISHEYE"}, "camera model OPENCV_FISHEYE is not supported"),
         ({"is_fisheye": True}, "camera model fisheye is not supported"),
         ({"k1": -5.0}, "cannot be inverted inside the image"),
-        ({"k1": math.inf}, "k1 must be a finite number, got inf"),
-        ({"k1": 10**400}, "k1 must be a finite number, got 1000"),
-        ({"fl_x": -(10**400)}, "fl_x must be a finite number, got -1000"),
-        ({"cy": 1e39}, "cy must be a finite number, got 1e+39"),
+        ({"k1": math.inf}, "k1 must be a finite number up to 1e+09, got inf"),
+        ({"k1": 10**400}, "k1 must be a finite number up to 1e+09, got 1000"),
+        ({"fl_x": -(10**400)}, "fl_x must be a finite number up to 1e+09, got -1000"),
+        ({"fl_x": 1e38}, "fl_x must be a finite number up to 1e+09, got 1e+38"),
+        ({"fl_x": 1e7}, "fl_x must give a focal length of 0.001 to 1000 times the 8 pixels of the image, got 1e+07"),
+        ({"fl_x": None, "camera_angle_x": 1e-300}, "camera_angle_x must be positive, got 1e-300"),
+        ({"fl_x": None, "camera_angle_x": 1e-5}, "camera_angle_x must give a focal length of 0.001 to 1000 times"),
+        (
+            {"distortion_params": [0.1, 0, 0, 0]},
+            "distortion_params must be six numbers, k1, k2, k3, k4, p1, p2, got [0.1",
+        ),
+        ({"distortion_params": [0, 0, 0.1, 0, 0, 0]}, "lens distortion k3 is not supported"),
+        ({"distortion_params": ["0"] * 6}, "k3 must be a finite number up to 1e+09, got '0'"),
+        ({"test_filenames": "0.png"}, "test_filenames must be a list of file names, got '0.png'"),
+        ({"test_filenames": ["9.png"]}, "test_filenames has 9.png, which is no file_path of a frame"),
+        ({"train_filenames": ["0.png"], "test_filenames": ["./0.png"]}, "must differ, both have 0.png"),
+        ({"train_filenames": ["0.png", "1.png", "2.png"]}, "leave no image for testing"),
+        ({"test_filenames": ["0.png", "1.png", "2.png"]}, "leave no image for training"),
+        ({"cy": 1e39}, "cy must be a finite number up to 1e+09, got 1e+39"),
     ],
 )
 def test_intrinsics_and_lens(tmp_path, entries, reason):
@@ -189,6 +217,8 @@ def test_blender(tmp_path):
     for entries, reason in (
         ({}, "transforms_train.json: camera_angle_x must be an angle between 0 and pi, got None"),
         ({"camera_angle_x": 0.7, "near": 9}, "near must be below far, got 9.0 and 6.0"),
+        ({"camera_angle_x": 0.7, "far": 1e38}, "far must be a finite number up to 1e+09, got 1e+38"),
+        ({"camera_angle_x": 1e-5}, "transforms_train.json: camera_angle_x must give a focal length of 0.001 to 1000"),
         ({"fl_x": 9.0, "k4": 0.1}, "lens distortion k4 is not supported"),
     ):
         for name in ("train", "test"):

@@ -215,6 +215,38 @@ def test_capture_intrinsics_per_frame_and_from_angles(tmp_path):
     assert train.cameras.distortion[:, 0].tolist() == pytest.approx([0, 0.05])
 
 
+@pytest.mark.parametrize(
+    ("lists", "train", "test"),
+    [
+        ({"train": (0, 1, 2), "test": (3, 4)}, (0, 1, 2), (3, 4)),
+        ({"train": (0, 1, 2), "test": (3, 4), "val": (5,)}, (0, 1, 2), (3, 4)),
+        ({"train": (0, 1), "val": (4,), "test": ()}, (0, 1), (4,)),
+        ({"test": (4,)}, (0, 1, 2, 3, 5), (4,)),
+        ({"test": (4,), "val": (3,)}, (0, 1, 2, 5), (4,)),
+        ({"train": (1, 2)}, (1, 2), (0, 3, 4, 5)),
+    ],
+)
+def test_lists_of_file_names_split_a_capture(tmp_path, lists, train, test):
+    """As nerfstudio writes them."""
+    write_capture(tmp_path, orbit_cameras(6, radius=2, elevation=5, width=4, height=4, focal=4))
+    named = {f"{name}_filenames": [f"./{index:02d}.png" for index in chosen] for name, chosen in lists.items()}
+    rewrite(tmp_path, lambda contents: contents.update(named))
+    scene = load_scene(tmp_path)
+    for split, chosen in ((scene.train, train), (scene.test, test)):
+        assert split.names == tuple(f"{index:02d}" for index in chosen)
+        assert split.images[:, 0, 0, 0].tolist() == list(chosen)
+
+
+def test_distortion_params_are_those_of_nerfstudio(tmp_path):
+    for folder, lens in (
+        ("named", {"k1": 0.02, "k2": -0.01, "p1": 0.001, "p2": 0.002}),
+        ("listed", {"k1": 9, "distortion_params": [0.02, -0.01, 0, 0, 0.001, 0.002]}),
+    ):
+        write_capture(tmp_path / folder, orbit_cameras(3, radius=2, elevation=5, width=8, height=8, focal=8), **lens)
+    named, listed = (load_scene(tmp_path / folder).train.cameras.distortion for folder in ("named", "listed"))
+    assert named is not None and torch.equal(named, listed)
+
+
 def test_capture_with_alpha_is_an_object_on_white(tmp_path):
     original = builtin_scene(20, train_views=12, test_views=1)
     write_capture(tmp_path, original.train.cameras, camera_angle_x=0.6911112, fl_x=None)

@@ -6,7 +6,6 @@ The object sits at the origin, cameras look at it from about 4 units away, and t
 from __future__ import annotations
 
 import logging
-import math
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from voronerf.data.capture import Listed, capture_scene, has_lens
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images
 from voronerf.data.scene import Scene, SceneError, Split
-from voronerf.data.transforms import Frame, distinct_names, number, read_transforms
+from voronerf.data.transforms import Frame, distinct_names, focal_length, number, read_transforms
 from voronerf.rendering.cameras import Cameras
 
 log = logging.getLogger(__name__)
@@ -81,11 +80,10 @@ def _split(
     size: tuple[int, int],
     downscale: int,
 ) -> Split:
-    angle = number(entries, "camera_angle_x", path, positive=True)
-    if angle is None or angle >= math.pi:
-        raise SceneError(f"{path}: camera_angle_x must be an angle between 0 and pi, got {angle}")
     width, height = size
-    focal = 0.5 * width / math.tan(0.5 * angle)
+    focal = focal_length(entries, "camera_angle_x", width, path)
+    if focal is None:
+        raise SceneError(f"{path}: camera_angle_x must be an angle between 0 and pi, got None")
     intrinsics = torch.tensor((focal, focal, width / 2, height / 2)).repeat(len(frames), 1)
     poses = torch.stack([frame.pose for frame in frames]).float()
     cameras = Cameras(poses, intrinsics, width, height).downscaled(downscale)

@@ -6,7 +6,8 @@ origin, their mean up direction the z axis, and the farthest camera is at distan
 
 from __future__ import annotations
 
-import math
+import logging
+import posixpath
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,22 +18,29 @@ from torch import Tensor
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images
 from voronerf.data.scene import Scene, SceneError, Split
-from voronerf.data.transforms import Frame, distinct_names, number, read_transforms
+from voronerf.data.transforms import Frame, distinct_names, focal_length, number, read_transforms
 from voronerf.rendering.cameras import Cameras, distort, focus_point, undistort
 
+log = logging.getLogger(__name__)
+
 HOLD_OUT = 8
+SPLITS = ("train_filenames", "test_filenames", "val_filenames")
 # Near bound as a share of the distance from the focus to the nearest camera; closer things are rarely in focus.
 NEAR = 0.35
 # Smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
 NEAREST = 0.05
 FAR = 4.0
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
-LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")
+LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "distortion_params", "camera_model", "is_fisheye")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's distortion_params
 UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 
 
 def load_capture(folder: Path, downscale: int) -> Scene:
     """Loads a capture; every 8th image in the order of their names is held out for testing.
+
+    Where the file has nerfstudio's `train_filenames`, `test_filenames` or `val_filenames`, they decide instead.
+    Validation images are for testing if there are no others, and are else left out.
 
     Rays of an opaque capture end at four times the distance of the farthest camera and are sampled in disparity. A
     plain network then learns the object and, coarsely, the room. The near bound is 0.35 of the distance to the nearest
@@ -51,8 +59,50 @@ def load_capture(folder: Path, downscale: int) -> Scene:
     frames = sorted(frames, key=lambda frame: frame.path.as_posix())
     if len(frames) < 2:
         raise SceneError(f"{path}: one image is too few, one is held out for testing")
-    held_out = torch.arange(len(frames)) % HOLD_OUT == 0
+    declared = _declared_split(path, entries, frames)
+    if declared is None:
+        held_out = torch.arange(len(frames)) % HOLD_OUT == 0
+    else:
+        frames, held_out = declared
     return capture_scene(folder, [Listed(path, entries, frame) for frame in frames], held_out, downscale)
+
+
+def _declared_split(path: Path, entries: dict[str, Any], frames: list[Frame]) -> tuple[list[Frame], Tensor] | None:
+    """The frames that nerfstudio's lists of file names choose, and which are held out; None without such lists.
+
+    Where one list is missing or empty, the images of no other list take its place.
+    """
+    lists: dict[str, set[str]] = {}
+    for key in SPLITS:
+        names = entries.get(key)
+        if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+            raise SceneError(f"{path}: {key} must be a list of file names, got {names!r:.60}")
+        lists[key] = {_plain(name) for name in names or ()}
+    every = {_plain(frame["file_path"]) for frame in entries["frames"]}
+    for key, names in lists.items():
+        if unknown := sorted(names - every):
+            raise SceneError(f"{path}: {key} has {unknown[0]}, which is no file_path of a frame")
+    train, test, validation = lists.values()
+    if not (train or test or validation):
+        return None
+    test = test or validation
+    train, test = train or every - test - validation, test or every - train
+    if both := sorted(train & test):
+        raise SceneError(f"{path}: train_filenames and the images for testing must differ, both have {both[0]}")
+    if unused := len(every - train - test - validation):
+        log.warning("%s: %d images are in none of %s and are left out", path, unused, ", ".join(SPLITS))
+    names = [_plain(frame.entries["file_path"]) for frame in frames]
+    chosen = [(frame, name in test) for frame, name in zip(frames, names) if name in train | test]
+    held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool)
+    for part, there in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
+        if not there:
+            raise SceneError(f"{path}: {', '.join(SPLITS)} leave no image for {part}")
+    return [frame for frame, _ in chosen], held_out
+
+
+def _plain(name: str) -> str:
+    """A file name in one spelling, so that ./images/a.png is images/a.png."""
+    return posixpath.normpath(name.replace("\\", "/"))
 
 
 class Listed(NamedTuple):
@@ -88,7 +138,7 @@ def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, down
 
     intrinsics, distortion = [], []
     for path, entries, frame in listed:
-        values = {**entries, **frame.entries}
+        values = {**_named_distortion(entries, path), **_named_distortion(frame.entries, path)}
         _check_lens_model(values, path)
         intrinsics.append(_intrinsics(values, size, path, frame))
         distortion.append([number(values, key, path) or 0.0 for key in ("k1", "k2", "p1", "p2")])
@@ -164,17 +214,10 @@ def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame
         stated = number(values, key, path, positive=True)
         if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
             raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {path} says {key} = {stated:g}")
-    fx, fy = (number(values, key, path, positive=True) for key in ("fl_x", "fl_y"))
-    angles = {}
-    for key in ("camera_angle_x", "camera_angle_y"):
-        angle = number(values, key, path, positive=True)
-        if angle is not None and angle >= math.pi:
-            raise SceneError(f"{path}: {key} must be an angle between 0 and pi, got {angle}")
-        angles[key] = angle
-    if fx is None and angles["camera_angle_x"] is not None:
-        fx = 0.5 * width / math.tan(0.5 * angles["camera_angle_x"])
-    if fy is None and angles["camera_angle_y"] is not None:
-        fy = 0.5 * height / math.tan(0.5 * angles["camera_angle_y"])
+    fx, fy = (
+        focal_length(values, f"fl_{axis}", side, path) or focal_length(values, f"camera_angle_{axis}", side, path)
+        for axis, side in zip("xy", size)
+    )
     if fx is None and fy is None:
         raise SceneError(f"{path}: has no focal length (fl_x or camera_angle_x)")
     fx, fy = fx or fy, fy or fx
@@ -183,11 +226,21 @@ def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame
     return [fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy]
 
 
+def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The entries with k1, k2... in the place of nerfstudio's distortion_params."""
+    given = entries.get("distortion_params")
+    if given is None or given == []:
+        return entries
+    if not isinstance(given, list) or len(given) != len(DISTORTION):
+        raise SceneError(f"{path}: distortion_params must be six numbers, {', '.join(DISTORTION)}, got {given!r:.60}")
+    return {**entries, **dict(zip(DISTORTION, given))}
+
+
 def _check_lens_model(values: dict[str, Any], path: Path) -> None:
     model = values.get("camera_model", "OPENCV")
     if values.get("is_fisheye") or model not in PINHOLE_MODELS:
         name = "fisheye" if values.get("is_fisheye") else model
-        raise SceneError(f"{path}: camera model {name} is not supported, only {', '.join(PINHOLE_MODELS)}")
+        raise SceneError(f"{path}: camera model {name!s:.60} is not supported, only {', '.join(PINHOLE_MODELS)}")
     used = [key for key in UNSUPPORTED if number(values, key, path)]
     if used:
         raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only k1, k2, p1, p2")

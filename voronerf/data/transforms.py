@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +14,16 @@ import torch
 from torch import Tensor
 
 from voronerf.data.scene import SceneError
+from voronerf.files import read_json
 
 log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 ORTHONORMAL = 2e-3
-LARGEST = float(np.finfo(np.float32).max)  # cameras are float32
+#: Of numbers and, where they are positive, its inverse the smallest; far from where float32 ends, even squared.
+LARGEST = 1e9
+#: Of a focal length, in sides of the image, and its inverse the smallest: fields of view of 0.06 to 179.9 degrees.
+LONGEST = 1000
 
 
 @dataclass(frozen=True)
@@ -47,12 +51,9 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
         SceneError: the file does not parse, has no frames, no image of any frame exists, or a matrix is not a pose.
     """
     try:
-        entries = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # ValueError: syntax, encoding, too long an integer
-        raise SceneError(f"{path}: is not JSON: {error}") from None
+        entries = read_json(path)
+    except ValueError as error:
+        raise SceneError(str(error)) from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
     frames = entries.get("frames") if isinstance(entries, dict) else None
@@ -64,6 +65,11 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or "\0" in name:
             raise SceneError(f"{path}: frame {position} has no file_path")
+        if frame.get("mask_path") is not None:
+            raise SceneError(
+                f"{path}: frame {position} ({name}): mask_path is not supported, images are used whole; without the "
+                "mask_path of its frames the scene can be loaded"
+            )
         pose = _pose(frame.get("transform_matrix"), f"{path}: frame {position} ({name})")
         image = _image_path(path.parent, name)
         if image is not None:
@@ -82,17 +88,51 @@ def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = Fa
     """A finite number of a transforms file; None if the entry is missing.
 
     Raises:
-        SceneError: the entry is not a number, not finite in float32, or not positive where it must be.
+        SceneError: the entry is not a number, out of range, or not positive where it must be.
     """
     value = entries.get(key)
     if value is None:
         return None
-    # The comparison, unlike math.isfinite, takes integers of any size; NaN fails it.
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-        raise SceneError(f"{path}: {key} must be a finite number, got {value!r:.60}")
-    if positive and value <= 0:
+    # The comparisons take integers of any size; NaN fails them.
+    if not is_number(value) or not abs(value) <= LARGEST:
+        raise SceneError(f"{path}: {key} must be a finite number up to {LARGEST:.0e}, got {value!r:.60}")
+    if positive and not value >= 1 / LARGEST:
         raise SceneError(f"{path}: {key} must be positive, got {value!r}")
     return float(value)
+
+
+def is_number(value: object) -> bool:
+    """Whether a value of JSON is a number, which a boolean is to Python."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> float | None:
+    """A focal length in pixels, from itself or from an angle of view; None if the entry is missing.
+
+    Args:
+        entries: of the file or a frame.
+        key: "fl_x" or "fl_y", "camera_angle_x" or "camera_angle_y".
+        side: pixels of the image along that axis.
+        path: the file.
+
+    Raises:
+        SceneError: the entry is no such number, or nothing that a camera has.
+    """
+    value = number(entries, key, path, positive=True)
+    if value is None:
+        return None
+    if key.startswith("camera_angle"):
+        if value >= math.pi:
+            raise SceneError(f"{path}: {key} must be an angle between 0 and pi, got {value}")
+        focal = 0.5 * side / math.tan(0.5 * value)
+    else:
+        focal = value
+    if not 1 / LONGEST <= focal / side <= LONGEST:
+        raise SceneError(
+            f"{path}: {key} must give a focal length of {1 / LONGEST:g} to {LONGEST} times the {side} pixels of the "
+            f"image, got {value:g}"
+        )
+    return focal
 
 
 def distinct_names(paths: list[Path], folder: Path) -> list[str]:
@@ -122,14 +162,17 @@ def _image_path(folder: Path, name: str) -> Path | None:
 
 def _pose(matrix: object, where: str) -> Tensor:
     """Checks that rows of numbers are a rigid motion; float64 [4, 4]."""
+    rows = matrix if isinstance(matrix, list) else [None]
     try:
-        values = np.array(matrix, dtype=np.float64)
+        if not all(isinstance(row, list) and all(map(is_number, row)) for row in rows):
+            raise TypeError
+        values = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise SceneError(f"{where}: transform_matrix is not a matrix of numbers") from None
     if values.shape not in ((4, 4), (3, 4)):
         raise SceneError(f"{where}: transform_matrix must be 4 x 4, got shape {list(values.shape)}")
     if not (np.abs(values) <= LARGEST).all():
-        raise SceneError(f"{where}: transform_matrix has values that are not finite")
+        raise SceneError(f"{where}: transform_matrix has values that are not finite, or above {LARGEST:.0e}")
     rotation = values[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > ORTHONORMAL or np.linalg.det(rotation) < 0:

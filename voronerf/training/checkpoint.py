@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from voronerf.files import rename, write_bytes
+from voronerf.files import parse_json, rename, write_bytes
 
 FORMAT = "voronerf-checkpoint-2"
 #: The name of the checksum of the JSON, beside those of the tensors.
@@ -169,7 +169,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
                 raise CheckpointError(f"{path}: not a {FORMAT} file, its format is {metadata.get('format')!r}")
-            sums = json.loads(metadata["checksums"])
+            sums = parse_json(metadata["checksums"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         found = {name: _checksum(tensor) for name, tensor in tensors.items()}
         found[_VALUES] = zlib.crc32(metadata["values"].encode())
@@ -177,7 +177,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             if sums.get(name) != found.get(name):
                 what = "has another checksum" if name in found else "is missing"
                 raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
-        return Checkpoint(tensors, json.loads(metadata["values"]), str(path))
+        return Checkpoint(tensors, parse_json(metadata["values"]), str(path))
     except CheckpointError:
         raise
     except (SafetensorError, ValueError, KeyError, AttributeError, OSError) as error:

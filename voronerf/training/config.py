@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from voronerf.fields import FIELDS, FieldType
+from voronerf.files import parse_json
 from voronerf.training.config_checks import NETWORK_SETTINGS, ConfigError, check_config, check_field, parse_option
 from voronerf.training.schedule import PlannedSplit, TimeUnit, default_times, final_cells, plan_splits
 from voronerf.training.schema import check_types
@@ -251,7 +252,7 @@ class TrainConfig:
             ConfigError: For text that is not a configuration, or one of another version; names ``source``.
         """
         try:
-            values = json.loads(text)
+            values = parse_json(text)
             if isinstance(values, dict):
                 values = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
                 paths = {name: values.get(name) for name in PATHS}

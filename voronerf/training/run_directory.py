@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import sys
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from typing import Any
 
 from voronerf.data import Scene
 from voronerf.evaluation.plots import plot_curves
-from voronerf.files import read_json_lines, remove_partial
+from voronerf.files import read_json, read_json_lines, remove_partial
 from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
 
@@ -82,11 +83,12 @@ def stored_config(run: Path) -> TrainConfig | None:
 
     Raises:
         ConfigError: When the file is of another version.
+        ValueError: When it is no JSON.
     """
     path = run / "config.json"
     if not path.is_file():
         return None
-    return replace(TrainConfig.from_json(path.read_text(), str(path)), out=run)
+    return replace(TrainConfig.from_json(json.dumps(read_json(path)), str(path)), out=run)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
