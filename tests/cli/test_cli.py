@@ -1,6 +1,7 @@
 """The command line as a user meets it: commands, files, and one line for everything that can go wrong."""
 
 import itertools
+import json
 import os
 import shutil
 import signal
@@ -182,6 +183,25 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
         "a checkpoint of another configuration: --lr ", "train --data builtin --out", run, "--resume", TINY, "--lr 0.1"
     )
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("\x1b]0;owned\x07", r"\x1b]0;owned\x07"),
+        ("\x9b2Jx", r"\x9b2Jx"),
+        ("a\u202egnp", r"a\u202egnp"),
+        ("\udc80", r"\udc80"),
+        ("x" * 10_000, "xxx ... xxx"),
+        ("é", "é"),
+    ],
+)
+def test_what_files_say_is_shown_and_not_obeyed(tmp_path, capsys, name, shown):
+    frame = {"file_path": name, "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 9, "frames": [frame]}))
+    assert main(["train", "--data", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert shown in said and str(tmp_path) in said and len(said) < 1000 and said[:-1].isprintable()
 
 
 def test_a_failed_run_leaves_its_folder_usable(tmp_path, fails):

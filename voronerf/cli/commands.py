@@ -17,7 +17,7 @@ from rich.progress import track
 from rich.table import Table
 
 from voronerf import backends
-from voronerf.cli.display import TrainingDisplay
+from voronerf.cli.display import TrainingDisplay, printable
 from voronerf.data import Scene, load_scene
 from voronerf.evaluation.panels import write_panels
 from voronerf.evaluation.video import check_video, write_video
@@ -36,8 +36,8 @@ STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "S
 
 
 def say(line: str) -> None:
-    """Prints a line as it is."""
-    console.print(line, highlight=False, markup=False, emoji=False)
+    """Prints a line as it is, but for what a terminal would obey."""
+    console.print(printable(line), highlight=False, markup=False, emoji=False)
 
 
 def train(config: TrainConfig) -> int:
@@ -152,7 +152,7 @@ def evaluate_run(
     result = opened.evaluate(views=views, lpips=perceived or "off")
     table = Table("view", "psnr [dB]", "ssim", "lpips")
     for view in result["views"]:
-        table.add_row(escape(view["name"]), *_figures(view))
+        table.add_row(escape(printable(view["name"])), *_figures(view))
     table.add_section()
     table.add_row("mean", *_figures(result))
     console.print(table)

@@ -12,6 +12,20 @@ from rich.text import Text
 
 from voronerf.training.progress import Progress as TrainingProgress
 
+LONGEST_LINE = 900
+
+
+def printable(text: str) -> str:
+    """Text with escapes for what is no visible character, such as a sequence that a terminal would obey."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def one_line(text: str) -> str:
+    """Printable text as a line of at most `LONGEST_LINE` characters, shortened in its middle."""
+    line = printable(" ".join(text.split()))
+    head, tail = 2 * LONGEST_LINE // 3, LONGEST_LINE // 3 - 5
+    return line if len(line) <= LONGEST_LINE else f"{line[:head]} ... {line[-tail:]}"
+
 
 class _Rate(ProgressColumn):
     """Rays per second, in thousands."""
@@ -44,7 +58,9 @@ class TrainingDisplay:
             disable=not console.is_terminal,
             refresh_per_second=4,
         )
-        self.task = self.progress.add_task(escape(label), total=1.0, step=0, stage="", speed=0.0, loss=0.0, psnr="")
+        self.task = self.progress.add_task(
+            escape(printable(label)), total=1.0, step=0, stage="", speed=0.0, loss=0.0, psnr=""
+        )
         self.loss = math.nan  # until the first is read
 
     def __enter__(self) -> TrainingDisplay:
@@ -71,4 +87,4 @@ class TrainingDisplay:
 
     def on_event(self, line: str) -> None:
         """Prints a line that stays, above the live one."""
-        self.console.print(line, highlight=False, markup=False, emoji=False)
+        self.console.print(printable(line), highlight=False, markup=False, emoji=False)

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from voronerf.backends import BackendUnavailable
 from voronerf.cli import commands, demo
+from voronerf.cli.display import one_line
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
 from voronerf.training.run_directory import stored_config
@@ -62,8 +63,7 @@ def main(args: list[str] | None = None) -> int:
     except EXPECTED as error:
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
-        text = " ".join(str(error).split()) or type(error).__name__
-        print(f"voronerf: error: {text}", file=sys.stderr)
+        print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
         return 1
 
 
@@ -91,7 +91,7 @@ def _train_command(args: list[str]) -> Callable[..., int]:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    Console(stderr=True).print(f"voronerf: {message}", highlight=False, markup=False)
+    Console(stderr=True).print(f"voronerf: {one_line(str(message))}", highlight=False, markup=False)
 
 
 if __name__ == "__main__":
