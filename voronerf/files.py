@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import threading
 from pathlib import Path
@@ -54,6 +55,21 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def json_text(value: Any, *, indent: int | None = None) -> str:
+    """A value as JSON, which has no infinity and no NaN: they become null, and the object that holds them tells which
+    by ``"not_finite": {"psnr": "inf"}``."""
+    return json.dumps(_finite(value), indent=indent, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        odd = {key: str(x) for key, x in value.items() if isinstance(x, float) and not math.isfinite(x)}
+        return {key: _finite(x) for key, x in value.items()} | ({"not_finite": odd} if odd else {})
+    if isinstance(value, (list, tuple)):
+        return [_finite(x) for x in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 #: Bytes of a JSON file; parsed, it takes some twenty times its size. A frame of a capture takes about a kilobyte.
 JSON_LIMIT = 2**25
 
@@ -92,7 +108,7 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     """The objects of a file with one JSON object a line; [] when there is no file.
 
     Raises:
-        ValueError: When a line is not JSON object; names the file and the line.
+        ValueError: When a line is no JSON object; names the file and the line.
     """
     if not path.is_file():
         return []
@@ -102,5 +118,7 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
             value = parse_json(line)
         except ValueError as error:
             raise ValueError(f"{path}: line {number} is not JSON: {error}") from None
+        if not isinstance(value, dict):
+            raise ValueError(f"{path}: line {number} must be an object, got {value!r:.60}")
         values.append(value)
     return values

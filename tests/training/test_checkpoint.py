@@ -132,3 +132,5 @@ def test_text_is_replaced_whole_and_broken_lines_of_json_are_named(tmp_path):
     assert read_json_lines(path) == [{"step": 1}]
     write_text(path, '{"step": 1}\n{"ste')
     refuses("metrics.jsonl: line 2 is not JSON", read_json_lines, path)
+    write_text(path, '{"step": 1}\n[1]\n')
+    refuses("metrics.jsonl: line 2 must be an object, got [1]", read_json_lines, path)

@@ -1,5 +1,6 @@
 """The training loop on a tiny built-in scene: stages, files, resume, ablations, and that it never dies."""
 
+import json
 import math
 import sys
 from dataclasses import replace
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import read_json, same
+from helpers import read_json, refuses, same
 from tiny_runs import small, stopping, tensors
 
 import voronerf.training.trainer as trainer_module
@@ -23,7 +24,7 @@ from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.networks import count_parameters, octaves_for, resolve_config, solve_width
-from voronerf.training.run_directory import choose_directory, held
+from voronerf.training.run_directory import choose_directory, held, write_curve
 from voronerf.training.trainer import Trainer, TrainingError
 
 
@@ -54,6 +55,22 @@ def test_a_run_and_its_directory(tmp_path, scene):
     assert TrainConfig.from_json((tmp_path / "config.json").read_text()) == trainer.config
     assert (tmp_path / "samples" / "level-1.npz").is_file()
     assert len(lines) == 3
+
+
+def test_infinite_scores_are_null_in_files(tmp_path, scene, monkeypatch):
+    monkeypatch.setattr("voronerf.evaluation.scores.psnr", lambda image, truth: torch.tensor(math.inf))
+    config = small(tmp_path)
+    for now in (config, replace(config, steps=26, resume=True)):
+        assert Trainer(now, scene).run()["psnr"] == math.inf
+        for name in ("metrics.jsonl", "summary.json"):
+            text = (tmp_path / name).read_text()
+            for value in [text] if name == "summary.json" else text.splitlines():
+                found = json.loads(value, parse_constant=pytest.fail)
+                assert found["psnr"] is None
+                assert found["not_finite"] == {"psnr": "inf", "psnr_of_mean_error": "inf"}
+        assert write_curve(tmp_path) is None
+    (tmp_path / "metrics.jsonl").write_text('{"step": "x"}')
+    refuses("metrics.jsonl: line 1: step must be an integer, got 'x'", Trainer, replace(config, resume=True), scene)
 
 
 def test_training_learns(tmp_path, scene):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import shlex
 import signal
 from pathlib import Path
@@ -21,7 +20,7 @@ from voronerf.cli.display import TrainingDisplay, printable
 from voronerf.data import Scene, load_scene
 from voronerf.evaluation.panels import write_panels
 from voronerf.evaluation.video import check_video, write_video
-from voronerf.files import write_text
+from voronerf.files import json_text, write_text
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.run import open_run
 from voronerf.training.config import ConfigError, TrainConfig
@@ -157,7 +156,7 @@ def evaluate_run(
     table.add_row("mean", *_figures(result))
     console.print(table)
     say(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB")
-    write_text(run / "eval.json", json.dumps(result, indent=2) + "\n")
+    write_text(run / "eval.json", json_text(result, indent=2) + "\n")
     if panels:
         write_panels(opened.renderer, opened.diagram, opened.scene, run / "images", views=panels)
     say(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""))

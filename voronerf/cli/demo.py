@@ -11,7 +11,7 @@ from voronerf.cli.commands import console, run_training, say
 from voronerf.data import BUILTIN_SIZE, Scene, load_scene
 from voronerf.evaluation.plots import plot_curves
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.run_directory import held, read_metrics
+from voronerf.training.run_directory import held, read_curve
 
 
 def demo(
@@ -64,7 +64,7 @@ def demo(
 
 def _report(out: Path, scene: Scene, results: dict[str, dict[str, Any]]) -> None:
     """Prints the comparison of the two runs and plots their curves."""
-    curves = {name: [(m["seconds"], m["psnr"]) for m in read_metrics(out / name)] for name in results}
+    curves = {name: read_curve(out / name) for name in results}
     splits = {name: [s["started_at_second"] for s in r["stages"][1:]] for name, r in results.items()}
     plot_curves(out / "psnr.png", curves, splits=splits, title="built-in scene, equal training time")
     table = Table("network", "parameters", "steps", "training [s]", "psnr [dB]", "ssim", title="test views")

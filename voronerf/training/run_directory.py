@@ -92,15 +92,30 @@ def stored_config(run: Path) -> TrainConfig | None:
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The evaluations of a run, in order."""
-    return read_json_lines(run / "metrics.jsonl")
+    """The evaluations of a run, in order.
+
+    Raises:
+        ValueError: When a line of the file is none; names the file and the line.
+    """
+    path = run / "metrics.jsonl"
+    metrics = read_json_lines(path)
+    for number, line in enumerate(metrics, 1):
+        if not isinstance(line.get("step"), int):
+            raise ValueError(f"{path}: line {number}: step must be an integer, got {line.get('step')!r:.60}")
+    return metrics
+
+
+def read_curve(run: Path) -> list[tuple[float, float]]:
+    """Training seconds and PSNR of the evaluations of a run, without those whose PSNR is not finite."""
+    points = [(line.get("seconds"), line.get("psnr")) for line in read_metrics(run)]
+    return [(x, y) for x, y in points if isinstance(x, (int, float)) and isinstance(y, (int, float))]
 
 
 def write_curve(run: Path) -> Path | None:
-    """Plots PSNR over training time into ``plots/psnr.png``; returns None if nothing was evaluated."""
-    metrics = read_metrics(run)
-    if not metrics:
+    """Plots PSNR over training time into ``plots/psnr.png``; returns None if there is nothing to plot."""
+    points = read_curve(run)
+    if not points:
         return None
     path = run / "plots" / "psnr.png"
-    plot_curves(path, {run.name: [(m["seconds"], m["psnr"]) for m in metrics]})
+    plot_curves(path, {run.name: points})
     return path

@@ -5,7 +5,6 @@ Time means training time: steps and splits count, evaluations and checkpoints do
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from voronerf.data import Scene
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import evaluate, mean_scores
-from voronerf.files import read_json_lines, write_text
+from voronerf.files import json_text, write_text
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
@@ -33,6 +32,7 @@ from voronerf.training.occupancy import make_grid, observe_samples, revisit_cell
 from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.renderers import make_renderer
 from voronerf.training.resume import resume_training, resumed_checkpoint, training_state
+from voronerf.training.run_directory import read_metrics
 from voronerf.training.splitting import median, save_samples, split_by_samples
 
 #: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
@@ -219,7 +219,7 @@ class Trainer:
                 self._read(loss)
             if self.on_step is not None:
                 speed = self.step * self.config.rays / max(self.seconds, 1e-9)
-                psnr = self.metrics[-1]["psnr"] if self.metrics else None
+                psnr = self.metrics[-1].get("psnr") if self.metrics else None
                 self.on_step(
                     Progress(self.step, self.seconds, self.fraction, self.loss, speed, self.router.num_cells, psnr)
                 )
@@ -355,7 +355,7 @@ class Trainer:
             **mean_scores(scores),
         }
         self.metrics = [m for m in self.metrics if m["step"] < self.step] + [now]
-        write_text(self.out / "metrics.jsonl", "".join(json.dumps(m) + "\n" for m in self.metrics))
+        write_text(self.out / "metrics.jsonl", "".join(json_text(m) + "\n" for m in self.metrics))
         self._say(
             f"{self.seconds:7.1f} s  step {self.step:6d}  {self.router.num_cells:4d} cells  "
             f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
@@ -363,7 +363,7 @@ class Trainer:
 
     def _summarise(self) -> dict[str, Any]:
         summary = {
-            **{key: self.metrics[-1][key] if self.metrics else None for key in FIGURES},
+            **{key: self.metrics[-1].get(key) if self.metrics else None for key in FIGURES},
             "complete": self.fraction >= 1 and not self.stopped,
             "seconds": self.seconds,
             "steps": self.step,
@@ -374,7 +374,7 @@ class Trainer:
             "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
         }
-        write_text(self.out / "summary.json", json.dumps(summary, indent=2) + "\n")
+        write_text(self.out / "summary.json", json_text(summary, indent=2) + "\n")
         return summary
 
     def save(self, *, wait: bool = True) -> None:
@@ -389,7 +389,7 @@ class Trainer:
         resume_training(self, checkpoint)
         self.evaluated = min(self.evaluated, self._due())  # fewer where the run was made longer
         # Evaluations made after the checkpoint will be made again.
-        self.metrics = [m for m in read_json_lines(self.out / "metrics.jsonl") if m["step"] <= self.step]
+        self.metrics = [m for m in read_metrics(self.out) if m["step"] <= self.step]
 
     def _say(self, line: str) -> None:
         if self.on_event is not None:
