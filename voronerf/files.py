@@ -44,6 +44,11 @@ def rename(old: Path, new: Path) -> None:
             os.close(folder)
 
 
+def leads_outside(path: Path, folder: Path) -> bool:
+    """Whether a path leaves a folder, as it is written (``..``, another root) or through a link."""
+    return any(not Path(of(path)).is_relative_to(of(folder)) for of in (os.path.abspath, os.path.realpath))
+
+
 def remove_partial(folder: Path) -> None:
     """Removes what processes that died left of files that they wrote below a folder."""
     for partial in folder.rglob(".*.partial"):

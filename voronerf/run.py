@@ -112,6 +112,7 @@ def open_run(
     scene: Scene | None = None,
     data: str | None = None,
     downscale: int | None = None,
+    allow_outside: bool = False,
     samples: int | None = None,
     fine_samples: int | None = None,
     occupancy: bool = False,
@@ -126,6 +127,7 @@ def open_run(
         scene: The scene, if it is loaded already.
         data: Scene folder, if it has moved since training.
         downscale: Factor on the images; None for that of the training.
+        allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray in the first pass; None for those of the training.
         fine_samples: Samples per ray in the second pass; None for those of the training.
         occupancy: Skip empty space, found by evaluating the field once. A run trained with occupancy always uses its
@@ -178,7 +180,7 @@ def open_run(
         data=config.data if data is None else data,
         downscale=config.downscale if downscale is None else downscale,
     )
-    scene = load_scene(config.data, downscale=config.downscale) if scene is None else scene
+    scene = load_scene(config.data, downscale=config.downscale, allow_outside=allow_outside) if scene is None else scene
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     state = checkpoint.group("occupancy")
     if state:

@@ -224,3 +224,30 @@ def test_blender(tmp_path):
         for name in ("train", "test"):
             (tmp_path / f"transforms_{name}.json").write_text(json.dumps(contents | entries))
         fails(tmp_path, reason)
+
+
+@pytest.mark.parametrize("kind", ["above", "absolute", "link", "linked folder", "suffix", "backslash"])
+def test_images_outside_of_the_folder(tmp_path, kind):
+    scene, elsewhere = tmp_path / "scene", tmp_path / "elsewhere"
+    write_noise(scene)
+    elsewhere.mkdir()
+    (scene / "1.png").rename(elsewhere / "1.png")
+    if kind == "link":
+        (scene / "1.png").symlink_to(elsewhere / "1.png")
+    elif kind == "linked folder":
+        (scene / "images").symlink_to(elsewhere)
+    elif kind == "suffix":
+        (scene / "1.png.JPG").symlink_to(elsewhere / "1.png")
+    named = {"above": "a/../../elsewhere/1.png", "absolute": str(elsewhere / "1.png"), "linked folder": "images/1.png"}
+    named["backslash"] = "..\\elsewhere\\1.png"
+    name = named.get(kind, "1.png")
+    (scene / "a").mkdir()
+    rewrite(scene, lambda contents: contents["frames"][1].update(file_path=name))
+    fails(scene, f"transforms.json: frame 1 ({name}): file_path must lead to a file in the folder of the scene")
+    assert len(load_scene(scene, allow_outside=True).train.names) == 2
+    (tmp_path / "link").symlink_to(scene)  # how the folder itself is named does not matter
+    (scene / "1.png.JPG").unlink(missing_ok=True)
+    (scene / "1.png").unlink(missing_ok=True)
+    (elsewhere / "1.png").rename(scene / "1.png")
+    rewrite(scene, lambda contents: contents["frames"][1].update(file_path="1.png"))
+    load_scene(tmp_path / "link")

@@ -45,7 +45,7 @@ def train(config: TrainConfig) -> int:
     With --resume, options that are not given keep their value from the run in --out.
     """
     check_device(config.device)
-    scene = load_scene(config.data, downscale=config.downscale)
+    scene = load_scene(config.data, downscale=config.downscale, allow_outside=config.allow_outside)
     summary = run_training(choose_directory(config, scene), scene)
     return 0 if summary["complete"] else 130
 
@@ -103,6 +103,7 @@ def evaluate_run(
     /,
     data: str | None = None,
     downscale: int | None = None,
+    allow_outside: bool = False,
     views: int | None = None,
     panels: int = 4,
     samples: int | None = None,
@@ -119,6 +120,7 @@ def evaluate_run(
         run: The run directory.
         data: Scene folder, if it has moved since training.
         downscale: Factor on the images; default as in training.
+        allow_outside: Also read images that lie outside of the scene folder.
         views: Number of test views, evenly spread; default all.
         panels: Number of views drawn.
         samples: Samples per ray in the first pass; default as in training.
@@ -138,6 +140,7 @@ def evaluate_run(
         run,
         data=data,
         downscale=downscale,
+        allow_outside=allow_outside,
         samples=samples,
         fine_samples=fine_samples,
         occupancy=occupancy,
@@ -171,6 +174,7 @@ def render(
     fps: int = 24,
     data: str | None = None,
     downscale: int | None = None,
+    allow_outside: bool = False,
     samples: int | None = None,
     fine_samples: int | None = None,
     occupancy: bool = False,
@@ -187,6 +191,7 @@ def render(
         fps: Frames per second.
         data: Scene folder, if it has moved since training.
         downscale: Factor on the images, which decides the video's size; default as in training.
+        allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray in the first pass; default as in training.
         fine_samples: Samples per ray in the second pass; default as in training.
         occupancy: Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses
@@ -200,6 +205,7 @@ def render(
         run,
         data=data,
         downscale=downscale,
+        allow_outside=allow_outside,
         samples=samples,
         fine_samples=fine_samples,
         occupancy=occupancy,

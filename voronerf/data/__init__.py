@@ -15,13 +15,15 @@ BUILTIN_SIZE = 100
 BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene, "builtin-translucent": translucent_scene}
 
 
-def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
+def load_scene(source: str | Path, *, downscale: int = 1, allow_outside: bool = False) -> Scene:
     """Loads a scene.
 
     Args:
         source: "builtin", "builtin-rich" or "builtin-translucent", or a folder with `transforms_train.json` (Blender
             synthetic) or `transforms.json` (capture).
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it.
+        allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
+            or a link.
 
     Raises:
         SceneError: the data cannot be used; one line that names the file and what is wrong with it.
@@ -42,9 +44,9 @@ def load_scene(source: str | Path, *, downscale: int = 1) -> Scene:
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")
     if (folder / "transforms_train.json").is_file():
-        return load_blender(folder, downscale)
+        return load_blender(folder, downscale, allow_outside)
     if (folder / "transforms.json").is_file():
-        return load_capture(folder, downscale)
+        return load_capture(folder, downscale, allow_outside)
     if not folder.is_dir():
         raise SceneError(f"{folder}: is not a folder")
     raise SceneError(f"{folder}: is not a scene, it has neither transforms_train.json (Blender) nor transforms.json")

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 NEAR, FAR = 2.0, 6.0
 
 
-def load_blender(folder: Path, downscale: int) -> Scene:
+def load_blender(folder: Path, downscale: int, allow_outside: bool = False) -> Scene:
     """Loads a Blender synthetic scene.
 
     The test views are those of `transforms_test.json`, or of `transforms_val.json` if the former is missing. Entries
@@ -33,6 +33,7 @@ def load_blender(folder: Path, downscale: int) -> Scene:
     Args:
         folder: holds `transforms_train.json`.
         downscale: factor by which images are reduced, averaging areas of the composited image.
+        allow_outside: also read images that lie outside of the folder.
 
     Returns:
         The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
@@ -48,8 +49,8 @@ def load_blender(folder: Path, downscale: int) -> Scene:
         raise SceneError(
             f"{folder}: has transforms_train.json but neither transforms_test.json nor transforms_val.json"
         )
-    entries, train_frames = read_transforms(train_file)
-    test_entries, test_frames = read_transforms(test_file)
+    entries, train_frames = read_transforms(train_file, allow_outside)
+    test_entries, test_frames = read_transforms(test_file, allow_outside)
 
     if has_lens(entries, train_frames) or has_lens(test_entries, test_frames):
         files = ((train_file, entries, train_frames), (test_file, test_entries, test_frames))

@@ -36,7 +36,7 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's d
 UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 
 
-def load_capture(folder: Path, downscale: int) -> Scene:
+def load_capture(folder: Path, downscale: int, allow_outside: bool = False) -> Scene:
     """Loads a capture; every 8th image in the order of their names is held out for testing.
 
     Where the file has nerfstudio's `train_filenames`, `test_filenames` or `val_filenames`, they decide instead.
@@ -50,12 +50,13 @@ def load_capture(folder: Path, downscale: int) -> Scene:
     Args:
         folder: holds `transforms.json`.
         downscale: factor by which images are reduced.
+        allow_outside: also read images that lie outside of the folder.
 
     Raises:
         SceneError: the file is broken, its lens model is not supported, or it has fewer than two images.
     """
     path = folder / "transforms.json"
-    entries, frames = read_transforms(path)
+    entries, frames = read_transforms(path, allow_outside)
     frames = sorted(frames, key=lambda frame: frame.path.as_posix())
     if len(frames) < 2:
         raise SceneError(f"{path}: one image is too few, one is held out for testing")

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from voronerf.data.scene import SceneError
-from voronerf.files import read_json
+from voronerf.files import leads_outside, read_json
 
 log = logging.getLogger(__name__)
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 ORTHONORMAL = 2e-3
 #: Of numbers and, where they are positive, its inverse the smallest; far from where float32 ends, even squared.
 LARGEST = 1e9
@@ -35,7 +35,7 @@ class Frame:
     entries: dict[str, Any]
 
 
-def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
+def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[Frame]]:
     """Reads a transforms file and finds its images.
 
     Images that are listed but missing are left out, with one line in the log (logger `voronerf.data.transforms`, level
@@ -43,12 +43,14 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
 
     Args:
         path: the JSON file.
+        allow_outside: also take images that lie outside of its folder.
 
     Returns:
         (the file's top-level entries, the frames whose image exists, in the file's order).
 
     Raises:
-        SceneError: the file does not parse, has no frames, no image of any frame exists, or a matrix is not a pose.
+        SceneError: the file does not parse, has no frames, no image of any frame exists, one lies outside of the
+            folder, or a matrix is not a pose.
     """
     try:
         entries = read_json(path)
@@ -71,7 +73,7 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[Frame]]:
                 "mask_path of its frames the scene can be loaded"
             )
         pose = _pose(frame.get("transform_matrix"), f"{path}: frame {position} ({name})")
-        image = _image_path(path.parent, name)
+        image = _find_image(path.parent, name, allow_outside, f"{path}: frame {position} ({name})")
         if image is not None:
             found.append(Frame(image, pose, frame))
     if not found:
@@ -150,14 +152,18 @@ def distinct_names(paths: list[Path], folder: Path) -> list[str]:
     return names
 
 
-def _image_path(folder: Path, name: str) -> Path | None:
+def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Path | None:
     """Finds an image file; Blender's files leave out the suffix, and files from Windows may have its separators."""
-    path = folder / name
-    if path.is_file():
-        return path
-    named = (path.with_name(path.name + suffix) for suffix in SUFFIXES if path.name)
-    found = next((candidate for candidate in named if candidate.is_file()), None)
-    return _image_path(folder, name.replace("\\", "/")) if found is None and "\\" in name else found
+    for spelt in dict.fromkeys((name, name.replace("\\", "/"))):
+        for suffix in SUFFIXES:
+            path = Path(f"{folder / spelt}{suffix}")
+            if not allow_outside and leads_outside(path, folder):
+                raise SceneError(
+                    f"{where}: file_path must lead to a file in the folder of the scene; --allow-outside reads others"
+                )
+            if os.path.isfile(path):
+                return path
+    return None
 
 
 def _pose(matrix: object, where: str) -> Tensor:

@@ -35,6 +35,8 @@ class TrainConfig:
     of solids, or "builtin-translucent" with fog and glass."""
     downscale: int = 1
     """Factor by which the images are made smaller when they are loaded."""
+    allow_outside: bool = False
+    """Also read images that lie outside of the scene folder, which it may name by .., an absolute path or a link."""
     out: Path | None = None
     """Run directory, which must not hold a run unless --resume is given; default: runs/SCENE, or the first free
     runs/SCENE-N."""
@@ -275,6 +277,7 @@ PATHS = ("out", "lpips")
 RESUMABLE = frozenset(
     {
         "data",
+        "allow_outside",
         "out",
         "resume",
         "device",

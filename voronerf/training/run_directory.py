@@ -81,6 +81,8 @@ def held(folder: Path) -> Iterator[None]:
 def stored_config(run: Path) -> TrainConfig | None:
     """The settings of the run in a directory, for its continuation; None if it holds no run.
 
+    ``allow_outside`` is not among them: whoever made the run may be another than who continues it.
+
     Raises:
         ConfigError: When the file is of another version.
         ValueError: When it is no JSON.
@@ -88,7 +90,7 @@ def stored_config(run: Path) -> TrainConfig | None:
     path = run / "config.json"
     if not path.is_file():
         return None
-    return replace(TrainConfig.from_json(json.dumps(read_json(path)), str(path)), out=run)
+    return replace(TrainConfig.from_json(json.dumps(read_json(path)), str(path)), out=run, allow_outside=False)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
