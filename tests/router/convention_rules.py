@@ -108,18 +108,6 @@ def two_layers() -> nn.Module:
     return nn.Sequential(nn.Linear(3, 6), nn.ReLU(), nn.Linear(6, 2))
 
 
-class Listed(nn.Module):
-    """Parameters in plain containers, which are registered elsewhere."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc = nn.Linear(7, 4)
-        self.weights, self.unregistered = [self.fc.weight, {"bias": self.fc.bias}], [1]
-
-    def forward(self, x: Tensor) -> Tensor:
-        return F.linear(x, self.weights[0], self.weights[1]["bias"])
-
-
 class Scales(nn.Module):
     """A function of the caller's own."""
 
@@ -153,7 +141,6 @@ RULES = [
     Case("planes", Planes, one(3)),
     Case("shared", Encoded, one(3), options=SHARED),
     Case("shared first layer", two_layers, one(3), options={"coords": "first3", "share": ["0.*"]}, fuses=True),
-    Case("listed", Listed, fuses=True),
     Case("a rule of one's own", lambda: Scales(scale_rows)),
     *(
         Case(f"step {i}", lambda step=step: Odd(step), one(3), way="cell by cell" if i in BY_CELL else "grouped")

@@ -46,20 +46,6 @@ def test_look_ups_give_what_one_module_for_each_cell_gives(make: Callable[[], nn
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.filterwarnings("error")
-def test_planes_run_cell_by_cell_where_cells_have_many_samples() -> None:
-    router = _router(Planes(), 3)
-    few, many = torch.rand(300, 3) * 2 - 1, torch.rand(600, 3) * 2 - 1
-    router(few)
-    assert "cell by cell" not in router.explain()
-    found = router(many)
-    assert "cell by cell: it reads planes" in router.explain() and "grouped" in router.explain()
-    torch.testing.assert_close(found, _loop(router, many)[0])
-    one = _router(Planes(), 1)
-    one(many)
-    assert "cell by cell" not in one.explain()
-
-
 def test_indices_outside_of_a_table_are_refused() -> None:
     router = _router(Corners(), 3)
     x = torch.rand(40, 3)

@@ -310,12 +310,11 @@ def test_decisions_are_those_of_each_cell_or_refused(generator: torch.Generator,
 
 def test_modules_that_cannot_be_cells_are_refused() -> None:
     listed = nn.Linear(3, 2)
-    listed.extra = [nn.Parameter(torch.zeros(2))]
+    listed.extra = [{"bias": listed.bias}]
     for module, says in (
         (nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4)), "`1`, a BatchNorm1d, mixes the samples of a batch"),
         (nn.Sequential(nn.Linear(3, 4), nn.SyncBatchNorm(4)), "`1`, a SyncBatchNorm, mixes the samples of a batch"),
         (nn.LSTM(3, 4), "a LSTM is recurrent"),
-        (nn.LazyLinear(4), "has no sizes yet"),
         (nn.utils.parametrizations.spectral_norm(nn.Linear(3, 4)), "keeps a state for each weight"),
         (listed, "keeps parameters in the plain list `extra`"),
     ):

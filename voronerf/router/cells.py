@@ -1,38 +1,240 @@
 """A module for each cell: stacked parameters, cells taken out and put in, splits, states of any number of cells.
 
-Parameters stay the same objects when cells are split or loaded, and get another shape, [k, ...]. The state that an
-optimiser has for them must have that shape too: it follows, or the optimiser says at its next step what to write.
+k cells; ``[k, ...]`` under the module's own names. Parameters stay the same objects when cells are split or loaded, and
+get another shape. The state that an optimiser has for them must have that shape too: it follows, or the optimiser says
+at its next step what to write.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import fnmatch
 import warnings
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrizations
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
-from voronerf.router.parameters import (
-    cell_parameters,
-    clone_module,
-    detach_results,
-    draw_parameters,
-    fill_cell,
-    inherit_parameters,
-    stack_parameters,
-    take_cell,
-)
+from voronerf.router.layout import tensors_of
 
 _OP = "VoronoiRouter"
-_ELEMENTWISE = "Adam AdamW RAdam NAdam Adamax SGD RMSprop Adagrad Adadelta Rprop ASGD"
-_ELEMENTWISE_OPTIMIZERS = tuple(getattr(torch.optim, name) for name in _ELEMENTWISE.split())
-"""Optimisers whose state is of the parameter's shape, entry by entry, or a number."""
+_SHARED = "_voronerf_shared"  # where a part of a routed module keeps the names of parameters that all cells share
+
+
+# Parameters -----------------------------------------------------------------------------------------------------------
+
+
+def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parameter]]:
+    """(owner, name, parameter) of every parameter of a module tree; one that is used twice comes twice."""
+    return [
+        (owner, name, parameter)
+        for owner in module.modules()
+        for name, parameter in list(owner._parameters.items())
+        if parameter is not None
+    ]
+
+
+def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
+    """The parameters that are stacked, [k, ...]; not those that all cells share."""
+    owned = [parameter for owner, name, parameter in owned_parameters(module) if not is_shared(owner, name)]
+    return list({id(parameter): parameter for parameter in owned}.values())
+
+
+def is_shared(owner: nn.Module, name: str) -> bool:
+    """Whether a parameter is one for all cells."""
+    return name in vars(owner).get(_SHARED, ())
+
+
+def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
+    """A deep copy, also of a module that keeps results of its last call (which torch refuses to copy)."""
+    memo = {} if memo is None else memo
+    detach_results(module, memo)
+    return copy.deepcopy(module, memo)
+
+
+def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
+    """Has ``copy.deepcopy`` take copies without a graph of the results that a module keeps."""
+    for part in module.modules():
+        for value in vars(part).values():
+            if isinstance(value, Tensor) and not value.is_leaf:
+                memo[id(value)] = value.detach().clone()
+
+
+def check_module(module: nn.Module) -> None:
+    """Refuses modules that cannot be one network for each cell.
+
+    Raises:
+        TypeError: For anything but a module, for layers that mix samples or keep a state of their own for each weight,
+            and for parameters in plain containers.
+    """
+    if not isinstance(module, nn.Module):
+        raise TypeError(f"{_OP}: module must be an nn.Module, got {type(module).__name__}")
+    for name, part in module.named_modules():
+        reason = _refusal(part)
+        if reason:
+            where = f"`{name}`, a {type(part).__name__}," if name else f"a {type(part).__name__}"
+            raise TypeError(f"{_OP}: module must treat samples one by one, but {where} {reason}")
+
+
+def _refusal(part: nn.Module) -> str:
+    if isinstance(part, nn.modules.batchnorm._BatchNorm):
+        return "mixes the samples of a batch (use LayerNorm or GroupNorm)"
+    if isinstance(part, nn.modules.instancenorm._InstanceNorm) and part.track_running_stats:
+        return "keeps statistics of the samples of a batch (set track_running_stats=False)"
+    if isinstance(part, nn.RNNBase):
+        return "is recurrent, with weights that cannot be one set for each cell"
+    hooks = part._forward_pre_hooks.values()
+    if isinstance(part, parametrizations._SpectralNorm) or any(type(hook).__name__ == "SpectralNorm" for hook in hooks):
+        return "keeps a state for each weight (spectral norm) that cells cannot share"
+    for name, value in vars(part).items():
+        plain = isinstance(value, (list, tuple, dict)) and name != "_parameters"
+        if plain and any(isinstance(item, nn.Parameter) for item in tensors_of(value)):
+            return f"keeps parameters in the plain {type(value).__name__} `{name}` (use nn.ParameterList)"
+    return ""
+
+
+def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
+    """Gives every parameter of a module k equal entries, in place, but for those that the patterns ``share`` name.
+
+    Raises:
+        ValueError: For a pattern that no parameter has.
+    """
+    named = list(module.named_parameters(remove_duplicate=False))
+    for pattern in share:
+        if not any(fnmatch.fnmatchcase(name, pattern) for name, _ in named):
+            raise ValueError(
+                f"{_OP}: share must name parameters of {type(module).__name__}, such as "
+                f"{', '.join(name for name, _ in named[:3])}, got {pattern!r}"
+            )
+    shared = {id(p) for name, p in named if any(fnmatch.fnmatchcase(name, pattern) for pattern in share)}
+    stacked: dict[int, nn.Parameter] = {}
+    for owner, name, parameter in owned_parameters(module):
+        if id(parameter) in shared:
+            vars(owner)[_SHARED] = (*vars(owner).get(_SHARED, ()), name)
+            continue
+        if id(parameter) not in stacked:
+            values = parameter.detach().expand(k, *parameter.shape).clone()
+            stacked[id(parameter)] = nn.Parameter(values, requires_grad=parameter.requires_grad)
+        owner.register_parameter(name, stacked[id(parameter)])
+
+
+def take_cell(module: nn.Module, index: int) -> nn.Module:
+    """A plain copy of one cell's module."""
+    plain: nn.Module = clone_module(
+        module, {id(p): nn.Parameter(p.detach()[index].clone(), p.requires_grad) for p in cell_parameters(module)}
+    )
+    for part in plain.modules():
+        vars(part).pop(_SHARED, None)
+    return plain
+
+
+@torch.no_grad()
+def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None:
+    """Puts a plain module's parameters into one cell.
+
+    Raises:
+        ValueError: Names, shapes or buffers that are not those of the routed module.
+    """
+    ours, theirs = dict(routed.named_parameters()), dict(module.named_parameters())
+    if ours.keys() != theirs.keys():
+        odd = sorted(ours.keys() ^ theirs.keys())
+        raise ValueError(f"{op}: module must have the parameters of the routed one, got a difference in {odd[0]!r}")
+    stacked = {id(parameter) for parameter in cell_parameters(routed)}
+    for name, parameter in theirs.items():
+        own = id(ours[name]) in stacked
+        shape = ours[name].shape[1:] if own else ours[name].shape
+        if parameter.shape != shape:
+            raise ValueError(f"{op}: module's {name} must have shape {list(shape)}, got {list(parameter.shape)}")
+        if not own and not torch.equal(parameter.to(ours[name]), ours[name]):
+            raise ValueError(f"{op}: module's {name} must be that of the routed one, since cells share it")
+    buffers = dict(module.named_buffers())
+    for name, buffer in routed.named_buffers():
+        if name not in buffers or not torch.equal(buffers[name].to(buffer.device), buffer):
+            raise ValueError(f"{op}: module's buffer {name} must be that of the routed one, since cells share buffers")
+    for name, parameter in theirs.items():
+        if id(ours[name]) in stacked:
+            ours[name][index] = parameter.to(ours[name])
+
+
+@contextlib.contextmanager
+def in_place_of_parameters(module: nn.Module, values: Mapping[int, Any]) -> Iterator[None]:
+    """Lets a module find other tensors where its parameters are; ``values`` by the id of the parameter."""
+    owned = [one for one in owned_parameters(module) if id(one[2]) in values]
+    # Hooks such as that of torch.nn.utils.weight_norm leave tensors made of parameters behind.
+    attributes = [(part, dict(vars(part))) for part in module.modules() if part._forward_pre_hooks]
+    for owner, name, parameter in owned:
+        owner._parameters[name] = values[id(parameter)]
+    try:
+        yield
+    finally:
+        for owner, name, parameter in owned:
+            owner._parameters[name] = parameter
+        for owner, before in attributes:
+            for name, value in list(vars(owner).items()):
+                if isinstance(value, Tensor) and value is not before.get(name):
+                    vars(owner)[name] = before.get(name)
+
+
+@torch.no_grad()
+def _inherit_parameters(module: nn.Module, parents: Tensor, fresh: dict[str, Tensor] | None, new: Tensor) -> None:
+    """Replaces the values of k cells by those of their children; the parameter objects stay.
+
+    Args:
+        module: With stacked parameters, changed in place.
+        parents: int64 [children], the cell that each child comes from.
+        fresh: By name, values [children, ...] for the cells that ``new`` names, or None.
+        new: bool [children].
+    """
+    stacked = {id(parameter) for parameter in cell_parameters(module)}
+    for name, parameter in module.named_parameters():
+        if id(parameter) not in stacked:
+            continue
+        with torch.inference_mode(False):
+            values = parameter.detach()[parents.to(parameter.device)]
+            if fresh is not None:
+                values[new.to(values.device)] = fresh[name][new].to(values)
+            # A graph of an earlier call that is still held remembers the old shape of the parameter, and would have the
+            # gradients of the new cells summed to it. With another dtype in between torch forgets it.
+            if values.is_floating_point():
+                other = torch.float32 if values.dtype == torch.float64 else torch.float64
+                parameter.data = values.new_empty(0, dtype=other)
+            parameter.data, parameter.grad = values, None
+
+
+def _draw_parameters(template: nn.Module, k: int, generator: torch.Generator | None) -> dict[str, Tensor]:
+    """Newly drawn parameters [k, ...] of a plain module, by name.
+
+    Raises:
+        ValueError: When the module has parameters, but no ``reset_parameters()`` in itself or its layers.
+    """
+    parts = {"": template} if hasattr(template, "reset_parameters") else dict(template.named_modules())
+    resets = [part for part in parts.values() if hasattr(part, "reset_parameters")]
+    for name, part in parts.items():
+        if part not in resets and any(parameter is not None for parameter in part._parameters.values()):
+            raise ValueError(
+                f"{_OP}.subdivide: inherit=False needs a field with reset_parameters(), or layers that have it; "
+                f"`{name}`, a {type(part).__name__}, has not"
+            )
+    drawn = []
+    # Of GPUs as well, which manual_seed reaches. Without a generator torch's own goes on.
+    with torch.random.fork_rng() if generator is not None else contextlib.nullcontext():
+        if generator is not None:
+            torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device=generator.device)))
+        for _ in range(k):
+            for part in resets:
+                part.reset_parameters()  # type: ignore[operator]
+            drawn.append({name: p.detach().clone() for name, p in template.named_parameters()})
+    return {name: torch.stack([values[name] for values in drawn]) for name in drawn[0]}
+
+
+# Cells ----------------------------------------------------------------------------------------------------------------
 
 
 class CellModules(nn.Module):
@@ -146,23 +348,37 @@ class CellModules(nn.Module):
         )
         # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
         new = torch.bincount(parents, minlength=self.num_cells)[parents] > 1
-        fresh = None if inherit else draw_parameters(self.cell(0), diagram.num_cells, self.generator)
+        fresh = None if inherit else _draw_parameters(self.cell(0), diagram.num_cells, self.generator)
         if optimizer is not None:
-            check_optimizer(optimizer, self.module)
+            _check_optimizer(optimizer, self.module, "subdivide")
         before = self.num_cells
-        inherit_parameters(self.module, parents, fresh, new)
+        _inherit_parameters(self.module, parents, fresh, new)
         self.diagram = copy.deepcopy(diagram).to(self.diagram.centres.device)
         self._forget_assignments()
         if optimizer is not None:
-            move_state(optimizer, self.module, parents, before, None if inherit else new)
+            _move_state(optimizer, self.module, parents, before, None if inherit else new)
         else:
             self._watch_optimizers("router.subdivide(..., optimizer=optimizer)")
         return parents
 
     def _watch_optimizers(self, line: str) -> None:
+        """Raises at the next step of an optimiser that holds state of other cells, and says which ``line`` to write."""
         if self._watch is not None:
             self._watch.remove()
-        self._watch = watch_optimizers(self.module, line)
+        watched = {id(parameter): weakref.ref(parameter) for parameter in cell_parameters(self.module)}
+
+        def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+            held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched]
+            if any(watched[id(parameter)]() is parameter and _is_stale(optimizer, parameter) for parameter in held):
+                raise ValueError(
+                    f"{_OP}: optimizer ({type(optimizer).__name__}) holds the state of other cells than the router "
+                    f"has; write {line}, or make the optimizer afterwards"
+                )
+            if held:
+                watched.clear()  # torch does not let a hook remove itself
+
+        self._watch = register_optimizer_step_pre_hook(check)
+        weakref.finalize(self.module, self._watch.remove)
 
     def load_state_dict(
         self,
@@ -189,10 +405,10 @@ class CellModules(nn.Module):
             ValueError: When the optimiser holds none of the router's parameters.
         """
         if optimizer is not None:
-            check_optimizer(optimizer, self.module, "load_state_dict")
+            _check_optimizer(optimizer, self.module, "load_state_dict")
         result = super().load_state_dict(state_dict, strict, assign)
         if optimizer is not None:
-            drop_state(optimizer)
+            _drop_state(optimizer)
         return result
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
@@ -218,17 +434,20 @@ class CellModules(nn.Module):
         return copied
 
 
-def check_optimizer(optimizer: torch.optim.Optimizer, module: nn.Module, method: str = "subdivide") -> None:
+# Optimisers -----------------------------------------------------------------------------------------------------------
+
+
+def _check_optimizer(optimizer: torch.optim.Optimizer, module: nn.Module, method: str) -> None:
     """Raises ValueError for an optimiser that holds none of a module's parameters."""
     ours = {id(parameter) for parameter in module.parameters()}
     if ours and not any(id(parameter) in ours for group in optimizer.param_groups for parameter in group["params"]):
         raise ValueError(f"{_OP}.{method}: optimizer must hold the router's parameters, got one of others")
 
 
-def move_state(
+def _move_state(
     optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
 ) -> None:
-    """Gives every cell the state that an optimiser has for its parent; other optimisers begin anew, which is said.
+    """Gives every cell the state that an optimiser has for its parent; a state that is not of cells begins anew.
 
     Args:
         optimizer: Of a module whose parameters are those of the new cells already.
@@ -237,28 +456,25 @@ def move_state(
         k: Cells before.
         fresh: bool [new cells], whose state is zero instead, or None.
     """
-    known, lost = isinstance(optimizer, _ELEMENTWISE_OPTIMIZERS), False
-    for parameter in {id(p): p for _, _, p in cell_parameters(module)}.values():
+    lost = False
+    for parameter in cell_parameters(module):
         old, state = (k, *parameter.shape[1:]), optimizer.state.get(parameter, {})
-        lost = lost or (bool(state) and not known)
+        if any(isinstance(v, list) or (isinstance(v, Tensor) and v.dim() and v.shape != old) for v in state.values()):
+            lost = True
         for key, value in state.items():
-            if isinstance(value, Tensor) and value.shape == old and known:
+            if isinstance(value, Tensor) and value.shape == old:
                 state[key] = value[parents.to(value.device)]
                 if fresh is not None:
                     state[key][fresh.to(value.device)] = 0
-    if not known:
-        # Some keep what is not a parameter's own, such as the last flattened gradient; nothing of it fits any more.
-        optimizer.state.clear()
-        if isinstance(optimizer, torch.optim.LBFGS):
-            optimizer._numel_cache = None  # the number of entries of all parameters together
     if lost:
-        name = type(optimizer).__name__
+        _begin_anew(optimizer)
         warnings.warn(
-            f"{_OP}.subdivide: the state of {name} cannot be inherited by cells and begins anew", stacklevel=4
+            f"{_OP}.subdivide: the state of {type(optimizer).__name__} cannot be inherited by cells and begins anew",
+            stacklevel=4,
         )
 
 
-def drop_state(optimizer: torch.optim.Optimizer) -> None:
+def _drop_state(optimizer: torch.optim.Optimizer) -> None:
     """Lets an optimiser begin anew where its state has the shapes of other cells than the parameters have."""
     for group in optimizer.param_groups:
         for parameter in group["params"]:
@@ -268,32 +484,15 @@ def drop_state(optimizer: torch.optim.Optimizer) -> None:
                     total = torch.full_like(parameter, group["initial_accumulator_value"])
                     optimizer.state[parameter].update(step=torch.tensor(0.0), sum=total)
     if isinstance(optimizer, torch.optim.LBFGS):
-        optimizer.state.clear()
-        optimizer._numel_cache = None
+        _begin_anew(optimizer)
+
+
+def _begin_anew(optimizer: torch.optim.Optimizer) -> None:
+    optimizer.state.clear()
+    if isinstance(optimizer, torch.optim.LBFGS):
+        optimizer._numel_cache = None  # the number of entries of all parameters together
 
 
 def _is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
     state = optimizer.state.get(parameter, {})
     return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())
-
-
-def watch_optimizers(module: nn.Module, line: str) -> Any:
-    """Raises at the next step of an optimiser that holds state of other cells than a module's parameters have.
-
-    The error says which ``line`` to write, so that the optimiser follows. ``remove()`` of the handle ends the watch.
-    """
-    watched = {id(parameter): weakref.ref(parameter) for _, _, parameter in cell_parameters(module)}
-
-    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched] if watched else []
-        if any(watched[id(parameter)]() is parameter and _is_stale(optimizer, parameter) for parameter in held):
-            raise ValueError(
-                f"{_OP}: optimizer ({type(optimizer).__name__}) holds the state of other cells than the router has; "
-                f"write {line}, or make the optimizer afterwards"
-            )
-        if held:
-            watched.clear()  # torch does not let a hook remove itself
-
-    handle = register_optimizer_step_pre_hook(check)
-    weakref.finalize(module, handle.remove)
-    return handle

@@ -24,12 +24,10 @@ from voronerf.backends import BackendUnavailable
 from voronerf.diagram.blending import Mixture
 from voronerf.layers import MLP
 from voronerf.router import rules  # noqa: F401  registers the rules
-from voronerf.router.admission import Choice, Trial, admitted, flattened
-from voronerf.router.grouped import Ungroupable, is_inside
-from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import Call
-from voronerf.router.loop import Results, restored, run_cells, run_grouped
-from voronerf.router.trees import rebuild, tensors_of
+from voronerf.router.grouped import Ungroupable, is_inside, run_grouped
+from voronerf.router.grouping import Grouping
+from voronerf.router.layout import Call, Results, rebuild, tensors_of
+from voronerf.router.loop import Choice, Trial, admitted, flattened, run_cells
 
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs
@@ -61,7 +59,7 @@ class Choices:
         Numbers count by what they are only where they would go into a fused network.
         """
         autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
-        modes = (call.method, call.module.training, torch.is_grad_enabled(), autocast, call.layout.one_ray)
+        modes = (call.method, call.module.training, torch.is_grad_enabled(), autocast)
         d = len(call.layout.lead)
         return (
             *modes,
@@ -118,18 +116,19 @@ def evaluate(call: Call, grouping: Grouping, choices: Choices, *, fuse: bool) ->
     """
     choice = _choose(call, grouping, choices, fuse)
     results, choice = _carry_out(call, grouping, choices, choice)
-    given = grouping if choice.program is None or not call.layout.n else None
-    return restored(results, call.layout, given, choice.flat), choice
+    order = grouping if choice.program is None or not call.layout.n else None
+    return results.restored(call.layout, order, choice.flat), choice
 
 
 def mixed(own: Any, call: Call, mixture: Mixture, grouping: Grouping, choices: Choices, choice: Choice) -> Any:
     """The blended results of a call that returned ``own`` for all samples in their own cells."""
-    entries = Entries(mixture.rows, mixture.cells, grouping.k, grouping.backend)
+    n, where = mixture.rows.shape[0], {"cells": mixture.cells}
+    entries = Grouping(where, n, grouping.k, grouping.device, grouping.backend, rows=mixture.rows)
     results, _ = _carry_out(call, entries, choices, choice)
     tensors = tensors_of(own)
     for i, tensor in enumerate(results.tensors):
         if results.rows[i]:
-            tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(entries.n, -1)))
+            tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(n, -1)))
     return rebuild(own, tensors)
 
 
@@ -137,17 +136,11 @@ def _carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice)
     """Results sorted by cell; of a fused network in the original order, but for entries and placeholders."""
     if choice.program is not None:
         choices.note(call, choice)
-        in_order = call.layout.n and not isinstance(grouping, Entries)
-        given = call.arranged(None if in_order else grouping)
-        return choice.program.run(given.rows, grouping), choice
+        rows = call.arranged(None if call.layout.n and grouping.rows is None else grouping)
+        return choice.program.run(rows, grouping), choice
     if choice.way == "grouped" and grouping.k > 1:
-        if grouping.n > choice.most * grouping.k:  # no warning: nothing stands in the way
-            why = f"it reads planes, which is faster so with more than {choice.most} samples a cell"
-            choice = replace(choice, way="cell by cell", why=why)
-            choices.note(call, choice)
-            return _by_cells(call, grouping, choice), choice
         try:
-            results = run_grouped(call, grouping, choice.piece)
+            results, _ = run_grouped(call, call.arranged(grouping), grouping, choice.piece)
             choices.note(call, choice)
             return results, choice
         except BackendUnavailable:
@@ -169,7 +162,7 @@ def _carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice)
 def _by_cells(call: Call, grouping: Grouping, choice: Choice) -> Results:
     """The loop over cells."""
     try:
-        return run_cells(call, call.arranged(grouping), grouping, again=choice.again)
+        return run_cells(call, call.arranged(grouping), grouping.occupied, again=choice.again)
     except Exception as error:
         if hasattr(error, "add_note") and len(call.layout.lead) > 1 and not call.layout.flat:  # since Python 3.11
             error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
@@ -185,9 +178,8 @@ def _choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Cho
         return Choice("cell by cell", f"for fewer than {_FEWEST} samples") if choice is None else choice
     devices = [grouping.device] if grouping.device.type == "cuda" else []
     with torch.random.fork_rng(devices):
-        flat: tuple[bool, ...] = () if choice is None else choice.flat
-        if choice is None and len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat and not layout.one_ray:
-            flat = flattened(call, grouping.device)
+        rays = len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat
+        flat = choice.flat if choice is not None else flattened(call) if rays else ()
         trial = Trial(call, grouping)
         if choice is not None and not trial.is_groupable():
             return choice

@@ -17,13 +17,12 @@ from torch import Tensor, nn
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
+from voronerf.router.cells import owned_parameters
 from voronerf.router.grouped import PerCell, for_all_cells
-from voronerf.router.grouping import Entries, Grouping
-from voronerf.router.layout import Call, Given
-from voronerf.router.loop import Results
-from voronerf.router.parameters import owned_parameters
+from voronerf.router.grouping import Grouping
+from voronerf.router.layout import Call, Results, tensors_of
+from voronerf.router.tracing import ROWS as ROWS
 from voronerf.router.tracing import TABLE, Linear, Ref, Segment, Step, Trace, Unfusable, map_arguments
-from voronerf.router.trees import tensors_of
 
 
 class Program:
@@ -32,15 +31,14 @@ class Program:
     Args:
         original: The routed module.
         call: Of the copy, which runs with the parameters of its first cell.
-        given: The arguments, for ``ROWS`` samples.
-        shared_layers: Whether layers that all cells share are in the table, and not among the steps.
+        given: The rows of the arguments, for ``ROWS`` samples.
 
     Raises:
         Unfusable: For a step that is no such network, or that cannot be done again for other samples.
     """
 
-    def __init__(self, original: nn.Module, call: Call, given: Given, shared_layers: bool = True) -> None:
-        trace = Trace(original, call, given, shared_layers)
+    def __init__(self, original: nn.Module, call: Call, given: list[Tensor]) -> None:
+        trace = Trace(original, call, given)
         self._result, self._outputs = trace.result, trace.outputs
         self._before, self._weights = trace.before, trace.weights
         self._sizes, self._parameters, self._shared = trace.sizes, trace.parameters, trace.shared
@@ -111,11 +109,8 @@ class Program:
     # Running ----------------------------------------------------------------------------------------------------------
 
     def run(self, inputs: Sequence[Tensor], grouping: Grouping) -> Results:
-        """The method's results for arguments in the original order, or sorted for ``Entries``.
-
-        The samples need not have been located yet.
-        """
-        n, chosen = inputs[0].shape[0], isinstance(grouping, Entries)
+        """The method's results for arguments in the original order, or sorted where the grouping has ``rows``."""
+        n = inputs[0].shape[0]
         parameters = {value: self._parameter(place) for value, place in self._parameters.items()}
         values: dict[int, Any] = {**dict(enumerate(inputs)), **parameters}
         for step in self._before:
@@ -125,16 +120,13 @@ class Program:
             for block in self._blocks
         ]
         weights, biases = self._stacked(values, grouping.k)
-        if chosen:
-            where: dict[str, Any] = {"cells": grouping.sorted_cells.int()}
-        else:
-            where = {"cells": grouping.cells} if grouping.tables is None else grouping.tables
+        where = grouping.where if grouping.rows is None else {"cells": grouping.sorted_cells.int()}
         directions = blocks[1] if len(blocks) > 1 else None
         raw, cells = routed_mlp(
             blocks[0], weights, biases, layers=self.table, directions=directions, backend=grouping.backend, **where
         )
-        if not chosen and grouping.tables is not None:
-            grouping.found(cells)
+        if where and grouping.rows is None:
+            grouping.where = {"cells": cells}
         for value, segments in self._needed.items():
             ranges = []
             for s in segments:
@@ -147,7 +139,7 @@ class Program:
         for step in self._behind:
             step.run(values, n)
         tensors = [values[item.value] if isinstance(item, Ref) else item for item in self._outputs]
-        return Results(self._result, tensors, [isinstance(item, Ref) for item in self._outputs], [False] * len(tensors))
+        return Results(self._result, tensors, [isinstance(item, Ref) for item in self._outputs])
 
     def _parameter(self, place: int) -> nn.Parameter:
         owner, name = self._owned[place]

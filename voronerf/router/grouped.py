@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import inspect
 import linecache
-import math
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -22,8 +21,9 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouping import Grouping, Tables
-from voronerf.router.trees import map_tree, tensors_of
+from voronerf.router.cells import cell_parameters, in_place_of_parameters
+from voronerf.router.grouping import Grouping
+from voronerf.router.layout import Call, Results, map_tensors, split_rows, tensors_of
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
 _WRITES = ("requires_grad_", "register_hook", "retain_grad", "backward", "__set__", "__setitem__")
@@ -54,6 +54,16 @@ METADATA = frozenset(
     torch.Tensor,
 )
 """What reads no value: shapes, dtypes, devices."""
+RANDOM = _find(
+    """
+    rand_like randn_like randint_like bernoulli normal_ uniform_ bernoulli_ exponential_ random_ cauchy_ log_normal_
+    geometric_ dropout dropout_ alpha_dropout feature_alpha_dropout rrelu rand randn randint randperm normal multinomial
+    """,
+    torch,
+    torch.Tensor,
+    torch.nn.functional,
+)
+"""What draws random numbers."""
 CREATE = _find("zeros ones full empty rand randn randint", torch)
 """New tensors of given sizes; with n of them in front they are rows."""
 
@@ -157,7 +167,7 @@ def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Excep
 
     def on_one(*single: Tensor) -> Any:
         following = iter(single)
-        given = map_tree((args, kwargs), lambda n, value, _: next(following) if isinstance(value, PerCell) else value)
+        given = map_tensors((args, kwargs), lambda value: next(following) if isinstance(value, PerCell) else value)
         return function(*given[0], **given[1])
 
     try:
@@ -168,7 +178,7 @@ def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Excep
         except Exception as error:
             raise fail(f"{name_of(func)} of parameters fails: {error}") from error
         result = _stack(func, singles, fail)
-    return map_tree(result, lambda name, value, nested: PerCell(value))
+    return map_tensors(result, PerCell)
 
 
 def _weight_norm(v: Tensor, g: Tensor, dim: int = 0) -> Tensor:
@@ -226,21 +236,19 @@ class GroupedRun(TorchFunctionMode):
 
     Args:
         grouping: Of the samples.
-        axis: The dimension of the rows in what the module sees; 0 but for a call of one ray.
         tables: Those that other parts of the call have looked up.
 
     Attributes:
         n: Samples.
         failed: Why the results are not valid, also where the module caught the error; None where they are.
         widest: Bytes of the largest tensor of rows that was made.
-        most: Samples a cell beyond which a rule says that the loop over cells is faster.
     """
 
-    def __init__(self, grouping: Grouping, axis: int = 0, tables: Tables | None = None) -> None:
+    def __init__(self, grouping: Grouping, tables: dict[Any, Any]) -> None:
         super().__init__()
-        self.grouping, self.n, self.axis, self.tables = grouping, grouping.n, axis, tables or Tables()
+        self.grouping, self.n, self.tables = grouping, grouping.n, tables
         self.failed: Ungroupable | None = None
-        self.widest, self.most = 0, math.inf
+        self.widest = 1
         self._token = object()
 
     # For rules --------------------------------------------------------------------------------------------------------
@@ -266,6 +274,7 @@ class GroupedRun(TorchFunctionMode):
     def mark(self, tensor: Tensor, tag: str = "") -> Tensor:
         """Notes that a tensor depends on the samples; ``tag`` is "any" or "all" for such a reduction of them."""
         setattr(tensor, _MARK, (self._token, tag))
+        self.widest = max(self.widest, tensor.numel() * tensor.element_size())
         return tensor
 
     def fail(self, reason: str, of_batch: bool = False) -> Ungroupable:
@@ -286,23 +295,18 @@ class GroupedRun(TorchFunctionMode):
             return self._with_parameters(func, args, kwargs, operands, marked)
         result = func(*args, **kwargs)
         found = tensors_of(result)
-        if not marked:
-            if func in CREATE:
-                for tensor in found:
-                    if tensor.dim() > self.axis and tensor.shape[self.axis] == self.n:
-                        self.mark(tensor)
-            return result
-        if writes_in_place(func):
-            self.mark(operands[0])
-        if isinstance(kwargs.get("out"), Tensor):
-            self.mark(kwargs["out"])
-        name = getattr(func, "__name__", "")
-        tag = name if name in ("any", "all") else ""
-        for tensor in found:
-            self.mark(tensor, tag)
-            self.widest = max(self.widest, tensor.numel() * tensor.element_size())
-        if not found:
-            self._check_read(func, result, marked[0])
+        if marked:
+            if writes_in_place(func):
+                self.mark(operands[0])
+            name = getattr(func, "__name__", "")
+            for tensor in found:
+                self.mark(tensor, name if name in ("any", "all") else "")
+            if not found:
+                self._check_read(func, result, marked[0])
+        elif func in CREATE:
+            for tensor in found:
+                if tensor.shape[:1] == (self.n,):
+                    self.mark(tensor)
         return result
 
     def _check_read(self, func: Any, result: Any, source: Tensor) -> None:
@@ -316,11 +320,11 @@ class GroupedRun(TorchFunctionMode):
 
     def _with_parameters(self, func: Any, args: Any, kwargs: Any, operands: list[Tensor], marked: list[Tensor]) -> Any:
         for tensor in operands:
-            unseen = type(tensor) is not PerCell and not hasattr(tensor, _MARK) and tensor.dim() > self.axis
-            if unseen and tensor.shape[self.axis] == self.n and not isinstance(tensor, torch.nn.Parameter):
+            unseen = type(tensor) is not PerCell and not hasattr(tensor, _MARK) and tensor.shape[:1] == (self.n,)
+            if unseen and not isinstance(tensor, torch.nn.Parameter):
                 raise self.fail(f"{name_of(func)} takes rows that no PyTorch function was seen to make")
         rule = _RULES.get(func)
-        result: Any = NotImplemented if rule is None else self._by_rule(rule, args, kwargs, marked)
+        result = NotImplemented if rule is None else rule(self, *args, **kwargs)
         if result is NotImplemented:
             if marked:
                 raise self.fail(f"{name_of(func)} meets parameters and has no rule for all cells at once")
@@ -328,18 +332,42 @@ class GroupedRun(TorchFunctionMode):
         for tensor in tensors_of(result):
             if type(tensor) is not PerCell:
                 self.mark(tensor)
-                self.widest = max(self.widest, tensor.numel() * tensor.element_size())
         return result
 
-    def _by_rule(self, rule: Rule, args: Any, kwargs: Any, marked: list[Tensor]) -> Any:
-        """Calls a rule; the rows of a call of one ray, [1, n, ...], are [n, ...] for it."""
-        axis = self.axis
-        if not axis or not marked or any(t.dim() <= axis or t.shape[axis] % self.n for t in marked):
-            return rule(self, *args, **kwargs)
 
-        def squeezed(name: str, value: Tensor, nested: bool) -> Tensor:
-            return self.mark(value.reshape(value.shape[axis:])) if self.is_rows(value) else value
+def run_grouped(call: Call, given: list[Tensor], grouping: Grouping, piece: int) -> tuple[Results, int]:
+    """A module's results for sorted rows of all cells, and the bytes of the largest tensor of rows that was made.
 
-        args, kwargs = map_tree((args, kwargs), squeezed)
-        result = rule(self, *args, **kwargs)
-        return map_tree(result, lambda name, value, nested: value.reshape(*[1] * axis, *value.shape))
+    Args:
+        call: Of the module.
+        given: The rows of its arguments, sorted.
+        grouping: Of the samples.
+        piece: Rows that it runs on at once on a CPU, whose cache holds their tensors then.
+
+    Raises:
+        Ungroupable: Where that is not possible.
+    """
+    parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
+    # Parameters are split once for all parts: their gradient is then put together once, where that of a slice would
+    # fill a tensor of all cells for each part. Parts of one cell have the same piece.
+    sizes = {part.start: part.k for part in parts}
+    stacked = cell_parameters(call.module)
+    pieces = [p.split(list(sizes.values())) if len(sizes) > 1 else (p,) for p in stacked]
+    number, values, widest = {start: i for i, start in enumerate(sizes)}, [], 1
+    tables: dict[Any, Any] = {}
+    for part, rows in zip(parts, split_rows(given, [part.n for part in parts]), strict=True):
+        run = GroupedRun(part, tables)
+        for tensor in rows:
+            run.mark(tensor)
+        stand_ins = {
+            id(p): PerCell(piece[number[part.start]], is_parameter=True, origin=(p, part.start))
+            for p, piece in zip(stacked, pieces, strict=True)
+        }
+        with in_place_of_parameters(call.module, stand_ins), run:
+            values.append(call.run(rows))
+        if run.failed is not None:
+            raise run.failed
+        if any(isinstance(tensor, PerCell) for tensor in tensors_of(values[-1])):
+            raise Ungroupable("a result is made of parameters alone")
+        widest = max(widest, run.widest)
+    return Results.joined(values, [part.n for part in parts], call.module), widest

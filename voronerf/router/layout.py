@@ -1,11 +1,14 @@
-"""How a call's arguments relate to its samples, and how they are brought into another order and back.
+"""A call: how its arguments relate to its samples, and how they are brought into another order and results back.
 
-Letters: n samples in leading dimensions ``lead``, for example (rays, samples of a ray); f features.
+Letters: n samples in leading dimensions ``lead``, for example (rays, samples of a ray); f features. Arguments and
+results may be of any structure: lists, tuples, named tuples, dicts, dataclasses, other objects.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -15,10 +18,89 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.router.grouping import Grouping
-from voronerf.router.trees import Change, map_children, map_tree, tensors_of
 
 _OP = "VoronoiRouter"
+_DEEPEST = 6  # objects within objects that are searched for tensors
 SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
+
+
+# Structures -----------------------------------------------------------------------------------------------------------
+
+
+def map_tree(value: Any, change: Callable[..., Any], name: str = "", nested: bool = False, depth: int = 0) -> Any:
+    """The same structure with every leaf changed, and the same object where no leaf is.
+
+    Args:
+        value: Of any structure.
+        change: Called with a leaf's name ("x", "samples.origins", "views.0"), the leaf, and whether it is inside an
+            object; returns what goes in its place.
+        name: Of the value.
+        nested: Whether the value is inside an object.
+        depth: Containers around the value; one that lies deeper than six is a leaf.
+    """
+    items = None if depth > _DEEPEST else _items(value)
+    if items is None:
+        return change(name, value, nested)
+    nested = nested or not isinstance(value, (dict, list, tuple))
+    new = {key: map_tree(item, change, f"{name}.{key}", nested, depth + 1) for key, item in items.items()}
+    return value if all(new[key] is item for key, item in items.items()) else _rebuilt(value, items, new)
+
+
+def _items(value: Any) -> dict[Any, Any] | None:
+    """What a container holds, by key, index or attribute; None for a leaf."""
+    if isinstance(value, (Tensor, int, str)):
+        return None
+    if isinstance(value, dict):
+        return value
+    if isinstance(value, (list, tuple)):
+        return dict(enumerate(value))
+    if isinstance(value, slice):
+        return {"start": value.start, "stop": value.stop, "step": value.step}
+    if callable(value):
+        return None
+    if dataclasses.is_dataclass(value) and not hasattr(value, "__dict__"):
+        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    return dict(vars(value)) if hasattr(value, "__dict__") else None
+
+
+def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
+    kind: Any = tuple if isinstance(value, torch.Size) else type(value)
+    if isinstance(value, dict):
+        rebuilt = kind.__new__(kind)  # no copy: dicts whose items are attributes have none
+        rebuilt.update(new)
+        return rebuilt
+    if isinstance(value, slice) or hasattr(value, "_fields"):
+        return kind(*new.values())
+    if isinstance(value, (list, tuple)):
+        return kind(new.values())
+    changed = {key: item for key, item in new.items() if item is not items[key]}
+    if hasattr(value, "__post_init__"):  # it may derive other attributes, such as a shape
+        given = {f.name for f in dataclasses.fields(value) if f.init}
+        value = dataclasses.replace(value, **{key: changed.pop(key) for key in given & changed.keys()})
+    rebuilt = copy.copy(value)
+    for key, item in changed.items():
+        object.__setattr__(rebuilt, key, item)
+    return rebuilt
+
+
+def tensors_of(value: Any, depth: int = 0) -> list[Tensor]:
+    """All tensors of a structure, in the order of :func:`map_tree`."""
+    if isinstance(value, Tensor):
+        return [value]
+    # Every function of a grouped module comes here with its arguments: lists are not made dicts for it.
+    items = value if type(value) in (list, tuple) else (_items(value) or {}).values()
+    return [tensor for item in items for tensor in tensors_of(item, depth + 1)] if depth <= _DEEPEST else []
+
+
+def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:
+    """The same structure with every tensor changed."""
+    return map_tree(value, lambda _, leaf, nested: change(leaf) if isinstance(leaf, Tensor) else leaf)
+
+
+def rebuild(value: Any, tensors: Iterable[Any]) -> Any:
+    """A structure with other tensors in the order of :func:`tensors_of`."""
+    following = iter(tensors)
+    return map_tensors(value, lambda tensor: next(following))
 
 
 # Layouts --------------------------------------------------------------------------------------------------------------
@@ -29,8 +111,7 @@ class Layout:
     """How the tensors of a call are laid out, and what the module sees of them.
 
     A module of layout "flat" sees [n, f] for every argument with rows. One of layout "rays" sees [n, 1, f] for
-    [rays, samples, f] and [n, f] for what is per ray: n rays of one sample. A call of one ray, [1, samples, f], stays
-    one ray: the module sees [1, n, f], and what is per ray is passed on.
+    [rays, samples, f] and [n, f] for what is per ray: n rays of one sample.
 
     Attributes:
         lead: Leading dimensions of a tensor with an entry for each sample.
@@ -48,16 +129,6 @@ class Layout:
     def n(self) -> int:
         """Samples."""
         return math.prod(self.lead)
-
-    @property
-    def one_ray(self) -> bool:
-        """Whether the module sees [1, n, f]."""
-        return not self.flat and len(self.lead) > 1 and self.lead[-1] > 1 and math.prod(self.lead[:-1]) == 1
-
-    @property
-    def axis(self) -> int:
-        """The dimension of the rows in what the module sees."""
-        return len(self.lead) - 1 if self.one_ray else 0
 
     def kind(self, name: str, tensor: Tensor, nested: bool) -> str:
         """What a tensor has an entry for: each sample, each ray, or neither.
@@ -115,18 +186,8 @@ class Layout:
 
     def shown(self, rows: Tensor, kind: str) -> Tensor:
         """Rows [n, ...] as the module sees them."""
-        if self.flat or len(self.lead) == 1:
-            return rows
-        ones = [1] * (len(self.lead) - (2 if kind == RAY else 1))
-        if self.one_ray:
-            return rows.reshape(*ones, *rows.shape)
+        ones = [1] * (0 if self.flat else len(self.lead) - (2 if kind == RAY else 1))
         return rows.reshape(rows.shape[0], *ones, *rows.shape[1:]) if ones else rows
-
-    def rows_of(self, result: Tensor) -> Tensor:
-        """A result of the module as rows [n * m, ...]."""
-        axis = self.axis
-        kept = axis and result.dim() > axis and all(size == 1 for size in result.shape[:axis])
-        return result.reshape(result.shape[axis:]) if kept else result
 
     def restore(self, rows: Tensor, flattened: bool) -> Tensor:
         """Rows of a result in the original order, with the leading dimensions of the call.
@@ -138,7 +199,7 @@ class Layout:
         n, rest = self.n, rows.shape[1:]
         if len(self.lead) == 1 or flattened or (n and rows.shape[0] != n):
             return rows
-        ones = 0 if self.flat or self.one_ray else len(self.lead) - 1
+        ones = 0 if self.flat else len(self.lead) - 1
         dropped = next((i for i, size in enumerate(rest[:ones]) if size != 1), min(ones, len(rest)))
         return rows.reshape(*self.lead, *rest[dropped:])
 
@@ -155,37 +216,11 @@ def _sizes(shape: Sequence[int], empty: str = "") -> str:
 
 
 @dataclasses.dataclass
-class Given:
-    """Arguments as a module sees them, sorted by cell, and the tensors among them that have rows."""
-
-    args: Sequence[Any]
-    kwargs: dict[str, Any]
-    rows: list[Tensor]
-
-    def part(self, first: int, last: int, axis: int) -> Given:
-        """Rows ``first`` to ``last`` alone."""
-        rows = {id(tensor) for tensor in self.rows}
-        found: list[Tensor] = []
-
-        def cut(name: str, value: Any, nested: bool) -> Any:
-            if not isinstance(value, Tensor):
-                if not any(id(tensor) in rows for tensor in tensors_of(value)):
-                    return value
-                value = value[(slice(None),) * axis + (slice(first, last),)]
-                found.extend(tensors_of(value))
-                return value
-            if id(value) not in rows:
-                return value
-            found.append(value.narrow(axis, first, last - first))
-            return found[-1]
-
-        args, kwargs = map_tree((tuple(self.args), self.kwargs), cut, batches=True)
-        return Given(args, kwargs, found)
-
-
-@dataclasses.dataclass
 class Call:
-    """A method of a module with the arguments of one call, their layout, and their names, of positional ones first."""
+    """A method of a module with the arguments of one call, their layout, and their names, of positional ones first.
+
+    ``kinds`` says what each tensor has an entry for, once it has been looked at; it stays so for a part of the call.
+    """
 
     module: nn.Module
     method: str
@@ -193,89 +228,125 @@ class Call:
     names: list[str]
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
-
-    def run(self, given: Given) -> Any:
-        """Calls the method; ``forward`` by way of the module, whose hooks run then."""
-        method = self.module if self.method == "forward" else getattr(self.module, self.method)
-        return method(*given.args, **given.kwargs)
+    kinds: dict[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """Of the method, for messages."""
         return f"{type(self.module).__name__}.{self.method}"
 
-    def arranged(self, grouping: Grouping | None) -> Given:
-        """The arguments as the module sees them, in the order of a grouping; None keeps the original order."""
-        order = _Order(self.layout, grouping)
-        return dataclasses.replace(self.changed(order.change), rows=order.found)
+    def run(self, rows: Iterable[Tensor]) -> Any:
+        """Calls the method for rows in the place of its arguments'; ``forward`` with the hooks of the module."""
+        following = iter(rows)
+        args, kwargs = self.changed(lambda tensor, kind: next(following))
+        return (self.module if self.method == "forward" else getattr(self.module, self.method))(*args, **kwargs)
 
-    def changed(self, change: Change) -> Given:
-        """The arguments with every tensor and batch-like object changed, see :func:`map_tree`."""
-        values = [
-            map_tree(value, change, name, batches=True)
-            for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        ]
-        return Given(values[: len(self.args)], dict(zip(self.kwargs, values[len(self.args) :])), [])
+    def changed(self, change: Callable[[Tensor, str], Tensor]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """The arguments with the tensors changed that have rows; ``change`` gets a tensor and its kind."""
 
+        def changed(name: str, value: Any, nested: bool) -> Any:
+            if not isinstance(value, Tensor):
+                return value
+            if name not in self.kinds:
+                self.kinds[name] = self.layout.kind(name, value, nested)
+            return value if self.kinds[name] == SHARED else change(value, self.kinds[name])
 
-class _Order:
-    """Brings tensors and batch-like objects into the order of a grouping."""
+        given = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
+        values = [map_tree(value, changed, name) for name, value in given]
+        return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
 
-    def __init__(self, layout: Layout, grouping: Grouping | None) -> None:
-        self.layout, self.grouping = layout, grouping
-        self.n = layout.n if grouping is None else grouping.n
-        self.found: list[Tensor] = []
-        self._rays: Tensor | None = None
+    def arranged(self, grouping: Grouping | None) -> list[Tensor]:
+        """The rows of the arguments as the module sees them, in the order of a grouping, or for None as they came."""
+        layout, n = self.layout, self.layout.n if grouping is None else grouping.n
+        found: list[Tensor] = []
 
-    def change(self, name: str, value: Any, nested: bool) -> Any:
-        if not isinstance(value, Tensor):
-            return self._batch(name, value)
-        kind = self.layout.kind(name, value, nested)
-        if kind == SHARED or (kind == RAY and self.layout.one_ray):
-            return value
-        rows = self.layout.shown(self._rows(self.layout.flatten(value, kind), kind == RAY), kind)
-        self.found.append(rows)
-        return rows
+        @functools.cache
+        def rays(device: torch.device) -> Tensor:
+            rows = None if grouping is None else grouping.source
+            rows = torch.arange(n, dtype=torch.int32, device=device) if rows is None else rows
+            return torch.div(rows, layout.lead[-1], rounding_mode="floor")
 
-    def _rows(self, flat: Tensor, ray: bool) -> Tensor:
-        if not self.layout.n:  # a module that is never called without rows gives its sizes on placeholders
-            empty = flat.new_full((self.n, *flat.shape[1:]), 0.5 if flat.is_floating_point() else 0)
-            return torch.cat([flat[:0], empty])  # joined, so that results depend on the argument as ever
-        if ray:
-            return flat.index_select(0, self._ray_of_rows(flat.device))
-        rows = flat if self.grouping is None else self.grouping.sort(flat)
-        return rows.view_as(rows) if rows is flat else rows  # an object of its own, to be told apart
+        def arrange(tensor: Tensor, kind: str) -> Tensor:
+            rows = layout.flatten(tensor, kind)
+            if not layout.n:  # a module that is never called without rows gives its sizes on placeholders
+                empty = rows.new_full((n, *rows.shape[1:]), 0.5 if rows.is_floating_point() else 0)
+                rows = torch.cat([rows[:0], empty])  # joined, so that results depend on the argument as ever
+            elif kind == RAY:
+                rows = rows.index_select(0, rays(rows.device))
+            elif grouping is not None:
+                rows = grouping.sort(rows)
+            found.append(layout.shown(rows.view_as(rows), kind))  # an object of its own, which is marked
+            return tensor
 
-    def _ray_of_rows(self, device: torch.device) -> Tensor:
-        if self._rays is None:
-            grouping = self.grouping or Grouping(None, self.n, 1, device, "auto")
-            self._rays = grouping.rays(self.layout.lead[-1])
-        return self._rays
-
-    def _batch(self, name: str, value: Any) -> Any:
-        """An object that can be flattened, indexed and reshaped as a whole."""
-        layout, shape = self.layout, tuple(value.shape)
-        if shape not in (layout.lead, layout.lead[:-1]) or not shape or (layout.one_ray and shape != layout.lead):
-            return value
-        if not layout.n:
-            return map_children(value, self.change, name)
-        flat, device = value.flatten(), next((t.device for t in tensors_of(value)), torch.device("cpu"))
-        if shape != layout.lead:
-            flat = flat[self._ray_of_rows(device).long()]
-        elif self.grouping is not None:
-            flat = flat[self.grouping.sort(torch.arange(layout.n, device=device))]
-        ones = () if layout.flat else (1,) * (len(shape) - 1)
-        rows = flat.reshape((*ones, self.n) if layout.one_ray else (self.n, *ones)) if ones else flat
-        axis = layout.axis
-        self.found += [t for t in tensors_of(rows) if t.dim() > axis and t.shape[axis] == self.n]
-        return rows
+        self.changed(arrange)
+        return found
 
 
-def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> tuple[Tensor, Tensor | None]:
-    """The positions of a call's samples.
+def split_rows(rows: list[Tensor], sizes: list[int]) -> list[Sequence[Tensor]]:
+    """The rows of arguments in parts of so many."""
+    return [rows] if len(sizes) == 1 else list(zip(*[tensor.split(sizes) for tensor in rows], strict=True))
 
-    Returns:
-        Positions [..., 3], and the tensor whose identity stands for them, or None.
+
+@dataclasses.dataclass
+class Results:
+    """What a method returned for rows.
+
+    Attributes:
+        value: Of any structure.
+        tensors: Its tensors, [n * m, ...] where they have rows.
+        rows: Which of them have rows.
+    """
+
+    value: Any
+    tensors: list[Tensor]
+    rows: list[bool]
+
+    @staticmethod
+    def joined(values: list[Any], counts: list[int], module: nn.Module) -> Results:
+        """What a method returned for parts of the rows, as one; buffers of the module are constants.
+
+        Raises:
+            ValueError: For a result without a row for each sample, or other results for some parts.
+        """
+        parts = [tensors_of(value) for value in values]
+        if any(len(part) != len(parts[0]) for part in parts):
+            raise ValueError(f"{_OP}: module must return as many tensors for every cell, got different numbers")
+        buffers = {id(buffer) for buffer in module.buffers()}
+        joined = Results(values[0], [], [])
+        for pieces in zip(*parts, strict=True):
+            rows, first = id(pieces[0]) not in buffers, pieces[0]
+            m = first.shape[0] // counts[0] if first.dim() else 0
+            if rows and (m == 0 or any(p.dim() == 0 or p.shape[0] != m * n for p, n in zip(pieces, counts))):
+                raise ValueError(
+                    f"{_OP}: results must have a row for each sample, got {list(first.shape)} for {counts[0]} samples"
+                )
+            joined.tensors.append(torch.cat(pieces) if rows and len(pieces) > 1 else first)
+            joined.rows.append(rows)
+        return joined
+
+    def restored(self, layout: Layout, grouping: Grouping | None, flat: Sequence[bool]) -> Any:
+        """The results in the caller's order, with the leading dimensions of the call.
+
+        Args:
+            layout: Of the call.
+            grouping: Whose order they have; None for the caller's.
+            flat: Which tensors the module itself flattens to [rays * samples, ...].
+        """
+        tensors = list(self.tensors)
+        for i, tensor in enumerate(tensors):
+            if not self.rows[i]:
+                continue
+            if grouping is not None:
+                m = tensor.shape[0] // grouping.n
+                tensor = grouping.unsort(tensor if m == 1 else tensor.unflatten(0, (grouping.n, m)))
+                tensor = tensor if layout.n else tensor[:0]
+                tensor = tensor if m == 1 else tensor.flatten(0, 1)
+            tensors[i] = layout.restore(tensor, i < len(flat) and flat[i])
+        return rebuild(self.value, tensors)
+
+
+def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:
+    """The positions of a call's samples, [..., 3].
 
     Raises:
         ValueError: Where no rule is given, or it does not fit the arguments.
@@ -287,15 +358,15 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> tu
             "coords='first3', a slice of the features or a function of the arguments to the router, or "
             "coords=positions [..., 3] to this call"
         )
-    source: Tensor | None
     if isinstance(rule, Tensor):
-        positions, source, what = rule, rule, "coords"
+        positions, what = rule, "coords"
     elif callable(rule):
-        positions, source, what = rule(*args, **kwargs), None, "what coords returns"
+        positions, what = rule(*args, **kwargs), "what coords returns"
     else:
-        source = next((v for v in (*args, *kwargs.values()) if isinstance(v, Tensor)), None)
+        given = [*args, *kwargs.values()]
+        source = next((value for value in given if isinstance(value, Tensor)), None)
         if source is None:
-            got = ", ".join(type(value).__name__ for value in (*args, *kwargs.values())) or "nothing"
+            got = ", ".join(type(value).__name__ for value in given) or "nothing"
             raise ValueError(
                 f"{_OP}: coords={rule!r} must find a tensor among the arguments, got {got}; pass a function"
             )
@@ -310,29 +381,19 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> tu
             f"{_OP}: {what} must have shape [..., 3] and a floating-point dtype, got {list(positions.shape)} of "
             f"{positions.dtype}"
         )
-    return positions, source
+    return positions
 
 
 def argument_names(function: Callable[..., Any], count: int) -> list[str]:
     """Names of the first positional arguments of a function; their numbers where it does not name them."""
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    names = [parameter.name for parameter in _signature(function) or () if parameter.kind in kinds]
-    return [names[i] if i < len(names) else str(i) for i in range(count)]
+    names = [parameter.name for parameter in inspect.signature(function).parameters.values() if parameter.kind in kinds]
+    return [*names[:count], *map(str, range(len(names), count))]
 
 
-def accepted_names(functions: Sequence[Callable[..., Any]]) -> list[str] | None:
+def accepted_names(functions: Iterable[Callable[..., Any]]) -> list[str] | None:
     """The names of the arguments that any of some functions take; None where one takes any name."""
-    names: dict[str, None] = {}
-    for function in functions:
-        parameters = _signature(function)
-        if parameters is None or any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-            return None
-        names |= dict.fromkeys(parameter.name for parameter in parameters)
-    return list(names)
-
-
-def _signature(function: Callable[..., Any]) -> list[inspect.Parameter] | None:
-    try:
-        return list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):
+    parameters = [p for function in functions for p in inspect.signature(function).parameters.values()]
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
         return None
+    return list(dict.fromkeys(p.name for p in parameters))

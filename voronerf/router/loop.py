@@ -1,31 +1,56 @@
-"""Running a module on rows that are sorted by cell: in a loop over cells, which defines the result, or once for all."""
+"""The loop over cells, which defines the results, and the comparison of other ways with it.
+
+Another way to run a kind of call is admitted if it gives what the loop gives. They run once on a few samples of the
+batch, in a copy of the module whose cells have parameters of their own, and results and gradients are compared.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable
-from voronerf.router.grouping import Grouping, Part, Tables
-from voronerf.router.layout import Call, Given, Layout
-from voronerf.router.parameters import cell_parameters, clone_module, in_place_of_parameters
-from voronerf.router.trees import rebuild, tensors_of
-from voronerf.tolerances import agree
+from voronerf.backends import BackendUnavailable
+from voronerf.router.cells import cell_parameters, clone_module, in_place_of_parameters
+from voronerf.router.fused import ROWS, Program, Unfusable
+from voronerf.router.grouped import RANDOM, Ungroupable, run_grouped
+from voronerf.router.grouping import Grouping
+from voronerf.router.layout import RAY, Call, Results, map_tree, split_rows, tensors_of
+from voronerf.tolerances import agree, agree_gradients
 
-_DRAWS = """
-    rand_like randn_like randint_like bernoulli normal_ uniform_ bernoulli_ exponential_ random_ cauchy_ log_normal_
-    geometric_ dropout dropout_ alpha_dropout feature_alpha_dropout rrelu rand randn randint randperm normal multinomial
-"""
-RANDOM = frozenset(
-    getattr(place, name) for place in (torch, torch.Tensor, F) for name in _DRAWS.split() if hasattr(place, name)
-)
-"""What draws random numbers."""
+_OP = "VoronoiRouter"
+_TRIED, _CELLS = 41, 3  # samples of a comparison, unlike any number of features, and their cells
+_PIECE = 4 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
+
+
+def run_cells(call: Call, given: list[Tensor], bounds: list[tuple[int, int, int]], *, again: bool = False) -> Results:
+    """A module's results for sorted rows, one call for each (cell, first row, row behind the last).
+
+    Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a copy of the
+    module, which keeps the cell's parameters.
+
+    Raises:
+        ValueError: For a result without a row for each sample, or other results in some cells.
+    """
+    module, counts = call.module, [last - first for _, first, last in bounds]
+    pieces = {id(p): p.unbind(0) for p in cell_parameters(module)}
+    values = []
+    for (cell, _, _), part in zip(bounds, split_rows(given, counts), strict=True):
+        own: dict[int, Any] = {key: piece[cell] for key, piece in pieces.items()}
+        if again:
+            kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
+            values.append(replace(call, module=clone_module(module, kept | own)).run(part))
+            continue
+        with in_place_of_parameters(module, own):
+            values.append(call.run(part))
+    return Results.joined(values, counts, module)
+
+
+# Comparison -----------------------------------------------------------------------------------------------------------
 
 
 class NoRandomness(TorchFunctionMode):
@@ -41,187 +66,268 @@ class NoRandomness(TorchFunctionMode):
 
 
 @dataclass
-class Results:
-    """What a method returned for rows.
+class Choice:
+    """How calls of a kind are carried out.
 
     Attributes:
-        value: Of any structure.
-        tensors: Its tensors, [n * m, ...] where they have rows.
-        rows: Which of them have rows.
-        flattened: Which of them are [n, ...] though the module saw [1, n, ...].
+        way: "fused", "grouped" or "cell by cell".
+        why: What stands in the way of a faster one; empty where nothing does.
+        flat: For the tensors of a result, whether the module itself flattens them to [rays * samples, ...].
+        piece: Rows that a grouped module runs on at once on a CPU.
+        again: Whether the module's code runs again in the backward pass.
+        open: Whether another batch may be carried out in a faster way.
+        fusable: Whether ``fuse=True`` would serve.
+        program: The fused network.
     """
 
-    value: Any
-    tensors: list[Tensor]
-    rows: list[bool]
-    flattened: list[bool]
+    way: str
+    why: str = ""
+    flat: tuple[bool, ...] = ()
+    piece: int = 1 << 16
+    again: bool = False
+    open: bool = False
+    fusable: bool = False
+    program: Program | None = None
 
 
-def run_cells(call: Call, given: Given, grouping: Grouping, *, again: bool = False) -> Results:
-    """A module's results for sorted rows, one call for each cell that has any.
+Run = Callable[[list[Tensor]], Results]
+Outcome = tuple[Results, list[Tensor]]
 
-    Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a copy of the
-    module, which keeps the cell's parameters.
 
-    Raises:
-        ValueError: For a result without a row for each sample, or other results in some cells.
+class Trial:
+    """A copy of a module and a few samples of a call, in cells of their own whose parameters differ.
+
+    Neither the module nor the arguments nor their gradients are touched.
     """
-    module, occupied = call.module, grouping.occupied()
-    parameters = {id(p): p for _, _, p in cell_parameters(module)}
-    pieces = {key: parameter.unbind(0) for key, parameter in parameters.items()}
-    results = []
-    for cell, first, last in occupied:
-        own: dict[int, Any] = {key: values[cell] for key, values in pieces.items()}
-        part = given if len(occupied) == 1 else given.part(first, last, call.layout.axis)
-        if again:
-            kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
-            results.append(replace(call, module=clone_module(module, kept | own)).run(part))
-            continue
-        with in_place_of_parameters(module, own):
-            results.append(call.run(part))
-    return _join(results, [last - first for _, first, last in occupied], module, call.layout)
 
+    def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
+        self.made_of, self.again, self.widest = (call, grouping), False, 1
+        device = grouping.device
+        picked = torch.arange(_TRIED, device=device) * call.layout.n // _TRIED
+        cells = (torch.arange(_TRIED, device=device) * 7 % 5 // 2).int()
+        self.entries = Grouping({"cells": cells}, _TRIED, _CELLS, device, grouping.backend, rows=picked)
+        generator = torch.Generator().manual_seed(0)
+        memo: dict[int, Any] = {id(p): _made_different(p, generator) for p in cell_parameters(call.module)}
+        module = clone_module(call.module, memo).to(dtype)
+        self._leaves: list[Tensor] = []
 
-def _join(results: list[Any], counts: list[int], module: nn.Module, layout: Layout) -> Results:
-    """The results of cells as one."""
-    parts = [tensors_of(result) for result in results]
-    if any(len(part) != len(parts[0]) for part in parts):
-        raise ValueError("VoronoiRouter: module must return as many tensors for every cell, got different numbers")
-    same = {id(buffer) for buffer in module.buffers()}
-    joined = Results(results[0], [], [], [])
-    for pieces in zip(*parts, strict=True):
-        constant = id(pieces[0]) in same
-        rows = [layout.rows_of(piece) for piece in pieces]
-        m = rows[0].shape[0] // counts[0] if rows[0].dim() else 0
-        if not constant and (m == 0 or any(r.dim() == 0 or r.shape[0] != m * n for r, n in zip(rows, counts))):
-            raise ValueError(
-                "VoronoiRouter: results must have a row for each sample, got "
-                f"{list(pieces[0].shape)} for {counts[0]} samples"
-            )
-        joined.tensors.append(pieces[0] if constant else rows[0] if len(rows) == 1 else torch.cat(rows))
-        joined.rows.append(not constant)
-        joined.flattened.append(layout.axis > 0 and pieces[0].shape == rows[0].shape)
-    return joined
+        def leaf(name: str, value: Any, nested: bool) -> Any:
+            """An argument with a gradient of its own, where it takes one."""
+            if not isinstance(value, Tensor):
+                return value
+            own = value.detach().to(dtype if value.is_floating_point() else None)
+            if value.requires_grad and torch.is_grad_enabled():
+                self._leaves.append(own.requires_grad_())
+            return own
 
+        args, kwargs = map_tree((call.args, call.kwargs), leaf)
+        self.call = replace(call, module=module, args=args, kwargs=kwargs)
 
-def check_rows(call: Call, given: Given, grouping: Grouping, again: bool) -> None:
-    """Finds out whether a module gives other results for samples when other samples are left out.
+    def given(self) -> list[Tensor]:
+        """The rows of the arguments, fresh for each run."""
+        return self.call.arranged(self.entries)
 
-    Raises:
-        TypeError: When it does.
-    """
-    cell, first, last = max(grouping.occupied(), key=lambda bounds: bounds[2] - bounds[1])
-    middle = (first + last) // 2
-    outcomes = []
-    for a, b in ((first, last), (first, middle), (middle, last)):
-        part = given.part(a, b, call.layout.axis)
-        cells = torch.full((b - a,), cell, dtype=torch.int32, device=grouping.device)
-        alone = Grouping(cells, b - a, grouping.k, grouping.device, grouping.backend)
-        outcomes.append(run_cells(call, part, alone, again=again))
-    whole, *halves = outcomes
-    for i, tensor in enumerate(whole.tensors):
-        if whole.rows[i] and not agree(torch.cat([half.tensors[i] for half in halves]), tensor):
+    def outcome(self, run: Run) -> Outcome:
+        """Results, and gradients of a weighted sum of them."""
+        with NoRandomness():
+            results = run(self.given())
+        generator, total = torch.Generator().manual_seed(7), []
+        for tensor in results.tensors:
+            if tensor.requires_grad and tensor.is_floating_point():
+                weights = torch.randn(tensor.shape, generator=generator).to(tensor)
+                total.append((tensor * weights).sum().float())
+        leaves = [t for t in (*self.call.module.parameters(), *self._leaves) if t.requires_grad]
+        if not total or not torch.is_grad_enabled():
+            return results, []
+        torch.stack(total).sum().backward()
+        gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in leaves]
+        for leaf in leaves:
+            leaf.grad = None
+        return results, gradients
+
+    def agrees(self, way: Callable[[Trial], Run], expected: Outcome) -> bool:
+        """Whether a way gives what the loop gives; where it does not, whether it does in float64.
+
+        A deep network of fast sines makes its own rounding as large as its results.
+        """
+        if _same(self.outcome(way(self)), expected):
+            return True
+        try:
+            exact = Trial(*self.made_of, dtype=torch.float64)
+            exact.again = self.again
+            return _same(exact.outcome(way(exact)), exact.outcome(exact.by_cells))
+        except Exception:
+            return False
+
+    def by_cells(self, given: list[Tensor]) -> Results:
+        """The loop."""
+        return run_cells(self.call, given, self.entries.occupied, again=self.again)
+
+    def grouped(self, given: list[Tensor]) -> Results:
+        """All cells at once."""
+        results, self.widest = run_grouped(self.call, given, self.entries, _TRIED)
+        return results
+
+    def fused(self, program: Program) -> Run:
+        """As one operation, with the parameters of the copy."""
+        here = program.with_parameters_of(self.call.module)
+        return lambda given: here.run(given, self.entries)
+
+    def is_groupable(self) -> bool:
+        """Whether the module runs for all cells at once on this batch, right or wrong."""
+        try:
+            with torch.no_grad(), NoRandomness():
+                self.grouped(self.given())
+        except Exception:
+            return False
+        return True
+
+    def traced(self) -> Program:
+        """The network as a layer table."""
+        with NoRandomness():
+            return Program(self.made_of[0].module, self.call, [rows[:ROWS] for rows in self.given()])
+
+    def why_not_fused(self, expected: Outcome) -> tuple[Program | None, str]:
+        """The network as a layer table, or what stands in the way."""
+        try:
+            program = self.traced()
+            same = self.agrees(lambda one: one.fused(program), expected)
+        except Unfusable as error:
+            return None, str(error)
+        except Exception as error:
+            return None, f"the traced network fails for other samples ({type(error).__name__}: {error})"
+        return (program, "") if same else (None, "the traced network gives other results than its forward")
+
+    def check_rows(self) -> None:
+        """Raises TypeError where results for samples change when others are left out."""
+        halves = []
+        for cell, first, last in self.entries.occupied:
+            middle = (first + last) // 2
+            halves += [(cell, first, middle), (cell, middle, last)]
+        with NoRandomness():
+            whole, apart = self.by_cells(self.given()), run_cells(self.call, self.given(), halves, again=self.again)
+        if not all(agree(a, b) for a, b in zip(apart.tensors, whole.tensors, strict=True)):
             raise TypeError(
-                f"VoronoiRouter: module must treat samples one by one, but {type(call.module).__name__} gives other "
+                f"{_OP}: module must treat samples one by one, but {type(self.call.module).__name__} gives other "
                 "results for a sample when other samples are left out: it mixes samples (attention or statistics over "
                 "a batch)"
             )
 
 
-def run_grouped(call: Call, grouping: Grouping, piece: int) -> Results:
-    """A module's results for the samples of all cells, in one run, or on a CPU in pieces of so many rows.
+def _same(found: Outcome, expected: Outcome) -> bool:
+    (a, ours), (b, theirs) = found, expected
+    if a.rows != b.rows or len(ours) != len(theirs):
+        return False
+    return all(agree(x, y) for x, y in zip(a.tensors, b.tensors, strict=True)) and agree_gradients(ours, theirs)
+
+
+@torch.no_grad()
+def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Parameter:
+    """Entries for the cells of a trial, [3, ...], each some way off the router's own."""
+    cells = torch.arange(_CELLS, device=parameter.device) % parameter.shape[0]
+    with torch.inference_mode(False):
+        values = parameter.detach()[cells].clone()
+        if values.is_floating_point() and values.numel():
+            size = float(values.float().square().mean().sqrt()) or 0.1
+            noise = torch.randn(values.shape, generator=generator)
+            values += (0.2 * size * noise).to(values)
+        return nn.Parameter(values, requires_grad=parameter.requires_grad)
+
+
+def admitted(trial: Trial, fuse: bool) -> Choice:
+    """The fastest way that gives what the loop gives.
 
     Raises:
-        Ungroupable: Where that is not possible.
+        ValueError: Where the module has to fuse and does not.
+        TypeError: Where it mixes samples.
     """
-    parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
-    tables, chunks = Tables(), _chunks(call.module, parts)
-    found = [
-        run_part(call, call.arranged(part), part, chunk, tables)[0] for part, chunk in zip(parts, chunks, strict=True)
-    ]
-    first = found[0]
-    if len(found) == 1:
-        return first
-    tensors = [
-        torch.cat([results.tensors[i] for results in found]) if first.rows[i] else tensor
-        for i, tensor in enumerate(first.tensors)
-    ]
-    return replace(first, tensors=tensors)
+    try:
+        try:
+            expected = trial.outcome(trial.by_cells)
+        except Exception:  # perhaps its code runs again in the backward pass
+            trial.again = True
+            expected = trial.outcome(trial.by_cells)
+    except Exception as error:
+        return Choice("cell by cell", f"its forward fails on a few samples ({type(error).__name__}: {error})")
+    if fuse:
+        program, why = trial.why_not_fused(expected)
+        if program is not None:
+            return Choice("fused", program=program)
+        trial.check_rows()
+        raise ValueError(
+            f"{_OP}: fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
+        )
+    open_ = False
+    try:
+        if trial.agrees(lambda one: one.grouped, expected):
+            piece = min(max(_PIECE * _TRIED // trial.widest, 1 << 10), 1 << 16)
+            fusable = trial.why_not_fused(expected)[0] is not None
+            return Choice("grouped", piece=piece, again=trial.again, fusable=fusable)
+        why = "its forward on the samples of all cells gives other results than on those of one cell"
+    except BackendUnavailable:
+        raise
+    except Ungroupable as error:
+        why, open_ = str(error), error.of_batch
+    except Exception as error:
+        why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
+    trial.check_rows()
+    return Choice("cell by cell", why, again=trial.again, open=open_)
 
 
-def _chunks(module: nn.Module, parts: list[Grouping]) -> list[dict[int, Tensor] | None]:
-    """For each part the parameters of its cells, by the ids of those of all cells; None for all of them.
+# Rays -----------------------------------------------------------------------------------------------------------------
 
-    They are split once for all parts: their gradient is then put together once, where that of a slice would fill a
-    tensor of all cells for each part.
+
+def flattened(call: Call) -> tuple[bool, ...]:
+    """For each tensor that a call with rays returns, whether the module itself makes [rays * samples, ...] of it.
+
+    The module runs on a few samples of two rays, as rays and as it would see them.
+
+    Raises:
+        TypeError: When the samples of a ray meet in the module.
+        ValueError: When the module gives other results for [n, 1, f] than for [rays, samples, f].
     """
-    own = [part for part in parts if isinstance(part, Part)]
-    if not own:
-        return [None] * len(parts)
-    sizes = {part.start: part.k for part in own}
-    pieces = {id(p): p.split(list(sizes.values())) for _, _, p in cell_parameters(module)}
-    number = {start: i for i, start in enumerate(sizes)}
-    return [{key: split[number[part.start]] for key, split in pieces.items()} for part in own]
+    name, lead = type(call.module).__name__, call.layout.lead
+    for samples in (6, lead[-1]):  # a module may be made for a number of samples
+        few = (*[1] * (len(lead) - 2), min(lead[-2], 2), min(lead[-1], samples))
+
+        found: list[Tensor] = []
+        others: list[Tensor] = []  # all but the first of each ray
+
+        def first(
+            tensor: Tensor, kind: str, few: tuple[int, ...] = few, found: Any = found, others: Any = others
+        ) -> Any:
+            found.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
+            others.append(found[-1].clone())
+            if kind != RAY and tensor.is_floating_point():
+                others[-1][(slice(None),) * (len(few) - 1) + (slice(1, None),)].mul_(0.7).add_(0.01)
+            return found[-1]
+
+        args, kwargs = call.changed(first)
+        small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
+        try:
+            whole, alone, other = (_in_first(small, rows) for rows in (found, small.arranged(None), others))
+        except Exception:
+            continue
+        for a, b in zip(whole, other, strict=True):
+            if a.dim() > len(few) and a.shape[: len(few)] == few and not agree(b[..., 0, :], a[..., 0, :]):
+                raise TypeError(
+                    f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when "
+                    "others along its ray change: it mixes the samples of a ray"
+                )
+        if len(whole) != len(alone) or not all(
+            a.numel() == b.numel() and a.dtype == b.dtype and agree(b.flatten(), a.flatten())
+            for a, b in zip(whole, alone)
+        ):
+            raise ValueError(
+                f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but {name} does not; "
+                "layout='flat' calls it with [n, f], for modules that squeeze or flatten their arguments"
+            )
+        return tuple(tuple(a.shape[: len(few)]) != few and a.shape[:1] == (small.layout.n,) for a in whole)
+    return ()
 
 
-def run_part(
-    call: Call,
-    given: Given,
-    part: Grouping,
-    chunk: dict[int, Tensor] | None = None,
-    tables: Tables | None = None,
-) -> tuple[Results, GroupedRun]:
-    """The results for some rows, and the run that gave them; ``chunk`` is None where the part has all cells."""
-    module, layout = call.module, call.layout
-    run = GroupedRun(part, layout.axis, tables)
-    for tensor in given.rows:
-        run.mark(tensor)
-    stand_ins: dict[int, Tensor] = {
-        id(p): PerCell(p if chunk is None else chunk[id(p)], is_parameter=True, origin=(p, part.start))
-        for _, _, p in cell_parameters(module)
-    }
-    with in_place_of_parameters(module, stand_ins), run:
-        value = call.run(given)
-    if run.failed is not None:
-        raise run.failed
-    results = Results(value, [], [], [])
-    buffers = {id(buffer) for buffer in module.buffers()}
-    for tensor in tensors_of(value):
-        if isinstance(tensor, PerCell):
-            raise Ungroupable("a result is made of parameters alone")
-        marked, rows = run.is_rows(tensor), layout.rows_of(tensor)
-        if marked and (rows.dim() == 0 or not rows.shape[0] or rows.shape[0] % part.n):
-            raise Ungroupable(f"a result of shape {list(tensor.shape)} has no row for each of {part.n} samples", True)
-        if not marked and rows.shape[:1] == (part.n,) and id(tensor) not in buffers:
-            raise Ungroupable("a result has rows that no PyTorch function was seen to make")
-        results.tensors.append(rows if marked else tensor)
-        results.rows.append(marked)
-        results.flattened.append(layout.axis > 0 and rows.shape == tensor.shape)
-    return results, run
-
-
-def restored(results: Results, layout: Layout, grouping: Grouping | None, flat: Sequence[bool]) -> Any:
-    """Results in the caller's order, with the leading dimensions of the call.
-
-    They are in that order already where ``grouping`` is None; ``flat`` says which tensors the module itself flattens to
-    [rays * samples, ...].
-    """
-    tensors = []
-    for i, tensor in enumerate(results.tensors):
-        if results.rows[i]:
-            tensor = _unsorted(tensor, layout, grouping)
-            tensor = layout.restore(tensor, results.flattened[i] or (i < len(flat) and flat[i]))
-        tensors.append(tensor)
-    return rebuild(results.value, tensors)
-
-
-def _unsorted(rows: Tensor, layout: Layout, grouping: Grouping | None) -> Tensor:
-    if grouping is None:
-        return rows
-    m = rows.shape[0] // grouping.n
-    if m > 1:
-        rows = rows.reshape(grouping.n, m, *rows.shape[1:])
-    rows = grouping.unsort(rows)
-    if not layout.n:
-        rows = rows[:0]
-    return rows.flatten(0, 1) if m > 1 else rows
+def _in_first(call: Call, rows: list[Tensor]) -> list[Tensor]:
+    """The tensors that the module returns with the parameters of its first cell."""
+    first = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
+    with torch.no_grad(), NoRandomness(), in_place_of_parameters(call.module, first):
+        return tensors_of(call.run(rows))

@@ -13,10 +13,11 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor, nn
 
+from voronerf.backends import BACKENDS
 from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.blending import Mixture
-from voronerf.router.cells import CellModules
+from voronerf.router.cells import CellModules, check_module, fill_cell
 from voronerf.router.evaluate import (
     Choices,
     LayeredField,
@@ -29,7 +30,6 @@ from voronerf.router.evaluate import (
 )
 from voronerf.router.grouping import Assignments, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
-from voronerf.router.parameters import check_module, check_options, fill_cell
 
 Assignment = Literal["nearest", "stochastic"]
 
@@ -60,8 +60,7 @@ class VoronoiRouter(CellModules):
     A module that mixes samples (BatchNorm, attention across samples) is refused.
 
     Arguments are per sample ``[..., f]``; per ray ``[rays, f]`` beside ``[rays, samples, f]``; numbers, flags, None and
-    tensors of one element, which are passed on; and objects that hold tensors: dataclasses, and classes with ``shape``,
-    ``flatten()``, ``reshape(shape)`` and indexing, such as nerfstudio's ``RaySamples``.
+    tensors of one element, which are passed on; and objects that hold tensors, such as nerfstudio's ``RaySamples``.
 
     Args:
         module: Any ``nn.Module`` that treats samples one by one; it is copied and never changed.
@@ -81,8 +80,7 @@ class VoronoiRouter(CellModules):
         fuse: Promises that ``forward`` does the same in every call. Its network is traced once and runs as one
             operation, or is refused with the line that stands in the way.
         layout: How the module sees samples ``[rays, samples, f]``: "rays" as ``[n, 1, f]``, with what is per ray as
-            ``[n, f]``; "flat" as ``[n, f]``, for modules that squeeze or flatten. One ray, ``[1, samples, f]``, stays
-            ``[1, n, f]`` with "rays".
+            ``[n, f]``; "flat" as ``[n, f]``, for modules that squeeze or flatten.
         assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell by the distances
             while training (:meth:`VoronoiDiagram.sample_cell`), and is "nearest" in eval mode.
         temperature: Of the stochastic assignment, in scene units.
@@ -133,10 +131,7 @@ class VoronoiRouter(CellModules):
         module = getattr(module, "_orig_mod", module)  # of torch.compile, which would not see the parameters of cells
         check_module(module)
         given = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
-        check_options(module, coords, given, layout, assignment, temperature, backend, blend)
-        for name in methods:
-            if hasattr(VoronoiRouter, name) or name in ("module", "diagram"):
-                raise ValueError(f"VoronoiRouter: methods must not name what a router has itself, got {name!r}")
+        _check_options(module, coords, given, layout, assignment, temperature, backend, blend)
         own = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
         super().__init__(module, own, share)
         self.assignment, self.temperature = assignment, temperature
@@ -285,7 +280,7 @@ class VoronoiRouter(CellModules):
         rule = coords if coords is not None else self.coords
         if rule is None and self._layered:
             rule = "first3"
-        positions, source = find_positions(rule, args, kwargs)
+        positions = find_positions(rule, args, kwargs)
 
         def named(item: str | int) -> str:
             return item if isinstance(item, str) else names[item] if item < len(names) else str(item)
@@ -298,11 +293,7 @@ class VoronoiRouter(CellModules):
         )
         call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
         with self._choices.lock:  # what stands in for the module's parameters does so for one call at a time
-            key = self._assignment_key()
-            grouping = self._assignments.find(method, source, positions, key)
-            if grouping is None:
-                grouping = self._group(positions, layout.n)
-                self._assignments.keep(method, source, positions, key, grouping)
+            grouping = self._group(method, positions)
             result, choice = evaluate(call, grouping, self._choices, fuse=self.fuse)
             mixture = self._mixture(positions)
             if mixture is None:
@@ -314,19 +305,23 @@ class VoronoiRouter(CellModules):
         blends = self.blend > 0 and not self.training and self.num_cells > 1
         return Mixture.of(self.diagram, positions, self.blend, self.backend) if blends else None
 
-    def _group(self, positions: Tensor, n: int) -> Grouping:
-        flat, k = positions.detach().reshape(-1, 3), self.num_cells
-        if not n:  # the module runs on placeholders, since it may not take an empty batch
-            return Grouping(torch.zeros(2, dtype=torch.int32, device=flat.device), 2, k, flat.device, self.backend)
-        where = self._where(flat, flat)
-        cells = where.get("cells", functools.partial(self.assign, flat)) if k > 1 else None
-        tables = None if k == 1 or "cells" in where else where
-        return Grouping(cells, n, k, positions.device, self.backend, tables)
-
-    def _assignment_key(self) -> tuple[Any, ...]:
+    def _group(self, method: str, positions: Tensor) -> Grouping:
+        """The samples in their cells; other methods that are called with the same positions share it."""
         drawn, centres = self.assignment == "stochastic" and self.training, self.diagram.centres
         version = object() if centres.is_inference() else centres._version  # of those changes are not told
-        return (id(self.diagram), version, drawn, self.temperature, self.backend)
+        key = id(self.diagram), version, drawn, self.temperature, self.backend
+        grouping = self._assignments.find(method, positions, key, drawn) if self.methods else None
+        if grouping is None:
+            flat, k = positions.detach().reshape(-1, 3), self.num_cells
+            if flat.shape[0]:
+                locate = functools.partial(self.assign, flat) if k > 1 else None
+                grouping = Grouping(self._where(flat, flat), flat.shape[0], k, flat.device, self.backend, locate)
+            else:  # the module runs on placeholders, since it may not take an empty batch
+                where = {"cells": torch.zeros(2, dtype=torch.int32, device=flat.device)}
+                grouping = Grouping(where, 2, k, flat.device, self.backend)
+            if self.methods:
+                self._assignments.keep(method, positions, key, grouping)
+        return grouping
 
     def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
         """What tells ``routed_mlp`` the cells: the diagram's tables, or the cells themselves.
@@ -357,3 +352,43 @@ class VoronoiRouter(CellModules):
     def extra_repr(self) -> str:
         """What ``print(router)`` shows beside the field's modules."""
         return f"num_cells={self.num_cells}, depth={self.diagram.depth}, assignment={self.assignment!r}"
+
+
+def _check_options(
+    module: nn.Module,
+    coords: Any,
+    lists: dict[str, Any],
+    layout: str,
+    assignment: str,
+    temperature: float,
+    backend: str,
+    blend: float,
+) -> None:
+    """Raises ValueError or TypeError for an option that is wrong; ``lists`` are per_ray and the like."""
+    where = coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords)
+    for name, value, fits, rule in (
+        ("assignment", assignment, assignment in ("nearest", "stochastic"), "'nearest' or 'stochastic'"),
+        ("temperature", temperature, temperature > 0, "positive"),
+        ("blend", blend, 0 <= blend < float("inf"), "finite and at least 0"),
+        ("layout", layout, layout in ("rays", "flat"), "'rays' or 'flat'"),
+        ("backend", backend, backend in ("auto", *BACKENDS), f"auto, {', '.join(BACKENDS)}"),
+        ("coords", coords, where, "'first3', a slice or a function"),
+    ):
+        if not fits:
+            raise ValueError(f"VoronoiRouter: {name} must be {rule}, got {value!r}")
+    for name, value in lists.items():
+        if isinstance(value, (str, int)):
+            raise TypeError(f"VoronoiRouter: {name} must be a list, got {value!r}")
+    kind, methods = type(module).__name__, lists["methods"]
+    for name in methods:
+        if not callable(getattr(module, name, None)):
+            raise ValueError(f"VoronoiRouter: methods must name methods of {kind}, got {name!r}")
+        if hasattr(VoronoiRouter, name):
+            raise ValueError(f"VoronoiRouter: methods must not name what a router has itself, got {name!r}")
+    known = accepted_names(getattr(module, name) for name in ("forward", *methods))
+    for item in (*(lists["per_ray"] or ()), *lists["shared"]):
+        if isinstance(item, str) and known is not None and item.split(".")[0] not in known:
+            raise ValueError(
+                f"VoronoiRouter: per_ray and shared must name arguments of {kind}, one of {', '.join(known)}, "
+                f"got {item!r}"
+            )

@@ -7,6 +7,7 @@ cell's part. A rule returns ``NotImplemented`` for arguments that have no form f
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -16,8 +17,7 @@ from torch import Tensor
 
 from voronerf.ops import grouped_linear
 from voronerf.router.grouped import GroupedRun, PerCell, register, writes_in_place
-from voronerf.router.grouping import Grouping
-from voronerf.router.trees import map_tree, tensors_of
+from voronerf.router.layout import map_tensors, tensors_of
 
 _ELEMENTWISE = """
     add sub subtract rsub mul multiply div divide true_divide remainder fmod pow maximum minimum atan2 hypot lerp where
@@ -164,7 +164,7 @@ def _elementwise(func: Any, run: GroupedRun, *args: Any, **kwargs: Any) -> Any:
         return NotImplemented  # it writes samples into a parameter
     wide = [tensor.dtype for tensor in tensors if tensor.dim() > 0 and tensor.is_floating_point()]
 
-    def expanded(_: str, value: Tensor, nested: bool) -> Tensor:
+    def expanded(value: Tensor) -> Tensor:
         if not isinstance(value, PerCell):
             return value
         parameter = _as_rows(run, value, dim, m)
@@ -172,7 +172,7 @@ def _elementwise(func: Any, run: GroupedRun, *args: Any, **kwargs: Any) -> Any:
         # A tensor without dimensions does not decide the dtype of a result, and its repetition must not either.
         return parameter.to(functools.reduce(torch.promote_types, wide)) if value.dim() == 0 and wide else parameter
 
-    args, kwargs = map_tree((args, kwargs), expanded)
+    args, kwargs = map_tensors((args, kwargs), expanded)
     return func(*args, **kwargs)
 
 
@@ -274,13 +274,72 @@ def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Ten
     index = index.long()
     if low < 0:
         index = torch.where(index < 0, index + entries, index)
-    whole, first = table.origin
-    occupied = run.grouping.occupied()
-    if len(occupied) == 1:
-        first += occupied[0][0]
-    else:
-        index = index + run.grouping.entry_offsets(entries, m).reshape(-1, *[1] * (index.dim() - 1))
-    return run.tables.look_up(whole, first * entries, index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
+    index = index + run.grouping.entry_offsets(entries, m).reshape(-1, *[1] * (index.dim() - 1))
+    return _rows_of_table(run, *table.origin, index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
+
+
+def _rows_of_table(run: GroupedRun, stacked: Tensor, start: int, index: Tensor) -> Tensor:
+    """Entries [m, c] of tables [k, e, c], for indices [m] that count from the table of cell ``start``.
+
+    A field reads a table many times in one forward: the eight corners of a voxel, for several levels. The gradient of
+    each look-up has the size of the whole table, so all look-ups of one table add theirs to one buffer.
+    """
+    key = id(stacked), torch.is_grad_enabled()
+    if key not in run.tables:
+        buffer: list[Tensor] = []
+        flat = stacked.reshape(-1, math.prod(stacked.shape[2:]))
+        source = _Source.apply(flat, buffer) if flat.requires_grad and key[1] else flat
+        run.tables[key] = stacked, source, buffer  # ``stacked`` as well: nothing else may get its id
+    _, source, buffer = run.tables[key]
+    found: Tensor = _LookUp.apply(source, start * stacked.shape[1], index, buffer)
+    return found
+
+
+class _Source(torch.autograd.Function):
+    """A table [k * e, c] whose gradient is what its look-ups have put into a buffer in this backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, buffer: list[Tensor]) -> Tensor:
+        ctx.buffer = buffer
+        ctx.set_materialize_grads(False)
+        return table.view_as(table)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor | None) -> tuple[Tensor | None, None]:
+        if ctx.buffer:
+            collected = ctx.buffer.pop()
+            gradient = collected if gradient is None else collected + gradient
+        return gradient, None
+
+
+class _LookUp(torch.autograd.Function):
+    """Rows of a :class:`_Source`, for indices that count from one of its rows."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, first: int, index: Tensor, buffer: list[Tensor]) -> Tensor:
+        ctx.save_for_backward(table, index)
+        ctx.first, ctx.buffer = first, buffer
+        return _as_moved(table[first:]).index_select(0, index).view(table.dtype).reshape(-1, table.shape[1])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None, None]:
+        table, index = ctx.saved_tensors
+        if torch.is_grad_enabled():  # the gradient has a gradient itself, which a buffer would lose
+            return torch.zeros_like(table).index_add(0, index + ctx.first, gradient), None, None, None
+        if not ctx.buffer:
+            ctx.buffer.append(torch.zeros_like(table))
+        sums, rows = _as_moved(ctx.buffer[0][ctx.first :]), _as_moved(gradient.contiguous())
+        if sums.is_complex():
+            sums.scatter_add_(0, index, rows)
+        else:
+            sums.index_add_(0, index, rows)
+        return None, None, None, None
+
+
+def _as_moved(rows: Tensor) -> Tensor:
+    """Rows of two numbers as one complex number on a CPU, where torch moves these three times as fast."""
+    paired = rows.device.type == "cpu" and rows.shape[-1] == 2 and rows.dtype == torch.float32
+    return torch.view_as_complex(rows) if paired else rows
 
 
 @rule(F.embedding)
@@ -301,56 +360,13 @@ def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
     return _look_up(run, source, index, -source.shape[0]) if index.dtype in _INTEGERS else NotImplemented
 
 
-_WASTE = 512
-"""Rows of padding that cost as much as one more call of ``grid_sample``."""
-_PLANES = 128
-"""Samples a cell beyond which planes are read faster cell by cell: each read has a gradient as large as its planes."""
-
-
 @rule(F.grid_sample)
 def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) -> Any:
-    """A plane [1, c, h, w] or volume [1, c, d, h, w] at rows [1, ..., 2] or [1, ..., 3]."""
-    if not isinstance(input, PerCell) or input.shape[0] != 1 or not run.is_rows(grid):
-        return NotImplemented
+    """A plane [1, c, h, w] or volume [1, c, d, h, w] at rows [1, ..., 2] or [1, ..., 3], one cell after the other."""
     places = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
-    if len(places) != 1 or grid.shape[0] != 1:
+    if not isinstance(input, PerCell) or not run.is_rows(grid) or len(places) != 1 or grid.shape[0] != 1:
         return NotImplemented
-    run.most = _PLANES
-    return _sampled(run.grouping, input.stacked.squeeze(1), grid, places[0], **options)
-
-
-def _sampled(grouping: Grouping, planes: Tensor, grid: Tensor, place: int, **options: Any) -> Tensor:
-    """``F.grid_sample`` of each cell's own plane or volume.
-
-    Args:
-        grouping: Of the samples.
-        planes: [k, c, h, w] or [k, c, d, h, w].
-        grid: [1, ..., 2] or [1, ..., 3].
-        place: The dimension of ``grid`` that is the n sorted samples.
-        **options: Of ``F.grid_sample``.
-
-    Returns:
-        [1, c, ...] with the sizes of ``grid``.
-    """
-    n, c = grouping.n, planes.shape[1]
-    rest = [size for d, size in enumerate(grid.shape[1:-1], 1) if d != place]
-    points = grid[0].movedim(place - 1, 0).reshape(n, -1, grid.shape[-1])
-    volume = [1] * (planes.dim() - 4)
-
-    def read(own: Tensor, at: Tensor) -> Tensor:
-        """[cells, c, h, w] at [cells, rows, q, 2] -> [cells, c, rows, q]."""
-        cells, rows, q, _ = at.shape
-        return F.grid_sample(own, at.reshape(cells, rows, q, *volume, -1), **options).reshape(cells, c, rows, q)
-
-    occupied = grouping.occupied()
-    most = max(last - first for _, first, last in occupied)
-    if len(occupied) > 1 and grouping.k * most - n <= _WASTE * len(occupied):
-        slots = grouping.slots
-        padded = points.new_zeros(grouping.k * most, *points.shape[1:]).index_copy(0, slots, points)
-        found = read(planes, padded.reshape(grouping.k, most, *points.shape[1:]))
-        found = found.transpose(1, 2).reshape(-1, c, points.shape[1]).index_select(0, slots).transpose(0, 1)[None]
-    else:
-        own = planes.split(1)
-        parts = [read(own[cell], points[None, first:last]) for cell, first, last in occupied]
-        found = parts[0] if len(parts) == 1 else torch.cat(parts, 2)
-    return found.reshape(1, c, n, *rest).movedim(2, 1 + place)
+    occupied, planes = run.grouping.occupied, input.stacked.unbind(0)
+    points = grid.split([last - first for _, first, last in occupied], places[0])
+    found = [F.grid_sample(planes[cell], own, **options) for (cell, _, _), own in zip(occupied, points, strict=True)]
+    return torch.cat(found, places[0] + 1)

@@ -24,11 +24,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouped import METADATA, name_of, user_line, writes_in_place
-from voronerf.router.layout import Call, Given
-from voronerf.router.loop import RANDOM
-from voronerf.router.parameters import cell_parameters, in_place_of_parameters, is_shared, owned_parameters
-from voronerf.router.trees import rebuild, tensors_of
+from voronerf.router.cells import cell_parameters, in_place_of_parameters, is_shared, owned_parameters
+from voronerf.router.grouped import METADATA, RANDOM, name_of, user_line, writes_in_place
+from voronerf.router.layout import Call, rebuild, tensors_of
 
 ROWS = 37  # in a trace
 _PATCHES = threading.RLock()  # one thread at a time changes what torch calls for a custom function
@@ -159,8 +157,7 @@ class Trace(TorchFunctionMode):
     Args:
         original: The routed module.
         call: Of a copy of it, which runs with the parameters of its first cell.
-        given: The arguments, for ``ROWS`` samples.
-        shared_layers: Whether linear layers with weights that all cells share are layers of the table, and no steps.
+        given: The rows of the arguments, for ``ROWS`` samples.
 
     Attributes:
         sizes: Of every value of rows, rows for each sample and the dimensions behind, 0 rows where their dimension is
@@ -177,10 +174,9 @@ class Trace(TorchFunctionMode):
         Unfusable: For a step that cannot be done again for other samples, or a layer that fits no table.
     """
 
-    def __init__(self, original: nn.Module, call: Call, given: Given, shared_layers: bool) -> None:
+    def __init__(self, original: nn.Module, call: Call, given: list[Tensor]) -> None:
         super().__init__()
         module = call.module
-        self._shared_layers = shared_layers
         self.shared: set[int] = set()
         self.sizes: list[tuple[int, ...] | None] = []
         self.stages: list[int] = []
@@ -189,7 +185,7 @@ class Trace(TorchFunctionMode):
         self.behind: list[Step] = []
         self.weights: list[Step] = []
         self.layers: list[Linear] = []
-        single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for _, _, p in cell_parameters(module)}
+        single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for p in cell_parameters(module)}
         owned = owned_parameters(module)
         self._places = {id(single.get(id(parameter), parameter)): i for i, (_, _, parameter) in enumerate(owned)}
         self._in_common = {i for i, (owner, name, _) in enumerate(owned) if is_shared(owner, name)}
@@ -199,9 +195,9 @@ class Trace(TorchFunctionMode):
         self._codes: dict[int, Tensor] = {}  # like each value, with the number of its column in each entry
         self._columns: list[tuple[int, int, tuple[str, float], int]] = []  # as in a segment
         self._scaled: dict[int, tuple[int, float]] = {}
-        kept = (*given.rows, *module.buffers(), *module.parameters())
+        kept = (*given, *module.buffers(), *module.parameters())
         self._given = {tensor.untyped_storage().data_ptr() for tensor in kept}
-        for tensor in given.rows:
+        for tensor in given:
             self.new(tensor)
         with in_place_of_parameters(module, single), _custom_functions(self), self:
             result = call.run(given)
@@ -281,7 +277,8 @@ class Trace(TorchFunctionMode):
         stage = max((self.stages[ref] for ref in refs), default=BEFORE)
         parameters = {ref for ref in refs if self.sizes[ref] is None}
         in_common = parameters <= self.shared
-        if rows and step.function is F.linear and parameters and (self._shared_layers or not in_common):
+        # A layer that all cells share, on what is no layer's, is part of an encoding.
+        if rows and step.function is F.linear and parameters and not (in_common and stage != TABLE):
             self._add_layer(step)
         elif not in_common:
             if rows:
