@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import imageio_ffmpeg
@@ -15,7 +16,8 @@ import pytest
 from helpers import python, read_json
 from PIL import Image
 
-from voronerf.cli import main
+from voronerf.cli import commands, main
+from voronerf.data import builtin_scene
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.trainer import Trainer
 
@@ -228,6 +230,35 @@ def test_a_full_disk_is_one_line(monkeypatch, tmp_path, fails):
         fails("No space left on device", *command)
     assert not list(tmp_path.rglob("*.partial"))
     succeeds(*command)
+
+
+def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails):
+    monkeypatch.chdir(tmp_path)
+    train = f"train --data builtin --device cpu {TINY}"
+    for message, given in (
+        ("--width 1000000 with 3 cells needs", "--width 1000000"),
+        ("--parameters 1000000000000 needs", f"--field kilonerf --parameters {10**12}"),
+        ("--rays 1000000000 with 8 samples needs", "--rays 1000000000"),
+        ("--rays 64 with 1000000000 samples needs", "--samples 1000000000"),
+        ("--reservoir 1000000000000 needs", "--reservoir 1000000000000"),
+    ):
+        fails(message, train, given)
+    monkeypatch.setattr("voronerf.training.networks.SAMPLE_BYTES", 0)
+    fails("not enough memory, 59604.6 GiB were asked for; try a smaller --width", train, "--rays 8000000000000")
+    assert [path.name for path in tmp_path.iterdir()] in ([], ["runs"]) and not list(tmp_path.glob("runs/*"))
+
+
+def test_image_names_that_are_too_long_for_panels(tmp_path, monkeypatch, fails):
+    def scene(name):
+        whole = builtin_scene(16, test_views=1)
+        return lambda *_, **__: replace(whole, test=replace(whole.test, names=(name,)))
+
+    monkeypatch.setattr(commands, "load_scene", scene("x" * 252))
+    fails("--panels must be 0 with image names of more than 251 bytes, got xxx", "train --out", tmp_path / "a", TINY)
+    assert not (tmp_path / "a").exists()
+    monkeypatch.setattr(commands, "load_scene", scene("x" * 251))
+    succeeds("train --out", tmp_path / "a", TINY)
+    assert (tmp_path / "a" / "images" / f"{'x' * 251}.png").is_file()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")

@@ -80,7 +80,7 @@ def test_bad_settings():
     refuses("HashGrid: log2_entries must be an integer from 10 to 24, got 30", HashGridField, log2_entries=30)
     with pytest.raises(ConfigError, match="--cell-tables must come with a field whose cells share parameters"):
         TrainConfig(field="nerf", cell_tables=True)
-    with pytest.raises(ConfigError, match=r"--field hashgrid with 4096 cells needs .* GiB for parameters, gradients"):
+    with pytest.raises(ConfigError, match=r"--field hashgrid of --width 32 with 4096 cells needs .* GiB of"):
         check_memory(TrainConfig(field="hashgrid", cells=(4096,), cell_tables=True))
     refuses("HashGridField: directions must be given", HashGridField(log2_entries=10), torch.rand(2, 3))
     capture = load_scene("builtin", downscale=10)

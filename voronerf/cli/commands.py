@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import os
 import shlex
 import signal
 from pathlib import Path
@@ -30,6 +32,8 @@ from voronerf.training.trainer import Trainer
 
 console = Console(soft_wrap=True)
 
+#: Bytes of a picture's name without its end, which most file systems take.
+LONGEST_NAME = 255 - len(".png")
 #: What ends a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 
@@ -46,7 +50,14 @@ def train(config: TrainConfig) -> int:
     """
     check_device(config.device)
     scene = load_scene(config.data, downscale=config.downscale, allow_outside=config.allow_outside)
-    summary = run_training(choose_directory(config, scene), scene)
+    chosen = choose_directory(config, scene)
+    assert chosen.out is not None
+    try:
+        summary = run_training(chosen, scene)
+    finally:
+        if config.out is None:
+            with contextlib.suppress(OSError):
+                chosen.out.rmdir()  # fails if something was written, and is then not needed
     return 0 if summary["complete"] else 130
 
 
@@ -57,6 +68,9 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
     the pictures are not. A second one ends the process at once.
     """
     assert config.out is not None
+    longest = max(scene.test.names, key=lambda name: len(os.fsencode(name)))
+    if config.panels and len(os.fsencode(longest)) > LONGEST_NAME:
+        raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
     with held(config.out):
         return _train_and_draw(config, config.out, scene)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -26,6 +27,9 @@ EXPECTED = (
     *(ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError),
     *(MemoryError, torch.OutOfMemoryError),
 )
+
+#: By which torch's plain RuntimeErrors tell that there is no memory left on a CPU, for tensors or for a thread.
+NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "can't start new thread")
 
 #: What ``voronerf NAME`` runs; arguments and docstring of each function are its options and its help.
 COMMANDS: dict[str, Callable[..., int]] = {
@@ -64,6 +68,14 @@ def main(args: list[str] | None = None) -> int:
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
         print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
+        return 1
+    except RuntimeError as error:
+        text = str(error)
+        if os.environ.get("VORONERF_TRACEBACK") or not any(sign in text for sign in NO_MEMORY):
+            raise
+        asked = re.search(r"tried to allocate (\d+) bytes", text)
+        size = f", {int(asked[1]) / 2**30:.1f} GiB were asked for" if asked else ""
+        print(f"voronerf: error: not enough memory{size}; try a smaller --width, --rays or --samples", file=sys.stderr)
         return 1
 
 

@@ -24,6 +24,8 @@ from voronerf.training.renderers import make_contraction
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
+#: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
+SAMPLE_BYTES = 64
 
 
 def octaves_for(scene: Scene) -> int:
@@ -132,18 +134,43 @@ def count_parameters(config: TrainConfig, width: int | None = None) -> int:
 
 
 def check_memory(config: TrainConfig) -> None:
-    """Refuses networks that do not fit into the machine: a parameter, its gradient and Adam's moments are 16 bytes, its
-    average 4 more.
+    """Refuses what does not fit into the machine.
 
     Raises:
         ConfigError: with the sizes.
     """
-    needed, there = (20 if config.average else 16) * count_parameters(config), physical_memory()
+    there = _memory(config)
+    parts = {
+        f"--rays {config.rays} with {config.samples} samples": SAMPLE_BYTES * config.rays * int(config.samples or 0),
+        f"--reservoir {config.reservoir}": 16 * config.reservoir,
+    }
+    for name, needed in parts.items():
+        _check_fits(name, needed, there)
+    # Counting makes a network. One too large for memory is found by narrower ones, whose parameters are fewer by the
+    # ratio of the widths or more.
+    full = config.width or 1
+    narrower = [width for width in (2**i for i in range(10, 40)) if width < full]
+    size = "" if config.width is None else f" of --width {full}"
+    for width in (*narrower, full):
+        count = count_parameters(config, width if config.width else None) * (full // width)
+        name = f"--field {config.field}{size} with {config.final_cells} cells"
+        _check_fits(name, _parameter_bytes(config) * count, there)
+
+
+def _parameter_bytes(config: TrainConfig) -> int:
+    """Of a parameter, its gradient, Adam's two moments and its average."""
+    return 20 if config.average else 16
+
+
+def _memory(config: TrainConfig) -> int:
+    """Bytes of memory where a run trains."""
+    device = torch.device(config.device)
+    return torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else physical_memory()
+
+
+def _check_fits(name: str, needed: int, there: int) -> None:
     if needed > there:
-        raise ConfigError(
-            f"--field {config.field} with {config.final_cells} cells needs {needed / 2**30:.1f} GiB for parameters, "
-            f"gradients, moments and averages, the machine has {there / 2**30:.1f} GiB"
-        )
+        raise ConfigError(f"{name} needs {needed / 2**30:.1f} GiB of memory or more, there are {there / 2**30:.1f}")
 
 
 def solve_width(config: TrainConfig, total: int) -> int:
@@ -154,6 +181,7 @@ def solve_width(config: TrainConfig, total: int) -> int:
     """
     if config.width is None:
         raise ConfigError(f"--parameters needs a field with an option width, {config.field} has none")
+    _check_fits(f"--parameters {total}", _parameter_bytes(config) * total, _memory(config))
     low, high = 2, 4
     if count_parameters(config, low) > total:
         least = count_parameters(config, low)

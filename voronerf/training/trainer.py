@@ -115,14 +115,13 @@ class Trainer:
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
         self.evaluated = 0
         self.metrics: list[dict[str, Any]] = []
-        self.stopped = False
+        self.stopped = self.described = False
         self.loss = math.nan
         self.writer = CheckpointWriter(self.out, config.keep_checkpoints)
         if checkpoint is not None:
             self._resume(checkpoint)
         self.saved_at = self.seconds
         self._compute = self._make_step()
-        write_text(self.out / "config.json", config.to_json())
 
     @property
     def router(self) -> VoronoiRouter:
@@ -379,6 +378,9 @@ class Trainer:
 
     def save(self, *, wait: bool = True) -> None:
         """Writes ``checkpoints/last.safetensors``; without ``wait`` it is begun, and :attr:`writer` ends it."""
+        if not self.described:  # not earlier: a run whose first step fails leaves nothing
+            write_text(self.out / "config.json", self.config.to_json())
+            self.described = True
         self.writer.write(training_state(self))
         self.saved_at = self.seconds
         if wait:
