@@ -281,7 +281,8 @@ class Counter:
 
     def __init__(self, monkeypatch: Any, cls: type[nn.Module], method: str) -> None:
         self.rows: list[int] = []
-        original = getattr(cls, method)
+        owner = next(base for base in cls.__mro__ if method in vars(base))
+        original = getattr(owner, method)
 
         @functools.wraps(original)
         def counted(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
@@ -289,4 +290,4 @@ class Counter:
             self.rows.append(found[0].shape[0])
             return original(module, *args, **kwargs)
 
-        monkeypatch.setattr(cls, method, counted)
+        monkeypatch.setattr(owner, method, counted)

@@ -161,8 +161,6 @@ def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Excep
         raise fail("it differentiates with respect to parameters")
     if getattr(func, "__name__", "") in _WRITES:
         raise fail(f"it calls {name_of(func)} on a parameter")
-    if func is torch.Tensor.data.__get__:  # type: ignore[attr-defined]
-        return PerCell(stacks[0].detach())
     function = _weight_norm if func is torch._weight_norm else func
 
     def on_one(*single: Tensor) -> Any:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -90,10 +91,7 @@ def matmul(run: GroupedRun, input: Tensor, other: Tensor) -> Any:
     return NotImplemented
 
 
-@rule(torch.Tensor.__rmatmul__)
-def reflected_matmul(run: GroupedRun, other: Tensor, input: Tensor) -> Any:
-    """``input @ other``, asked of the second."""
-    return matmul(run, input, other)
+register(torch.Tensor.__rmatmul__, lambda run, other, input: matmul(run, input, other))
 
 
 @rule(torch.addmm, torch.Tensor.addmm)
@@ -104,71 +102,41 @@ def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: f
     return linear(run, mat1, PerCell(mat2.stacked.transpose(1, 2)), input)
 
 
+_CONTRACTION = re.compile(r"(\w+?)(\w+),(?:(\w)\2|\2(\w))->\1(?:\3|\4)")
+
+
 @rule(torch.einsum)
 def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
-    """A contraction of rows with a parameter, ``"ni,oi->no"``, as a product."""
-    if len(operands) == 1 and isinstance(operands[0], (list, tuple)):
-        operands = tuple(operands[0])
-    terms, arrow, out = equation.replace(" ", "").partition("->")
-    names = terms.split(",")
-    if len(names) != 2 or len(operands) != 2 or not arrow or "." in equation:
+    """Rows with a parameter, whose letters are contracted and a new one: ``"ni,oi->no"``, ``"nij,ijo->no"``."""
+    found = _CONTRACTION.fullmatch(equation.replace(" ", ""))
+    if found is None or len(operands) != 2 or not isinstance(operands[1], PerCell):
         return NotImplemented
-    (x, x_names), (w, w_names) = sorted(zip(operands, names, strict=True), key=lambda one: isinstance(one[0], PerCell))
-    if not run.is_rows(x) or not isinstance(w, PerCell) or len(set(x_names)) < len(x_names):
-        return NotImplemented
-    row = x_names[0]
-    contracted = [name for name in x_names if name in w_names]
-    kept = [name for name in x_names if name not in w_names]
-    added = [name for name in w_names if name not in x_names]
-    if row in w_names or len(set(w_names)) < len(w_names) or out[:1] != row or not contracted:
-        return NotImplemented
-    if sorted(out) != sorted(kept + added):
-        return NotImplemented
-    sizes = {**dict(zip(x_names, x.shape, strict=True)), **dict(zip(w_names, w.shape, strict=True))}
-    rows = x.permute([x_names.index(name) for name in kept + contracted])
-    rows = rows.reshape(*[sizes[name] for name in kept], -1)
-    weight = w.stacked.permute(0, *[1 + w_names.index(name) for name in added + contracted])
-    product = linear(run, run.mark(rows), PerCell(weight.reshape(weight.shape[0], -1, rows.shape[-1])))
-    if product is NotImplemented:
-        return NotImplemented
-    product = product.reshape([sizes[name] for name in kept + added])
-    return product.permute([(kept + added).index(name) for name in out])
+    x, weight = operands[0], operands[1].stacked
+    weight = weight.flatten(2) if found[3] else weight.flatten(1, -2).transpose(1, 2)
+    return linear(run, run.mark(x.flatten(len(found[1]))) if run.is_rows(x) else x, PerCell(weight))
 
 
 # Scales and shifts ----------------------------------------------------------------------------------------------------
-
-
-def _as_rows(run: GroupedRun, parameter: PerCell, dim: int, m: int) -> Tensor | None:
-    """A parameter as rows of ``dim`` dimensions, [n * m, 1..., *shape]; None if it has more itself."""
-    shape = parameter.shape
-    if len(shape) == dim and shape[0] == 1:
-        shape = shape[1:]
-    if len(shape) >= dim:
-        return None
-    return run.rows_of(parameter, m).reshape(-1, *[1] * (dim - 1 - len(shape)), *shape)
 
 
 def _elementwise(func: Any, run: GroupedRun, *args: Any, **kwargs: Any) -> Any:
     """A function of entries, for rows [n * m, ...] and parameters that broadcast to them."""
     tensors = tensors_of((args, kwargs))
     rows = [tensor for tensor in tensors if run.is_rows(tensor)]
-    if not rows:
+    if not rows or (isinstance(args[0], PerCell) and writes_in_place(func)):  # which writes samples into a parameter
         return NotImplemented
-    others = [tensor for tensor in tensors if not run.is_rows(tensor)]
     dim, m = max(tensor.dim() for tensor in rows), run.entries(rows[0])
     if any(tensor.dim() != dim or run.entries(tensor) != m for tensor in rows):
         return NotImplemented
-    if any(tensor.dim() > dim or (tensor.dim() == dim and tensor.shape[0] != 1) for tensor in others):
+    if any(t.dim() > dim or (t.dim() == dim and t.shape[0] != 1) for t in tensors if not run.is_rows(t)):
         return NotImplemented
-    if isinstance(args[0], PerCell) and writes_in_place(func):
-        return NotImplemented  # it writes samples into a parameter
     wide = [tensor.dtype for tensor in tensors if tensor.dim() > 0 and tensor.is_floating_point()]
 
     def expanded(value: Tensor) -> Tensor:
         if not isinstance(value, PerCell):
             return value
-        parameter = _as_rows(run, value, dim, m)
-        assert parameter is not None
+        shape = value.shape[value.dim() == dim :]
+        parameter = run.rows_of(value, m).reshape(-1, *[1] * (dim - 1 - len(shape)), *shape)
         # A tensor without dimensions does not decide the dtype of a result, and its repetition must not either.
         return parameter.to(functools.reduce(torch.promote_types, wide)) if value.dim() == 0 and wide else parameter
 
@@ -213,39 +181,25 @@ def repeat(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
 # Norms and activations with parameters --------------------------------------------------------------------------------
 
 
-def _scale_and_shift(run: GroupedRun, x: Tensor, weight: Tensor | None, bias: Tensor | None) -> Any:
-    for parameter, join in ((weight, torch.mul), (bias, torch.add)):
-        if isinstance(parameter, PerCell):
-            parameter = _as_rows(run, parameter, x.dim(), run.entries(x))
-            if parameter is None:
-                return NotImplemented
-        x = x if parameter is None else join(x, parameter)
-    return x
+def _by_feature(parameter: Tensor, x: Tensor) -> Tensor:
+    """A parameter [c] as [c, 1, ...], beside rows [n * m, c, ...]."""
+    ones = [1] * (x.dim() - 2)
+    if isinstance(parameter, PerCell):
+        return PerCell(parameter.stacked.reshape(*parameter.stacked.shape, *ones))
+    return parameter.reshape(*parameter.shape, *ones)
 
 
-def _norm(
-    func: Any,
-    run: GroupedRun,
-    input: Tensor,
-    over: Any,
-    weight: Tensor | None = None,
-    bias: Tensor | None = None,
-    **options: Any,
-) -> Any:
+def _norm(func: Any, run: GroupedRun, x: Tensor, over: Any, weight: Any = None, bias: Any = None, **more: Any) -> Any:
     """A norm over the last dimensions, or of groups of features: without its parameters, then those."""
-    if not run.is_rows(input):
+    if not run.is_rows(x):
         return NotImplemented
-    parameters = [weight, bias]
-    if func is F.group_norm:
-        if any(p is not None and not isinstance(p, PerCell) for p in parameters):
-            return NotImplemented
-        ones = [1] * (input.dim() - 2)
-        parameters = [
-            PerCell(p.stacked.reshape(*p.stacked.shape, *ones)) if isinstance(p, PerCell) else p for p in parameters
-        ]
-    elif len(over) >= input.dim():
-        return NotImplemented
-    return _scale_and_shift(run, func(input, over, **options), *parameters)
+    x = func(x, over, **more)
+    for parameter, join in ((weight, torch.mul), (bias, torch.add)):
+        if parameter is not None and x is not NotImplemented:
+            parameter = _by_feature(parameter, x) if func is F.group_norm else parameter
+            seen = isinstance(parameter, PerCell)
+            x = _elementwise(join, run, run.mark(x), parameter) if seen else join(x, parameter)
+    return x
 
 
 for _function in (F.layer_norm, F.rms_norm, F.group_norm):
@@ -255,11 +209,8 @@ for _function in (F.layer_norm, F.rms_norm, F.group_norm):
 @rule(F.prelu)
 def prelu(run: GroupedRun, input: Tensor, weight: Tensor) -> Any:
     """One slope, or one for each of the features [n * m, features, ...]."""
-    if not isinstance(weight, PerCell) or not run.is_rows(input) or weight.dim() != 1:
-        return NotImplemented
-    slope = run.rows_of(weight, run.entries(input))
-    slope = slope.reshape(slope.shape[0], *[slope.shape[1], *[1] * (input.dim() - 2)][: input.dim() - 1])
-    return torch.where(input >= 0, input, slope * input)
+    negative = _elementwise(torch.mul, run, input, _by_feature(weight, input))
+    return negative if negative is NotImplemented else torch.where(input >= 0, input, negative)
 
 
 # Look-ups -------------------------------------------------------------------------------------------------------------
