@@ -22,7 +22,8 @@ def write_bytes(path: Path, data: bytes) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with open(partial, "wb") as file:
+            partial.unlink(missing_ok=True)
+            with open(partial, "xb") as file:  # which follows no link that lies there
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())

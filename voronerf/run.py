@@ -23,6 +23,7 @@ from voronerf.training.networks import check_shapes, make_routers, parameter_gro
 from voronerf.training.occupancy import make_picture_grid
 from voronerf.training.renderers import make_renderer
 from voronerf.training.resume import stored_values
+from voronerf.training.run_directory import check_folders, check_stored_paths
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,8 @@ class Run:
         Args:
             weights: A file or folder, or "off"; None searches as in training, see ``TrainConfig.lpips``.
         """
+        if weights is None:
+            check_stored_paths(self.path, lpips=self.config.lpips)
         weights = self.config.lpips if weights is None else Path(weights)
         cameras = self.scene.test.cameras
         return find_lpips(weights, self.config.data, (cameras.height, cameras.width))
@@ -125,7 +128,8 @@ def open_run(
     Args:
         path: The run directory.
         scene: The scene, if it is loaded already.
-        data: Scene folder, if it has moved since training.
+        data: Scene folder; None for that of the training, if it lies in the run directory, the working directory or
+            ``VORONERF_DATA``, since a run may be another person's.
         downscale: Factor on the images; None for that of the training.
         allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray in the first pass; None for those of the training.
@@ -138,7 +142,8 @@ def open_run(
 
     Raises:
         CheckpointError: If there is no usable checkpoint.
-        ConfigError: For an argument that cannot be used, or occupancy for a run that cannot use a grid.
+        ConfigError: For an argument that cannot be used, occupancy for a run that cannot use a grid, a scene that
+            must be given, or a folder of the run that is a link to elsewhere.
         SceneError: If the scene cannot be read.
 
     Examples:
@@ -165,8 +170,11 @@ def open_run(
     check_device(device)
     if blend is not None and not 0 <= blend < math.inf:
         raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
+    check_folders(path)
     checkpoint = last_checkpoint(path)
     config, _ = stored_values(checkpoint)
+    if scene is None and data is None:
+        check_stored_paths(path, data=config.data)
     check_shapes(config, checkpoint)
     routers = make_routers(config, device)
     restore_routers(routers, checkpoint)

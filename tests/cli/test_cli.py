@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import imageio_ffmpeg
 import pytest
+from cli_commands import TINY, words
 from helpers import python, read_json
 from PIL import Image
 
@@ -21,32 +22,9 @@ from voronerf.data import builtin_scene
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.trainer import Trainer
 
-TINY = (
-    "--downscale 6 --steps 16 --cells 3 --split-at 0.5 --width 8 --depth 2 --rays 64 --samples 8 --evaluations 2 "
-    "--eval-views 2 --final-views 2 --panels 1"
-)
-
-
-def words(*parts):
-    """A command: text is split at its spaces, other things are one word each."""
-    return [word for part in parts for word in (part.split() if isinstance(part, str) else [str(part)])]
-
 
 def succeeds(*parts):
     assert main(words(*parts)) == 0
-
-
-@pytest.fixture
-def fails(capsys):
-    """Fails unless the command prints a single line that contains the message, and has an exit status."""
-
-    def check(message, *parts):
-        capsys.readouterr()
-        assert main(words(*parts)) != 0
-        text = capsys.readouterr().err
-        assert text.startswith("voronerf: error: ") and text.count("\n") == 1 and message in text, text
-
-    return check
 
 
 @pytest.fixture(scope="module")

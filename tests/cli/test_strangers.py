@@ -1,13 +1,15 @@
 """Runs that a stranger made: nothing in them takes memory or time, or leads outside, before it is refused."""
 
 import json
+import os
 import shutil
 import sys
+import threading
 
 import pytest
 import torch
+from cli_commands import TINY, words
 from helpers import python
-from test_cli import TINY, words
 
 from voronerf.cli import main
 from voronerf.training.checkpoint import load_checkpoint, save_checkpoint
@@ -18,6 +20,61 @@ def trained(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "tiny"
     assert main(words("train --data builtin --field nerf --no-occupancy --out", out, TINY)) == 0
     return out
+
+
+@pytest.fixture
+def copied(trained, tmp_path):
+    """A run that a test may change."""
+    shutil.copytree(trained, tmp_path / "run")
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "images", "plots", "samples"])
+def test_folders_that_lead_out_of_a_run(copied, tmp_path, fails, name):
+    outside = tmp_path / "outside"
+    (copied / name).rename(outside)
+    (copied / name).symlink_to(outside)
+    before = {path: path.stat().st_mtime_ns for path in outside.iterdir()}
+    for command in ("eval --views 1", "render --frames 1", "train --resume --steps 18 --out"):
+        fails(f"{name} must be in the run directory, got a link to {outside}", command, copied)
+    assert before == {path: path.stat().st_mtime_ns for path in outside.iterdir()}
+    (copied / name).unlink()
+    outside.rename(copied / "elsewhere")
+    (copied / name).symlink_to("elsewhere")
+    assert main(words("eval --views 1", copied)) == 0
+
+
+def test_files_that_are_links_are_replaced_and_not_followed(copied, tmp_path):
+    mine = tmp_path / "mine"
+    mine.write_text("mine")
+    partial = f".{os.getpid()}-{threading.get_native_id()}.partial"
+    for name in ("eval.json", partial, f"images/{partial}", f".turntable.{os.getpid()}.mp4", "turntable.mp4"):
+        (copied / name).unlink(missing_ok=True)
+        (copied / name).symlink_to(mine)
+    assert main(words("eval --views 1 --panels 1", copied)) == main(words("render --frames 1", copied)) == 0
+    assert mine.read_text() == "mine" and not (copied / "eval.json").is_symlink()
+
+
+@pytest.mark.parametrize("option", ["data", "lpips"])
+def test_paths_in_the_settings_of_a_run(copied, tmp_path, fails, monkeypatch, option):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    path = copied / "checkpoints" / "last.safetensors"
+    checkpoint = load_checkpoint(path)
+    for value in (outside, copied / ".." / "outside", copied / "link"):
+        (copied / "link").unlink(missing_ok=True)
+        (copied / "link").symlink_to(outside)
+        settings(**{option: str(value)})(copied, checkpoint)
+        save_checkpoint(path, checkpoint)
+        for command in ("eval --views 1", "train --resume --steps 18 --out"):
+            fails(f"--{option} must be given", command, copied)
+    given = {"data": "--data builtin", "lpips": "--lpips off"}[option]
+    assert main(words("eval --views 1", copied, given)) == 0
+    settings(**{option: str(outside)})(copied, checkpoint)
+    save_checkpoint(path, checkpoint)
+    monkeypatch.chdir(tmp_path)
+    used = {"data": "outside: is not a scene", "lpips": "--lpips must be off or come with larger images"}[option]
+    fails(used, "eval --views 1", copied)
 
 
 def settings(**changes):

@@ -27,7 +27,7 @@ from voronerf.rendering.cameras import turntable_cameras
 from voronerf.run import open_run
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device, why_no_occupancy
-from voronerf.training.run_directory import choose_directory, held, write_curve
+from voronerf.training.run_directory import choose_directory, held, is_outside, write_curve
 from voronerf.training.trainer import Trainer
 
 console = Console(soft_wrap=True)
@@ -102,7 +102,8 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene) -> dict[str, A
         finally:
             restore()
     if not summary["complete"]:
-        say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}")
+        again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
+        say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
         return summary
     if config.panels:
         with trainer.averaged():
@@ -132,7 +133,8 @@ def evaluate_run(
 
     Args:
         run: The run directory.
-        data: Scene folder, if it has moved since training.
+        data: Scene folder; default as in training, if that lies in the run directory, the working directory or
+            VORONERF_DATA, since a run may be another person's.
         downscale: Factor on the images; default as in training.
         allow_outside: Also read images that lie outside of the scene folder.
         views: Number of test views, evenly spread; default all.
@@ -203,7 +205,8 @@ def render(
         out: The video file, .mp4; default turntable.mp4 in the run directory.
         frames: Frames of one turn.
         fps: Frames per second.
-        data: Scene folder, if it has moved since training.
+        data: Scene folder; default as in training, if that lies in the run directory, the working directory or
+            VORONERF_DATA, since a run may be another person's.
         downscale: Factor on the images, which decides the video's size; default as in training.
         allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray in the first pass; default as in training.

@@ -20,7 +20,7 @@ from voronerf.cli import commands, demo
 from voronerf.cli.display import one_line
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
-from voronerf.training.run_directory import stored_config
+from voronerf.training.run_directory import check_stored_paths, stored_config
 
 #: Errors that a user can cause; they are printed as one line. ValueError includes SceneError and CheckpointError.
 EXPECTED = (
@@ -86,13 +86,20 @@ def _train_command(args: list[str]) -> Callable[..., int]:
     out = next((after for word, after in itertools.pairwise(args) if word == "--out"), None)
     out = next((word.removeprefix("--out=") for word in args if word.startswith("--out=")), out)
     stored = None if out is None else stored_config(Path(out))
-    if stored is None:
+    if out is None or stored is None:
         return commands.train
+
+    def given(name: str) -> bool:
+        return any(word == f"--{name}" or word.startswith(f"--{name}=") for word in args)
+
+    check_stored_paths(
+        Path(out), data=None if given("data") else stored.data, lpips=None if given("lpips") else stored.lpips
+    )
     # A given --steps replaces a stored budget and the other way round; the number that is set here is replaced in turn.
-    given = {name for name in ("budget", "steps") if any(w == f"--{name}" or w.startswith(f"--{name}=") for w in args)}
-    if given == {"steps"} and stored.budget is not None:
+    length = {name for name in ("budget", "steps") if given(name)}
+    if length == {"steps"} and stored.budget is not None:
         stored = replace(stored, budget=None, steps=sys.maxsize)
-    elif given == {"budget"} and stored.steps is not None:
+    elif length == {"budget"} and stored.steps is not None:
         stored = replace(stored, budget=sys.float_info.max, steps=None)
 
     def train(config: TrainConfig = stored) -> int:

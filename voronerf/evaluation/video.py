@@ -29,6 +29,7 @@ def check_video(path: Path) -> None:
         raise ImportError("writing a video needs imageio-ffmpeg and its ffmpeg: pip install imageio-ffmpeg") from None
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = _partial(path)
+    partial.unlink(missing_ok=True)  # a link would be followed
     partial.touch()
     partial.unlink()
 

@@ -5,17 +5,59 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from voronerf.data import Scene
+from voronerf.data import BUILTIN, Scene
+from voronerf.evaluation.lpips import OFF
 from voronerf.evaluation.plots import plot_curves
-from voronerf.files import read_json, read_json_lines, remove_partial
+from voronerf.files import leads_outside, read_json, read_json_lines, remove_partial
 from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
+
+#: The folders of a run, in which files are written.
+FOLDERS = ("checkpoints", "images", "plots", "samples")
+
+
+def check_folders(run: Path) -> None:
+    """Refuses a run with a folder that leads out of it, where files that are none of the run would be replaced.
+
+    Raises:
+        ConfigError: names the folder.
+    """
+    for name in FOLDERS:
+        if leads_outside(run / name, run):
+            raise ConfigError(f"{run}: {name} must be in the run directory, got a link to {(run / name).resolve()}")
+
+
+def is_outside(run: Path, path: str | Path) -> bool:
+    """Whether a path is in no folder of the user's choice: the run's, the working directory, ``VORONERF_DATA``."""
+    data = os.environ.get("VORONERF_DATA")
+    return all(leads_outside(Path(path), folder) for folder in (run, Path.cwd(), *([Path(data)] if data else [])))
+
+
+def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None = None) -> None:
+    """Refuses paths of a run's settings outside of what the user chose, since the run may be another person's.
+
+    Args:
+        run: The run directory.
+        data: The scene of the settings.
+        lpips: The weights of the settings.
+
+    Raises:
+        ConfigError: One lies in no folder of the user's choice.
+    """
+    paths = {"data": None if data in BUILTIN else data, "lpips": None if str(lpips) == OFF else lpips}
+    for option, path in paths.items():
+        if path is not None and is_outside(run, path):
+            raise ConfigError(
+                f"{run}: --{option} must be given, since the settings of the run name what is outside of it, of the "
+                f"working directory and of VORONERF_DATA: --{option} {shlex.quote(str(path))}"
+            )
 
 
 def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
@@ -51,8 +93,9 @@ def held(folder: Path) -> Iterator[None]:
     """Locks a run directory, so that two processes cannot write it; without effect on file systems without locks.
 
     Raises:
-        ConfigError: When another process holds it.
+        ConfigError: When another process holds it, or a folder of it leads elsewhere.
     """
+    check_folders(folder)
     made = _made(folder)
     if sys.platform == "win32":
         yield

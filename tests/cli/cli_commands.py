@@ -1,0 +1,11 @@
+"""Commands as lists of words, and options of a run of a few steps."""
+
+TINY = (
+    "--downscale 6 --steps 16 --cells 3 --split-at 0.5 --width 8 --depth 2 --rays 64 --samples 8 --evaluations 2 "
+    "--eval-views 2 --final-views 2 --panels 1"
+)
+
+
+def words(*parts):
+    """A command: text is split at its spaces, other things are one word each."""
+    return [word for part in parts for word in (part.split() if isinstance(part, str) else [str(part)])]
