@@ -99,5 +99,5 @@ def test_cells_by_the_mean_of_a_gaussian(kind, assignment):
 def test_shapes_are_checked():
     router = VoronoiRouter(MipNeRF(width=8, depth=1, position_octaves=2), torch.zeros(2, 3))
     refuses("positions must have shape [n, 6], got [4, 3]", router, torch.zeros(4, 3), directions(4))
-    rule = "coords must have shape [4, 3], got [4, 6]"
+    rule = "coords must have shape [..., 3], got [4, 6]"
     refuses(rule, router, gaussians(4), directions(4), coords=gaussians(4))

@@ -161,7 +161,7 @@ def test_coords_of_a_field_with_a_table(rule: str) -> None:
 @pytest.mark.parametrize("coords", [lambda p, *_: p.long(), lambda p, *_: 3])
 def test_coords_that_are_none(coords: Any) -> None:
     router = VoronoiRouter(NeRF(width=16, depth=2), centres(), coords=coords)
-    with pytest.raises(TypeError, match=r"coords must be floating-point, got torch.int64|must be a tensor, got int"):
+    with pytest.raises(TypeError, match=r"coords returns must be (floating-point, got torch.int64|a tensor, got int)"):
         router(samples()[:, :3], directions(40))
 
 

@@ -181,7 +181,7 @@ def test_cells_take_what_fits_them(generator: torch.Generator) -> None:
         router.load_cell(0, SkipNet(width=13))
     other = Heads()
     other.bands.mul_(3)
-    with pytest.raises(ValueError, match="buffer bands must be that of the routed one"):
+    with pytest.raises(ValueError, match="module's bands must be that of the routed one"):
         router_of(Heads(), generator).load_cell(0, other)
     with pytest.raises(IndexError, match="index must be below 4, got 4"):
         router.load_cell(4, modules[0])

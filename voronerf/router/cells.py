@@ -86,8 +86,6 @@ def check_module(module: nn.Module) -> None:
 def _refusal(part: nn.Module) -> str:
     if isinstance(part, nn.modules.batchnorm._BatchNorm):
         return "mixes the samples of a batch (use LayerNorm or GroupNorm)"
-    if isinstance(part, nn.modules.instancenorm._InstanceNorm) and part.track_running_stats:
-        return "keeps statistics of the samples of a batch (set track_running_stats=False)"
     if isinstance(part, nn.RNNBase):
         return "is recurrent, with weights that cannot be one set for each cell"
     hooks = part._forward_pre_hooks.values()
@@ -142,25 +140,20 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
     Raises:
         ValueError: Names, shapes or buffers that are not those of the routed module.
     """
-    ours, theirs = dict(routed.named_parameters()), dict(module.named_parameters())
-    if ours.keys() != theirs.keys():
-        odd = sorted(ours.keys() ^ theirs.keys())
-        raise ValueError(f"{op}: module must have the parameters of the routed one, got a difference in {odd[0]!r}")
     stacked = {id(parameter) for parameter in cell_parameters(routed)}
-    for name, parameter in theirs.items():
-        own = id(ours[name]) in stacked
-        shape = ours[name].shape[1:] if own else ours[name].shape
-        if parameter.shape != shape:
-            raise ValueError(f"{op}: module's {name} must have shape {list(shape)}, got {list(parameter.shape)}")
-        if not own and not torch.equal(parameter.to(ours[name]), ours[name]):
+    ours, theirs = routed.state_dict(keep_vars=True), module.state_dict()
+    odd = sorted(ours.keys() ^ theirs.keys())
+    if odd:
+        raise ValueError(f"{op}: module must have the parameters of the routed one, got a difference in {odd[0]!r}")
+    for name, own in ours.items():
+        shape, value = own.shape[id(own) in stacked :], theirs[name]
+        if value.shape != shape:
+            raise ValueError(f"{op}: module's {name} must have shape {list(shape)}, got {list(value.shape)}")
+        if id(own) not in stacked and not torch.equal(value.to(own), own):
             raise ValueError(f"{op}: module's {name} must be that of the routed one, since cells share it")
-    buffers = dict(module.named_buffers())
-    for name, buffer in routed.named_buffers():
-        if name not in buffers or not torch.equal(buffers[name].to(buffer.device), buffer):
-            raise ValueError(f"{op}: module's buffer {name} must be that of the routed one, since cells share buffers")
-    for name, parameter in theirs.items():
-        if id(ours[name]) in stacked:
-            ours[name][index] = parameter.to(ours[name])
+    for name, own in ours.items():
+        if id(own) in stacked:
+            own[index] = theirs[name].to(own)
 
 
 @contextlib.contextmanager

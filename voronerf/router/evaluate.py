@@ -12,14 +12,12 @@ from __future__ import annotations
 import inspect
 import threading
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
-from voronerf import ops
 from voronerf.backends import BackendUnavailable
 from voronerf.diagram.blending import Mixture
 from voronerf.layers import MLP
@@ -244,13 +242,6 @@ def described_by_table(field: nn.Module) -> bool:
     )
 
 
-def coords_by_rule(rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """The positions that decide the cells, by a router's rule; None for those of the samples themselves."""
-    if isinstance(rule, slice):
-        return (args[0] if args else kwargs["positions"])[..., rule]
-    return rule(*args, **kwargs) if callable(rule) else None
-
-
 def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """The arguments for a field's own ``forward``: a direction for each sample, in the place of one for each ray."""
     given = dict(zip(("positions", "directions", "ray_index"), args)) | kwargs
@@ -260,77 +251,3 @@ def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple
     changed = {"directions": directions.index_select(0, index), "ray_index": None}
     placed = (*args[:1], *list(changed.values())[: max(len(args) - 1, 0)], *args[3:])
     return placed, {name: changed.get(name, value) for name, value in kwargs.items()}
-
-
-def evaluate_table(
-    field: LayeredField,
-    where: Callable[[Tensor, Tensor | None], dict[str, Any]],
-    k: int,
-    backend: str,
-    mixture_at: Callable[[Tensor], Mixture | None],
-    positions: Tensor,
-    directions: Tensor | None = None,
-    ray_index: Tensor | None = None,
-    *,
-    coords: Tensor | None = None,
-    raw: bool = False,
-) -> Any:
-    """What a field with stacked parameters and a layer table gives: colour [n, 3] and density [n].
-
-    Args:
-        field: Whose ``activate`` gives the results; they are mixed behind it.
-        where: What tells ``routed_mlp`` the cells, for positions and coords.
-        k: The number of cells.
-        backend: Of the operation.
-        mixture_at: Other cells that some samples are evaluated in too, or None.
-        positions: [n, 3] in scene units; [n, 6], means and variances, where the table integrates over Gaussians.
-        directions: unit vectors, [n, 3], or [r, 3] together with ``ray_index``.
-        ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
-        coords: [n, 3] or None, positions that decide the cells in the place of ``positions`` (of Gaussians, the means).
-        raw: Gives the outputs of the network, [n, out], in the place of what ``activate`` makes of them.
-
-    Raises:
-        ValueError: For shapes that disagree, or directions that the field needs and did not get.
-        TypeError: For coords that are no floating-point tensor.
-    """
-    table, n = field.layers, positions.shape[0]
-    features = 6 if table.integrated else 3
-    if positions.ndim != 2 or positions.shape[1] != features:
-        raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
-    if coords is not None:
-        if not isinstance(coords, Tensor):
-            raise TypeError(f"VoronoiRouter: coords must be a tensor, got {type(coords).__name__}")
-        if coords.shape != (n, 3):
-            raise ValueError(f"VoronoiRouter: coords must have shape [{n}, 3], got {list(coords.shape)}")
-        if not coords.is_floating_point():
-            raise TypeError(f"VoronoiRouter: coords must be floating-point, got {coords.dtype}")
-    if not table.uses_directions:
-        directions = ray_index = None
-    if directions is not None and ray_index is None and directions.shape[0] != n:
-        raise ValueError(
-            "VoronoiRouter: directions must have a row for each position, or come with ray_index, got "
-            f"{directions.shape[0]} rows for {n} positions"
-        )
-    linears = field.linears()
-    # A parameter that all cells share has no dimension of cells; the operation takes one for each.
-    weights = [w if w.dim() == 3 else w.expand(k, -1, -1) for w in [layer.weight for layer in linears]]
-    biases = [b if b is None or b.dim() == 2 else b.expand(k, -1) for b in [layer.bias for layer in linears]]
-    hashed = {} if table.grid is None else {"features": field.features}  # type: ignore[attr-defined]
-
-    def run(x: Tensor, d: Tensor | None, index: Tensor | None, cells: dict[str, Any]) -> Any:
-        given = {"directions": d, "direction_index": index, "backend": backend, **hashed, **cells}
-        outputs = ops.routed_mlp(x, weights, biases, layers=table, **given)[0]
-        return outputs if raw else field.activate(outputs)
-
-    own = run(positions, directions, ray_index, where(positions, coords))
-    if raw:
-        return own
-    mixture = mixture_at(positions[:, :3] if coords is None else coords)
-    if mixture is None:
-        return own
-    if ray_index is not None:
-        ray_index = ray_index[mixture.rows]
-    elif directions is not None:
-        directions = directions[mixture.rows]
-    others = run(positions[mixture.rows], directions, ray_index, {"cells": mixture.cells})
-    return mixture.mix(own[0], others[0]), mixture.mix(own[1], others[1])

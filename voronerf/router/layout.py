@@ -350,7 +350,7 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Te
 
     Raises:
         ValueError: Where no rule is given, or it does not fit the arguments.
-        TypeError: For positions that are no tensor.
+        TypeError: For positions that are no floating-point tensor.
     """
     if rule is None:
         raise ValueError(
@@ -376,11 +376,10 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Te
         what = f"what coords={rule!r} takes from the first tensor, {list(source.shape)},"
     if not isinstance(positions, Tensor):
         raise TypeError(f"{_OP}: {what} must be a tensor, got {type(positions).__name__}")
-    if positions.dim() == 0 or positions.shape[-1] != 3 or not positions.is_floating_point():
-        raise ValueError(
-            f"{_OP}: {what} must have shape [..., 3] and a floating-point dtype, got {list(positions.shape)} of "
-            f"{positions.dtype}"
-        )
+    if positions.shape[-1:] != (3,):
+        raise ValueError(f"{_OP}: {what} must have shape [..., 3], got {list(positions.shape)}")
+    if not positions.is_floating_point():
+        raise TypeError(f"{_OP}: {what} must be floating-point, got {positions.dtype}")
     return positions
 
 

@@ -13,6 +13,7 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor, nn
 
+from voronerf import ops
 from voronerf.backends import BACKENDS
 from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
@@ -21,11 +22,9 @@ from voronerf.router.cells import CellModules, check_module, fill_cell
 from voronerf.router.evaluate import (
     Choices,
     LayeredField,
-    coords_by_rule,
     described_by_table,
     each_direction,
     evaluate,
-    evaluate_table,
     mixed,
 )
 from voronerf.router.grouping import Assignments, Grouping
@@ -210,11 +209,7 @@ class VoronoiRouter(CellModules):
         if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
             self._by_table = described_by_table(self.module)
         if self._by_table:
-            coords = coords_by_rule(self.coords, args, kwargs) if coords is None else coords
-            at = self._mixture
-            return evaluate_table(
-                self.field, self._where, self.num_cells, self.backend, at, *args, coords=coords, **kwargs
-            )
+            return self._evaluate_table(self._coords_of_table(coords, args, kwargs), False, *args, **kwargs)
         if self._layered:
             args, kwargs = each_direction(args, kwargs)
         return self._call_method("forward", *args, coords=coords, **kwargs)
@@ -230,10 +225,49 @@ class VoronoiRouter(CellModules):
         Arguments are those of ``forward``.
         """
         given = positions, directions, ray_index
-        coords = coords_by_rule(self.coords, given, {})
-        at, k = self._mixture, self.num_cells
-        found: Tensor = evaluate_table(self.field, self._where, k, self.backend, at, *given, coords=coords, raw=True)
+        found: Tensor = self._evaluate_table(self._coords_of_table(None, given, {}), True, *given)
         return found
+
+    def _coords_of_table(self, coords: Tensor | None, args: Any, kwargs: Any) -> Tensor | None:
+        """The positions that decide the cells; None for those of the samples themselves."""
+        rule = self.coords if coords is None else coords
+        return None if rule is None or isinstance(rule, str) else find_positions(rule, args, kwargs)
+
+    def _evaluate_table(
+        self,
+        coords: Tensor | None,
+        raw: bool,
+        positions: Tensor,
+        directions: Tensor | None = None,
+        ray_index: Tensor | None = None,
+    ) -> Any:
+        field, table, k = self.field, self.field.layers, self.num_cells
+        features = 6 if table.integrated else 3
+        if positions.ndim != 2 or positions.shape[1] != features:
+            raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
+        if not table.uses_directions:
+            directions = ray_index = None
+        linears = field.linears()
+        # A parameter that all cells share has no dimension of cells; the operation takes one for each.
+        weights = [w if w.dim() == 3 else w.expand(k, -1, -1) for w in [layer.weight for layer in linears]]
+        biases = [b if b is None or b.dim() == 2 else b.expand(k, -1) for b in [layer.bias for layer in linears]]
+        hashed = {} if table.grid is None else {"features": field.features}  # type: ignore[attr-defined]
+
+        def run(x: Tensor, d: Tensor | None, index: Tensor | None, cells: dict[str, Any]) -> Any:
+            given = {"directions": d, "direction_index": index, "backend": self.backend, **hashed, **cells}
+            outputs = ops.routed_mlp(x, weights, biases, layers=table, **given)[0]
+            return outputs if raw else field.activate(outputs)
+
+        own = run(positions, directions, ray_index, self._where(positions, coords))
+        mixture = None if raw else self._mixture(positions[:, :3] if coords is None else coords)
+        if mixture is None:
+            return own
+        if ray_index is not None:
+            ray_index = ray_index[mixture.rows]
+        elif directions is not None:
+            directions = directions[mixture.rows]
+        others = run(positions[mixture.rows], directions, ray_index, {"cells": mixture.cells})
+        return mixture.mix(own[0], others[0]), mixture.mix(own[1], others[1])
 
     def explain(self) -> str:
         """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
