@@ -1,5 +1,7 @@
 """PSNR by where the centres of the cells lie, with how even and how compact these cells are.
 
+Cells gain over one network with the same seed, which starts from the same weights and sees the same rays.
+
     python benchmarks/centres.py --scenes ../shared/data/lego --downscale 8 --steps 400 --cells 16 \\
         --fields nerf "hashgrid levels=8" --seeds 3 --json results/centres.json
 
@@ -15,6 +17,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import statistics
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -189,6 +192,31 @@ def line(row: dict[str, Any]) -> str:
     return text
 
 
+def table(results: list[dict[str, Any]]) -> str:
+    """Gain in dB over one network with the same seed: mean, least and most over the seeds, as Markdown.
+
+    Imbalance and the largest radius are means over all runs of a placement.
+    """
+    single = {(r["scene"], r["field"], r["seed"]): r["psnr"] for r in results if r["placement"] == "single"}
+    gains: dict[tuple[str, str, str], dict[str, list[float]]] = {}
+    shapes: dict[str, list[tuple[float, float]]] = {}
+    for row in results:
+        one = single.get((row["scene"], row["field"], row["seed"]))
+        if one is None or row["placement"] == "single":
+            continue
+        where = (row["scene"], row["field"], row["cells"])
+        gains.setdefault(where, {}).setdefault(row["placement"], []).append(row["psnr"] - one)
+        shapes.setdefault(row["placement"], []).append((row["imbalance"], row["radius_max"]))
+    heads = ["", *(f"{scene}, {field}, {cells} cells" for scene, field, cells in gains), "imbalance", "largest radius"]
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for placement in (name for name in PLACEMENTS if name in shapes):
+        values = (found.get(placement) for found in gains.values())
+        texts = [f"{statistics.mean(v):+.2f} ({min(v):+.2f} to {max(v):+.2f})" if v else "-" for v in values]
+        shape = [f"{statistics.mean(part):.3f}" for part in zip(*shapes[placement])]
+        lines.append(f"| {' | '.join([placement, *texts, *shape])} |")
+    return "\n".join(lines)
+
+
 def main() -> int:
     """Measures, prints and stores."""
     options = tyro.cli(Options, description=__doc__)
@@ -196,7 +224,7 @@ def main() -> int:
         f"{'scene':10} {'field':16} {'cells':>6} {'placement':21} seed    PSNR  seconds"
         "  imbalance  r mean      r max     box mean    box max"
     )
-    measure(options)
+    print(table(measure(options)["results"]))
     return 0
 
 

@@ -76,7 +76,30 @@ def test_centres_makes_only_the_rows_that_are_missing(tmp_path):
     assert regular["radius_mean"] < regular["diagonal_mean"] <= regular["diagonal_max"] <= 1
     _, second, said = outcome("centres", tmp_path, options + " centroidal-transport")
     assert second[:2] == first and second[2]["placement"] == "centroidal-transport"
-    assert "regular" not in said
+    assert not re.search("^builtin .* regular", said, re.MULTILINE)
+    gains = [row["psnr"] - first[0]["psnr"] for row in second]
+    for gain, name in zip(gains[1:], ("regular", "centroidal-transport"), strict=True):
+        assert f"| {name} | {gain:+.2f} ({gain:+.2f} to {gain:+.2f}) |" in said
+
+
+def test_defaults_make_only_the_scenes_that_are_missing(tmp_path):
+    path = tmp_path / "defaults.json"
+    sides = ("default: --rays 32 --samples 8", "more: --rays 64 --samples 8")
+    options = ("--budget", "0.2", "--eval-views", "1", "--json", path, "--sides", *sides)
+    python(BENCHMARKS / "defaults.py", *options, "--scenes", "builtin", "--downscale", "10")
+    first = read_json(path)["results"]
+    assert [(row["scene"], row["downscale"], row["side"], len(row["psnr"])) for row in first] == [
+        ("builtin", 10, "default", 2),
+        ("builtin", 10, "more", 2),
+    ]
+    scenes = ("--scenes", "builtin", "builtin-translucent", "--downscale", "10", "10")
+    said = python(BENCHMARKS / "defaults.py", *options, *scenes)
+    rows = read_json(path)["results"]
+    assert rows[:2] == first and [row["scene"] for row in rows[2:]] == ["builtin-translucent"] * 2
+    gains = [[b - a for a, b in zip(*(row["psnr"] for row in pair))] for pair in (rows[:2], rows[2:])]
+    means = [sum(at) / 2 for at in zip(*gains)]
+    expected = [", ".join(f"{x:+.2f}" for x in pair) for pair in (*gains, means)]
+    assert f"| more | {' | '.join(expected)} |" in said
 
 
 def test_sides_train_for_the_same_time(tmp_path):

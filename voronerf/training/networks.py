@@ -45,6 +45,17 @@ def pixel_at_the_middle(scene: Scene) -> float:
     return distance / float(cameras.intrinsics[:, :2].mean())
 
 
+def samples_for(scene: Scene) -> int:
+    """Samples of a ray through a scene with a box whose empty space is skipped.
+
+    They grow with the square root of the box's pixels: 64 for the 100 x 100 images of Lego, 128 for those of 400 x 400.
+    Every sample costs time, every pixel that a stratum is longer than costs sharpness.
+    """
+    assert scene.box is not None
+    pixels = float((scene.box[1] - scene.box[0]).amax()) / pixel_at_the_middle(scene)
+    return min(max(8 * round(0.85 * math.sqrt(pixels)), 48), 192)
+
+
 def space_of(config: TrainConfig, scene: Scene) -> tuple[tuple[float, ...], ...]:
     """The corners of the space that the networks see: the scene's box, or the cube of a contraction.
 
@@ -67,8 +78,8 @@ def space_of(config: TrainConfig, scene: Scene) -> tuple[tuple[float, ...], ...]
 def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Fills in the settings that depend on the scene.
 
-    They are the contraction, whether empty space is skipped, octaves, options of the field, and with ``parameters`` the
-    width and learning rate.
+    They are the contraction, whether empty space is skipped, samples of a ray, octaves, options of the field, and with
+    ``parameters`` the width and learning rate.
 
     Raises:
         ConfigError: When the smallest networks have more parameters than asked for.
@@ -79,6 +90,8 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
         config = replace(config, contraction="sphere" if unbounded else "none")
     if config.occupancy and (scene.box is None or why_no_occupancy(config) is not None):
         config = replace(config, occupancy=False)
+    if config.samples is None:
+        config = replace(config, samples=samples_for(scene) if config.occupancy else 64)
     if config.position_octaves is None and "position_octaves" in kind.options:
         config = replace(config, position_octaves=kind.octaves(octaves_for(scene)))
     if kind.scene_options is not None:
