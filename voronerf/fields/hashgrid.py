@@ -107,15 +107,18 @@ class HashGridField(RadianceField):
         return 0.01
 
     @staticmethod
-    def scene_options(pixel: float, box: Box) -> dict[str, Any]:
+    def scene_options(pixel: float, box: Box, contracted: bool) -> dict[str, Any]:
         """The grid covers the space, its finest cells are half as wide as a pixel, and finer grids have more entries.
 
         A surface meets as many cells as the square of the resolution; the entries grow with the resolution itself,
-        since larger tables take longer to read and to learn: 2^15 for 100 pixels, 2^17 for 400.
+        since larger tables take longer to read and to learn: 2^15 for an object of 100 pixels, 2^17 for 400. In a
+        contracted scene, seen from within, larger tables were worse.
         """
         pixels = max(high - low for low, high in zip(*box)) / pixel
-        entries = min(max(round(math.log2(pixels) + 8.5), 14), 19)
-        return {"box": box, "finest": max(round(2 * pixels), 32), "log2_entries": entries}
+        found: dict[str, Any] = {"box": box, "finest": max(round(2 * pixels), 32)}
+        if not contracted:
+            found["log2_entries"] = min(max(round(math.log2(pixels) + 8.5), 14), 19)
+        return found
 
     def reset_parameters(self) -> None:
         """Features near zero, as published; the layers as in :func:`voronerf.fields.radiance.reset_layers`."""

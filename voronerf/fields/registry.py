@@ -10,8 +10,10 @@ have these attributes, all of which are optional:
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
     sparse_parameters        names of tables, as patterns, of which a step of training reads few entries. On a CPU their
                              entries without a gradient stay as they are, see ``voronerf.ops.sparse_adam``
-    scene_options(pixel, box) static method: options from the width of a pixel at the middle of the scene and the
-                             corners of the space that the field sees, both in scene units; for those not given
+    scene_options(pixel, box, contracted)
+                             static method: options from the width of a pixel at the middle of the scene and the
+                             corners of the space that the field sees, both in scene units, and whether all of space
+                             was contracted into it; for those not given
     octaves(finest)          static method: position_octaves for images that show ``finest`` octaves; default all
 
 Its options are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is called with

@@ -95,7 +95,8 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     if config.position_octaves is None and "position_octaves" in kind.options:
         config = replace(config, position_octaves=kind.octaves(octaves_for(scene)))
     if kind.scene_options is not None:
-        found = kind.scene_options(pixel_at_the_middle(scene), space_of(config, scene))
+        contracted = config.contraction != "none"
+        found = kind.scene_options(pixel_at_the_middle(scene), space_of(config, scene), contracted)
         more = [f"{name}={value}" for name, value in found.items() if name not in config.network_options]
         config = replace(config, field_options=(*config.field_options, *more))
     if config.parameters is None:
