@@ -9,7 +9,7 @@ import torch
 from helpers import refuses
 
 from voronerf import HashGridField, VoronoiRouter
-from voronerf.data import load_scene
+from voronerf.data import builtin_scene, load_scene
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.networks import check_memory, count_parameters, make_routers, resolve_config
 
@@ -95,3 +95,15 @@ def test_a_table_that_does_not_fit_into_memory(monkeypatch):
         ValueError, match=r"log2_entries must be smaller: 8 levels .* take 1.6 MiB, the machine has 1.0"
     ):
         HashGridField()
+
+
+@pytest.mark.parametrize(
+    ("side", "contraction", "samples", "entries"),
+    [(100, "none", 64, 15), (20, "none", 48, 14), (20, "sphere", 64, None)],
+)
+def test_larger_images_get_more_samples_and_larger_tables(side, contraction, samples, entries):
+    scene = builtin_scene(side, train_views=2, test_views=1)
+    config = resolve_config(TrainConfig(contraction=contraction), scene)
+    given = dict(text.split("=", 1) for text in config.field_options)
+    assert config.samples == samples and given.get("log2_entries") == (entries and str(entries))
+    assert resolve_config(TrainConfig(samples=7, contraction=contraction), scene).samples == 7
