@@ -1,10 +1,8 @@
 """How a routed call is carried out: chosen once for a kind of call, and admitted by one comparison with the loop.
 
-The loop over cells (:mod:`voronerf.router.loop`) is the definition of the result. The faster ways are the module's own
-``forward`` once for the rows of all cells (:mod:`voronerf.router.grouped`) and, where the user said ``fuse=True``, one
-fused operation (:mod:`voronerf.router.fused`). Before a kind of call takes one of them, both run on a few samples of
-the batch, in cells whose parameters are made different, and have to give the same results and gradients. A field that
-describes itself by a layer table needs none of this: it is one fused operation at once.
+The loop over cells (:mod:`voronerf.router.loop`) defines the result. The faster ways are the module's own ``forward``
+once for the rows of all cells (:mod:`voronerf.router.grouped`) and, where the user said ``fuse=True``, one operation
+(:mod:`voronerf.router.fused`). A field that describes itself by a layer table needs none of this.
 """
 
 from __future__ import annotations
@@ -58,13 +56,8 @@ class Choices:
         """
         autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
         modes = (call.method, call.module.training, torch.is_grad_enabled(), autocast)
-        d = len(call.layout.lead)
-        return (
-            *modes,
-            tuple(call.kwargs),
-            d,
-            *[_description(value, d, fuse) for value in (*call.args, *call.kwargs.values())],
-        )
+        d, values = len(call.layout.lead), (*call.args, *call.kwargs.values())
+        return *modes, tuple(call.kwargs), d, *[_description(value, d, fuse) for value in values]
 
     def note(self, call: Call, choice: Choice) -> None:
         """For :meth:`explain`: how a method was carried out."""
@@ -87,9 +80,6 @@ class Choices:
         while frame is not None and is_inside(frame.f_code.co_filename, package=True):
             level, frame = level + 1, frame.f_back
         warnings.warn(f"{_OP}: {message}", stacklevel=level)
-
-    def __deepcopy__(self, memo: Any) -> Choices:
-        return Choices()
 
     def __reduce__(self) -> tuple[type[Choices], tuple[()]]:
         return Choices, ()
@@ -141,30 +131,23 @@ def _carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice)
             results, _ = run_grouped(call, call.arranged(grouping), grouping, choice.piece)
             choices.note(call, choice)
             return results, choice
-        except BackendUnavailable:
-            raise
-        except Ungroupable as error:
-            choice = replace(choice, way="cell by cell", why=f"for some batches, since {error}")
         except Exception as error:
-            if isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error):
+            lacking = (BackendUnavailable, MemoryError, torch.OutOfMemoryError)
+            if isinstance(error, lacking) or "can't allocate memory" in str(error):
                 raise
-            choice = replace(choice, way="cell by cell", why=f"for some batches, since its forward fails ({error})")
-    results = _by_cells(call, grouping, choice)
+            why = error if isinstance(error, Ungroupable) else f"its forward fails ({error})"
+            choice = replace(choice, way="cell by cell", why=f"for some batches, since {why}")
+    try:
+        results = run_cells(call, call.arranged(grouping), grouping.occupied, again=choice.again)
+    except Exception as error:
+        if hasattr(error, "add_note") and len(call.layout.lead) > 1 and not call.layout.flat:  # since Python 3.11
+            error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
+        raise
     one = Choice("the module itself", "there is one cell")
     choices.note(call, choice if grouping.k > 1 or choice.way != "grouped" else one)
     if grouping.k > 1 and choice.why and call.layout.n >= _FEWEST:
         choices.say_once(f"cells {call.method}", f"{call.name} runs cell by cell: {choice.why}")
     return results, choice
-
-
-def _by_cells(call: Call, grouping: Grouping, choice: Choice) -> Results:
-    """The loop over cells."""
-    try:
-        return run_cells(call, call.arranged(grouping), grouping.occupied, again=choice.again)
-    except Exception as error:
-        if hasattr(error, "add_note") and len(call.layout.lead) > 1 and not call.layout.flat:  # since Python 3.11
-            error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
-        raise
 
 
 def _choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
@@ -244,10 +227,9 @@ def described_by_table(field: nn.Module) -> bool:
 
 def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """The arguments for a field's own ``forward``: a direction for each sample, in the place of one for each ray."""
-    given = dict(zip(("positions", "directions", "ray_index"), args)) | kwargs
-    directions, index = given.get("directions"), given.get("ray_index")
+    names = ("positions", "directions", "ray_index")
+    positions, directions, index = ((dict(zip(names, args)) | kwargs).get(name) for name in names)
     if directions is None or index is None:
         return args, kwargs
-    changed = {"directions": directions.index_select(0, index), "ray_index": None}
-    placed = (*args[:1], *list(changed.values())[: max(len(args) - 1, 0)], *args[3:])
-    return placed, {name: changed.get(name, value) for name, value in kwargs.items()}
+    others = {name: value for name, value in kwargs.items() if name not in names}
+    return (positions, directions.index_select(0, index), None, *args[3:]), others

@@ -6,6 +6,7 @@ batch, in a copy of the module whose cells have parameters of their own, and res
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -90,8 +91,7 @@ class Choice:
     program: Program | None = None
 
 
-Run = Callable[[list[Tensor]], Results]
-Outcome = tuple[Results, list[Tensor]]
+Outcome = tuple[Results, list[Tensor]]  # and gradients
 
 
 class Trial:
@@ -127,10 +127,10 @@ class Trial:
         """The rows of the arguments, fresh for each run."""
         return self.call.arranged(self.entries)
 
-    def outcome(self, run: Run) -> Outcome:
+    def outcome(self, way: Callable[[Trial, list[Tensor]], Results]) -> Outcome:
         """Results, and gradients of a weighted sum of them."""
         with NoRandomness():
-            results = run(self.given())
+            results = way(self, self.given())
         generator, total = torch.Generator().manual_seed(7), []
         for tensor in results.tensors:
             if tensor.requires_grad and tensor.is_floating_point():
@@ -145,17 +145,17 @@ class Trial:
             leaf.grad = None
         return results, gradients
 
-    def agrees(self, way: Callable[[Trial], Run], expected: Outcome) -> bool:
+    def agrees(self, way: Callable[[Trial, list[Tensor]], Results], expected: Outcome) -> bool:
         """Whether a way gives what the loop gives; where it does not, whether it does in float64.
 
         A deep network of fast sines makes its own rounding as large as its results.
         """
-        if _same(self.outcome(way(self)), expected):
+        if _same(self.outcome(way), expected):
             return True
         try:
             exact = Trial(*self.made_of, dtype=torch.float64)
             exact.again = self.again
-            return _same(exact.outcome(way(exact)), exact.outcome(exact.by_cells))
+            return _same(exact.outcome(way), exact.outcome(Trial.by_cells))
         except Exception:
             return False
 
@@ -168,11 +168,6 @@ class Trial:
         results, self.widest = run_grouped(self.call, given, self.entries, _TRIED)
         return results
 
-    def fused(self, program: Program) -> Run:
-        """As one operation, with the parameters of the copy."""
-        here = program.with_parameters_of(self.call.module)
-        return lambda given: here.run(given, self.entries)
-
     def is_groupable(self) -> bool:
         """Whether the module runs for all cells at once on this batch, right or wrong."""
         try:
@@ -182,16 +177,12 @@ class Trial:
             return False
         return True
 
-    def traced(self) -> Program:
-        """The network as a layer table."""
-        with NoRandomness():
-            return Program(self.made_of[0].module, self.call, [rows[:ROWS] for rows in self.given()])
-
-    def why_not_fused(self, expected: Outcome) -> tuple[Program | None, str]:
-        """The network as a layer table, or what stands in the way."""
+    def fused(self, expected: Outcome) -> tuple[Program | None, str]:
+        """The network as one operation, or what stands in the way."""
         try:
-            program = self.traced()
-            same = self.agrees(lambda one: one.fused(program), expected)
+            with NoRandomness():
+                program = Program(self.made_of[0].module, self.call, [rows[:ROWS] for rows in self.given()])
+            same = self.agrees(lambda t, rows: program.with_parameters_of(t.call.module).run(rows, t.entries), expected)
         except Unfusable as error:
             return None, str(error)
         except Exception as error:
@@ -241,37 +232,36 @@ def admitted(trial: Trial, fuse: bool) -> Choice:
         ValueError: Where the module has to fuse and does not.
         TypeError: Where it mixes samples.
     """
-    try:
+    for trial.again in (False, True):
         try:
-            expected = trial.outcome(trial.by_cells)
-        except Exception:  # perhaps its code runs again in the backward pass
-            trial.again = True
-            expected = trial.outcome(trial.by_cells)
-    except Exception as error:
-        return Choice("cell by cell", f"its forward fails on a few samples ({type(error).__name__}: {error})")
+            expected = trial.outcome(Trial.by_cells)
+            break
+        except Exception as error:  # perhaps its code runs again in the backward pass
+            why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
+    else:
+        return Choice("cell by cell", why)
     if fuse:
-        program, why = trial.why_not_fused(expected)
+        program, why = trial.fused(expected)
         if program is not None:
             return Choice("fused", program=program)
         trial.check_rows()
         raise ValueError(
             f"{_OP}: fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
         )
-    open_ = False
+    choice = Choice("cell by cell", again=trial.again)
     try:
-        if trial.agrees(lambda one: one.grouped, expected):
+        if trial.agrees(Trial.grouped, expected):
             piece = min(max(_PIECE * _TRIED // trial.widest, 1 << 10), 1 << 16)
-            fusable = trial.why_not_fused(expected)[0] is not None
-            return Choice("grouped", piece=piece, again=trial.again, fusable=fusable)
-        why = "its forward on the samples of all cells gives other results than on those of one cell"
+            return replace(choice, way="grouped", piece=piece, fusable=trial.fused(expected)[0] is not None)
+        choice.why = "its forward on the samples of all cells gives other results than on those of one cell"
     except BackendUnavailable:
         raise
     except Ungroupable as error:
-        why, open_ = str(error), error.of_batch
+        choice.why, choice.open = str(error), error.of_batch
     except Exception as error:
-        why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
+        choice.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
     trial.check_rows()
-    return Choice("cell by cell", why, again=trial.again, open=open_)
+    return choice
 
 
 # Rays -----------------------------------------------------------------------------------------------------------------
@@ -289,23 +279,8 @@ def flattened(call: Call) -> tuple[bool, ...]:
     name, lead = type(call.module).__name__, call.layout.lead
     for samples in (6, lead[-1]):  # a module may be made for a number of samples
         few = (*[1] * (len(lead) - 2), min(lead[-2], 2), min(lead[-1], samples))
-
-        found: list[Tensor] = []
-        others: list[Tensor] = []  # all but the first of each ray
-
-        def first(
-            tensor: Tensor, kind: str, few: tuple[int, ...] = few, found: Any = found, others: Any = others
-        ) -> Any:
-            found.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
-            others.append(found[-1].clone())
-            if kind != RAY and tensor.is_floating_point():
-                others[-1][(slice(None),) * (len(few) - 1) + (slice(1, None),)].mul_(0.7).add_(0.01)
-            return found[-1]
-
-        args, kwargs = call.changed(first)
-        small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
         try:
-            whole, alone, other = (_in_first(small, rows) for rows in (found, small.arranged(None), others))
+            whole, alone, other = _of_few(call, few)
         except Exception:
             continue
         for a, b in zip(whole, other, strict=True):
@@ -322,12 +297,26 @@ def flattened(call: Call) -> tuple[bool, ...]:
                 f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but {name} does not; "
                 "layout='flat' calls it with [n, f], for modules that squeeze or flatten their arguments"
             )
-        return tuple(tuple(a.shape[: len(few)]) != few and a.shape[:1] == (small.layout.n,) for a in whole)
+        return tuple(tuple(a.shape[: len(few)]) != few and a.shape[:1] == (math.prod(few),) for a in whole)
     return ()
 
 
-def _in_first(call: Call, rows: list[Tensor]) -> list[Tensor]:
-    """The tensors that the module returns with the parameters of its first cell."""
-    first = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
-    with torch.no_grad(), NoRandomness(), in_place_of_parameters(call.module, first):
-        return tensors_of(call.run(rows))
+def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
+    """The tensors that the module's first cell returns for the first samples of the first rays.
+
+    They are seen as rays, as the module would see them, and as rays with others behind the first sample of each.
+    """
+    found, others = [], []
+
+    def first(tensor: Tensor, kind: str) -> Tensor:
+        found.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
+        others.append(found[-1].clone())
+        if kind != RAY and tensor.is_floating_point():
+            others[-1][(slice(None),) * (len(few) - 1) + (slice(1, None),)].mul_(0.7).add_(0.01)
+        return found[-1]
+
+    args, kwargs = call.changed(first)
+    small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
+    cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
+    with torch.no_grad(), NoRandomness(), in_place_of_parameters(call.module, cell):
+        return [tensors_of(small.run(rows)) for rows in (found, small.arranged(None), others)]
