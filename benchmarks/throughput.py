@@ -38,6 +38,7 @@ from ops import cases_lookup as cases_lookup
 from ops import cases_marching as cases_marching
 from ops import cases_network as cases_network
 from ops import cases_sampling as cases_sampling
+from ops import cases_step as cases_step
 from ops.case import Case, Contender, NotApplicable, Work, dtype_name
 from ops.targets import architecture_lines, target_lines
 
@@ -95,7 +96,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """The cases that the options select."""
     every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases(), *cases_marching.cases()]
-    every += cases_hash.cases()
+    every += [*cases_hash.cases(), *cases_step.cases()]
     if options.foreign:
         every = cases_foreign.cases()
     if options.filter is not None:

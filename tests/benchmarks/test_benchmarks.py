@@ -22,6 +22,7 @@ from ops import (
     cases_marching,
     cases_network,
     cases_sampling,
+    cases_step,
     networks,
     route,
     targets,
@@ -35,8 +36,10 @@ CPU = torch.device("cpu")
 OPS = {
     *("nearest_centre", "locate_cell", "draw_cell", "cell_sort", "grouped_linear", "grouped_mlp", "frequency_encode"),
     *("integrated_encode", "spherical_harmonics", "hash_encode", "composite", "resample", "routed_mlp"),
+    "render_loss",
 }
 NOT_DIFFERENTIABLE = {"march_rays", "update_occupancy", "camera_rays", "balance_centres", "select_heaviest"}
+NOT_DIFFERENTIABLE |= {"pixel_rays", "observe_occupancy", "sparse_adam"}
 OPS |= NOT_DIFFERENTIABLE
 COLUMNS = [
     *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "threads"),
@@ -226,6 +229,10 @@ def test_what_is_compared_is_right_in_every_small_case():
         "camera_rays, lens": marching._camera_work(300, True, CPU),
         "balance_centres": marching._balance_work(600, 5, CPU),
         "select_heaviest": marching._heaviest_work(2000, CPU),
+        "pixel_rays": cases_step._pixel_work(CPU),
+        "render_loss": cases_step._loss_work(CPU),
+        "observe_occupancy": cases_step._observe_work(CPU),
+        "sparse_adam": cases_step._adam_work(1000, 0.1, CPU),
     }
     for direction in ("forward", "forward+backward"):
         for op in ("frequency_encode", "integrated_encode"):

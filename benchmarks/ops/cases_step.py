@@ -1,0 +1,255 @@
+"""Cases of what surrounds the networks in a training step: pixel_rays, render_loss, observe_occupancy and sparse_adam.
+
+b rays of a batch, m samples of all rays, n rows of the table: rays, samples or entries. The sizes are those of a step
+on Lego at 100 x 100. One thread.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation
+from voronerf import ops
+from voronerf.reference.observe_occupancy import cells_of
+from voronerf.rendering.cameras import orbit_cameras
+
+RAYS, SAMPLES = 1 << 10, 1 << 13
+"""Of a step."""
+GRID = 64
+"""Cells of the occupancy grid along each axis."""
+SCALE = 10.0
+"""Of the density."""
+
+BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+Results = list[Tensor]
+
+
+def cases() -> list[Case]:
+    """The rows of these ops."""
+    rows: list[tuple[str, str, str, int, Callable[[torch.device], Work]]] = [
+        ("pixel_rays", f"100 views of 100 x 100 b={RAYS}", FORWARD, RAYS, _pixel_work),
+        ("render_loss", f"b={RAYS} m={SAMPLES}", BACKWARD, SAMPLES, _loss_work),
+        ("observe_occupancy", f"m={SAMPLES} in {GRID}^3 cells", FORWARD, SAMPLES, _observe_work),
+    ]
+    for log2_entries, touched in ((15, 1.0), (19, 1 / 64)):
+        entries = 8 << log2_entries
+        name = f"8 x 2^{log2_entries} entries, {touched:.0%} with a gradient"
+        rows.append(("sparse_adam", name, FORWARD, entries, functools.partial(_adam_work, entries, touched)))
+    backends = ("native", "reference")
+    return [
+        Case(op, name, torch.float32, direction, n, None, work, backends, "2^19" not in name, threads=1)
+        for op, name, direction, n, work in rows
+    ]
+
+
+def _worst(expected: Results) -> Callable[[Any], float]:
+    return lambda found: max(relative_error(a, b) for a, b in zip(found, expected, strict=True))
+
+
+def _pixel_work(device: torch.device) -> Work:
+    draw, side, views = generator(0), 100, 100
+    cameras = orbit_cameras(views, radius=4.0, elevation=0.5, width=side, height=side, focal=140.0).to(device)
+    images = torch.randint(0, 256, (views, side, side, 4), generator=draw, dtype=torch.uint8).to(device)
+    box = torch.tensor(BOX, device=device)
+    count = rotation(RAYS * 64)
+    sets = [torch.randint(0, views * side * side, (RAYS,), generator=draw).to(device) for _ in range(count)]
+    colours = torch.rand(RAYS, 3, generator=draw).to(device)
+
+    def contender(function: Callable[..., Any]) -> Contender:
+        given = {"near": 2.0, "far": 6.0, "box": box, "background": colours}
+        return Contender(lambda call: function(cameras.poses, cameras.intrinsics, images, sets[call % count], **given))
+
+    exact = [x.double() for x in contender(functools.partial(ops.pixel_rays, backend="reference")).run(0)]
+    return Work(
+        lambda backend: contender(functools.partial(ops.pixel_rays, backend=backend)),
+        {"torch, rays by matmul": lambda: contender(_rays_by_matmul)},
+        _worst(exact),
+        1e-4,
+        RAYS * 64.0,  # an index, a colour, eleven floats
+        "copy",
+    )
+
+
+def _rays_by_matmul(
+    poses: Tensor,
+    intrinsics: Tensor,
+    images: Tensor,
+    index: Tensor,
+    *,
+    near: float,
+    far: float,
+    box: Any,
+    background: Any,
+) -> Results:
+    """As loaders of other codebases draw a batch: gather, directions, a matrix for each ray, slabs."""
+    height, width = images.shape[1:3]
+    camera, pixel = index // (height * width), index % (height * width)
+    fx, fy, cx, cy = intrinsics[camera].unbind(-1)
+    x, y = (pixel % width + 0.5 - cx) / fx, (pixel // width + 0.5 - cy) / fy
+    local = torch.stack((x, -y, -torch.ones_like(x)), dim=-1)
+    pose = poses[camera]
+    directions = F.normalize((pose[:, :3, :3] @ local[:, :, None])[..., 0], dim=-1)
+    origins = pose[:, :3, 3]
+    slabs = (box[:, None] - origins) / directions
+    enter = slabs.amin(0).amax(-1).clamp(near, far)
+    leave = torch.maximum(slabs.amax(0).amin(-1).clamp(near, far), enter)
+    values = images.view(-1, 4)[index].float() / 255
+    return [origins, directions, enter, leave, values[:, :3] * values[:, 3:] + background * (1 - values[:, 3:])]
+
+
+def _loss_work(device: torch.device) -> Work:
+    draw = generator(0)
+    cuts = torch.randint(0, SAMPLES + 1, (RAYS - 1,), generator=draw).sort().values
+    offsets = F.pad(cuts, (1, 1))
+    offsets[-1] = SAMPLES
+    offsets = offsets.int().to(device)
+    count = rotation(SAMPLES * 4 * 10)
+    sets = [torch.randn(SAMPLES, 4, generator=draw).to(device) for _ in range(count)]
+    deltas = torch.rand(SAMPLES, generator=draw).to(device) / 16
+    target, background = torch.rand(2, RAYS, 3, generator=draw).to(device)
+
+    def results(loss: Callable[..., Tensor], raw: Tensor) -> Results:
+        leaf = raw.detach().requires_grad_()
+        value = loss(leaf)
+        return [value.detach(), *torch.autograd.grad(value, leaf)]
+
+    def contender(loss: Callable[..., Tensor]) -> Contender:
+        return Contender(lambda call: results(loss, sets[call % count]))
+
+    def by_ours(raw: Tensor, backend: str = "reference") -> Tensor:
+        lengths, aim, behind = (x.to(raw.dtype) for x in (deltas, target, background))
+        given = {"background": behind, "density_scale": SCALE, "backend": backend}
+        return ops.render_loss(raw, lengths, offsets, aim, **given).loss
+
+    def by_composite(raw: Tensor) -> Tensor:
+        colour, sigma = torch.sigmoid(raw[:, :3]), SCALE * F.softplus(raw[:, 3])
+        depths = torch.zeros_like(deltas)
+        seen = ops.composite(sigma, colour, depths, deltas, ray_offsets=offsets, background=background).colour
+        return F.mse_loss(seen, target)
+
+    rays = torch.repeat_interleave(torch.arange(RAYS, device=device), offsets.diff().long())
+
+    def by_sums(raw: Tensor) -> Tensor:
+        """As nerfacc composites packed samples in PyTorch: sums over all samples, less what was before each ray."""
+        colour, taken = torch.sigmoid(raw[:, :3]), SCALE * F.softplus(raw[:, 3]) * deltas
+        before = F.pad(taken.cumsum(0), (1, 0))
+        weights = torch.exp(before[offsets[:-1].long()][rays] - before[:-1]) * -torch.expm1(-taken)
+        seen = raw.new_zeros(RAYS, 3).index_add(0, rays, weights[:, None] * colour)
+        opacity = raw.new_zeros(RAYS).index_add(0, rays, weights)
+        return F.mse_loss(seen + (1 - opacity)[:, None] * background, target)
+
+    exact = results(by_ours, sets[0].double())
+    return Work(
+        lambda backend: contender(functools.partial(by_ours, backend=backend)),
+        {
+            "activations, composite, mse_loss": lambda: contender(by_composite),
+            "torch, sums over all samples": lambda: contender(by_sums),
+        },
+        _worst(exact),
+        1e-2,
+        SAMPLES * 4.0 * (4 + 4 + 1),
+        "copy",
+    )
+
+
+def _observe_work(device: torch.device) -> Work:
+    draw = generator(0)
+    box = torch.tensor(BOX, device=device)
+    count = rotation(SAMPLES * 24)
+
+    def batch() -> Results:
+        shell = F.normalize(torch.randn(SAMPLES, 3, generator=draw), dim=1) * 0.7
+        values = torch.rand(3, SAMPLES, generator=draw)
+        return [x.to(device) for x in (shell, 50 * values[0], values[1] / 32, values[2] / 64)]
+
+    sets = [batch() for _ in range(count)]
+    settings = {"decay": 0.8, "threshold": 2.0, "hidden": 1e-3}
+
+    def contender(function: Callable[..., Any]) -> Contender:
+        density = torch.rand((GRID,) * 3, generator=generator(1)).to(device) * 4
+        occupied = density >= settings["threshold"]
+
+        def run(call: int) -> Results:
+            function(density, occupied, box, *sets[call % count], **settings)
+            return [density, occupied.float()]
+
+        return Contender(run)
+
+    exact = contender(functools.partial(ops.observe_occupancy, backend="reference")).run(0)
+    return Work(
+        lambda backend: contender(functools.partial(ops.observe_occupancy, backend=backend)),
+        {"torch, as nerfacc": lambda: contender(_observe_all)},
+        _worst(exact),
+        1e-5,
+        SAMPLES * 24.0,
+        "copy",
+    )
+
+
+def _observe_all(
+    density: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    positions: Tensor,
+    sigma: Tensor,
+    deltas: Tensor,
+    weights: Tensor,
+    *,
+    decay: float,
+    threshold: float,
+    hidden: float,
+) -> None:
+    """The cells of the samples, then the threshold for all cells, as nerfacc's ``OccGridEstimator`` does it."""
+    rows = cells_of(positions, box, density.shape).long()
+    seen = weights > hidden * (1 - torch.exp(-sigma * deltas))
+    flat = density.view(-1)
+    flat[rows] = flat[rows] * decay
+    flat.scatter_reduce_(0, rows, torch.where(seen, sigma, 0), "amax")
+    occupied.copy_(density >= threshold)
+
+
+def _adam_work(entries: int, touched: float, device: torch.device) -> Work:
+    draw = generator(0)
+    table = torch.randn(entries, 2, generator=draw).to(device)
+    present = torch.rand(entries, 1, generator=draw) < touched
+    gradient = (torch.randn(entries, 2, generator=draw) * present).to(device)
+
+    def ours(backend: str) -> Contender:
+        state = [table.clone(), torch.zeros_like(table), torch.zeros_like(table)]
+
+        def run(call: int) -> Results:
+            ops.sparse_adam(state[0], gradient, *state[1:], step=call + 1, learning_rate=1e-2, backend=backend)
+            return state[:1]
+
+        return Contender(run)
+
+    def torchs(**options: Any) -> Contender:
+        parameter = torch.nn.Parameter(table.clone())
+        parameter.grad = gradient
+        optimizer = torch.optim.Adam([parameter], lr=1e-2, **options)
+
+        def run(call: int) -> Results:
+            optimizer.step()
+            return [parameter.detach()]
+
+        return Contender(run)
+
+    exact = [x.clone() for x in ours("reference").run(0)]
+    return Work(
+        ours,
+        {
+            "torch.optim.Adam, fused": lambda: torchs(fused=True),
+            "torch.optim.Adam, foreach": lambda: torchs(foreach=True),
+        },
+        _worst(exact),
+        1e-5,
+        # the gradient is read; of the entries that have one, parameter and two moments are read and written
+        gradient.nbytes * (1 + 6 * touched),
+        "copy",
+    )
