@@ -28,7 +28,7 @@ class Adam(torch.optim.Adam):
         tables = [(p, p.grad, group) for group in groups for p in group["params"] if p.grad is not None]
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
-        if overflow is None or not overflow.item():
+        if tables and (overflow is None or not overflow.item()):
             for parameter, gradient, group in tables:
                 self._step_table(parameter, gradient if scale is None else gradient / scale, group)
         for parameter, _, _ in tables:

@@ -160,15 +160,9 @@ def check_memory(config: TrainConfig) -> None:
     }
     for name, needed in parts.items():
         _check_fits(name, needed, there)
-    # Counting makes a network. One too large for memory is found by narrower ones, whose parameters are fewer by the
-    # ratio of the widths or more.
-    full = config.width or 1
-    narrower = [width for width in (2**i for i in range(10, 40)) if width < full]
-    size = "" if config.width is None else f" of --width {full}"
-    for width in (*narrower, full):
-        count = count_parameters(config, width if config.width else None) * (full // width)
-        name = f"--field {config.field}{size} with {config.final_cells} cells"
-        _check_fits(name, _parameter_bytes(config) * count, there)
+    width = "" if config.width is None else f" of --width {config.width}"
+    name = f"--field {config.field}{width} with {config.final_cells} cells"
+    _check_fits(name, _parameter_bytes(config) * count_parameters(config), there)
 
 
 def _parameter_bytes(config: TrainConfig) -> int:

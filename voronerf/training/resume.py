@@ -20,6 +20,7 @@ from voronerf.training.checkpoint import (
     optimizer_tensors,
 )
 from voronerf.training.config import TrainConfig, differences
+from voronerf.training.divergence import GradientGuard
 from voronerf.training.networks import check_shapes, make_optimizer, restore_routers, router_states
 from voronerf.training.progress import Stage
 from voronerf.training.schema import check_types
@@ -37,6 +38,8 @@ class Stored:
     seconds: float
     stages: tuple[dict[str, Any], ...]
     evaluated: int
+    skipped: int
+    rate_factor: float
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
@@ -83,6 +86,8 @@ def training_state(trainer: Trainer) -> Checkpoint:
         "seconds": trainer.seconds,
         "stages": [asdict(stage) for stage in trainer.stages],
         "evaluated": trainer.evaluated,
+        "skipped": int(trainer.guard.skipped),
+        "rate_factor": trainer.rate_factor,
     }
     return Checkpoint(tensors, values)
 
@@ -132,3 +137,5 @@ def resume_training(trainer: Trainer, checkpoint: Checkpoint) -> None:
     trainer.seconds = stored.seconds
     trainer.stages = [Stage(**stage) for stage in stored.stages]
     trainer.evaluated = stored.evaluated
+    trainer.guard = GradientGuard(trainer.device, stored.skipped)
+    trainer.rate_factor = stored.rate_factor

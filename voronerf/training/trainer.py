@@ -24,9 +24,17 @@ from voronerf.files import json_text, write_text
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
-from voronerf.training.checkpoint import Checkpoint, CheckpointWriter, checkpoint_paths
+from voronerf.training.checkpoint import Checkpoint, CheckpointWriter, checkpoint_paths, last_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
+from voronerf.training.divergence import (
+    PATIENCE,
+    SETTLED,
+    GradientGuard,
+    all_finite,
+    one_colour_psnr,
+    why_scores_are_poor,
+)
 from voronerf.training.networks import check_memory, make_optimizer, make_routers, resolve_config
 from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
@@ -110,6 +118,9 @@ class Trainer:
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
         self.occupancy = make_grid(config, scene, self.device) if config.occupancy else None
         self.renderer = make_renderer(config, scene, self.routers, occupancy=self.occupancy)
+        self.guard = GradientGuard(self.device)
+        self.rate_factor = 1.0  # 0.5 after a divergence
+        self.one_colour: float | None = None
         self.step = 0
         self.seconds = 0.0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
@@ -154,7 +165,8 @@ class Trainer:
         rise = 1.0
         if done < config.warmup and self.step < WARMUP_STEPS:
             rise = 0.01 + 0.99 * max(done / config.warmup, self.step / WARMUP_STEPS)
-        return config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**self.level
+        rate = config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**self.level
+        return rate * self.rate_factor
 
     def temperature(self) -> float:
         """Of the stochastic assignment: exponential decay from ``temperature``, by ``temperature_final`` in all."""
@@ -179,7 +191,8 @@ class Trainer:
         """Trains to the end of the budget, or until :meth:`request_stop`; returns what ``summary.json`` holds.
 
         Raises:
-            TrainingError: When the loss stops being finite; the last checkpoint is left as it was.
+            TrainingError: When the loss or the moments stop being finite, with half the learning rate again or before
+                the first checkpoint; the last checkpoint is left as it was.
             OSError: When a checkpoint cannot be written.
         """
         self.advance()
@@ -225,24 +238,51 @@ class Trainer:
             saving = self.seconds - self.saved_at >= self.config.checkpoint_every and not self.writer.busy
             if saving or self._due() > self.evaluated:
                 self._read(loss)
-            if saving:
+            if saving and self._check_moments():
                 self.save(wait=False)
         if loss is not None:
             self._read(loss)
+            if not self._check_moments():
+                self.advance(until)
         self.writer.wait()
 
     def _read(self, loss: Tensor) -> None:
         """Waits for a step's loss; the wait is training time.
 
         Raises:
-            TrainingError: When it is not finite.
+            TrainingError: When steps are skipped again and again, see :meth:`_go_back`.
         """
         started = self.clock()
-        self.loss = float(loss)
+        self.loss, in_a_row = torch.stack((loss.float(), self.guard.in_a_row)).tolist()
         self.seconds += self.clock() - started
-        if not math.isfinite(self.loss):
-            kept = "the checkpoint is as it was" if checkpoint_paths(self.out) else "there is no checkpoint"
-            raise TrainingError(f"{self.out}: the loss is {self.loss} at step {self.step}, try a smaller --lr; {kept}")
+        if in_a_row >= PATIENCE:
+            self._go_back(f"gradients of {int(in_a_row)} steps in a row not finite")
+
+    def _check_moments(self) -> bool:
+        """Whether parameters and moments are finite; goes back to the last checkpoint where they are not."""
+        finite = all_finite(self.optimizer)
+        if not finite:
+            self._go_back("parameters or moments of Adam not finite")
+        return finite
+
+    def _go_back(self, reason: str) -> None:
+        """Goes on from the last checkpoint with half the learning rate, once in a run.
+
+        Raises:
+            TrainingError: The second time, or without a checkpoint.
+        """
+        self.writer.wait()
+        at, there = self.step, bool(checkpoint_paths(self.out))
+        if self.rate_factor < 1 or not there:
+            kept = "with half the rate again; the checkpoint is as it was" if there else "there is no checkpoint"
+            raise TrainingError(f"{self.out}: {reason} at step {at}, try a smaller --lr; {kept}")
+        skipped = int(self.guard.skipped)
+        self._resume(last_checkpoint(self.out))
+        self.guard.skipped.fill_(skipped)
+        self.rate_factor = 0.5
+        self.saved_at = self.seconds
+        self._compute = self._make_step()
+        self._say(f"{reason} at step {at}: back to step {self.step}, with half the learning rate")
 
     def _make_step(self) -> Callable[[], tuple[Tensor, Tensor | None, Tensor | None]]:
         """The function of a step: the plain one, or a new CUDA graph of it."""
@@ -280,6 +320,7 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         # Nothing is read on the host: the fused optimiser skips a step whose gradients have overflowed by itself.
         self.scaler.scale(loss).backward()
+        self.guard.watch(loss, self.optimizer, scaled=self.scaler.is_enabled())
         self.scaler.step(self.optimizer)
         self.scaler.update()
         if self.level >= len(self.plan):
@@ -359,6 +400,12 @@ class Trainer:
             f"{self.seconds:7.1f} s  step {self.step:6d}  {self.router.num_cells:4d} cells  "
             f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
         )
+        if self.one_colour is None:
+            self.one_colour = one_colour_psnr(self.scene)
+        settled = self.step >= SETTLED and self.fraction >= 0.5
+        poor = why_scores_are_poor(self.metrics, self.config, self.one_colour, settled=settled)
+        if poor is not None:
+            self._say(poor)
 
     def _summarise(self) -> dict[str, Any]:
         summary = {
@@ -370,6 +417,7 @@ class Trainer:
             "parameters": sum(p.numel() for router in self.routers.values() for p in router.parameters()),
             "cells": self.router.num_cells,
             "splits_left": len(self.plan) - self.level,
+            "skipped_steps": int(self.guard.skipped),
             "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
         }

@@ -1,0 +1,95 @@
+"""How a training that goes wrong is noticed: by its gradients, its moments and its scores."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.utils import get_total_norm
+
+from voronerf.data import Scene
+from voronerf.evaluation.scores import view_numbers
+from voronerf.training.config import TrainConfig
+
+#: Gradients from here on have squares beyond float32, which make Adam's second moment infinite for good.
+LARGEST = 1e18
+#: Skipped steps in a row after which waiting is of no use.
+PATIENCE = 10
+#: Decibels below the best evaluation so far that are a collapse.
+COLLAPSE = 5.0
+#: A run is compared with pictures of one colour from its middle on, and from this step.
+SETTLED = 200
+
+
+class GradientGuard:
+    """Keeps an optimiser from steps whose loss or gradients are not finite, and counts them on the device.
+
+    Attributes:
+        skipped: How many there were, a scalar tensor.
+        in_a_row: How many the last steps were.
+    """
+
+    def __init__(self, device: torch.device, skipped: int = 0) -> None:
+        self.skipped = torch.tensor(float(skipped), device=device)
+        self.in_a_row = torch.zeros((), device=device)
+        self._found = torch.zeros((), device=device)
+
+    def watch(self, loss: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool) -> None:
+        """Tells the optimiser whether to skip the step that comes; the host waits for nothing.
+
+        Gradients of tables that are updated by entries are not read, which takes time: they are products of those of
+        the first layer, which are. Scaled gradients are the scaler's own matter.
+        """
+        parts = [loss.detach().float()]
+        if not scaled:
+            dense = (p.grad for g in optimizer.param_groups if not g.get("sparse") for p in g["params"])
+            parts += [gradient.sum() for gradient in dense if gradient is not None]  # a norm takes five times as long
+        self._found.copy_(torch.stack(parts).sum().abs().lt(LARGEST).logical_not_())  # true for NaN
+        self.skipped.add_(self._found)
+        self.in_a_row.add_(1).mul_(self._found)
+        if not scaled:
+            optimizer.found_inf = self._found  # type: ignore[attr-defined]  # what torch's scaler sets too
+
+
+def all_finite(optimizer: torch.optim.Optimizer) -> bool:
+    """Whether all parameters of an optimiser and its moments are finite; reads all of them."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    moments = [entry for state in optimizer.state.values() for entry in state.values() if isinstance(entry, Tensor)]
+    return bool(get_total_norm([tensor.detach() for tensor in (*parameters, *moments)], math.inf).isfinite())
+
+
+def one_colour_psnr(scene: Scene, views: int = 5) -> float:
+    """PSNR in dB of test views that are painted in their mean colour."""
+    background = scene.background_colour()
+    pixels = torch.cat([scene.test.truth(i, background).reshape(-1, 3) for i in view_numbers(len(scene.test), views)])
+    return -10 * math.log10(max(float(pixels.var(0, correction=0).mean()), 1e-10))
+
+
+def why_scores_are_poor(
+    metrics: Sequence[Mapping[str, Any]], config: TrainConfig, one_colour: float, *, settled: bool
+) -> str | None:
+    """What is wrong with the last evaluation of a run and probably its cause, in a line; None if nothing is.
+
+    Args:
+        metrics: All evaluations.
+        config: The settings of the run.
+        one_colour: See :func:`one_colour_psnr`.
+        settled: Whether the run is so far that it must have learnt something.
+    """
+    *earlier, now = (math.nan if m["psnr"] is None else m["psnr"] for m in metrics)
+    best = max((psnr for psnr in earlier if math.isfinite(psnr)), default=-math.inf)
+    assert config.lr is not None
+    usual = config.field_type.learning_rate(config.network_options)
+    rate = usual if config.lr > usual else config.lr / 4
+    if best - now > COLLAPSE:
+        return f"psnr fell from {best:.2f} to {now:.2f} dB: the learning rate is probably too high, try --lr {rate:.2g}"
+    if settled and not now > one_colour:
+        other = "" if config.lr > usual else ", or cameras, near and far do not fit the images"
+        return (
+            f"nothing is learnt: psnr is {now:.2f} dB, where a single colour gives {one_colour:.2f}; the learning rate "
+            f"is probably too high, try --lr {rate:.2g}{other}"
+        )
+    return None
