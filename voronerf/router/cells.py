@@ -68,12 +68,7 @@ def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
 
 
 def check_module(module: nn.Module) -> None:
-    """Refuses modules that cannot be one network for each cell.
-
-    Raises:
-        TypeError: For anything but a module, for layers that mix samples or keep a state of their own for each weight,
-            and for parameters in plain containers.
-    """
+    """Raises TypeError for what cannot be one network for each cell."""
     if not isinstance(module, nn.Module):
         raise TypeError(f"{_OP}: module must be an nn.Module, got {type(module).__name__}")
     for name, part in module.named_modules():
@@ -99,11 +94,7 @@ def _refusal(part: nn.Module) -> str:
 
 
 def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
-    """Gives every parameter of a module k equal entries, in place, but for those that the patterns ``share`` name.
-
-    Raises:
-        ValueError: For a pattern that no parameter has.
-    """
+    """Gives every parameter of a module k equal entries, in place, but for those that the patterns ``share`` name."""
     named = list(module.named_parameters(remove_duplicate=False))
     for pattern in share:
         if not any(fnmatch.fnmatchcase(name, pattern) for name, _ in named):
@@ -123,23 +114,9 @@ def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
         owner.register_parameter(name, stacked[id(parameter)])
 
 
-def take_cell(module: nn.Module, index: int) -> nn.Module:
-    """A plain copy of one cell's module."""
-    plain: nn.Module = clone_module(
-        module, {id(p): nn.Parameter(p.detach()[index].clone(), p.requires_grad) for p in cell_parameters(module)}
-    )
-    for part in plain.modules():
-        vars(part).pop(_SHARED, None)
-    return plain
-
-
 @torch.no_grad()
 def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None:
-    """Puts a plain module's parameters into one cell.
-
-    Raises:
-        ValueError: Names, shapes or buffers that are not those of the routed module.
-    """
+    """Puts a plain module's parameters into one cell, or raises ValueError where names, shapes or buffers differ."""
     stacked = {id(parameter) for parameter in cell_parameters(routed)}
     ours, theirs = routed.state_dict(keep_vars=True), module.state_dict()
     odd = sorted(ours.keys() ^ theirs.keys())
@@ -175,38 +152,20 @@ def in_place_of_parameters(module: nn.Module, values: Mapping[int, Any]) -> Iter
                     vars(owner)[name] = before.get(name)
 
 
-@torch.no_grad()
-def _inherit_parameters(module: nn.Module, parents: Tensor, fresh: dict[str, Tensor] | None, new: Tensor) -> None:
-    """Replaces the values of k cells by those of their children; the parameter objects stay.
+def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
+    """Gives a parameter values of another shape.
 
-    Args:
-        module: With stacked parameters, changed in place.
-        parents: int64 [children], the cell that each child comes from.
-        fresh: By name, values [children, ...] for the cells that ``new`` names, or None.
-        new: bool [children].
+    A graph of an earlier call that is still held remembers the old shape, and would have the gradients of the new cells
+    summed to it. With another dtype in between torch forgets it.
     """
-    stacked = {id(parameter) for parameter in cell_parameters(module)}
-    for name, parameter in module.named_parameters():
-        if id(parameter) not in stacked:
-            continue
-        with torch.inference_mode(False):
-            values = parameter.detach()[parents.to(parameter.device)]
-            if fresh is not None:
-                values[new.to(values.device)] = fresh[name][new].to(values)
-            # A graph of an earlier call that is still held remembers the old shape of the parameter, and would have the
-            # gradients of the new cells summed to it. With another dtype in between torch forgets it.
-            if values.is_floating_point():
-                other = torch.float32 if values.dtype == torch.float64 else torch.float64
-                parameter.data = values.new_empty(0, dtype=other)
-            parameter.data, parameter.grad = values, None
+    if values.is_floating_point():
+        other = torch.float32 if values.dtype == torch.float64 else torch.float64
+        parameter.data = values.new_empty(0, dtype=other)
+    parameter.data, parameter.grad = values, None
 
 
 def _draw_parameters(template: nn.Module, k: int, generator: torch.Generator | None) -> dict[str, Tensor]:
-    """Newly drawn parameters [k, ...] of a plain module, by name.
-
-    Raises:
-        ValueError: When the module has parameters, but no ``reset_parameters()`` in itself or its layers.
-    """
+    """Newly drawn parameters [k, ...] of a plain module, by name."""
     parts = {"": template} if hasattr(template, "reset_parameters") else dict(template.named_modules())
     resets = [part for part in parts.values() if hasattr(part, "reset_parameters")]
     for name, part in parts.items():
@@ -266,7 +225,12 @@ class CellModules(nn.Module):
         Raises:
             IndexError: If there is no such cell.
         """
-        return take_cell(self.module, self._check_index("cell", index))
+        self._check_index("cell", index)
+        own = {id(p): nn.Parameter(p.detach()[index].clone(), p.requires_grad) for p in cell_parameters(self.module)}
+        plain: nn.Module = clone_module(self.module, own)
+        for part in plain.modules():
+            vars(part).pop(_SHARED, None)
+        return plain
 
     def load_cell(self, index: int, module: nn.Module) -> None:
         """Copies the parameters of a plain module into one cell. Parameter objects and optimisers stay the same.
@@ -345,7 +309,14 @@ class CellModules(nn.Module):
         if optimizer is not None:
             _check_optimizer(optimizer, self.module, "subdivide")
         before = self.num_cells
-        _inherit_parameters(self.module, parents, fresh, new)
+        stacked = {id(parameter) for parameter in cell_parameters(self.module)}
+        for name, parameter in self.module.named_parameters():
+            if id(parameter) in stacked:
+                with torch.inference_mode(False):
+                    values = parameter.detach()[parents.to(parameter.device)]
+                    if fresh is not None:
+                        values[new.to(values.device)] = fresh[name][new].to(values)
+                    _replace_values(parameter, values)
         self.diagram = copy.deepcopy(diagram).to(self.diagram.centres.device)
         self._forget_assignments()
         if optimizer is not None:
@@ -440,14 +411,9 @@ def _check_optimizer(optimizer: torch.optim.Optimizer, module: nn.Module, method
 def _move_state(
     optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
 ) -> None:
-    """Gives every cell the state that an optimiser has for its parent; a state that is not of cells begins anew.
+    """Gives every cell the state that an optimiser has for its parent among k cells, or zero to those of ``fresh``.
 
-    Args:
-        optimizer: Of a module whose parameters are those of the new cells already.
-        module: With stacked parameters.
-        parents: int64 [new cells].
-        k: Cells before.
-        fresh: bool [new cells], whose state is zero instead, or None.
+    The parameters have their new shapes already. A state that is not of cells begins anew.
     """
     lost = False
     for parameter in cell_parameters(module):

@@ -141,12 +141,7 @@ class _Linear:
 
 
 class _Trace(TorchFunctionMode):
-    """Takes down the functions that a module calls, each in its place.
-
-    Args:
-        original: The routed module.
-        call: Of a copy of it, which runs with the parameters of its first cell.
-        given: The rows of the arguments, for ``ROWS`` samples.
+    """Takes down the functions that a copy of the routed module calls with its first cell's parameters.
 
     Attributes:
         sizes: Of every value of rows, rows for each sample and the dimensions behind, 0 rows where their dimension is
@@ -155,9 +150,6 @@ class _Trace(TorchFunctionMode):
         parameters: Values that are parameters, with their place among ``owned_parameters``.
         shared: Values that are parameters of all cells in common, or made of such alone.
         outputs: For each tensor of the result what stands for it, or the tensor where it depends on no sample.
-
-    Raises:
-        Unfusable: For a step that cannot be done again for other samples, or a layer that fits no table.
     """
 
     def __init__(self, original: nn.Module, call: Call, given: list[Tensor]) -> None:

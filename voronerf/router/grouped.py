@@ -230,14 +230,10 @@ def user_line() -> str:
 
 
 class GroupedRun(TorchFunctionMode):
-    """Active while a module runs on the sorted rows of all cells; what a rule is given.
-
-    Args:
-        grouping: Of the samples.
-        tables: Those that other parts of the call have looked up.
+    """Active while a module runs on the n sorted rows of all cells; what a rule is given.
 
     Attributes:
-        n: Samples.
+        tables: Those that parts of the call have looked up.
         failed: Why the results are not valid, also where the module caught the error; None where they are.
         widest: Bytes of the largest tensor of rows that was made.
     """
@@ -336,14 +332,7 @@ class GroupedRun(TorchFunctionMode):
 def run_grouped(call: Call, given: list[Tensor], grouping: Grouping, piece: int) -> tuple[Results, int]:
     """A module's results for sorted rows of all cells, and the bytes of the largest tensor of rows that was made.
 
-    Args:
-        call: Of the module.
-        given: The rows of its arguments, sorted.
-        grouping: Of the samples.
-        piece: Rows that it runs on at once on a CPU, whose cache holds their tensors then.
-
-    Raises:
-        Ungroupable: Where that is not possible.
+    On a CPU it runs on pieces of so many rows, so that the cache holds their tensors. Raises :class:`Ungroupable`.
     """
     parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
     # Parameters are split once for all parts: their gradient is then put together once, where that of a slice would

@@ -30,13 +30,7 @@ SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
 def map_tree(value: Any, change: Callable[..., Any], name: str = "", nested: bool = False, depth: int = 0) -> Any:
     """The same structure with every leaf changed, and the same object where no leaf is.
 
-    Args:
-        value: Of any structure.
-        change: Called with a leaf's name ("x", "samples.origins", "views.0"), the leaf, and whether it is inside an
-            object; returns what goes in its place.
-        name: Of the value.
-        nested: Whether the value is inside an object.
-        depth: Containers around the value; one that lies deeper than six is a leaf.
+    ``change`` gets a leaf's name ("x", "samples.origins", "views.0"), the leaf, and whether it is inside an object.
     """
     items = None if depth > _DEEPEST else _items(value)
     if items is None:
@@ -133,13 +127,7 @@ class Layout:
     def kind(self, name: str, tensor: Tensor, nested: bool) -> str:
         """What a tensor has an entry for: each sample, each ray, or neither.
 
-        Args:
-            name: Of the argument; of an attribute of it, "argument.attribute".
-            tensor: The argument.
-            nested: Inside an object, where what fits nothing is left alone.
-
-        Raises:
-            ValueError: For a tensor that fits nothing, or two readings.
+        Raises ValueError for one that fits two readings, or nothing and is not ``nested``, inside an object.
         """
         shape, lead, d = tuple(tensor.shape), self.lead, len(self.lead)
         if not shape or _named(name, self.shared):
@@ -190,11 +178,9 @@ class Layout:
         return rows.reshape(rows.shape[0], *ones, *rows.shape[1:]) if ones else rows
 
     def restore(self, rows: Tensor, flattened: bool) -> Tensor:
-        """Rows of a result in the original order, with the leading dimensions of the call.
+        """Rows [n * m, ...] of a result in the original order, with the leading dimensions of the call.
 
-        Args:
-            rows: [n * m, ...], from [n, 1, ...] with its dimension of one.
-            flattened: Whether the module itself makes [rays * samples, ...] of what it gets.
+        They stay as they are where the module itself has ``flattened`` rays to [rays * samples, ...].
         """
         n, rest = self.n, rows.shape[1:]
         if len(self.lead) == 1 or flattened or (n and rows.shape[0] != n):
@@ -303,11 +289,7 @@ class Results:
 
     @staticmethod
     def joined(values: list[Any], counts: list[int], module: nn.Module) -> Results:
-        """What a method returned for parts of the rows, as one; buffers of the module are constants.
-
-        Raises:
-            ValueError: For a result without a row for each sample, or other results for some parts.
-        """
+        """What a method returned for parts of the rows, as one; buffers of the module are constants."""
         parts = [tensors_of(value) for value in values]
         if any(len(part) != len(parts[0]) for part in parts):
             raise ValueError(f"{_OP}: module must return as many tensors for every cell, got different numbers")
@@ -327,10 +309,7 @@ class Results:
     def restored(self, layout: Layout, grouping: Grouping | None, flat: Sequence[bool]) -> Any:
         """The results in the caller's order, with the leading dimensions of the call.
 
-        Args:
-            layout: Of the call.
-            grouping: Whose order they have; None for the caller's.
-            flat: Which tensors the module itself flattens to [rays * samples, ...].
+        ``grouping`` is None where they have that order; ``flat`` says which tensors the module itself flattens.
         """
         tensors = list(self.tensors)
         for i, tensor in enumerate(tensors):
@@ -346,12 +325,7 @@ class Results:
 
 
 def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:
-    """The positions of a call's samples, [..., 3].
-
-    Raises:
-        ValueError: Where no rule is given, or it does not fit the arguments.
-        TypeError: For positions that are no floating-point tensor.
-    """
+    """The positions of a call's samples, [..., 3], by a rule or as a tensor."""
     if rule is None:
         raise ValueError(
             f"{_OP}: coords must say where the positions are, since a module's arguments do not: pass "

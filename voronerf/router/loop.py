@@ -33,9 +33,6 @@ def run_cells(call: Call, given: list[Tensor], bounds: list[tuple[int, int, int]
 
     Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a copy of the
     module, which keeps the cell's parameters.
-
-    Raises:
-        ValueError: For a result without a row for each sample, or other results in some cells.
     """
     module, counts = call.module, [last - first for _, first, last in bounds]
     pieces = {id(p): p.unbind(0) for p in cell_parameters(module)}
@@ -226,12 +223,7 @@ def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Paramet
 
 
 def admitted(trial: Trial, fuse: bool) -> Choice:
-    """The fastest way that gives what the loop gives.
-
-    Raises:
-        ValueError: Where the module has to fuse and does not.
-        TypeError: Where it mixes samples.
-    """
+    """The fastest way that gives what the loop gives; an error where the module has to fuse and does not."""
     for trial.again in (False, True):
         try:
             expected = trial.outcome(Trial.by_cells)
@@ -270,11 +262,8 @@ def admitted(trial: Trial, fuse: bool) -> Choice:
 def flattened(call: Call) -> tuple[bool, ...]:
     """For each tensor that a call with rays returns, whether the module itself makes [rays * samples, ...] of it.
 
-    The module runs on a few samples of two rays, as rays and as it would see them.
-
-    Raises:
-        TypeError: When the samples of a ray meet in the module.
-        ValueError: When the module gives other results for [n, 1, f] than for [rays, samples, f].
+    The module runs on a few samples of two rays. It is refused if the samples of a ray meet in it, or if it gives other
+    results for [n, 1, f] than for [rays, samples, f].
     """
     name, lead = type(call.module).__name__, call.layout.lead
     for samples in (6, lead[-1]):  # a module may be made for a number of samples
