@@ -14,9 +14,6 @@ JOBS ?= auto
 # Every architecture nvcc 13 knows that a user may have; the last also as PTX.
 CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
 
-# The CUDA code takes minutes to compile, and nothing here would run it without a GPU: `make cuda-check` compiles all of it.
-export VORONERF_CUDA ?= $(if $(wildcard /dev/nvidiactl /dev/dxg),auto,0)
-
 SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10

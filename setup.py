@@ -6,7 +6,8 @@ for each instruction set (csrc/common/isa.h); the choice among them is made at r
 
 Environment:
     CXX, CXXFLAGS                the C++ compiler and its flags (default c++, else g++); "ccache g++" works too
-    VORONERF_CUDA                auto (default): with CUDA where nvcc is found; 1: fail without it; 0: never
+    VORONERF_CUDA                auto (default): with CUDA where nvcc and a GPU are found, for that GPU; 1: for all
+                                 GPUs, also where none is found, and fail without nvcc; 0: never
     VORONERF_CUDA_ARCHITECTURES  such as "80;90": machine code for each, and PTX of the last for what comes after it
     CUDA_HOME, MAX_JOBS          where CUDA is; parallel jobs
 """
@@ -88,13 +89,29 @@ def find_cuda() -> Cuda:
         if wish == "1":
             raise SystemExit("voronerf: VORONERF_CUDA=1 but no nvcc; install the CUDA toolkit or set CUDA_HOME")
         return Cuda("built without CUDA: no nvcc on PATH, in CUDA_HOME or in /usr/local/cuda")
+    there = architectures_there()
+    if wish == "auto" and there is None:
+        return Cuda("built without CUDA: no GPU here; VORONERF_CUDA=1 compiles it, which takes some twenty minutes")
     wanted = os.environ.get("VORONERF_CUDA_ARCHITECTURES")
     if wanted:
         architectures = tuple(wanted.replace(",", ";").split(";"))
     else:
         known = subprocess.run([found, "--list-gpu-code"], check=True, capture_output=True, text=True).stdout.split()
-        architectures = tuple(arch for arch in DEFAULT_ARCHITECTURES.split(";") if f"sm_{arch}" in known)
+        choices = (there if wish == "auto" and there else (), DEFAULT_ARCHITECTURES.split(";"))
+        known_of = [tuple(arch for arch in choice if f"sm_{arch}" in known) for choice in choices]
+        architectures = known_of[0] or known_of[1]
     return Cuda(f"built with CUDA for {';'.join(architectures)} by {found}", Path(found), architectures)
+
+
+def architectures_there() -> tuple[str, ...] | None:
+    """The architectures of this machine's GPUs; () where the driver does not tell, None without a GPU."""
+    try:
+        command = ["nvidia-smi", "--query-gpu=compute_cap", "--format=csv,noheader"]
+        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    except (OSError, subprocess.CalledProcessError):
+        said = []
+    found = tuple(sorted({cap.replace(".", "") for cap in said if cap.replace(".", "").isdigit()}, key=int))
+    return found if found or any(Path(device).exists() for device in ("/dev/nvidiactl", "/dev/dxg")) else None
 
 
 def compiler() -> list[str]:

@@ -88,12 +88,30 @@ def test_nvcc_is_found_where_cuda_home_has_none(build, monkeypatch, tmp_path):
     nvcc, own = tmp_path / "path" / "nvcc", tmp_path / "home" / "bin" / "nvcc"
     for path in (nvcc, own):
         path.parent.mkdir(parents=True)
-    settings = {"VORONERF_CUDA": "auto", "VORONERF_CUDA_ARCHITECTURES": "80", "PATH": str(nvcc.parent)}
+    settings = {"VORONERF_CUDA": "1", "VORONERF_CUDA_ARCHITECTURES": "80", "PATH": str(nvcc.parent)}
     for name, value in (settings | {"CUDA_HOME": str(tmp_path / "home")}).items():
         monkeypatch.setenv(name, value)
     for path in (nvcc, own):
         program(path)
         assert build["find_cuda"]().nvcc == path
+
+
+def test_cuda_is_compiled_for_the_gpu_that_is_there(build, monkeypatch, tmp_path):
+    program(tmp_path / "nvcc", "echo sm_75; echo sm_80; echo sm_89; echo sm_90")
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    for name in ("VORONERF_CUDA_ARCHITECTURES", "CUDA_HOME", "CUDA_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    every = ("75", "80", "90")
+    for said, auto in (("exit 1", None), ("echo 8.9; echo 8.0; echo 8.9", ("80", "89")), ("echo 13.0", every)):
+        program(tmp_path / "nvidia-smi", said)
+        if auto is None and any(Path(device).exists() for device in ("/dev/nvidiactl", "/dev/dxg")):
+            continue  # a GPU of which the driver says nothing
+        for wish, architectures in (("auto", auto), ("1", every)):
+            monkeypatch.setenv("VORONERF_CUDA", wish)
+            found = build["find_cuda"]()
+            assert found.architectures == (architectures or ())
+            assert (found.nvcc is None) == (architectures is None)
+            assert architectures is not None or "no GPU here; VORONERF_CUDA=1 compiles it" in found.outcome
 
 
 def test_one_word_and_none(build, monkeypatch):

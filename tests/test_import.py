@@ -22,6 +22,15 @@ def test_nothing_is_printed(backend: str) -> None:
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
 
+def test_a_missing_torch_is_one_line(tmp_path) -> None:
+    line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch\n"
+    without = "import sys; sys.modules['torch'] = None; sys.argv[0] = {!r}; import voronerf"
+    for program, text in (("notebook", f"ImportError: {line}"), ("/bin/voronerf", f"voronerf: error: {line}")):
+        run = subprocess.run([sys.executable, "-c", without.format(program)], capture_output=True, text=True)
+        assert run.returncode == 1 and run.stderr.endswith(text) and run.stderr.count("Traceback") == ("I" in text[:1])
+        assert "During handling" not in run.stderr
+
+
 @pytest.mark.warp
 def test_other_errors_still_reach_stderr_while_warp_starts() -> None:
     code = "import os, warp; warp.init = lambda: os.write(2, b'trouble\\n'); import voronerf.kernels"

@@ -2,6 +2,18 @@
 
 __version__ = "0.1.0"
 
+import sys
+
+try:
+    import torch as _torch  # noqa: F401
+except ModuleNotFoundError as error:
+    if error.name != "torch":
+        raise
+    line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch"
+    if sys.argv and sys.argv[0].endswith(("/voronerf", "\\voronerf", "\\voronerf.exe")):  # the command
+        sys.exit(f"voronerf: error: {line}")
+    raise ImportError(line) from None
+
 from voronerf.backends import BackendUnavailable
 from voronerf.diagram import (
     Balance,
