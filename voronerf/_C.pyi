@@ -154,12 +154,19 @@ MlpCaller: tuple[str, ...]  # grouped_mlp grouped_linear routed_mlp
 
 MlpCudaWay: tuple[str, ...]  # auto chain tiles layers wgmma
 
+class MlpEncoding(NamedTuple):
+    kind: str  # MlpEncodingKind
+    size: int  # int32
+
+MlpEncodingKind: tuple[str, ...]  # none frequency integrated hash spherical
+
 class MlpGradients(NamedTuple):
     output: Tensor | None  # const float32*
     weights: Sequence[Tensor | None] | None  # float32**
     biases: Sequence[Tensor | None] | None  # float32**
     positions: Tensor | None  # float32*
     directions: Tensor | None  # float32*
+    features: Tensor | None  # float32*
 
 class MlpInputs(NamedTuple):
     positions: Tensor | None  # const float32*
@@ -172,6 +179,10 @@ class MlpInputs(NamedTuple):
     r: int  # int64
     k: int  # int64
     order: Tensor | None  # const int32*
+    features: Tensor | None  # const any*
+    features_type: str  # TableType
+    tables: int  # int64
+    encoded: Tensor | None  # float32*
 
 class MlpLayer(NamedTuple):
     width: int  # int64
@@ -185,9 +196,9 @@ class MlpTable(NamedTuple):
     outputs: Sequence[int]  # int32[]
     positions: int  # int64
     directions: int  # int64
-    position_octaves: int  # int32
-    direction_octaves: int  # int32
-    integrated: bool
+    position: MlpEncoding
+    direction: MlpEncoding
+    grid: HashGrid
     half: bool
     caller: str  # MlpCaller
 

@@ -1,4 +1,5 @@
-"""Cases of hash_encode. n samples along rays, L levels, e entries of all levels, f features of a level."""
+"""Cases of hash_encode, and of a network behind it. n samples along rays, k cells, L levels, e entries of all levels, f
+features of a level."""
 
 from __future__ import annotations
 
@@ -12,19 +13,25 @@ from torch import Tensor
 
 from ops.alternatives import compile_now
 from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation
-from voronerf import HashGrid
-from voronerf.ops import hash_encode
+from voronerf import MLP, HashGrid, Layer
+from voronerf.ops import hash_encode, nearest_centre, routed_mlp, spherical_harmonics
 
 SAMPLES = 64
 """Of a ray."""
+CELLS = 16
 PRIMES = (1, 2654435761, 805459861)
 
 Encode = Callable[[Tensor, Tensor], Tensor]
 
 
 def cases() -> list[Case]:
-    """The rows of hash_encode, on one thread; backwards to the table alone, as in training."""
+    """Rows on one thread; backwards to tables and weights, as in training."""
     found = []
+    for n in (1 << 16, 1 << 18):
+        for direction in (FORWARD, BACKWARD):
+            work = functools.partial(_network, n, direction)
+            name, quick = f"hash + MLP n={n}", (n, direction) == (1 << 16, FORWARD)
+            found.append(Case("routed_mlp", name, torch.float32, direction, n, CELLS, work, quick=quick, threads=1))
     for n, log2_entries in ((1 << 16, 15), (1 << 18, 15), (1 << 16, 19)):
         for direction in (FORWARD, BACKWARD):
             name = f"8 x 2^{log2_entries} x 2 n={n}"
@@ -116,4 +123,61 @@ def _work(n: int, log2_entries: int, direction: str, compiled: bool, device: tor
         1e-3,
         amount,
         "copy",
+    )
+
+
+HIDDEN = (
+    Layer(("positions",), 32, "relu"),
+    Layer((0,), 16),
+    Layer((1,), 1),
+    Layer((1, "directions"), 32, "relu"),
+    Layer((3,), 3),
+)
+"""The density from 16 features, and the colour from these and the direction."""
+
+
+def _network(n: int, direction: str, device: torch.device) -> Work:
+    """A hash grid of all cells, harmonics of the directions, and a small network for each cell."""
+    grid, draw = HashGrid(levels=8, features=2, log2_entries=15, base=16, finest=256), generator(9)
+    inside = MLP(HIDDEN, (4, 2), None, None, "hash", grid, "spherical", 4)
+    behind = MLP(HIDDEN, (4, 2))
+    shapes = inside.weight_shapes(3, 3)
+    parameters = [torch.randn(grid.table_shape, generator=draw)]
+    parameters += [torch.randn(CELLS, o, i, generator=draw) / i**0.5 for o, i in shapes]
+    parameters += [torch.randn(CELLS, o, generator=draw) / 8 for o, _ in shapes]
+    parameters = [parameter.to(device) for parameter in parameters]
+    rays = F.normalize(torch.randn(n // SAMPLES, 3, generator=draw), dim=1).to(device)
+    index = (torch.arange(n, device=device) // SAMPLES).int()
+    gradient, centres = torch.randn(n, 4, generator=draw).to(device), torch.rand(CELLS, 3, generator=draw).to(device)
+    count = rotation(n * 4 * 3)
+    sets = [_samples(n, seed, device) for seed in range(count)]
+    cells = [nearest_centre(x, centres) for x in sets]
+
+    def results(call: int, fused: bool, backend: str, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+        leaves = [parameter.to(dtype).requires_grad_(direction == BACKWARD) for parameter in parameters]
+        table, weights, biases = leaves[0], leaves[1 : len(shapes) + 1], leaves[len(shapes) + 1 :]
+        x, seen = sets[call % count].to(dtype), rays.to(dtype)
+        given: dict[str, Any] = {"cells": cells[call % count], "direction_index": index, "backend": backend}
+        if fused:
+            out, _ = routed_mlp(x, weights, biases, layers=inside, directions=seen, features=table, **given)
+        else:
+            x, seen = hash_encode(x, table, grid, backend=backend), spherical_harmonics(seen, 4, backend=backend)
+            out, _ = routed_mlp(x, weights, biases, layers=behind, directions=seen, **given)
+        return [out] if direction == FORWARD else [out, *torch.autograd.grad(out, leaves, gradient.to(dtype))]
+
+    @functools.cache
+    def exact() -> list[Tensor]:
+        return results(0, True, "reference", torch.float64)
+
+    def error(found: Any) -> float:
+        return max(relative_error(a, b) for a, b in zip(found, exact(), strict=True))
+
+    operations = 2.0 * n * sum(o * i for o, i in shapes) * (1 if direction == FORWARD else 3)
+    return Work(
+        lambda backend: Contender(lambda call: results(call, True, backend)),
+        {"native, encoded before": lambda: Contender(lambda call: results(call, False, "native"))},
+        error,
+        3e-2,  # a ReLU within rounding of its kink may go either way
+        operations,
+        "float32",
     )

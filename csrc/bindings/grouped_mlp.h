@@ -1,7 +1,7 @@
 // The structs of grouped_mlp as Python passes them.
 #pragma once
 
-#include "bindings/bind.h"
+#include "bindings/hash_encode.h"
 #include "network/grouped_mlp.h"
 
 namespace voronerf {
@@ -11,9 +11,11 @@ VN_NAMES(MlpCaller, "grouped_mlp", "grouped_linear", "routed_mlp");
 VN_NAMES(MlpPrecision, "float32", "bfloat16", "float16", "tf32");
 VN_NAMES(MlpCudaWay, "auto", "chain", "tiles", "layers", "wgmma");
 VN_STRUCT(MlpLayer, width, activation, inputs);
-VN_STRUCT(MlpTable, layers, outputs, positions, directions, position_octaves, direction_octaves, integrated, half,
-          caller);
-VN_STRUCT(MlpInputs, positions, directions, direction_index, offsets, weights, biases, n, r, k, order);
-VN_STRUCT(MlpGradients, output, weights, biases, positions, directions);
+VN_NAMES(MlpEncodingKind, "none", "frequency", "integrated", "hash", "spherical");
+VN_STRUCT(MlpEncoding, kind, size);
+VN_STRUCT(MlpTable, layers, outputs, positions, directions, position, direction, grid, half, caller);
+VN_STRUCT(MlpInputs, positions, directions, direction_index, offsets, weights, biases, n, r, k, order, features,
+          features_type, tables, encoded);
+VN_STRUCT(MlpGradients, output, weights, biases, positions, directions, features);
 
 }  // namespace voronerf

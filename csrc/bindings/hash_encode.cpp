@@ -1,13 +1,6 @@
-#include "encoding/hash_encode.h"
-
-#include "bindings/bind.h"
+#include "bindings/hash_encode.h"
 
 namespace voronerf {
-
-VN_NAMES(TableType, "float32", "bfloat16", "float16");
-VN_STRUCT(GridLevel, scale, shift, side, entries, offset, hashed);
-VN_STRUCT(HashGrid, levels, low, high, features, smooth);
-VN_STRUCT(HashInputs, positions, direction, table, type, cells, n, tables, entries);
 
 VN_BINDINGS(module) {
   module.cpu("hash_encode", VN_CPU(hash_encode_cpu));

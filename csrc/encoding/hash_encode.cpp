@@ -17,17 +17,22 @@ namespace {
 
 constexpr int64_t kRun = 16 * kHashBlock;  // points of a task
 
-void encode_rows(Isa isa, const HashEncoding& in, float* out, int64_t begin, int64_t end) {
-  VN_FOR_ISA(isa, hash_encode_rows(in, out, begin, end))
+int64_t width_of(const HashEncoding& in) {
+  return int64_t{in.count} * in.features;
 }
 
-void level_backward(Isa isa, const HashEncoding& in, int64_t level, const float* gradient, float* of_table) {
-  VN_FOR_ISA(isa, hash_encode_level_backward(in, level, gradient, of_table))
+void encode_rows(Isa isa, const HashEncoding& in, float* out, int64_t begin, int64_t end) {
+  VN_FOR_ISA(isa, hash_encode_rows(in, out, width_of(in), begin, end))
+}
+
+void level_rows(Isa isa, const HashEncoding& in, int64_t level, const float* gradient, int64_t stride, int64_t begin,
+                int64_t end, float* of_table) {
+  VN_FOR_ISA(isa, hash_encode_level_backward(in, level, gradient, stride, begin, end, of_table))
 }
 
 void positions_backward(Isa isa, const HashEncoding& in, const float* gradient, float* of_positions, int64_t begin,
                         int64_t end) {
-  VN_FOR_ISA(isa, hash_encode_positions_backward(in, gradient, of_positions, begin, end))
+  VN_FOR_ISA(isa, hash_encode_positions_backward(in, gradient, width_of(in), of_positions, begin, end))
 }
 
 void check(const HashInputs& in) {
@@ -51,6 +56,16 @@ void hash_encode_cpu(const HashInputs& in, const HashGrid& grid, float* out, Isa
   for_points(in.n, threads, [&](int64_t begin, int64_t end) { encode_rows(isa, given, out, begin, end); });
 }
 
+void hash_level_backward_cpu(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,
+                             int64_t begin, int64_t end, float* of_table, Isa isa) {
+  const GridLevel& own = in.levels[level];
+  for (int64_t table = 0; table < in.in.tables; ++table) {
+    std::memset(of_table + (table * in.in.entries + own.offset) * in.features, 0,
+                sizeof(float) * static_cast<size_t>(own.entries * in.features));
+  }
+  level_rows(isa, in, level, gradient, stride, begin, end, of_table);
+}
+
 void hash_encode_backward_cpu(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                               float* of_positions, Isa isa, int threads) {
   check(in);
@@ -60,13 +75,8 @@ void hash_encode_backward_cpu(const HashInputs& in, const HashGrid& grid, const 
                [&](int64_t begin, int64_t end) { positions_backward(isa, given, gradient, of_positions, begin, end); });
   }
   if (of_table == nullptr) return;
-  parallel_for(given.count, 1, threads, [&](int64_t i) {
-    const GridLevel& level = given.levels[i];
-    for (int64_t table = 0; table < in.tables; ++table) {
-      std::memset(of_table + (table * in.entries + level.offset) * grid.features, 0,
-                  sizeof(float) * static_cast<size_t>(level.entries * grid.features));
-    }
-    level_backward(isa, given, i, gradient, of_table);
+  parallel_for(given.count, 1, threads, [&](int64_t level) {
+    hash_level_backward_cpu(given, level, gradient, width_of(given), 0, in.n, of_table, isa);
   });
 }
 

@@ -42,6 +42,11 @@ void hash_encode_cpu(const HashInputs& in, const HashGrid& grid, float* out, Isa
 void hash_encode_backward_cpu(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                               float* of_positions, Isa isa, int threads);
 
+// Gradient of one level's entries, zero before: what points `begin` to `end` give, in their order, of a gradient whose
+// rows are `stride` floats apart. A part of hash_encode_backward_cpu, on the calling thread.
+void hash_level_backward_cpu(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,
+                             int64_t begin, int64_t end, float* of_table, Isa isa);
+
 // Points whose cell has no table get zeros and give nothing. The table's gradient is added up in any order.
 void hash_encode_cuda(const HashInputs& in, const HashGrid& grid, float* out, void* stream);
 void hash_encode_backward_cuda(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,

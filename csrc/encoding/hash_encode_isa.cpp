@@ -68,35 +68,33 @@ VN_INLINE void corners_of(const HashEncoding& in, const GridLevel& level, const 
 
 }  // namespace
 
-void hash_encode_rows(const HashEncoding& in, float* out, int64_t begin, int64_t end) {
-  const int64_t width = int64_t{in.count} * in.features;
+void hash_encode_rows(const HashEncoding& in, float* out, int64_t stride, int64_t begin, int64_t end) {
   for_table(in, [&](auto features, auto type) {
     HashCorners corners;
     for_blocks(in, begin, end, [&](int64_t first, int64_t rows, const HashPlaces& places) {
       for (int32_t level = 0; level < in.count; ++level) {
         corners_of<false>(in, in.levels[level], places, rows, corners);
         hash_interpolate<features.value, typename decltype(type)::Value>(
-            in, in.levels[level], corners, first, rows, out + first * width + level * features.value, width);
+            in, in.levels[level], corners, first, rows, out + first * stride + level * features.value, stride);
       }
     });
   });
 }
 
-void hash_encode_level_backward(const HashEncoding& in, int64_t level, const float* gradient, float* of_table) {
-  const int64_t width = int64_t{in.count} * in.features;
+void hash_encode_level_backward(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,
+                                int64_t begin, int64_t end, float* of_table) {
   for_width(in.features, [&](auto features) {
     HashCorners corners;
-    for_blocks(in, 0, in.in.n, [&](int64_t first, int64_t rows, const HashPlaces& places) {
+    for_blocks(in, begin, end, [&](int64_t first, int64_t rows, const HashPlaces& places) {
       corners_of<false>(in, in.levels[level], places, rows, corners);
       hash_scatter<features.value>(in, in.levels[level], corners, first, rows,
-                                   gradient + first * width + level * features.value, width, of_table);
+                                   gradient + first * stride + level * features.value, stride, of_table);
     });
   });
 }
 
-void hash_encode_positions_backward(const HashEncoding& in, const float* gradient, float* of_positions, int64_t begin,
-                                    int64_t end) {
-  const int64_t width = int64_t{in.count} * in.features;
+void hash_encode_positions_backward(const HashEncoding& in, const float* gradient, int64_t stride, float* of_positions,
+                                    int64_t begin, int64_t end) {
   for_table(in, [&](auto features, auto type) {
     HashCorners corners;
     Four sums[3][kHashBlock];
@@ -104,8 +102,9 @@ void hash_encode_positions_backward(const HashEncoding& in, const float* gradien
       __builtin_memset(sums, 0, sizeof sums);
       for (int32_t level = 0; level < in.count; ++level) {
         corners_of<true>(in, in.levels[level], places, rows, corners);
-        hash_slopes<features.value, typename decltype(type)::Value>(
-            in, in.levels[level], corners, first, rows, gradient + first * width + level * features.value, width, sums);
+        hash_slopes<features.value, typename decltype(type)::Value>(in, in.levels[level], corners, first, rows,
+                                                                    gradient + first * stride + level * features.value,
+                                                                    stride, sums);
       }
       for (int64_t i = 0; i < rows; ++i) {
         for (int axis = 0; axis < 3; ++axis) {

@@ -10,15 +10,16 @@ namespace voronerf {
 
 constexpr int64_t kHashBlock = 64;  // points whose corners are in cache at a time
 
-// Points `begin` to `end` of a result [n, levels x features].
-VN_DECLARE_FOR_ISA(void hash_encode_rows(const HashEncoding& in, float* out, int64_t begin, int64_t end))
+// Points `begin` to `end` of a result [n, levels x features] or a gradient of that, rows `stride` floats apart.
+VN_DECLARE_FOR_ISA(void hash_encode_rows(const HashEncoding& in, float* out, int64_t stride, int64_t begin,
+                                         int64_t end))
 
-// Adds what all points give to the entries of one level to of_table.
+// Adds what those points give to the entries of one level to of_table.
 VN_DECLARE_FOR_ISA(void hash_encode_level_backward(const HashEncoding& in, int64_t level, const float* gradient,
-                                                   float* of_table))
+                                                   int64_t stride, int64_t begin, int64_t end, float* of_table))
 
-// Gradients to the positions of points `begin` to `end`.
-VN_DECLARE_FOR_ISA(void hash_encode_positions_backward(const HashEncoding& in, const float* gradient,
+// Gradients to their positions. These may take the place of the positions themselves.
+VN_DECLARE_FOR_ISA(void hash_encode_positions_backward(const HashEncoding& in, const float* gradient, int64_t stride,
                                                        float* of_positions, int64_t begin, int64_t end))
 
 }  // namespace voronerf

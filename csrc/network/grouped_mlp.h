@@ -16,6 +16,8 @@
 #include <vector>
 
 #include "common/isa.h"
+#include "encoding/hash_encode.h"
+#include "network/grouped_mlp_encoding.h"
 
 namespace voronerf {
 
@@ -33,14 +35,14 @@ struct MlpLayer {
   std::vector<int> inputs;  // earlier layers, kFromPositions or kFromDirections
 };
 
-// The layer table of voronerf/layers.py; octaves -1: taken as they come.
+// The layer table of voronerf/layers.py.
 struct MlpTable {
   std::vector<MlpLayer> layers;
   std::vector<int> outputs;
   int64_t positions = 0, directions = 0;  // p and q
-  int position_octaves = -1, direction_octaves = -1;
-  bool integrated = false;  // positions are means and variances, each half of them, encoded as mip-NeRF does
-  bool half = false;        // round what enters a product to bfloat16, where the processor multiplies that faster
+  MlpEncoding position, direction;
+  HashGrid grid{};    // of positions that are hashed
+  bool half = false;  // round what enters a product to bfloat16, where the processor multiplies that faster
   MlpCaller caller = MlpCaller::grouped_mlp;
 };
 
@@ -53,6 +55,13 @@ struct MlpInputs {
   const float* const* biases;
   int64_t n, r, k;
   const int32_t* order = nullptr;  // null: rows are sorted
+  // Of a hash grid: [entries, features], or one for each cell, [k, entries, features].
+  const void* features = nullptr;
+  TableType features_type = TableType::float32;
+  int64_t tables = 1;
+  // Hashed positions [n, encoded_width rounded up to 16] in their sorted order: filled by the forward pass where it is
+  // not null, read by the backward pass.
+  float* encoded = nullptr;
 };
 
 // Where gradients go; every element is written. Null: not wanted (weights: all or none; a layer without bias has null).
@@ -61,7 +70,8 @@ struct MlpGradients {
   float* const* weights;
   float* const* biases;
   float* positions;
-  float* directions;  // [n,q], or [r,q] summed over each ray's samples in their order
+  float* directions;          // [n,q], or [r,q] summed over each ray's samples in their order
+  float* features = nullptr;  // in float32 whatever their type, each entry summed over the rows in their sorted order
 };
 
 // Throws std::invalid_argument for offsets that fall or exceed n and for a direction_index out of range.

@@ -5,11 +5,24 @@
 #include <cstdint>
 #include <vector>
 
+#include "network/grouped_mlp_encoding.h"
+
 namespace voronerf {
 
-// Features of `raw` values after their encoding; no octaves (-1) leave them as they are.
-inline int64_t encoded_width(int64_t raw, int octaves, bool integrated) {
-  return octaves < 0 ? raw : integrated ? raw * octaves : raw * (1 + 2 * octaves);
+// Features of `raw` values after their encoding.
+inline int64_t encoded_width(int64_t raw, const MlpEncoding& encoding) {
+  switch (encoding.kind) {
+    case MlpEncodingKind::none:
+      return raw;
+    case MlpEncodingKind::frequency:
+      return raw * (1 + 2 * encoding.size);
+    case MlpEncodingKind::integrated:
+      return raw * encoding.size;
+    case MlpEncodingKind::hash:
+      return encoding.size;
+    default:
+      return int64_t{encoding.size} * encoding.size;
+  }
 }
 
 // Buffers whose lifetimes do not overlap share memory: first fit, in the order of asking. A lifetime is closed at both

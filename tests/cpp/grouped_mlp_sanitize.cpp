@@ -14,10 +14,13 @@
 #include <vector>
 
 #include "network/grouped_mlp.h"
+#include "network/grouped_mlp_layout.h"
 
 namespace {
 
 using voronerf::Activation;
+using voronerf::encoded_width;
+using voronerf::MlpEncodingKind;
 using voronerf::MlpTable;
 using Array = std::vector<float>;
 
@@ -40,8 +43,19 @@ Array poisoned(int64_t size) {
   return values;
 }
 
-int64_t encoded(int64_t d, int octaves, bool integrated) {
-  return octaves < 0 ? d : integrated ? d * octaves : d * (1 + 2 * octaves);
+// Up to five levels, the first of which have an entry for each corner.
+voronerf::HashGrid random_grid() {
+  voronerf::HashGrid grid{{}, {-1.0f, -1.0f, -1.0f}, {0.5f, 1.0f, 2.0f}, int64_t{1} << below(4), below(2) == 0};
+  const int64_t levels = 1 + below(5);
+  int64_t offset = 0;
+  for (int64_t l = 0; l < levels; ++l) {
+    const int32_t side = static_cast<int32_t>(3 + below(3) + 3 * l);
+    const bool hashes = side * side * side > 1024;
+    const int64_t entries = hashes ? 1024 : (side * side * side + 7) / 8 * 8;
+    grid.levels.push_back({static_cast<float>(side - 1), 0.5f, side, entries, offset, hashes});
+    offset += entries;
+  }
+  return grid;
 }
 
 MlpTable random_table() {
@@ -49,11 +63,19 @@ MlpTable random_table() {
   MlpTable table;
   table.positions = 1 + below(20);
   table.directions = 1 + below(4);
-  table.position_octaves = static_cast<int>(below(6)) - 1;
-  table.direction_octaves = static_cast<int>(below(4)) - 1;
+  table.position = {static_cast<MlpEncodingKind>(below(4)), static_cast<int>(1 + below(4))};
+  table.direction = {below(2) == 0 ? MlpEncodingKind::none : MlpEncodingKind::frequency, static_cast<int>(below(3))};
   table.half = below(2) == 0;
-  table.integrated = table.position_octaves > 0 && below(3) == 0;
-  if (table.integrated) table.positions = 6;
+  if (table.position.kind == MlpEncodingKind::integrated) table.positions = 6;
+  if (table.position.kind == MlpEncodingKind::hash) {
+    table.grid = random_grid();
+    table.positions = 3;
+    table.position.size = static_cast<int>(static_cast<int64_t>(table.grid.levels.size()) * table.grid.features);
+  }
+  if (below(3) == 0) {
+    table.directions = 3;
+    table.direction = {MlpEncodingKind::spherical, static_cast<int>(1 + below(4))};
+  }
   const int64_t layers = 1 + below(5);
   for (int64_t l = 0; l < layers; ++l) {
     voronerf::MlpLayer layer;
@@ -69,7 +91,7 @@ MlpTable random_table() {
 }
 
 struct Result {
-  Array out, positions, directions;
+  Array out, positions, directions, features;
   std::vector<Array> weights, biases;
 
   bool finite() const {
@@ -93,7 +115,7 @@ struct Result {
   }
 
   std::vector<const Array*> all() const {
-    std::vector<const Array*> arrays = {&out, &positions, &directions};
+    std::vector<const Array*> arrays = {&out, &positions, &directions, &features};
     for (const Array& array : weights) arrays.push_back(&array);
     for (const Array& array : biases) arrays.push_back(&array);
     return arrays;
@@ -103,9 +125,9 @@ struct Result {
 struct Case {
   MlpTable table = random_table();
   std::vector<int32_t> offsets, index, order;
-  Array positions, directions, gradient;
+  Array positions, directions, gradient, features;
   std::vector<Array> weights, biases;
-  int64_t n, rays, k, width = 0;
+  int64_t n, rays, k, width = 0, tables = 1;
   bool bias = below(3) > 0;
 
   Case() {
@@ -125,13 +147,18 @@ struct Case {
     std::shuffle(order.begin(), order.end(), generator);
     positions = uniform(n * table.positions);
     directions = uniform(rays * table.directions);
-    std::vector<int64_t> depths;
+    tables = below(2) == 0 ? 1 : k;
+    for (const voronerf::GridLevel& level : table.grid.levels) {
+      const Array more = uniform(tables * level.entries * table.grid.features);
+      features.insert(features.end(), more.begin(), more.end());
+    }
+    features.shrink_to_fit();
     for (const voronerf::MlpLayer& layer : table.layers) {
       int64_t depth = 0;
       for (const int from : layer.inputs) {
         depth += from >= 0                          ? table.layers[from].width
-                 : from == voronerf::kFromPositions ? encoded(table.positions, table.position_octaves, table.integrated)
-                                                    : encoded(table.directions, table.direction_octaves, false);
+                 : from == voronerf::kFromPositions ? encoded_width(table.positions, table.position)
+                                                    : encoded_width(table.directions, table.direction);
       }
       weights.push_back(uniform(k * layer.width * depth));
       for (float& weight : weights.back()) weight /= static_cast<float>(depth);
@@ -156,6 +183,8 @@ struct Case {
     result.out = poisoned(n * width);
     result.positions = poisoned(inputs ? positions.size() : 0);
     result.directions = poisoned(inputs ? directions.size() : 0);
+    result.features = poisoned(inputs ? features.size() : 0);
+    Array hashed = poisoned(table.grid.levels.empty() ? 0 : n * ((table.position.size + 15) / 16 * 16));
     const voronerf::MlpInputs in{positions.data(),
                                  directions.data(),
                                  index.empty() ? nullptr : index.data(),
@@ -165,11 +194,16 @@ struct Case {
                                  n,
                                  rays,
                                  k,
-                                 order.empty() ? nullptr : order.data()};
+                                 order.empty() ? nullptr : order.data(),
+                                 features.data(),
+                                 voronerf::TableType::float32,
+                                 tables,
+                                 hashed.data()};
     voronerf::grouped_mlp_cpu(table, in, result.out.data(), isa, threads);
     const voronerf::MlpGradients gradients{gradient.data(), parameters ? grad_w.data() : nullptr, grad_b.data(),
                                            inputs ? result.positions.data() : nullptr,
-                                           inputs ? result.directions.data() : nullptr};
+                                           inputs ? result.directions.data() : nullptr,
+                                           inputs && !features.empty() ? result.features.data() : nullptr};
     voronerf::grouped_mlp_backward_cpu(table, in, gradients, isa, threads);
     return result;
   }

@@ -38,7 +38,7 @@ check() {
   setarch -R "$build/$name/run" "$count"
 }
 
-mlp="csrc/network/cpu/grouped_mlp_isa csrc/network/cpu/grouped_mlp_half_isa csrc/network/grouped_mlp csrc/network/cpu/grouped_mlp_plan csrc/network/cpu/row_tasks csrc/common/isa
+mlp="csrc/network/cpu/grouped_mlp_isa csrc/network/cpu/grouped_mlp_half_isa csrc/network/cpu/grouped_mlp csrc/encoding/hash_encode csrc/encoding/hash_encode_isa csrc/network/cpu/grouped_mlp_plan csrc/network/cpu/row_tasks csrc/common/isa
   tests/cpp/grouped_mlp_sanitize"
 check grouped_mlp "-fsanitize=address,undefined -fopenmp" "$mlp" "$cases"
 check grouped_mlp_threads "-fsanitize=thread -DVN_STD_THREADS" "$mlp" "$((cases / 3))"

@@ -172,9 +172,9 @@ def table(module):
         outputs=(2, 0),
         positions=3,
         directions=3,
-        position_octaves=2,
-        direction_octaves=-1,
-        integrated=False,
+        position=module.MlpEncoding("frequency", 2),
+        direction=module.MlpEncoding("none", 0),
+        grid=module.HashGrid([], [], [], 0, False),
         half=False,
         caller="grouped_mlp",
     )
@@ -187,7 +187,17 @@ def network(module, n, k, offsets, precision, ways):
     index, order = RANDOM.integers(0, r, n).astype(np.int32), RANDOM.permutation(n).astype(np.int32)
     weights, biases = [floats(k, o, i) for o, i in SHAPES], [floats(k, o) for o, _ in SHAPES]
     given = module.MlpInputs(
-        *every((positions, directions, index, offsets)), every(weights), every(biases), n, r, k, at(order)
+        *every((positions, directions, index, offsets)),
+        every(weights),
+        every(biases),
+        n,
+        r,
+        k,
+        at(order),
+        None,
+        "float32",
+        1,
+        None,
     )
 
     def rest(backward):
@@ -199,7 +209,7 @@ def network(module, n, k, offsets, precision, ways):
     grad_weights, grad_biases = [unwritten(*x.shape) for x in weights], [unwritten(*x.shape) for x in biases]
     module.grouped_mlp(table(module), given, at(out), *rest(False))
     gradients = module.MlpGradients(
-        at(gradient), every(grad_weights), every(grad_biases), at(grad_positions), at(grad_directions)
+        at(gradient), every(grad_weights), every(grad_biases), at(grad_positions), at(grad_directions), None
     )
     module.grouped_mlp_backward(table(module), given, gradients, *rest(True))
     return [out, *grad_weights, *grad_biases, grad_positions, grad_directions]

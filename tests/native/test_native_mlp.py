@@ -9,6 +9,7 @@ import torch
 from helpers import on_any_number_of_threads
 from torch import Tensor
 
+from voronerf.grids import HashGrid
 from voronerf.layers import MLP, Layer
 from voronerf.ops import grouped_mlp
 
@@ -36,6 +37,12 @@ def nerf(width: int, depth: int, activation: str = "softplus") -> MLP:
     return MLP((*trunk, *heads), (depth + 3, depth), 4, 2)
 
 
+def hashed(layers: MLP, degree: int, **grid) -> MLP:
+    """The layers on a hash grid, and on spherical harmonics of the directions."""
+    grid = HashGrid(log2_entries=10, base=4, **grid)
+    return MLP(layers.layers, layers.outputs, None, None, "hash", grid, "spherical", degree)
+
+
 NETWORKS = {
     "one layer": MLP((Layer(("positions",), 5),), (0,), None),
     "width 1": chain(1, 2, out=1),
@@ -48,6 +55,9 @@ NETWORKS = {
     "nerf 64": nerf(64, 3),
     "nerf 18": nerf(18, 2),
     "integrated": MLP(nerf(33, 2).layers, nerf(33, 2).outputs, 16, 2, "integrated"),
+    "hashed 32": hashed(nerf(32, 2), 4, levels=8, features=2, finest=64),
+    "hashed 17": hashed(nerf(17, 2), 3, levels=3, features=1, finest=9, interpolation="smoothstep"),
+    "hashed 256": hashed(nerf(256, 2), 2, levels=5, features=8, finest=30, box=((-1, -1, -1), (0, 1, 2))),
     "sigmoid": chain(20, 2, activation="sigmoid"),
     "sine": chain(20, 2, activation="sine"),
     # Few outputs of whole vectors of inputs: in one piece and concatenated, read by other layers, with activations.
@@ -80,8 +90,13 @@ NETWORKS = {
 }
 
 
-def arguments(layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, p: int = 3, q: int = 3) -> dict:
-    """Float64 arguments of grouped_mlp for cells of the given sizes; rays 0: a direction for each sample."""
+def arguments(
+    layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, p: int = 3, q: int = 3, own: bool = False
+) -> dict:
+    """Float64 arguments of grouped_mlp for cells of the given sizes.
+
+    rays 0: a direction for each sample; own: a hash grid for each cell.
+    """
     n, k = sum(counts), len(counts)
     p = 6 if layers.integrated else p
     uniform = torch.distributions.Uniform(torch.tensor(-1.0, dtype=torch.float64), 1.0)
@@ -95,6 +110,8 @@ def arguments(layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, 
     }
     if layers.integrated:
         given["positions"][:, 3:].square_()
+    if layers.grid is not None:
+        given["features"] = uniform.sample((*([k] if own else []), *layers.grid.table_shape))
     if layers.uses_directions:
         given["directions"] = uniform.sample((rays or n, q))
         given["direction_index"] = torch.randint(rays, (n,), dtype=torch.int32) if rays else None
@@ -103,7 +120,7 @@ def arguments(layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, 
 
 def tensors(given: dict) -> list[Tensor]:
     """The floating-point tensors of arguments, in one order."""
-    found = [given["positions"], given.get("directions"), *given["weights"], *given["biases"]]
+    found = [given["positions"], given.get("directions"), given.get("features"), *given["weights"], *given["biases"]]
     return [tensor for tensor in found if tensor is not None]
 
 
@@ -111,7 +128,7 @@ def cast(given: dict, dtype: torch.dtype) -> dict:
     def one(tensor: Tensor | None) -> Tensor | None:
         return None if tensor is None else tensor.detach().to(dtype).requires_grad_()
 
-    changed = {key: one(given[key]) for key in ("positions", "directions") if key in given}
+    changed = {key: one(given[key]) for key in ("positions", "directions", "features") if key in given}
     lists = {key: [one(tensor) for tensor in given[key]] for key in ("weights", "biases")}
     return {**given, **changed, **lists}
 
@@ -149,8 +166,14 @@ def test_any_number_of_rows(rows: int) -> None:
     assert_close(arguments(nerf(16, 2), [rows], rays=5))
 
 
+@pytest.mark.parametrize("rows", [0, 1, 15, 63, 64, 65, 95, 96, 97, 1100])
+def test_any_number_of_hashed_rows(rows: int) -> None:
+    assert_close(arguments(NETWORKS["hashed 17"], [rows], rays=5))
+    assert_close(arguments(NETWORKS["hashed 17"], [3, 0, rows], own=True))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("name", ["heads", "nerf 64", "graph", "width 63"])
+@pytest.mark.parametrize("name", ["heads", "nerf 64", "graph", "width 63", "hashed 32"])
 def test_a_row_does_not_depend_on_its_place(name: str, dtype: torch.dtype, isa: str) -> None:
     given = cast(arguments(NETWORKS[name], [41]), dtype)
     together = grouped_mlp(**given, backend="native").detach()
@@ -225,8 +248,10 @@ def test_relu_stops_an_infinite_gradient_and_passes_what_is_not_a_number(o: int,
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_same_bits_for_any_number_of_threads(isa: str, dtype: torch.dtype) -> None:
-    given = arguments(nerf(40, 2), [5000, 3, 0, 900], rays=50)
+@pytest.mark.parametrize("network", ["nerf", "hashed", "own tables"])
+def test_same_bits_for_any_number_of_threads(isa: str, dtype: torch.dtype, network: str) -> None:
+    layers = nerf(40, 2) if network == "nerf" else NETWORKS["hashed 32"]
+    given = arguments(layers, [5000, 3, 0, 900], rays=50, own=network == "own tables")
     on_any_number_of_threads(lambda: evaluate(given, dtype, "native"))
 
 
@@ -247,8 +272,9 @@ def test_several_python_threads_at_once() -> None:
     assert all(torch.equal(a, b) for one, other in zip(alone, together) for a, b in zip(one, other))
 
 
-def test_every_output_is_written(request: pytest.FixtureRequest) -> None:
-    given = arguments(NETWORKS["graph"], [0, 50, 13, 0], rays=4)
+@pytest.mark.parametrize("name", ["graph", "hashed 17"])
+def test_every_output_is_written(request: pytest.FixtureRequest, name: str) -> None:
+    given = arguments(NETWORKS[name], [0, 50, 13, 0], rays=4)
     given["positions"] = torch.cat([given["positions"], torch.ones(6, 3, dtype=torch.float64)])  # rows of no cell
     given["direction_index"] = torch.cat([given["direction_index"], torch.zeros(6, dtype=torch.int32)])
     want = evaluate(given, torch.float32, "native")
@@ -259,11 +285,12 @@ def test_every_output_is_written(request: pytest.FixtureRequest) -> None:
     assert (got[0][-6:] == 0).all() and (got[1][-6:] == 0).all()
 
 
-def test_only_the_gradients_asked_for() -> None:
-    given = cast(arguments(nerf(16, 2), [20, 30], rays=7), torch.float32)
+@pytest.mark.parametrize("layers", [nerf(16, 2), NETWORKS["hashed 32"]], ids=["nerf", "hashed"])
+def test_only_the_gradients_asked_for(layers: MLP) -> None:
+    given = cast(arguments(layers, [20, 30], rays=7), torch.float32)
     everything = tensors(given)
     full = torch.autograd.grad(grouped_mlp(**given, backend="native").sum(), everything)
-    for chosen in ([0], [1], [0, 1], [3], [2, len(everything) - 1]):
+    for chosen in ([0], [1], [2], [0, 1], [3], [2, len(everything) - 1]):
         for index, tensor in enumerate(everything):
             tensor.requires_grad_(index in chosen)
         some = torch.autograd.grad(grouped_mlp(**given, backend="native").sum(), [everything[i] for i in chosen])
@@ -343,21 +370,22 @@ def test_opcheck() -> None:
     passed = [given[name] for name in ("positions", "weights", "biases", "layers", "directions")]
     table = layer_table.network(*passed).table
     shared = (given["positions"], given["offsets"], given["weights"], given["biases"], table)
-    directions = (given["directions"], given["direction_index"])
-    torch.library.opcheck(ops.grouped_mlp_native.default, (*shared, *directions))
+    directions = (given["directions"], given["direction_index"], None)
+    torch.library.opcheck(ops.grouped_mlp_native.default, (*shared, *directions, False))
     # Gradients that are differentiated again are not this op's.
     shared, directions = torch.utils._pytree.tree_map_only(Tensor, Tensor.detach, (shared, directions))
-    gradient, order = torch.randn(13, 4), torch.randperm(13, dtype=torch.int32)
+    gradient, order, encoded = torch.randn(13, 4), torch.randperm(13, dtype=torch.int32), torch.empty(0)
     backward = ops.grouped_mlp_native_backward.default
-    torch.library.opcheck(backward, (gradient, *shared, *directions, order, [True, True, True]))
+    torch.library.opcheck(backward, (gradient, *shared, *directions, order, encoded, [True, True, True, False]))
     # Memory only for the gradients that are asked for.
-    sizes = [each.numel() for each in backward(gradient, *shared, *directions, None, [False, True, False])]
-    assert [size > 0 for size in sizes] == [False] * (len(sizes) - 2) + [True, False]
+    found = backward(gradient, *shared, *directions, None, encoded, [False, True, False, False])
+    assert [each.numel() > 0 for each in found] == [False] * (len(found) - 3) + [True, False, False]
     assert layer_table.Table.parse(table).with_widths(given["weights"]) == given["layers"]
 
 
-def test_compiles_whole() -> None:
-    given = cast(arguments(nerf(8, 2), [9, 0, 4], rays=3), torch.float32)
+@pytest.mark.parametrize("layers", [nerf(8, 2), NETWORKS["hashed 17"]], ids=["nerf", "hashed"])
+def test_compiles_whole(layers: MLP) -> None:
+    given = cast(arguments(layers, [9, 0, 4], rays=3), torch.float32)
 
     @torch.compile(fullgraph=True)
     def loss(positions: Tensor, weights: list[Tensor]) -> Tensor:

@@ -21,7 +21,7 @@ from voronerf import native
 from voronerf.derivatives import asked_for
 from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 from voronerf.native.custom_op import custom_op, on_huge_pages
-from voronerf.native.layer_table import Table, compiled_table, in_float32, network
+from voronerf.native.layer_table import Network, Table, compiled_table, in_float32, network
 from voronerf.reference.grouped_mlp import cells_of
 
 # Of one layer, whose width does not matter here.
@@ -70,10 +70,19 @@ def grouped_mlp(
     Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
     """
     own = features is not None and features.dim() == 3
-    cells = cells_of(offsets, positions) if own else None
+    cells = cells_of(offsets, positions) if own and native.on_cuda(positions) else None
     given = network(positions, weights, biases, layers, directions, features, cells)
-    out: Tensor = _forward(
-        given.positions, offsets, given.weights, given.biases, given.table, given.directions, direction_index
+    out: Tensor
+    out, _ = _forward(
+        given.positions,
+        offsets,
+        given.weights,
+        given.biases,
+        given.table,
+        given.directions,
+        direction_index,
+        given.features,
+        keeps_encoded(given),
     )
     return out.to(given.dtype)
 
@@ -86,7 +95,8 @@ def grouped_linear(
     For CUDA; the CPU has kernels of one layer (``voronerf/native/grouped_linear.py``).
     """
     given = in_float32(x, [weight], [bias], _LINEAR[activation], None, "grouped_linear")
-    out: Tensor = _forward(given.positions, offsets, given.weights, given.biases, given.table, None, None)
+    out: Tensor
+    out, _ = _forward(given.positions, offsets, given.weights, given.biases, given.table, None, None, None, False)
     return out.to(given.dtype)
 
 
@@ -99,10 +109,31 @@ def _forward(
     table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
-) -> Iterator[Tensor]:
-    out = new_output(positions, table, weights)
-    yield out
-    run(out, positions, offsets, weights, biases, table, directions, direction_index, None)
+    features: Tensor | None,
+    keep: bool,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Output, and for the backward pass what `new_encoded` says."""
+    out, encoded = new_output(positions, table, weights), new_encoded(positions, table, keep)
+    yield out, encoded
+    run(out, encoded, positions, offsets, weights, biases, table, directions, direction_index, features, None)
+
+
+def keeps_encoded(given: Network) -> bool:
+    """Whether the forward pass of a network keeps hashed positions for the backward pass.
+
+    They take as long to write and to read as a fifth of the look-ups that would compute them again.
+    """
+    inputs = (given.positions, given.directions, given.features, *given.weights, *given.biases)
+    differentiable = any(tensor is not None and tensor.requires_grad for tensor in inputs)
+    return given.features is not None and torch.is_grad_enabled() and differentiable
+
+
+def new_encoded(positions: Tensor, table: str, keep: bool) -> Tensor:
+    """For hashed positions in the order of their cells, [n, features rounded up to 16]; empty if they are not kept."""
+    grid = Table.parse(table).layers.grid
+    if grid is None or not keep:
+        return positions.new_empty(0)
+    return positions.new_empty(positions.shape[0], -(-grid.out_features // 16) * 16)
 
 
 def new_output(positions: Tensor, table: str, weights: Sequence[Tensor]) -> Tensor:
@@ -113,6 +144,7 @@ def new_output(positions: Tensor, table: str, weights: Sequence[Tensor]) -> Tens
 
 def run(
     out: Tensor,
+    encoded: Tensor,
     positions: Tensor,
     offsets: Tensor,
     weights: Sequence[Tensor],
@@ -120,12 +152,14 @@ def run(
     table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
+    features: Tensor | None,
     order: Tensor | None,
 ) -> None:
     """Fills the output of sorted rows, or of those that ``order`` int32 [n] sorts."""
     on_huge_pages(out)
+    on_huge_pages(encoded)
     given = compiled_table(table, positions, weights, directions)
-    inputs = _inputs(positions, offsets, weights, biases, directions, direction_index, order)
+    inputs = _inputs(positions, offsets, weights, biases, directions, direction_index, features, order, encoded)
     compiled, machine = native.compiled, native.machine(positions)
     if isinstance(machine, compiled.Cuda):
         rest = _on_cuda(table, given, inputs, machine, backward=False, parameters=False)
@@ -144,23 +178,28 @@ def backward(
     table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
+    features: Tensor | None,
     order: Tensor | None,
+    encoded: Tensor,
     wanted: Sequence[bool],
 ) -> Iterator[list[Tensor]]:
-    """Gradients of weights, biases, positions, directions; empty unless wanted: (parameters, positions, directions)."""
+    """Gradients of weights, biases, positions, directions and features, in float32.
+
+    They are empty unless wanted: (parameters, positions, directions, features).
+    """
     count = len(weights)
-    chosen = [wanted[0]] * (2 * count) + [wanted[1], wanted[2]]
+    chosen = [wanted[0]] * (2 * count) + list(wanted[1:])
     results = [
-        tensor.new_empty(tensor.shape) if tensor is not None and want else positions.new_empty(0)
-        for tensor, want in zip((*weights, *biases, positions, directions), chosen)
+        positions.new_empty(tensor.shape if tensor is not None and want else 0)
+        for tensor, want in zip((*weights, *biases, positions, directions, features), chosen)
     ]
     yield results
     for result in results:
         on_huge_pages(result)
     compiled, machine = native.compiled, native.machine(positions)
     given = compiled_table(table, positions, weights, directions)
-    inputs = _inputs(positions, offsets, weights, biases, directions, direction_index, order)
-    to_directions = results[-1] if wanted[2] else None
+    inputs = _inputs(positions, offsets, weights, biases, directions, direction_index, features, order, encoded)
+    to_directions = results[-2] if wanted[2] else None
     of_samples = None
     if isinstance(machine, compiled.Cuda) and wanted[2] and direction_index is not None and directions is not None:
         to_directions = of_samples = positions.new_empty(positions.shape[0], directions.shape[1])
@@ -168,8 +207,9 @@ def backward(
         output=gradient,
         weights=results[:count] if wanted[0] else None,
         biases=_present(results[count : 2 * count]) if wanted[0] else None,
-        positions=results[-2] if wanted[1] else None,
+        positions=results[-3] if wanted[1] else None,
         directions=to_directions,
+        features=results[-1] if wanted[3] else None,
     )
     if isinstance(machine, compiled.Cuda):
         rest = _on_cuda(table, given, inputs, machine, backward=True, parameters=wanted[0])
@@ -178,7 +218,7 @@ def backward(
         compiled.grouped_mlp_backward(given, inputs, gradients, machine)
     if of_samples is not None and direction_index is not None:
         # torch adds in a fixed order where deterministic algorithms are asked for.
-        results[-1].zero_().index_add_(0, direction_index, of_samples)
+        results[-2].zero_().index_add_(0, direction_index, of_samples)
 
 
 def _inputs(
@@ -188,7 +228,9 @@ def _inputs(
     biases: Sequence[Tensor],
     directions: Tensor | None,
     direction_index: Tensor | None,
+    features: Tensor | None,
     order: Tensor | None,
+    encoded: Tensor,
 ) -> native.compiled.MlpInputs:
     return native.compiled.MlpInputs(
         positions=positions,
@@ -201,6 +243,10 @@ def _inputs(
         r=0 if directions is None else directions.shape[0],
         k=offsets.shape[0] - 1,
         order=order,
+        features=features,
+        features_type="float32" if features is None else str(features.dtype).removeprefix("torch."),
+        tables=1 if features is None or features.dim() == 2 else features.shape[0],
+        encoded=encoded if encoded.numel() else None,
     )
 
 
@@ -229,20 +275,26 @@ def _on_cuda(
     return precision, _way, positions.new_empty(size, dtype=torch.uint8)
 
 
-def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    positions, offsets, weights, biases, ctx.table, directions, direction_index = inputs
+def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    positions, offsets, weights, biases, ctx.table, directions, direction_index, features, _ = inputs
     ctx.count = len(weights)
-    ctx.save_for_backward(positions, offsets, *weights, *biases, directions, direction_index)
+    ctx.mark_non_differentiable(output[1])
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(output[1], positions, offsets, *weights, *biases, directions, direction_index, features)
 
 
-def _forward_backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
-    saved = positions, offsets, *parameters, directions, direction_index = ctx.saved_tensors
-    to_positions, _, *to_parameters, to_directions, _ = asked_for(ctx, saved)
+def _forward_backward(ctx: Any, gradient: Tensor | None, _of_encoded: None) -> tuple[Any, ...]:
+    if gradient is None:
+        return (None, None, [None] * ctx.count, [None] * ctx.count, *[None] * 5)
+    encoded, *saved = ctx.saved_tensors
+    positions, offsets, *parameters, directions, direction_index, features = saved
+    to_positions, _, *to_parameters, to_directions, _, to_features = asked_for(ctx, saved)
     network = positions, offsets, parameters[: ctx.count], parameters[ctx.count :], ctx.table, directions
-    found = gradients(gradient, *network, direction_index, None, asked=(*to_parameters, to_positions, to_directions))
-    *of_parameters, of_positions, of_directions = found
+    asked = *to_parameters, to_positions, to_directions, to_features
+    found = gradients(gradient, *network, direction_index, features, None, encoded, asked=asked)
+    *of_parameters, of_positions, of_directions, of_features = found
     of_weights, of_biases = of_parameters[: ctx.count], of_parameters[ctx.count :]
-    return of_positions, None, of_weights, of_biases, None, of_directions, None
+    return of_positions, None, of_weights, of_biases, None, of_directions, None, of_features, None
 
 
 def gradients(
@@ -254,22 +306,27 @@ def gradients(
     table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
+    features: Tensor | None,
     order: Tensor | None,
+    encoded: Tensor,
     *,
     asked: Sequence[bool],
 ) -> list[Tensor | None]:
-    """Gradients of weights, biases, positions and directions, None for those that are not asked for."""
+    """Gradients of weights, biases, positions, directions and features, None for those that are not asked for."""
     if torch.is_grad_enabled():
         # Late: that module takes grouped_linear, which takes this one for CUDA.
         from voronerf.native.layerwise import gradients as differentiable
 
         layers = Table.parse(table).with_widths(weights)
-        given = gradient, positions, offsets, weights, biases, layers, directions, direction_index, order
+        given = gradient, positions, offsets, weights, biases, layers, directions, direction_index, features, order
         return differentiable(*given, asked=asked)
-    *parameters, to_positions, to_directions = asked
-    wanted = [any(parameters), to_positions, to_directions]
-    results = backward(gradient, positions, offsets, weights, biases, table, directions, direction_index, order, wanted)
-    return [result if want else None for result, want in zip(results, asked)]
+    *parameters, to_positions, to_directions, to_features = asked
+    wanted = [any(parameters), to_positions, to_directions, to_features]
+    network = positions, offsets, weights, biases, table, directions, direction_index, features, order
+    *results, of_features = backward(gradient, *network, encoded, wanted)
+    if features is not None and to_features:
+        of_features = of_features.to(features.dtype)
+    return [result if want else None for result, want in zip((*results, of_features), asked)]
 
 
 _forward.register_autograd(_forward_backward, setup_context=_forward_setup)

@@ -32,7 +32,7 @@ def _encode(
     yield out
     on_huge_pages(out)
     given = _inputs(positions, table, direction, cells)
-    native.compiled.hash_encode(given, _grid(grid), out, native.machine(positions))
+    native.compiled.hash_encode(given, compiled_grid(grid), out, native.machine(positions))
 
 
 @custom_op("hash_encode_native_backward")
@@ -53,7 +53,7 @@ def _backward(
     on_huge_pages(of_table)
     native.compiled.hash_encode_backward(
         _inputs(positions, table, direction, cells),
-        _grid(grid),
+        compiled_grid(grid),
         gradient,
         of_table if to_table else None,
         of_positions if to_positions else None,
@@ -77,7 +77,8 @@ def _inputs(
 
 
 @functools.lru_cache(maxsize=256)
-def _grid(text: str) -> native.compiled.HashGrid:
+def compiled_grid(text: str) -> native.compiled.HashGrid:
+    """A grid, as its text, as compiled functions take it."""
     grid = HashGrid.parse(text)
     return native.compiled.HashGrid(
         levels=[native.compiled.GridLevel(*level) for level in grid.rows],

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from voronerf import native
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
-from voronerf.native.hash_encode import hash_encode
+from voronerf.native.hash_encode import compiled_grid, hash_encode
 from voronerf.native.spherical_harmonics import spherical_harmonics
 from voronerf.reference.grouped_mlp import encode_directions, encode_positions
 
@@ -33,6 +33,7 @@ class Network(NamedTuple):
     biases: list[Tensor]  # Autograd takes no list of optional tensors; an empty one stands for no bias.
     table: str
     directions: Tensor | None
+    features: Tensor | None  # Of a hash grid, unless positions are encoded already; not in float32.
     dtype: torch.dtype
 
 
@@ -48,13 +49,16 @@ def network(
 ) -> Network:
     """What the ops take for a layer table.
 
-    Positions and directions in float64 are encoded in float64, beforehand. Positions that are hashed and directions of
-    spherical harmonics are encoded beforehand as well.
+    Octaves and harmonics of float64 are computed in float64, beforehand. On CUDA, so are positions that are hashed, of
+    which ``cells`` says the tables where each cell has one, and directions of spherical harmonics.
     """
-    encoded = ""
-    if layers.grid is not None:
+    encoded, before = "", native.on_cuda(positions)
+    if features is not None and features.dtype == torch.float64:
+        features = features.float()
+    if layers.grid is not None and before:
         assert features is not None
         positions = hash_encode(positions, features, layers.grid, cells=cells if features.dim() == 3 else None)
+        features = None
         encoded += POSITIONS
     elif positions.dtype == torch.float64 and layers.position_octaves is not None:
         positions = encode_positions(positions, layers)
@@ -64,10 +68,10 @@ def network(
         if wide and (layers.direction_octaves is not None or layers.direction_degree is not None):
             directions = encode_directions(directions, layers)
             encoded += DIRECTIONS
-        elif layers.direction_degree is not None:
+        elif layers.direction_degree is not None and before:
             directions = spherical_harmonics(directions.float(), layers.direction_degree)
             encoded += DIRECTIONS
-    return in_float32(positions, weights, biases, layers.text, directions, caller, encoded)
+    return in_float32(positions, weights, biases, layers.text, directions, caller, features, encoded)
 
 
 def in_float32(
@@ -77,6 +81,7 @@ def in_float32(
     text: str,
     directions: Tensor | None,
     caller: str,
+    features: Tensor | None = None,
     encoded: str = "",
 ) -> Network:
     """Everything in float32, with a table of which the layers are ``text`` (``MLP.text``).
@@ -94,6 +99,7 @@ def in_float32(
         [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in biases],
         f'{{"caller": "{caller}", "operands": "{operands}", "encoded": "{encoded}", "layers": {text}}}',
         None if directions is None else directions.float(),
+        features,
         dtype,
     )
 
@@ -126,17 +132,22 @@ class Table:
         """The table of a string."""
         said = json.loads(text)
         layers = MLP.parse(json.dumps(said["layers"]))
-        if POSITIONS in said["encoded"]:
-            layers = replace(layers, position_octaves=None, position_encoding="frequency", grid=None)
-        if DIRECTIONS in said["encoded"]:
-            layers = replace(layers, direction_octaves=None, direction_encoding="frequency", direction_degree=None)
-        return Table(said["caller"], said["operands"], layers)
+        return Table(said["caller"], said["operands"], encoded_already(layers, said["encoded"]))
 
     def with_widths(self, weights: Sequence[Tensor]) -> MLP:
         """The layer table, with the widths of the weights."""
         given = zip(self.layers.layers, weights)
         layers = tuple(replace(layer, width=int(weight.shape[1])) for layer, weight in given)
         return replace(self.layers, layers=layers)
+
+
+def encoded_already(layers: MLP, sources: str) -> MLP:
+    """The table without the encodings of these sources."""
+    if POSITIONS in sources:
+        layers = replace(layers, position_octaves=None, position_encoding="frequency", grid=None)
+    if DIRECTIONS in sources:
+        layers = replace(layers, direction_octaves=None, direction_encoding="frequency", direction_degree=None)
+    return layers
 
 
 def compiled_table(
@@ -163,9 +174,17 @@ def _compiled(text: str, p: int, q: int, widths: tuple[int, ...]) -> native.comp
         outputs=layers.outputs,
         positions=p,
         directions=q,
-        position_octaves=-1 if layers.position_octaves is None else layers.position_octaves,
-        direction_octaves=-1 if layers.direction_octaves is None else layers.direction_octaves,
-        integrated=layers.integrated,
+        position=_encoding(
+            layers.position_encoding, layers.position_octaves, layers.grid.out_features if layers.grid else None
+        ),
+        direction=_encoding(layers.direction_encoding, layers.direction_octaves, layers.direction_degree),
+        grid=compiled.HashGrid([], [], [], 0, False) if layers.grid is None else compiled_grid(layers.grid.text),
         half=table.operands != "float32",
         caller=table.caller,
     )
+
+
+def _encoding(kind: str, octaves: int | None, size: int | None) -> native.compiled.MlpEncoding:
+    """An encoding of octaves, or of another ``size``; neither: none."""
+    size = octaves if size is None else size
+    return native.compiled.MlpEncoding("none", 0) if size is None else native.compiled.MlpEncoding(kind, size)

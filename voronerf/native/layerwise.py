@@ -13,10 +13,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.layers import MLP
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.native.grouped_linear import _forward as linear
+from voronerf.native.hash_encode import hash_encode
+from voronerf.native.layer_table import encoded_already
+from voronerf.native.spherical_harmonics import spherical_harmonics
 from voronerf.reference.activation import activate
 from voronerf.reference.grouped_linear import grouped_linear as _reference
+from voronerf.reference.grouped_mlp import cells_of
 from voronerf.reference.grouped_mlp import grouped_mlp as compose
 
 # Rows that go through the layers together: their values stay in the cache.
@@ -32,11 +36,12 @@ def gradients(
     layers: MLP,
     directions: Tensor | None,
     direction_index: Tensor | None,
+    features: Tensor | None,
     order: Tensor | None,
     *,
     asked: Sequence[bool],
 ) -> list[Tensor | None]:
-    """Gradients of weights, biases, positions and directions, None where they are not asked for.
+    """Gradients of weights, biases, positions, directions and features, None where they are not asked for.
 
     Args:
         gradient: [n, out], the incoming one.
@@ -47,20 +52,30 @@ def gradients(
         layers: the layer table, with the widths of the weights.
         directions: [n, q] or [r, q].
         direction_index: int32 [n] or None.
+        features: of a hash grid, [e, f] or [k, e, f], or None.
         order: int32 [n] that sorts the rows by cell, or None where they are sorted.
         asked: which gradients, in the order of the results.
     """
     count = len(weights)
     present = [bias if bias.numel() else None for bias in biases]
     # Aliases: where one input was computed from another, that path is the caller's.
-    leaves = [None if leaf is None else leaf.view_as(leaf) for leaf in (*weights, *present, positions, directions)]
-    *parameters, rows, seen = leaves
+    leaves = [
+        None if leaf is None else leaf.view_as(leaf) for leaf in (*weights, *present, positions, directions, features)
+    ]
+    *parameters, rows, seen, table = leaves
     assert rows is not None
+    if seen is not None and layers.direction_degree is not None:
+        seen = spherical_harmonics(seen, layers.direction_degree)
+        layers = encoded_already(layers, DIRECTIONS)
     if seen is not None and direction_index is not None:
         seen = seen.index_select(0, direction_index.long())
     if order is not None:
         gradient, rows = (tensor.index_select(0, order.long()) for tensor in (gradient, rows))
         seen = None if seen is None else seen.index_select(0, order.long())
+    if table is not None and layers.grid is not None:
+        own = cells_of(offsets, rows) if table.dim() == 3 else None
+        rows = hash_encode(rows, table, layers.grid, cells=own)
+        layers = encoded_already(layers, POSITIONS)
     cells, lengths = _pieces(offsets, rows.shape[0])
     parts = [_split(parameter, cells) for parameter in parameters]
     outputs, first, start = [], 0, 0

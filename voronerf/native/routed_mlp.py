@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf import native
 from voronerf.derivatives import asked_for
 from voronerf.layers import MLP
 from voronerf.native import cell_sort, grouped_mlp, locate_cell, nearest_centre
@@ -40,30 +41,33 @@ def routed_mlp(
     features: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
-    if features is not None and features.dim() == 3 and len(features) > 1 and cells is None:
+    own = features is not None and features.dim() == 3
+    if own and weights[0].shape[0] > 1 and cells is None and native.on_cuda(positions):
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
             cells = nearest_centre.nearest_centre(coords, centres, weights=centre_weights)
         else:
             cells = locate_cell.locate_cell(coords, centres, child_offsets, child, depth=depth, weights=centre_weights)
         centres = None
-    if features is not None and cells is None and features.dim() == 3:
+    if features is not None and own and weights[0].shape[0] == 1:
         features = features[0]
     given = network(positions, weights, biases, layers, directions, features, cells, "routed_mlp")
     tables = centres, child_offsets, child, centre_weights
     if cells is None and weights[0].shape[0] == 1:
         coords, tables = None, (None, None, None, None)
-    out, found, _, _ = _forward(
+    out, found, *_ = _forward(
         given.positions,
         given.weights,
         given.biases,
         given.table,
         given.directions,
         direction_index,
+        given.features,
         cells,
         coords,
         *tables,
         depth,
+        grouped_mlp.keeps_encoded(given),
     )
     return out.to(given.dtype), found if cells is None else cells
 
@@ -76,6 +80,7 @@ def _forward(
     table: str,
     directions: Tensor | None,
     direction_index: Tensor | None,
+    features: Tensor | None,
     cells: Tensor | None,
     coords: Tensor | None,
     centres: Tensor | None,
@@ -83,8 +88,9 @@ def _forward(
     child: Tensor | None,
     centre_weights: Tensor | None,
     depth: int,
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Output, cells (empty where they are given), order (empty where there is one cell) and offsets.
+    keep: bool,
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    """Output, cells (empty where they are given), order (empty where there is one cell), offsets, encoded positions.
 
     With neither cells nor centres there is one cell.
     """
@@ -94,7 +100,8 @@ def _forward(
     found = positions.new_empty(n if cells is None else 0, dtype=torch.int32)
     order = positions.new_empty(0 if alone else n, dtype=torch.int32)
     offsets = positions.new_empty(k + 1, dtype=torch.int32)
-    yield out, found, order, offsets
+    encoded = grouped_mlp.new_encoded(positions, table, keep)
+    yield out, found, order, offsets, encoded
     if alone:
         found.zero_()
         offsets[0], offsets[1] = 0, n
@@ -105,28 +112,27 @@ def _forward(
             else:
                 locate_cell.find(found, coords, centres, child_offsets, child, depth, centre_weights, "routed_mlp")
         cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
-    grouped_mlp.run(
-        out, positions, offsets, weights, biases, table, directions, direction_index, None if alone else order
-    )
+    network = positions, offsets, weights, biases, table, directions, direction_index, features
+    grouped_mlp.run(out, encoded, *network, None if alone else order)
 
 
-def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
-    positions, weights, biases, ctx.table, directions, direction_index, cells, _, centres, *_ = inputs
-    _, found, order, offsets = output
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    positions, weights, biases, ctx.table, directions, direction_index, features, cells, _, centres, *_ = inputs
+    _, found, order, offsets, encoded = output
     ctx.count, ctx.alone = len(weights), cells is None and centres is None
-    ctx.mark_non_differentiable(found, order, offsets)
+    ctx.mark_non_differentiable(found, order, offsets, encoded)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(order, offsets, positions, *weights, *biases, directions, direction_index)
+    ctx.save_for_backward(order, offsets, encoded, positions, *weights, *biases, directions, direction_index, features)
 
 
 def _backward(ctx: Any, gradient: Tensor | None, *_others: None) -> tuple[Any, ...]:
     count = ctx.count
     if gradient is None:
-        return (None, [None] * count, [None] * count, *[None] * 10)
-    order, offsets, *inputs = ctx.saved_tensors
-    positions, *parameters, directions, direction_index = inputs
-    to_positions, *to_parameters, to_directions, _ = asked_for(ctx, inputs)
-    *of_parameters, of_positions, of_directions = grouped_mlp.gradients(
+        return (None, [None] * count, [None] * count, *[None] * 12)
+    order, offsets, encoded, *inputs = ctx.saved_tensors
+    positions, *parameters, directions, direction_index, features = inputs
+    to_positions, *to_parameters, to_directions, _, to_features = asked_for(ctx, inputs)
+    *of_parameters, of_positions, of_directions, of_features = grouped_mlp.gradients(
         gradient,
         positions,
         offsets,
@@ -135,10 +141,13 @@ def _backward(ctx: Any, gradient: Tensor | None, *_others: None) -> tuple[Any, .
         ctx.table,
         directions,
         direction_index,
+        features,
         None if ctx.alone else order,
-        asked=(*to_parameters, to_positions, to_directions),
+        encoded,
+        asked=(*to_parameters, to_positions, to_directions, to_features),
     )
-    return of_positions, of_parameters[:count], of_parameters[count:], None, of_directions, *[None] * 8
+    of_weights, of_biases = of_parameters[:count], of_parameters[count:]
+    return of_positions, of_weights, of_biases, None, of_directions, None, of_features, *[None] * 8
 
 
 _forward.register_autograd(_backward, setup_context=_setup)

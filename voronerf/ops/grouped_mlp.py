@@ -49,8 +49,7 @@ def grouped_mlp(
         layers: the layer table.
         directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions. q = 3, unit
             vectors, for spherical harmonics.
-        direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample. A direction is then
-            encoded once for each ray instead of once for each sample.
+        direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
         features: the table of the hash encoding, [e, f] for all cells (``layers.grid.table_shape``), or [k, e, f] with
             one for each cell; None without a grid.
         backend: "auto", "reference" or "native".

@@ -13,8 +13,12 @@ namespace {
 // library.
 constexpr int kRelu = 1, kSoftplus = 2, kSigmoid = 3, kSine = 4;
 
-// Few outputs, as heads have, are not worth a call of memcpy.
+// Few outputs, as heads have, and points are not worth a call of memcpy.
 VN_INLINE void copy_row(const float* from, int64_t width, float* to) {
+  if (width == 3) {
+    __builtin_memcpy(to, from, 3 * sizeof(float));
+    return;
+  }
   if (width == 4) {
     __builtin_memcpy(to, from, 4 * sizeof(float));
     return;

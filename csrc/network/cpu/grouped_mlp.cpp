@@ -63,15 +63,15 @@ void pack(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, float
 }
 void forward(Isa isa, const MlpPlan& plan, const MlpData& data, const RowTask& task, float* own) {
 #if VN_HAS_HALF
-  if (plan.half) return avx512::mlp_half_forward(plan, data, task.begin, task.end, own);
+  if (plan.half) return avx512::mlp_half_forward(plan, data, task.cell, task.begin, task.end, own);
 #endif
-  VN_FOR_ISA(isa, mlp_forward(plan, data, task.begin, task.end, own))
+  VN_FOR_ISA(isa, mlp_forward(plan, data, task.cell, task.begin, task.end, own))
 }
 void backward(Isa isa, const MlpPlan& plan, const MlpData& data, const RowTask& task, float* own, float* partial) {
 #if VN_HAS_HALF
-  if (plan.half) return avx512::mlp_half_backward(plan, data, task.begin, task.end, own, partial);
+  if (plan.half) return avx512::mlp_half_backward(plan, data, task.cell, task.begin, task.end, own, partial);
 #endif
-  VN_FOR_ISA(isa, mlp_backward(plan, data, task.begin, task.end, own, partial))
+  VN_FOR_ISA(isa, mlp_backward(plan, data, task.cell, task.begin, task.end, own, partial))
 }
 void reduce(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t layer, float* partials,
             int64_t count) {
@@ -116,11 +116,39 @@ MlpData pointers(const MlpInputs& in) {
   data.order = in.order;
   data.weights = in.weights;
   data.biases = in.biases;
+  data.hashed = in.encoded;
   return data;
 }
 
 MlpGathered gathered(const MlpInputs& in) {
   return {in.order != nullptr, in.order != nullptr || in.direction_index != nullptr};
+}
+
+// Without levels where positions are not hashed.
+HashEncoding hash_of(const MlpTable& table, const MlpInputs& in) {
+  if (table.position.kind != MlpEncodingKind::hash) return {};
+  HashInputs given{};
+  given.table = in.features;
+  given.type = in.features_type;
+  given.tables = in.tables;
+  for (const GridLevel& level : table.grid.levels) given.entries += level.entries;
+  return hash_encoding(given, table.grid);
+}
+
+// Gradient of the hash grid's tables: the levels of each, one at a time, since one fits a cache where all of them do
+// not, and since the rows are then added up in their sorted order by any number of threads.
+void scatter_hashed(const MlpInputs& in, const MlpPlan& plan, const HashEncoding& all, const float* positions,
+                    const float* gradient, float* of_tables, Isa isa, int threads) {
+  parallel_for(in.tables * all.count, 1, threads, [&](int64_t item) {
+    const int64_t table = item / all.count, level = item % all.count;
+    const bool shared = in.tables == 1;
+    HashEncoding one = all;
+    one.in.positions = positions;
+    one.in.tables = 1;
+    hash_level_backward_cpu(one, level, gradient, plan.positions.gradient.stride, in.offsets[shared ? 0 : table],
+                            in.offsets[shared ? in.k : table + 1], of_tables + table * all.in.entries * all.features,
+                            isa);
+  });
 }
 
 // Gradients of the samples' directions, rows as sorted, summed over each ray's samples in that order.
@@ -136,13 +164,15 @@ void sum_by_ray(const MlpInputs& in, int64_t q, const float* samples, float* out
 
 void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa isa, int threads) {
   check(table, in);
-  const MlpPlanner planner(table, gathered(in), {false, false, false, use_half(table, isa)});
+  const MlpPlanner planner(table, gathered(in), {false, false, false, false, use_half(table, isa)});
   const MlpPlan& plan = planner.plan();
   zero_strays(in, plan.out_features, out);
   const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kRows, kTaskUnit, 0);
   if (tasks.tasks.empty()) return;
   MlpData data = pointers(in);
   data.out = out;
+  const HashEncoding hash = hash_of(table, in);
+  if (hash.count > 0) data.hash = &hash;
   const Workspace workspace(stride(plan) * threads);
   run_tasks(tasks, plan, data, workspace.data(), isa, threads,
             [&](const RowTask& task, float* own) { forward(isa, plan, data, task, own); });
@@ -153,7 +183,7 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   check(table, in);
   const bool indexed = in.direction_index != nullptr;
   const MlpWanted wanted{gradients.weights != nullptr, gradients.positions != nullptr, gradients.directions != nullptr,
-                         use_half(table, isa)};
+                         gradients.features != nullptr, use_half(table, isa)};
   const MlpPlanner planner(table, gathered(in), wanted);
   const MlpPlan& plan = planner.plan();
   const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kGradientRows, kTaskUnit, plan.partial);
@@ -161,10 +191,16 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   // Gradients of the samples' directions, before they are summed over each ray's samples.
   const bool by_ray = wanted.directions && indexed && plan.directions.used;
   const int64_t samples = by_ray ? in.n * table.directions : 0;
-  const Workspace workspace(stride(plan) * threads + partials * plan.partial + ceil_div(samples, kGranule) * kGranule);
+  // Of rows as sorted: what the levels of a hash grid are given.
+  const bool scattered = wanted.features && plan.positions.used;
+  const int64_t hashed = scattered ? in.n * plan.positions.gradient.stride : 0;
+  const int64_t sorted = scattered && in.order != nullptr ? in.n * table.positions : 0;
+  const Workspace workspace(stride(plan) * threads + partials * plan.partial + hashed + samples + sorted);
   float* memory = workspace.data();
   float* partial = memory + stride(plan) * threads;
-  float* sample_directions = partial + partials * plan.partial;
+  float* hashed_gradient = partial + partials * plan.partial;
+  float* sample_directions = hashed_gradient + hashed;
+  float* sorted_positions = sample_directions + samples;
 
   MlpData data = pointers(in);
   data.grad_out = gradients.output;
@@ -172,6 +208,12 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   data.grad_biases = gradients.biases;
   data.grad_positions = gradients.positions;
   data.grad_directions = indexed ? sample_directions : gradients.directions;
+  const HashEncoding hash = hash_of(table, in);
+  if (hash.count > 0) data.hash = &hash;
+  VN_CHECK(hash.count == 0 || in.n == 0 || in.encoded != nullptr,
+           "grouped_mlp: hashed positions must be given encoded");
+  if (scattered) data.hashed_gradient = hashed_gradient;
+  if (sorted > 0) data.sorted_positions = sorted_positions;
   const auto clear = [&](float* out, int64_t width, bool used) {
     if (used) {
       zero_strays(in, width, out);
@@ -197,6 +239,12 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
       const bool empty = in.offsets[cell + 1] == in.offsets[cell];
       if (count > 0 || empty) reduce(isa, plan, data, cell, l, partial + first * plan.partial, count);
     });
+  }
+  if (scattered) {
+    scatter_hashed(in, plan, hash, sorted > 0 ? sorted_positions : in.positions, hashed_gradient, gradients.features,
+                   isa, threads);
+  } else if (wanted.features) {
+    std::fill_n(gradients.features, in.tables * hash.in.entries * hash.features, 0.0f);
   }
   if (by_ray) {
     sum_by_ray(in, table.directions, sample_directions, gradients.directions);

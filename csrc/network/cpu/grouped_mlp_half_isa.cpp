@@ -16,13 +16,14 @@ void mlp_half_pack(const MlpPlan& plan, const MlpData& data, int64_t cell, float
   pack_cell(plan, data, cell, workspace);
 }
 
-void mlp_half_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace) {
-  run_forward(plan, data, begin, end, workspace);
+void mlp_half_forward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end,
+                      float* workspace) {
+  run_forward(plan, data, cell, begin, end, workspace);
 }
 
-void mlp_half_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace,
-                       float* partial) {
-  run_backward(plan, data, begin, end, workspace, partial);
+void mlp_half_backward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end,
+                       float* workspace, float* partial) {
+  run_backward(plan, data, cell, begin, end, workspace, partial);
 }
 
 }  // namespace VN_ISA_NAMESPACE

@@ -16,7 +16,7 @@ namespace VN_ISA_NAMESPACE {
 void mlp_prepare(const MlpPlan& plan, float* workspace) {
   const MlpPlanInput* inputs[] = {&plan.positions, &plan.directions};
   for (const MlpPlanInput* input : inputs) {
-    if (input->used && input->octaves >= 0) {
+    if (input->used && has_octaves(*input)) {
       encode_table(workspace + input->table, input->value.stride, columns_of(*input));
     }
   }
@@ -26,13 +26,13 @@ void mlp_pack(const MlpPlan& plan, const MlpData& data, int64_t cell, float* wor
   pack_cell(plan, data, cell, workspace);
 }
 
-void mlp_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace) {
-  run_forward(plan, data, begin, end, workspace);
+void mlp_forward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end, float* workspace) {
+  run_forward(plan, data, cell, begin, end, workspace);
 }
 
-void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace,
+void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end, float* workspace,
                   float* partial) {
-  run_backward(plan, data, begin, end, workspace, partial);
+  run_backward(plan, data, cell, begin, end, workspace, partial);
 }
 
 void mlp_reduce(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t l, float* partials, int64_t count) {

@@ -12,21 +12,22 @@ VN_DECLARE_FOR_ISA(void mlp_prepare(const MlpPlan& plan, float* workspace))
 // Packs a cell's weights into a workspace.
 VN_DECLARE_FOR_ISA(void mlp_pack(const MlpPlan& plan, const MlpData& data, int64_t cell, float* workspace))
 
-// Rows [begin, end) of the packed cell through the network.
-VN_DECLARE_FOR_ISA(void mlp_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end,
+// Rows [begin, end) of the cell, which is packed, through the network.
+VN_DECLARE_FOR_ISA(void mlp_forward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end,
                                     float* workspace))
 
 // Their gradients; those of the parameters fill `partial`.
-VN_DECLARE_FOR_ISA(void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end,
+VN_DECLARE_FOR_ISA(void mlp_backward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end,
                                      float* workspace, float* partial))
 
 // The same with bfloat16 products.
 #if VN_HAS_HALF
 namespace avx512 {
 void mlp_half_pack(const MlpPlan& plan, const MlpData& data, int64_t cell, float* workspace);
-void mlp_half_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace);
-void mlp_half_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace,
-                       float* partial);
+void mlp_half_forward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end,
+                      float* workspace);
+void mlp_half_backward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end,
+                       float* workspace, float* partial);
 }  // namespace avx512
 #endif
 

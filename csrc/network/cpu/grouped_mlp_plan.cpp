@@ -150,26 +150,28 @@ void MlpPlanner::mark_live(const MlpTable& table) {
 
 MlpPlanner::MlpPlanner(const MlpTable& table, const MlpGathered& gathered, const MlpWanted& wanted) {
   plan_.layer_count = static_cast<int64_t>(table.layers.size());
-  plan_.gradients = wanted.parameters || wanted.positions || wanted.directions;
+  plan_.gradients = wanted.parameters || wanted.positions || wanted.directions || wanted.features;
   plan_.parameter_gradients = wanted.parameters;
   plan_.half = wanted.half;
   layers_.resize(table.layers.size());
   sources_.resize(table.layers.size());
-  const auto input = [&wanted](int64_t raw, int octaves, bool integrated, bool gather, bool gradient) {
+  const auto input = [&wanted](int64_t raw, const MlpEncoding& encoding, bool gather, bool gradient) {
     MlpPlanInput it{};
     it.raw = raw;
-    it.octaves = octaves;
-    it.integrated = integrated;
-    it.width = encoded_width(raw, octaves, integrated);
-    it.copied = octaves >= 0 || gather || wanted.half;
+    it.encoding = encoding;
+    it.width = encoded_width(raw, encoding);
+    it.copied = encoding.kind != MlpEncodingKind::none || gather || wanted.half;
     it.gradient_wanted = gradient;
     return it;
   };
-  VN_CHECK(!table.integrated || (table.position_octaves > 0 && table.positions % 2 == 0),
+  const MlpEncoding &position = table.position, &direction = table.direction;
+  const bool integrated = position.kind == MlpEncodingKind::integrated;
+  VN_CHECK(!integrated || (position.size > 0 && table.positions % 2 == 0),
            "grouped_mlp: the integrated encoding must have octaves and as many means as variances");
-  plan_.positions =
-      input(table.positions, table.position_octaves, table.integrated, gathered.positions, wanted.positions);
-  plan_.directions = input(table.directions, table.direction_octaves, false, gathered.directions, wanted.directions);
+  VN_CHECK(position.kind != MlpEncodingKind::hash || table.positions == 3,
+           "grouped_mlp: positions that are hashed must have three features");
+  plan_.positions = input(table.positions, position, gathered.positions, wanted.positions || wanted.features);
+  plan_.directions = input(table.directions, direction, gathered.directions, wanted.directions);
 
   for (size_t l = 0; l < layers_.size(); ++l) {
     MlpPlanLayer& layer = layers_[l];

@@ -5,6 +5,9 @@
 
 #include <cstdint>
 
+#include "encoding/hash_encode_math.h"
+#include "network/grouped_mlp_encoding.h"
+
 namespace voronerf {
 
 constexpr int64_t kGranule = 16;  // columns of every buffer are padded to a multiple of this
@@ -51,12 +54,12 @@ struct MlpPlanOutput {
 
 // Raw features and their encoding.
 struct MlpPlanInput {
-  int64_t raw, octaves, width;  // octaves -1: none
-  bool integrated;              // raw features are means, then variances
-  bool used, copied;            // copied: values lie in `value`, otherwise they are read where they are
+  int64_t raw, width;
+  MlpEncoding encoding;
+  bool used, copied;  // copied: values lie in `value`, otherwise they are read where they are
   MlpBuffer staged, value, narrow, gradient;
-  int64_t table;  // lanes of the encoding, in the workspace: [3][value.stride] source feature, scale, phase
-  bool gradient_wanted;
+  int64_t table;         // lanes of the encoding, in the workspace: [3][value.stride] source feature, scale, phase
+  bool gradient_wanted;  // of the encoding, for that of the raw features or of a hash grid
 };
 
 struct MlpPlan {
@@ -88,7 +91,13 @@ struct MlpData {
   float* const* grad_weights = nullptr;
   float* const* grad_biases = nullptr;
   float* grad_positions = nullptr;
-  float* grad_directions = nullptr;  // one row a sample; with direction_index in sorted order, to be summed by ray
+  float* grad_directions = nullptr;    // one row a sample; with direction_index in sorted order, to be summed by ray
+  const HashEncoding* hash = nullptr;  // of positions that are hashed: the tables of all cells
+  // Rows of hashed positions in sorted order, or null: as they are encoded, which the forward pass writes and the
+  // backward pass reads; and for the gradient of the hash grid, that of the encoding, and the raw rows.
+  float* hashed = nullptr;
+  float* hashed_gradient = nullptr;
+  float* sorted_positions = nullptr;
 };
 
 }  // namespace voronerf

@@ -9,8 +9,8 @@
 namespace voronerf {
 
 struct MlpWanted {
-  bool parameters, positions, directions;  // gradients; none: a forward pass
-  bool half;                               // bfloat16 operands
+  bool parameters, positions, directions, features;  // gradients; none: a forward pass
+  bool half;                                         // bfloat16 operands
 };
 
 // Inputs whose rows are not where the tile's are.

@@ -1,8 +1,8 @@
 // A tile of samples through the network of a cell, forward and backward; see grouped_mlp_isa.cpp.
 #pragma once
 
-#include "encoding/frequency_encode_tile.h"
 #include "network/cpu/activation_tile.h"
+#include "network/cpu/encoding_tile.h"
 #include "network/cpu/few_outputs_tile.h"
 #include "network/cpu/grouped_mlp_pack.h"
 
@@ -21,19 +21,25 @@ VN_INLINE void prefetch(const float* row, int64_t width) {
   for (int64_t c = 0; c < width; c += 16) __builtin_prefetch(row + c);
 }
 
-// How an input is encoded; one that is not has no octaves.
-VN_INLINE Columns columns_of(const MlpPlanInput& input) {
-  return {input.integrated ? input.raw / 2 : input.raw, input.octaves < 0 ? 0 : input.octaves, !input.integrated};
-}
-
 // Rows of one tile: where its values are.
 struct Tile {
   const MlpPlan& plan;
   const MlpData& data;
+  const HashEncoding& hash;  // of the cell
   float* workspace;
   int64_t begin, rows;
 
   float* at(const MlpBuffer& buffer) const { return workspace + buffer.offset; }
+
+  // An input as encoded, and the gradient of that: in the workspace, or in the memory of hashed positions.
+  float* value(const MlpPlanInput& input) const {
+    const bool outside = &input == &plan.positions && data.hashed != nullptr;
+    return outside ? data.hashed + begin * input.value.stride : at(input.value);
+  }
+  float* gradient(const MlpPlanInput& input) const {
+    const bool outside = &input == &plan.positions && data.hashed_gradient != nullptr;
+    return outside ? data.hashed_gradient + begin * input.gradient.stride : at(input.gradient);
+  }
 
   // Where a row of the tile lies in the caller's arrays.
   int64_t place(int64_t row) const { return data.order == nullptr ? begin + row : data.order[begin + row]; }
@@ -48,7 +54,7 @@ struct Tile {
 #else
     if (from >= 0) return {at(plan.layers[from].value), plan.layers[from].value.stride, width};
     const MlpPlanInput& input = from == kFromPositions ? plan.positions : plan.directions;
-    if (input.copied) return {at(input.value), input.value.stride, width};
+    if (input.copied) return {value(input), input.value.stride, width};
     return {(from == kFromPositions ? data.positions : data.directions) + begin * input.raw, input.raw, width};
 #endif
   }
@@ -56,7 +62,7 @@ struct Tile {
   // Raw features, gathered by order and `index` where there are any, to what the layers read.
   void read_input(const MlpPlanInput& input, const float* raw, const int32_t* index) const {
     if (!input.used || !input.copied) return;
-    const bool encoded = input.octaves >= 0;
+    const bool encoded = input.encoding.kind != MlpEncodingKind::none;
     float* staged = encoded ? at(input.staged) : at(input.value);
     const int64_t stride = encoded ? input.raw : input.value.stride;
     if (index == nullptr && data.order == nullptr && stride == input.raw) {
@@ -76,23 +82,16 @@ struct Tile {
 #else
     float* const pairs = nullptr;
 #endif
-    if (encoded) {
-      const Columns columns = columns_of(input);
-      const float* table = workspace + input.table;
-      const bool last = !input.integrated;
-      encode(staged, stride, table, rows, columns, at(input.value), input.value.stride, last ? pairs : nullptr,
-             pairs == nullptr || plan.gradients || !last);
-      if (last) return;
-      blur(staged + columns.d, stride, table, rows, at(input.value), input.value.stride);
-    }
-#if VN_HALF
-    narrow(at(input.value), input.value.stride, input.width, rows, pairs);
-#endif
+    encode_input(input, hash, staged, stride, workspace + input.table, rows, value(input), pairs, plan.gradients);
   }
 
   // The values of all layers that reach an output; `heads` false leaves out those that only do.
   void run_layers(bool heads) const {
     read_input(plan.positions, data.positions, nullptr);
+    if (data.sorted_positions != nullptr) {
+      const int64_t raw = plan.positions.raw;
+      __builtin_memcpy(data.sorted_positions + begin * raw, at(plan.positions.staged), sizeof(float) * rows * raw);
+    }
     read_input(plan.directions, data.directions, data.direction_index);
     for (int64_t l = 0; l < plan.layer_count; ++l) {
       const MlpPlanLayer& layer = plan.layers[l];
@@ -207,11 +206,11 @@ struct Tile {
   // A source's values with the samples as k.
   Source by_samples(const MlpPlanSource& s) const {
 #if VN_HALF
-    const MlpBuffer& value = s.from >= 0                ? plan.layers[s.from].value
-                             : s.from == kFromPositions ? plan.positions.value
-                                                        : plan.directions.value;
-    interleave_rows(at(value), value.stride, rows, workspace + plan.scratch_input);
-    return {workspace + plan.scratch_input, value.stride, (rows + 1) / 2};
+    const MlpPlanInput& input = s.from == kFromPositions ? plan.positions : plan.directions;
+    const int64_t stride = s.from >= 0 ? plan.layers[s.from].value.stride : input.value.stride;
+    const float* from = s.from >= 0 ? at(plan.layers[s.from].value) : value(input);
+    interleave_rows(from, stride, rows, workspace + plan.scratch_input);
+    return {workspace + plan.scratch_input, stride, (rows + 1) / 2};
 #else
     return source(s.from, rows);
 #endif
@@ -228,16 +227,16 @@ struct Tile {
 
   // `a`: the layer's gradient, a row of k for every sample.
   void source_gradient(const MlpPlanLayer& layer, const MlpPlanSource& s, const Source& a) const {
-    const MlpBuffer& to = s.from >= 0                ? plan.layers[s.from].gradient
-                          : s.from == kFromPositions ? plan.positions.gradient
-                                                     : plan.directions.gradient;
+    const MlpPlanInput& input = s.from == kFromPositions ? plan.positions : plan.directions;
+    const int64_t stride = s.from >= 0 ? plan.layers[s.from].gradient.stride : input.gradient.stride;
+    float* const to = s.from >= 0 ? at(plan.layers[s.from].gradient) : gradient(input);
     const bool fused = s.last && s.from >= 0 && plan.layers[s.from].slope_fused;
     const float* slope = fused ? at(plan.layers[s.from].value) : nullptr;
-    for (int64_t first = 0; first < to.stride; first += kPanel) {
-      const int64_t columns = smaller(kPanel, to.stride - first);
-      float* c = at(to) + first;
+    for (int64_t first = 0; first < stride; first += kPanel) {
+      const int64_t columns = smaller(kPanel, stride - first);
+      float* c = to + first;
       multiply<false>({&a, 1, workspace + s.packed + first * layer.packed_width, columns, s.first ? kZeros : c,
-                       s.first ? 0 : to.stride, c, to.stride, fused ? Finish::relu_slope : Finish::none,
+                       s.first ? 0 : stride, c, stride, fused ? Finish::relu_slope : Finish::none,
                        fused ? slope + first : nullptr, nullptr, 0},
                       rows, columns);
     }
@@ -267,16 +266,20 @@ struct Tile {
   }
 
   void input_gradient(const MlpPlanInput& input, float* out, bool sorted) const {
-    if (!input.gradient_wanted) return;
-    const Columns columns = columns_of(input);
+    if (!input.gradient_wanted || out == nullptr) return;
+    const auto row_of = [&](int64_t row) { return out + (sorted ? begin + row : place(row)) * input.raw; };
+    if (has_points(input)) {
+      float* points = at(input.staged);
+      points_backward(input, hash, gradient(input), rows, points);
+      for (int64_t row = 0; row < rows; ++row) copy_row(points + row * input.raw, input.raw, row_of(row));
+      return;
+    }
     const int64_t stride = input.gradient.stride;
-    const float *gradient = at(input.gradient), *table = workspace + input.table;
-    // Without octaves `value` is walked but not read.
-    const float* value = input.octaves >= 0 ? at(input.value) : gradient;
-    for (int64_t row = 0; row < rows; ++row, value += stride, gradient += stride) {
-      float* to = out + (sorted ? begin + row : place(row)) * input.raw;
-      encode_row_backward(value, gradient, table, stride, columns, to);
-      if (input.integrated) blur_row_backward(value, gradient, table, stride, columns, to + columns.d);
+    const float* given = gradient(input);
+    // Without octaves values are walked but not read.
+    const float* encoded = has_octaves(input) ? at(input.value) : given;
+    for (int64_t row = 0; row < rows; ++row, encoded += stride, given += stride) {
+      waves_backward(input, encoded, given, workspace + input.table, row_of(row));
     }
   }
 };
@@ -302,21 +305,30 @@ void pack_cell(const MlpPlan& plan, const MlpData& data, int64_t cell, float* wo
   }
 }
 
-void run_forward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace) {
+// run(tile) for each tile of rows [begin, end) of a cell.
+template <typename Run>
+VN_INLINE void for_tiles(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end,
+                         float* workspace, const Run& run) {
+  HashEncoding hash;
+  if (data.hash != nullptr) hash = hash_of_cell(*data.hash, cell, workspace + plan.positions.staged.offset);
   for (int64_t row = begin; row < end; row += plan.tile) {
-    const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
-    tile.run_layers(true);
-    tile.write_outputs();
+    run(Tile{plan, data, hash, workspace, row, smaller(plan.tile, end - row)});
   }
 }
 
-void run_backward(const MlpPlan& plan, const MlpData& data, int64_t begin, int64_t end, float* workspace,
+void run_forward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end, float* workspace) {
+  for_tiles(plan, data, cell, begin, end, workspace, [](const Tile& tile) {
+    tile.run_layers(true);
+    tile.write_outputs();
+  });
+}
+
+void run_backward(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t begin, int64_t end, float* workspace,
                   float* partial) {
-  for (int64_t row = begin; row < end; row += plan.tile) {
-    const Tile tile{plan, data, workspace, row, smaller(plan.tile, end - row)};
+  for_tiles(plan, data, cell, begin, end, workspace, [partial, begin](const Tile& tile) {
     tile.run_layers(false);
-    tile.run_gradients(partial, row == begin);
-  }
+    tile.run_gradients(partial, tile.begin == begin);
+  });
 }
 
 }  // namespace

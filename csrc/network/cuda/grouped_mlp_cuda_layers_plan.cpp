@@ -18,19 +18,19 @@ int64_t pad(int64_t width) {
   return ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth;
 }
 
-MlpLayersInput input_of(int64_t raw, int octaves, bool integrated) {
+MlpLayersInput input_of(int64_t raw, const MlpEncoding& encoding) {
   MlpLayersInput input{};
   input.raw = static_cast<int>(raw);
-  input.octaves = octaves;
-  input.integrated = integrated;
-  input.width = static_cast<int>(encoded_width(raw, octaves, integrated));
+  input.octaves = encoding.kind == MlpEncodingKind::none ? -1 : encoding.size;
+  input.integrated = encoding.kind == MlpEncodingKind::integrated;
+  input.width = static_cast<int>(encoded_width(raw, encoding));
   input.padded = pad(input.width);
   return input;
 }
 
 const char* copy_table(const MlpTable& table, MlpLayersPlan& plan) {
-  plan.positions = input_of(table.positions, table.position_octaves, table.integrated);
-  plan.directions = input_of(table.directions, table.direction_octaves, false);
+  plan.positions = input_of(table.positions, table.position);
+  plan.directions = input_of(table.directions, table.direction);
   for (const MlpLayer& given : table.layers) {
     MlpLayersLayer layer{};
     if (given.inputs.size() > kLayersParts) return "a layer must have at most 64 sources";

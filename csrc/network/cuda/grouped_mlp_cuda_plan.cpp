@@ -23,12 +23,12 @@ bool is_half(MlpPrecision precision) {
   return precision == MlpPrecision::bfloat16 || precision == MlpPrecision::float16;
 }
 
-MlpCudaInput input_of(int64_t raw, int octaves, bool integrated) {
+MlpCudaInput input_of(int64_t raw, const MlpEncoding& encoding) {
   MlpCudaInput input{};
   input.raw = static_cast<int>(raw);
-  input.octaves = octaves;
-  input.integrated = integrated;
-  input.width = static_cast<int>(encoded_width(raw, octaves, integrated));
+  input.octaves = encoding.kind == MlpEncodingKind::none ? -1 : encoding.size;
+  input.integrated = encoding.kind == MlpEncodingKind::integrated;
+  input.width = static_cast<int>(encoded_width(raw, encoding));
   input.padded = pad(input.width);
   return input;
 }
@@ -102,8 +102,8 @@ int slot_of(const MlpCudaPlan& plan, int skew) {
 const char* mlp_cuda_read_table(const MlpTable& table, MlpCudaPlan& plan) {
   if (table.layers.size() > kMlpCudaLayers) return "a table must have at most 16 layers";
   if (table.outputs.size() > kMlpCudaOutputs) return "a table must have at most 8 outputs";
-  plan.positions = input_of(table.positions, table.position_octaves, table.integrated);
-  plan.directions = input_of(table.directions, table.direction_octaves, false);
+  plan.positions = input_of(table.positions, table.position);
+  plan.directions = input_of(table.directions, table.direction);
   plan.layer_count = static_cast<int>(table.layers.size());
   for (int l = 0; l < plan.layer_count; ++l) {
     const MlpLayer& given = table.layers[l];
