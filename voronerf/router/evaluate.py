@@ -8,9 +8,11 @@ once for the rows of all cells (:mod:`voronerf.router.grouped`) and, where the u
 from __future__ import annotations
 
 import inspect
+import os
 import threading
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -20,7 +22,7 @@ from voronerf.backends import BackendUnavailable
 from voronerf.diagram.blending import Mixture
 from voronerf.layers import MLP
 from voronerf.router import rules  # noqa: F401  registers the rules
-from voronerf.router.grouped import Ungroupable, is_inside, run_grouped
+from voronerf.router.grouped import Ungroupable, run_grouped
 from voronerf.router.grouping import Grouping
 from voronerf.router.layout import Call, Results, rebuild, tensors_of
 from voronerf.router.loop import Choice, Trial, admitted, flattened, run_cells
@@ -29,6 +31,7 @@ _OP = "VoronoiRouter"
 _FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs
 _GAIN = "about 1.5 times as fast at width 64 and 65,536 samples"
 _KINDS = 256  # kinds of calls that are remembered
+_OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
 
 
 class Choices:
@@ -77,7 +80,7 @@ class Choices:
             return
         self._said.add(topic)
         level, frame = 1, inspect.currentframe()
-        while frame is not None and is_inside(frame.f_code.co_filename, package=True):
+        while frame is not None and frame.f_code.co_filename.startswith(_OWN):
             level, frame = level + 1, frame.f_back
         warnings.warn(f"{_OP}: {message}", stacklevel=level)
 
@@ -97,23 +100,20 @@ def _description(value: Any, d: int, fuse: bool) -> Any:
 # Carrying out ---------------------------------------------------------------------------------------------------------
 
 
-def evaluate(call: Call, grouping: Grouping, choices: Choices, *, fuse: bool) -> tuple[Any, Choice]:
-    """What a method of a module returns for the samples of all cells, and how that was found.
+def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, *, fuse: bool) -> Any:
+    """What a method of a module returns for the samples of all cells, mixed with what other cells return for some.
 
     Where there are no samples, ``grouping`` is of two placeholders.
     """
     choice = _choose(call, grouping, choices, fuse)
     results, choice = _carry_out(call, grouping, choices, choice)
     order = grouping if choice.program is None or not call.layout.n else None
-    return results.restored(call.layout, order, choice.flat), choice
-
-
-def mixed(own: Any, call: Call, mixture: Mixture, grouping: Grouping, choices: Choices, choice: Choice) -> Any:
-    """The blended results of a call that returned ``own`` for all samples in their own cells."""
-    n, where = mixture.rows.shape[0], {"cells": mixture.cells}
+    own = results.restored(call.layout, order, choice.flat)
+    if mixture is None:
+        return own
+    n, where, tensors = mixture.rows.shape[0], {"cells": mixture.cells}, tensors_of(own)
     entries = Grouping(where, n, grouping.k, grouping.device, grouping.backend, rows=mixture.rows)
     results, _ = _carry_out(call, entries, choices, choice)
-    tensors = tensors_of(own)
     for i, tensor in enumerate(results.tensors):
         if results.rows[i]:
             tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(n, -1)))

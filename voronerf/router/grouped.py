@@ -26,7 +26,6 @@ from voronerf.router.grouping import Grouping
 from voronerf.router.layout import Call, Results, map_tensors, split_rows, tensors_of
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
-_WRITES = ("requires_grad_", "register_hook", "retain_grad", "backward", "__set__", "__setitem__")
 _INPLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "div", "floordiv", "mod", "pow", "and", "or")}
 _MARK = "_voronerf_rows"
 
@@ -156,11 +155,8 @@ class PerCell(torch.Tensor):
 def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Exception] = Ungroupable) -> Any:
     """A function of parameters and constants alone, for all cells at once; results are :class:`PerCell`."""
     stacks = [leaf.stacked for leaf in tensors_of((args, kwargs)) if isinstance(leaf, PerCell)]
-
     if func is torch.autograd.grad:
         raise fail("it differentiates with respect to parameters")
-    if getattr(func, "__name__", "") in _WRITES:
-        raise fail(f"it calls {name_of(func)} on a parameter")
     function = _weight_norm if func is torch._weight_norm else func
 
     def on_one(*single: Tensor) -> Any:
@@ -206,11 +202,6 @@ def writes_in_place(function: Any) -> bool:
     """Whether a function writes to its first argument."""
     name = getattr(function, "__name__", "")
     return name == "__setitem__" or name in _INPLACE or (name.endswith("_") and not name.startswith("__"))
-
-
-def is_inside(file: str, package: bool = False) -> bool:
-    """Whether a file is one of PyTorch or the router, or of this package."""
-    return file.startswith((_TORCH, os.path.dirname(_HERE[:-1]) if package else _HERE))
 
 
 def user_line() -> str:

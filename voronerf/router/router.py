@@ -25,7 +25,6 @@ from voronerf.router.evaluate import (
     described_by_table,
     each_direction,
     evaluate,
-    mixed,
 )
 from voronerf.router.grouping import Assignments, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
@@ -327,12 +326,8 @@ class VoronoiRouter(CellModules):
         )
         call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
         with self._choices.lock:  # what stands in for the module's parameters does so for one call at a time
-            grouping = self._group(method, positions)
-            result, choice = evaluate(call, grouping, self._choices, fuse=self.fuse)
-            mixture = self._mixture(positions)
-            if mixture is None:
-                return result
-            return mixed(result, call, mixture, grouping, self._choices, choice)
+            mixture, grouping = self._mixture(positions), self._group(method, positions)
+            return evaluate(call, grouping, mixture, self._choices, fuse=self.fuse)
 
     def _mixture(self, positions: Tensor) -> Mixture | None:
         """The other cells that samples near borders are evaluated in too."""
