@@ -99,15 +99,12 @@ def test_what_does_not_fit_into_memory_is_not_decoded(tmp_path, monkeypatch):
     paths = [tmp_path / f"{index}.png" for index in range(4)]
     for path in paths:
         Image.new("RGB", (100, 50)).save(path)
-    pixels = 4 * 100 * 50 * 3 + 100 * 50 * 4  # of the scene, and of one image as Pillow keeps it
-    monkeypatch.setattr(images, "available_memory", lambda: 2 * pixels)
+    needed = 100 * 50 * (4 * 3 + 550)  # of the images, and of a view while it is scored
+    monkeypatch.setattr(images, "available_memory", lambda: needed / 0.75)
     assert read_images(paths, 1)[0].shape == (4, 50, 100, 3)
-    monkeypatch.setattr(images, "available_memory", lambda: 2 * pixels - 1)
-    refuses(
-        "0.png: loading 4 images of 100 x 50 needs 0.00 GiB with --downscale 1, more than 50% of",
-        read_images,
-        paths,
-        1,
-        error=SceneError,
+    monkeypatch.setattr(images, "available_memory", lambda: (needed - 1) / 0.75)
+    message = (
+        "0.png: 4 images of 100 x 50 need 0.00 GiB with --downscale 1, more than 75% of the 0.00 GiB that are free"
     )
+    refuses(message, read_images, paths, 1, error=SceneError)
     assert read_images(paths, 2)[0].shape == (4, 25, 50, 3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -25,8 +24,12 @@ FORMATS = ("PNG", "JPEG")
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_DEPTH = 24  # offset of the bits a channel
-#: Share of the free memory that loading may take; the rest is for training.
-SHARE = 0.5
+#: Share of the free memory that a scene may need; the rest is for the networks.
+SHARE = 0.75
+#: Bytes for each pixel while a view is rendered and scored, most of them for SSIM.
+VIEW = 550
+#: Bytes for the number of each pixel whose ray meets the box, which images with alpha have.
+NUMBER = 8
 #: Images are decoded by up to four threads while those in hand take at most this many bytes.
 THREADS, IN_HAND = 4, 2**26
 #: Pixels that are converted and averaged at a time.
@@ -138,12 +141,14 @@ def read_images(paths: Sequence[Path], factor: int) -> tuple[Tensor, tuple[int, 
     channels = 4 if any(header.alpha for header in headers) else 3
     shape = (len(paths), size[1] // factor, size[0] // factor, channels)
     decoded = max(header.decoded for header in headers)
-    needed, free = math.prod(shape) + decoded, available_memory()
+    pixels = shape[1] * shape[2]
+    each = pixels * (channels + (NUMBER if channels == 4 else 0))
+    needed, free = len(paths) * each + max(decoded, pixels * VIEW), available_memory()
     if needed > SHARE * free:
         raise SceneError(
-            f"{paths[0]}: loading {len(paths)} images of {size[0]} x {size[1]} needs {needed / 2**30:.2f} GiB with "
-            f"--downscale {factor}, more than {SHARE:.0%} of the {free / 2**30:.2f} GiB that are free; "
-            "use a larger --downscale, fewer or smaller images"
+            f"{paths[0]}: {len(paths)} images of {size[0]} x {size[1]} need {needed / 2**30:.2f} GiB with --downscale "
+            f"{factor}, more than {SHARE:.0%} of the {free / 2**30:.2f} GiB that are free; use a larger --downscale, "
+            "fewer or smaller images"
         )
     images = np.full(shape, 255, dtype=np.uint8)
 

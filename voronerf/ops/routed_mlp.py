@@ -46,9 +46,10 @@ def routed_mlp(
 
     Equivalent to ``locate_cell``, ``cell_sort``, permuting the inputs, ``grouped_mlp``, and undoing the permutation.
     The native CPU implementation gathers and scatters rows inside the tiles of the network: it makes no permuted copy,
-    and keeps only the order (int32) for the backward pass, and of hashed positions their features. Gradients of every order to positions, directions, features,
-    weights and biases; none through the choice of the cell. A sample whose coordinates are not finite goes to the first
-    cell, as in ``locate_cell``. A network of one cell (k = 1) needs no tables, and is neither located nor sorted.
+    and keeps only the order (int32) for the backward pass, and of hashed positions their features. Gradients of every
+    order to positions, directions, features, weights and biases; none through the choice of the cell. A sample whose
+    coordinates are not finite goes to the first cell, as in ``locate_cell``. A network of one cell (k = 1) needs no
+    tables, and is neither located nor sorted.
 
     Args:
         positions: [n, p] floating point, n < 2**31: the input of the layers, as in ``grouped_mlp``.
