@@ -207,27 +207,6 @@ class Scripted(nn.Module):
         return self.out(scripted(self.fc(x), 4.0))
 
 
-class Operations(nn.Module):
-    """Functions along features that are neither products nor elementwise."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc, self.out = nn.Linear(7, 9), nn.Linear(17, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        h = self.fc(x)
-        a, b, c = h.unflatten(-1, (3, 3)).unbind(1)
-        cross = torch.linalg.cross(a, b)
-        h = torch.where(h > 0, h, 0.1 * h)
-        h[h > 0.5] = 0.5
-        best = h.topk(2, -1).values
-        index = c.argmax(-1, keepdim=True)
-        chosen = torch.gather(a, 1, index)
-        parts = [cross, best, chosen, h.cumsum(-1)[:, -2:], h.index_select(1, torch.tensor([4, 2]))]
-        parts += [h.sort(dim=-1)[0][:, :3], F.normalize(c, dim=1), (a * b).sum(1, keepdim=True)]
-        return self.out(torch.hstack(parts))
-
-
 class TruncExp(torch.autograd.Function):
     """As torch-ngp's: the exponential of small numbers only in the backward pass, under automatic mixed precision."""
 
@@ -281,7 +260,6 @@ CALLS = [
     ),
     Case("scripted", Scripted, way="cell by cell"),
     Case("truncated exponential", Truncated, fuses=True),
-    Case("operations", Operations),
     Case("checkpointed", Checkpointed, way="cell by cell"),
     Case("named tuple", Named, lead=RAYS, fuses=True),
     Case("containers", TakesContainers, query, points_of, options={"coords": points_of}, fuses=True),

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from convention_harness import Case, one, uniform
-from convention_listed import pair
 from torch import Tensor, nn
 
 
@@ -203,18 +202,6 @@ class LowRank(nn.Module):
         return self.out(F.relu(F.linear(x, self.base.weight + 0.5 * self.b @ self.a, self.base.bias)))
 
 
-class Lipschitz(nn.Module):
-    """Rows of a weight scaled to a learned bound (Liu et al. 2022)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc, self.out, self.bound = nn.Linear(7, 8), nn.Linear(8, 3), nn.Parameter(torch.tensor(0.5))
-
-    def forward(self, x: Tensor) -> Tensor:
-        scale = torch.clamp(F.softplus(self.bound) / self.fc.weight.abs().sum(1), max=1.0)
-        return self.out(torch.tanh(F.linear(x, self.fc.weight * scale[:, None], self.fc.bias)))
-
-
 class Convolution(nn.Module):
     """A convolution over features: no sample sees another, and no grouped version."""
 
@@ -225,27 +212,6 @@ class Convolution(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         assert x.shape[0] > 0, "called without rows"
         return self.fc(self.conv(x[:, None]).flatten(1))
-
-
-class Bilinear(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc, self.mix = nn.Linear(3, 4), nn.Bilinear(4, 3, 2)
-
-    def forward(self, x: Tensor, d: Tensor) -> Tensor:
-        return self.mix(torch.relu(self.fc(x)), d)
-
-
-class Grid(nn.Module):
-    """A dense grid of features beside a network (DVGO)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.grid, self.fc = nn.Parameter(torch.randn(1, 4, 3, 3, 3)), nn.Linear(4, 3)
-
-    def forward(self, x: Tensor) -> Tensor:
-        found = F.grid_sample(self.grid, x[:, :3].view(1, 1, 1, -1, 3), align_corners=True)
-        return self.fc(found.view(4, -1).t())
 
 
 class FourierFeatures(nn.Module):
@@ -289,9 +255,6 @@ LAYERS = [
     Case("embedding", Lookup, images),
     Case("embedding's average", Lookup),
     Case("low rank", LowRank, fuses=True),
-    Case("lipschitz", Lipschitz),
     Case("fourier features", FourierFeatures, one(3), fuses=True),
     Case("convolution", Convolution, way="cell by cell"),
-    Case("bilinear", Bilinear, pair, way="cell by cell"),
-    Case("grid", Grid, one(3)),
 ]

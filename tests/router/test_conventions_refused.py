@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from convention_listed import RAYS, mip_field, nerfacc, uniform
+from convention_listed import RAYS, uniform
+from router_fields import Heads
 from torch import Tensor, nn
 
-from voronerf import VoronoiRouter
+from voronerf import NeRF, VoronoiRouter
 
 
 @pytest.fixture
@@ -80,76 +81,115 @@ def test_modules_that_mix_samples_are_refused(number: int, centres: Tensor) -> N
 
 
 class Field(nn.Module):
+    """Takes features, and others of a sample or a ray."""
+
     def __init__(self) -> None:
         super().__init__()
         self.fc = nn.Linear(7, 4)
+        self.register_buffer("bands", torch.ones(2))
 
-    def forward(self, x: Tensor, z: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, z: Tensor | None = None, note: str = "") -> Tensor:
         return self.fc(x if z is None else torch.cat([x, z.expand(*x.shape[:-1], -1)], -1))
 
-    @property
-    def width(self) -> int:
-        return 7
+
+def routed(coords: Any = "first3", **options: Any) -> VoronoiRouter:
+    return VoronoiRouter(Field(), torch.rand(4, 3), coords=coords, **options)
 
 
-X = torch.zeros(6, 7)
+def layered(**options: Any) -> VoronoiRouter:
+    return VoronoiRouter(NeRF(width=8, depth=2), torch.rand(3, 3), **options)
 
-WRONG: dict[str, tuple[Callable[[Tensor], Any], type[Exception], str]] = {
-    "no coords, integrated encoding": (
-        lambda c: VoronoiRouter(mip_field(), c, per_ray=["view_direction"])(uniform(RAYS, 12), uniform((9,), 9)),
+
+def single(module: Any) -> VoronoiRouter:
+    return VoronoiRouter(module, torch.zeros(2, 3))
+
+
+def listed() -> nn.Module:
+    module = nn.Linear(3, 2)
+    module.extra = [{"bias": module.bias}]
+    return module
+
+
+def split(parents: Any) -> None:
+    router = layered()
+    router.subdivide(router.diagram.refine({0: torch.randn(2, 3)})[0], torch.tensor(parents))
+
+
+def other_buffer() -> nn.Module:
+    field = Field()
+    field.bands.mul_(3)
+    return field
+
+
+X, INF, NAN = torch.zeros(6, 7), float("inf"), float("nan")
+SPECTRAL = nn.utils.parametrizations.spectral_norm
+Errors = list[tuple[Callable[[], Any], type[Exception], str]]
+MODULES: Errors = [
+    (lambda: single(3), TypeError, "module must be an nn.Module, got int"),
+    (
+        lambda: single(nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4))),
+        TypeError,
+        "`1`, a BatchNorm1d, mixes",
+    ),
+    (lambda: single(nn.Sequential(nn.Linear(3, 4), nn.SyncBatchNorm(4))), TypeError, "`1`, a SyncBatchNorm, mixes"),
+    (lambda: single(nn.LSTM(3, 4)), TypeError, "a LSTM is recurrent"),
+    (lambda: single(SPECTRAL(nn.Linear(3, 4))), TypeError, "keeps a state for each weight"),
+    (lambda: single(listed()), TypeError, "keeps parameters in the plain list `extra`"),
+]
+OPTIONS: Errors = [
+    (lambda: VoronoiRouter(Field(), torch.randn(8, 2)), ValueError, "centres must"),
+    (lambda: routed(assignment="near"), ValueError, "assignment must be 'nearest' or 'stochastic', got 'near'"),
+    (lambda: routed(temperature=0), ValueError, "temperature must be positive, got 0"),
+    *((lambda b=b: routed(blend=b), ValueError, "blend must be finite and at least 0, got") for b in (-0.1, INF, NAN)),
+    (lambda: routed(layout="row"), ValueError, "layout must be 'rays' or 'flat', got 'row'"),
+    (lambda: routed(backend="nativ"), ValueError, "backend must be auto, reference, native, warp, got 'nativ'"),
+    (lambda: routed("last3"), ValueError, "coords must be 'first3', a slice or a function, got 'last3'"),
+    (lambda: routed(methods=["colour_of"]), ValueError, "methods must name methods of Field, got 'colour_of'"),
+    (lambda: VoronoiRouter(Heads(), X[:, :3], methods=["cell"]), ValueError, "methods must name methods of Heads"),
+    (lambda: routed(methods=["train"]), ValueError, "methods must not name what a router has itself, got 'train'"),
+    (lambda: routed(methods="density"), TypeError, "methods must be a list, got 'density'"),
+    (lambda: routed(per_ray=["view"]), ValueError, "must name arguments of Field, one of x, z, note, got 'view'"),
+    (lambda: routed(share=["out.*"]), ValueError, r"share must name parameters of Field, such as .*, got 'out\.\*'"),
+    (lambda: routed(share="fc"), TypeError, "share must be a list, got 'fc'"),
+]
+CALLS: Errors = [
+    (lambda: routed(None)(X), ValueError, "coords must say where the positions are.*coords=positions"),
+    (lambda: routed(slice(0, 4))(X), ValueError, r"coords=slice\(0, 4, None\) takes .* must have shape \[\.\.\., 3\]"),
+    (lambda: routed(lambda x: None)(X), TypeError, "what coords returns must be a tensor, got NoneType"),
+    (lambda: routed()(X, coords=X[:, :2]), ValueError, r"coords must have shape \[\.\.\., 3\], got \[6, 2\]"),
+    (lambda: routed()(X, coords=torch.zeros(5, 3)), ValueError, "x must be per sample"),
+    (lambda: routed()(X, coords=X[:, :3].long()), TypeError, "coords must be floating-point, got torch.int64"),
+    (lambda: routed()("x"), ValueError, "must find a tensor among the arguments, got str"),
+    (lambda: routed()(X, X[:4]), ValueError, r"z must be per sample \[6, \.\.\.\], or named in shared=, got \[4, 7\]"),
+    (lambda: routed()(X[:, :6]), RuntimeError, "shape|sizes"),
+    (lambda: layered(coords=lambda p, *_: p.long())(X[:, :3], X[:, :3]), TypeError, "floating-point, got torch.int64"),
+    (lambda: layered(coords=lambda p, *_: 3)(X[:, :3], X[:, :3]), TypeError, "must be a tensor, got int"),
+    (lambda: layered()(X[:, :2]), ValueError, r"positions must have shape \[n, 3\], got \[6, 2\]"),
+    (lambda: layered()(X[:, :3]), ValueError, "directions must be given"),
+    (lambda: layered()(X[:, :3], X[:2, :3]), ValueError, r"directions must have shape .* n = 6, got \[2, 3\]"),
+]
+CELLS: Errors = [
+    (lambda: routed().cell(4), IndexError, "index must be below 4, got 4"),
+    (lambda: routed().load_cell(4, Field()), IndexError, "index must be below 4, got 4"),
+    (lambda: routed().load_cell(0, nn.Linear(7, 4)), ValueError, "module must have the parameters of the routed one"),
+    (lambda: routed().load_cell(0, other_buffer()), ValueError, "module's bands must be that of the routed one"),
+    (lambda: VoronoiRouter.from_modules([], X[:4, :3]), ValueError, "must hold a module for each cell, got none"),
+    (lambda: VoronoiRouter.from_modules([Field()], X[:4, :3]), ValueError, "a module for each of 4 cells, got 1"),
+    (
+        lambda: VoronoiRouter.from_modules([nn.Linear(7, 2), nn.Linear(7, 3)], X[:2, :3]),
         ValueError,
-        "coords=",
+        r"modules\[1\]: module's weight must have shape \[2, 7\], got \[3, 7\]",
     ),
-    "slice of four": (lambda c: VoronoiRouter(Field(), c, coords=slice(0, 4))(X), ValueError, "3"),
-    "slice past the end": (lambda c: VoronoiRouter(Field(), c, coords=slice(6, 9))(X), ValueError, "3"),
-    "callable that gives None": (
-        lambda c: VoronoiRouter(Field(), c, coords=lambda x: None)(X),
-        (TypeError, ValueError),
-        "coords",
-    ),
-    "fewer positions than samples": (
-        lambda c: VoronoiRouter(Field(), c)(X, coords=torch.zeros(5, 3)),
-        ValueError,
-        "[56]",
-    ),
-    "positions of integers": (
-        lambda c: VoronoiRouter(Field(), c)(X, coords=torch.zeros(6, 3, dtype=torch.int64)),
-        (TypeError, ValueError),
-        "int64",
-    ),
-    "no modules": (lambda c: VoronoiRouter.from_modules([], c, coords="first3"), ValueError, "module"),
-    "module without parameters": (
-        lambda c: VoronoiRouter.from_modules([nn.Linear(7, 2), nn.Identity()], c[:2], coords="first3"),
-        (ValueError, TypeError),
-        "parameters",
-    ),
-}
+    (lambda: split([0, 1, 2]), ValueError, r"parents must have shape \[4\], got \[3\]"),
+    (lambda: split([0.0, 0, 1, 2]), TypeError, "parents must be int64, got torch.float32"),
+    (lambda: split([0, 1, 2, 7]), ValueError, r"parents must lie in 0\.\.2, got 0\.\.7"),
+]
 
 
-@pytest.mark.parametrize(("call", "kind", "says"), WRONG.values(), ids=WRONG)
-def test_wrong_use_says_what_is_wrong(call: Callable[[Tensor], Any], kind: Any, says: str, centres: Tensor) -> None:
-    with pytest.raises(kind, match=says) as error:
-        call(centres)
-    text = str(error.value)
-    assert "VoronoiRouter" in text or "VoronoiDiagram" in text or "backend" in text, text
-
-
-def test_as_many_rays_as_samples_must_be_said(centres: Tensor) -> None:
-    """[5, 5, 3] with [5, 3]: a row for each ray, or positions that broadcast over rays? Only the caller knows."""
-    field = nerfacc.VanillaNeRFRadianceField(2, 8)
-    x, condition = uniform((5, 5)), uniform((5,))
-    told = VoronoiRouter(field, centres, coords="first3", per_ray=["condition"])
-    torch.testing.assert_close(told(x, condition), field(x, condition))
-    with pytest.raises(ValueError, match="per_ray"):
-        VoronoiRouter(field, centres, coords="first3")(x, condition)
-
-
-def test_rays_are_found_where_shapes_say_so(centres: Tensor) -> None:
-    field = nerfacc.VanillaNeRFRadianceField(2, 8)
-    x, condition = uniform(RAYS), uniform(RAYS[:1])
-    router = VoronoiRouter(field, centres, coords="first3")
-    torch.testing.assert_close(router(x, condition), field(x, condition))
-    torch.testing.assert_close(router(x, condition=condition), field(x, condition))
+@pytest.mark.parametrize(("call", "kind", "says"), [*MODULES, *OPTIONS, *CALLS, *CELLS])
+def test_wrong_use_says_what_is_wrong(call: Callable[[], Any], kind: type[Exception], says: str) -> None:
+    with pytest.raises(kind, match=says):
+        call()
 
 
 def test_an_error_of_the_field_itself_is_shown(centres: Tensor) -> None:

@@ -185,31 +185,3 @@ def test_frozen_parameters_stay_frozen(field: NeRF) -> None:
     router.subdivide(diagram, parents)
     frozen = {name for name, p in router.named_parameters() if not p.requires_grad}
     assert frozen == {"module.density.weight", "module.density.bias"}
-
-
-def test_errors(field: NeRF, generator: torch.Generator) -> None:
-    centres = torch.randn(3, 3, generator=generator)
-    with pytest.raises(TypeError, match=r"module must be an nn.Module, got int"):
-        VoronoiRouter(3, centres)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="centres must"):
-        VoronoiRouter(field, torch.randn(8, 2))
-    with pytest.raises(ValueError, match="assignment must be 'nearest' or 'stochastic', got 'near'"):
-        VoronoiRouter(field, centres, assignment="near")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="temperature must be positive, got 0"):
-        VoronoiRouter(field, centres, temperature=0)
-    router = VoronoiRouter(field, centres)
-    with pytest.raises(ValueError, match=r"positions must have shape \[n, 3\], got \[4, 2\]"):
-        router(torch.randn(4, 2))
-    with pytest.raises(ValueError, match="directions must be given"):
-        router(torch.randn(4, 3))
-    with pytest.raises(ValueError, match=r"directions must have shape .* n = 4, got \[2, 3\]"):
-        router(torch.randn(4, 3), torch.randn(2, 3))
-    with pytest.raises(IndexError, match="index must be below 3, got 3"):
-        router.cell(3)
-    finer, parents = router.diagram.refine({0: torch.randn(2, 3)})
-    with pytest.raises(ValueError, match=r"parents must have shape \[4\], got \[3\]"):
-        router.subdivide(finer, parents[:3])
-    with pytest.raises(TypeError, match=r"parents must be int64, got torch.int32"):
-        router.subdivide(finer, parents.int())
-    with pytest.raises(ValueError, match=r"parents must lie in 0\.\.2, got 0\.\.7"):
-        router.subdivide(finer, torch.tensor([0, 1, 2, 7]))

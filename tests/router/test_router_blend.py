@@ -137,8 +137,5 @@ def test_nothing_jumps_across_borders() -> None:
 
 
 def test_the_setting() -> None:
-    for blend in (-0.1, float("inf"), float("nan")):
-        with pytest.raises(ValueError, match="VoronoiRouter: blend must be finite and at least 0, got"):
-            VoronoiRouter(nn.Linear(3, 2), torch.randn(3, 3), coords="first3", blend=blend)
     router = VoronoiRouter(nn.Linear(3, 2), torch.randn(3, 3), coords="first3", blend=0.25)
     assert copy.deepcopy(router).blend == 0.25 and "blend" not in "".join(router.state_dict())

@@ -58,6 +58,7 @@ def test_per_ray_has_to_be_said_where_shapes_do_not_tell(generator: torch.Genera
         said.load_state_dict(router.state_dict())
         longer = torch.cat([x, x], 1)
         expected = router(longer, d, code=code, time=time)[:, :samples]
+        assert router.explain() == "forward: grouped"
         torch.testing.assert_close(said(x, d, code=code, time=time), expected)
 
 
@@ -175,16 +176,6 @@ def test_cells_take_what_fits_them(generator: torch.Generator) -> None:
     router.load_cell(2, modules[0])
     for a, b in zip(router.cell(2).parameters(), modules[0].parameters(), strict=True):
         assert torch.equal(a, b)
-    with pytest.raises(ValueError, match="a module for each of 4 cells, got 3"):
-        VoronoiRouter.from_modules(modules[:3], centres, coords="first3")
-    with pytest.raises(ValueError, match=r"trunk\.0\.weight must have shape \[12, 9\], got \[13, 9\]"):
-        router.load_cell(0, SkipNet(width=13))
-    other = Heads()
-    other.bands.mul_(3)
-    with pytest.raises(ValueError, match="module's bands must be that of the routed one"):
-        router_of(Heads(), generator).load_cell(0, other)
-    with pytest.raises(IndexError, match="index must be below 4, got 4"):
-        router.load_cell(4, modules[0])
 
 
 # Modes and wrappers ---------------------------------------------------------------------------------------------------
@@ -275,7 +266,7 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
         torch.distributed.destroy_process_group()
 
 
-# Errors ---------------------------------------------------------------------------------------------------------------
+# Decisions ------------------------------------------------------------------------------------------------------------
 
 
 class Decides(nn.Module):
@@ -306,44 +297,3 @@ def test_decisions_are_those_of_each_cell_or_refused(generator: torch.Generator,
         assert "mixes samples" in str(error)
     else:
         torch.testing.assert_close(found, masked_loop(router, router.diagram.locate(x), [x])[0][0])
-
-
-def test_modules_that_cannot_be_cells_are_refused() -> None:
-    listed = nn.Linear(3, 2)
-    listed.extra = [{"bias": listed.bias}]
-    for module, says in (
-        (nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4)), "`1`, a BatchNorm1d, mixes the samples of a batch"),
-        (nn.Sequential(nn.Linear(3, 4), nn.SyncBatchNorm(4)), "`1`, a SyncBatchNorm, mixes the samples of a batch"),
-        (nn.LSTM(3, 4), "a LSTM is recurrent"),
-        (nn.utils.parametrizations.spectral_norm(nn.Linear(3, 4)), "keeps a state for each weight"),
-        (listed, "keeps parameters in the plain list `extra`"),
-    ):
-        with pytest.raises(TypeError, match=says):
-            VoronoiRouter(module, torch.zeros(2, 3))
-
-
-def test_errors_say_what_came(generator: torch.Generator) -> None:
-    centres, x = uniform(generator, 3, 3), uniform(generator, 10, 3)
-    for options, says in (
-        ({"coords": "last3"}, "coords must be 'first3', a slice or a function, got 'last3'"),
-        ({"methods": ["colour_of"]}, "methods must name methods of Heads, got 'colour_of'"),
-        ({"methods": ["cell"]}, "methods must name methods of Heads, got 'cell'"),
-        ({"per_ray": ["view"]}, "must name arguments of Heads, one of x, d, density_only, got 'view'"),
-    ):
-        with pytest.raises(ValueError, match=says):
-            VoronoiRouter(Heads(), centres, **options)
-    with pytest.raises(TypeError, match="methods must be a list, got 'density'"):
-        VoronoiRouter(Heads(), centres, methods="density")
-    router = VoronoiRouter(Heads(), centres)
-    for call, says in (
-        (lambda: router(x), "coords must say where the positions are.*coords=positions"),
-        (lambda: router(x, coords=x[:, :2]), r"coords must have shape \[\.\.\., 3\].*got \[10, 2\]"),
-        (lambda: router(x, x[:4], coords=x), r"d must be per sample \[10, \.\.\.\], or named in shared=, got \[4, 3\]"),
-    ):
-        with pytest.raises(ValueError, match=says):
-            call()
-    router = VoronoiRouter(SkipNet(), centres, coords="first3")
-    with pytest.raises(ValueError, match="must find a tensor among the arguments, got str"):
-        router("x")
-    with pytest.raises(RuntimeError, match="sizes"):
-        router(x)

@@ -157,6 +157,7 @@ def _choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Cho
         return choice
     if layout.n < _FEWEST:
         return Choice("cell by cell", f"for fewer than {_FEWEST} samples") if choice is None else choice
+    call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is found out
     devices = [grouping.device] if grouping.device.type == "cuda" else []
     with torch.random.fork_rng(devices):
         rays = len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat
