@@ -77,6 +77,12 @@ def test_paths_in_the_settings_of_a_run(copied, tmp_path, fails, monkeypatch, op
     fails(used, "eval --views 1", copied)
 
 
+def test_settings_that_a_terminal_would_obey(copied, fails):
+    config = json.loads((copied / "config.json").read_text()) | {"data": "\x1b]0;owned\x07"}
+    (copied / "config.json").write_text(json.dumps(config))
+    fails(r"data must be printable text, got '\x1b]0;owned\x07'", "train --resume --help --out", copied)
+
+
 def settings(**changes):
     """Other settings, in the checkpoint as in config.json."""
 
@@ -94,11 +100,16 @@ def many_centres(run, checkpoint):
     checkpoint.tensors["router.diagram.child"] = -1 - torch.arange(len(centres), dtype=torch.int32)
 
 
+def flat_average(run, checkpoint):
+    checkpoint.tensors["optimizer.0.average"] = checkpoint.tensors["optimizer.0.average"].flatten()
+
+
 #: Changes of a run, and what is said of it.
 OVERSIZED = {
     "width": (settings(width=18_000), "router.module.trunk.0.weight must have shape [3, 18000, 39], got [3, 8, 39]"),
     "depth": (settings(depth=1_000_000), "--depth must be at least 1 and at most 1000, got 1000000"),
     "octaves": (settings(position_octaves=10**9), "router.module.trunk.0.weight must have shape [3, 8, 6000000003]"),
+    "average": (flat_average, "optimizer.0.average must have shape [3, 8, 39], got [936]"),
     "centres": (many_centres, "router.module.trunk.0.weight must have shape [2000000, 8, 39], got [3, 8, 39]"),
 }
 

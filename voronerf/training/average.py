@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from voronerf.training.checkpoint import Checkpoint
+from voronerf.training.checkpoint import Checkpoint, CheckpointError
 
 #: Steps from one update of the averages to the next: weights of steps in between are much the same, and a large table
 #: takes time to read.
@@ -60,12 +60,21 @@ def averages_in_place(optimizer: torch.optim.Optimizer) -> Iterator[None]:
 
 
 def load_averages(parameters: Sequence[Tensor], checkpoint: Checkpoint) -> None:
-    """Replaces weights, in the optimiser's order, by the averages that a checkpoint has of them."""
-    stored = checkpoint.group("optimizer")
+    """Replaces weights, in the optimiser's order, by the averages that a checkpoint has of them.
+
+    Raises:
+        CheckpointError: When an average has another shape.
+    """
     with torch.no_grad():
         for index, parameter in enumerate(parameters):
-            if f"{index}.{_KEY}" in stored:
-                parameter.copy_(stored[f"{index}.{_KEY}"])
+            name = f"optimizer.{index}.{_KEY}"
+            average = checkpoint.tensors.get(name)
+            if average is None:
+                continue
+            if average.shape != parameter.shape:
+                wanted, came = list(parameter.shape), list(average.shape)
+                raise CheckpointError(f"{checkpoint.source}: {name} must have shape {wanted}, got {came}")
+            parameter.copy_(average)
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> list[torch.nn.Parameter]:

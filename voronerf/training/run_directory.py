@@ -127,13 +127,17 @@ def stored_config(run: Path) -> TrainConfig | None:
     ``allow_outside`` is not among them: whoever made the run may be another than who continues it.
 
     Raises:
-        ConfigError: When the file is of another version.
+        ConfigError: When the file is of another version, or text in it would be obeyed by a terminal.
         ValueError: When it is no JSON.
     """
     path = run / "config.json"
     if not path.is_file():
         return None
-    return replace(TrainConfig.from_json(json.dumps(read_json(path)), str(path)), out=run, allow_outside=False)
+    config = TrainConfig.from_json(json.dumps(read_json(path)), str(path))
+    for name, value in vars(config).items():  # they are defaults, which the help prints
+        if not "".join(map(str, value if isinstance(value, tuple) else (value,))).isprintable():
+            raise ConfigError(f"{path}: {name} must be printable text, got {value!r:.60}")
+    return replace(config, out=run, allow_outside=False)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
