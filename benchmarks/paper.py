@@ -3,7 +3,10 @@
 import os
 import sys
 
-from paper.main import EXPECTED, data_folder, main
+from paper.main import main
+from paper.runs import data_folder
+
+from voronerf.cli.main import EXPECTED
 
 if __name__ == "__main__":
     # built-in scenes have no folder beside which weights for LPIPS would be found

@@ -41,9 +41,9 @@ both sides of each comparison for the same training time, on the same kernels, w
     make paper        # all of it in small, which is docs/paper.md
 
 This page is written by `benchmarks/paper.py report`; its verdicts are computed from the figures. Published figures are
-those of 400 x 400 images after 24 h on an RTX 2080 Ti, with the usual eight hidden layers where networks here have
-four (KiloNeRF's two) on both sides of each comparison. Values are means over the seeds, with their range; a gain is
-taken seed by seed."""
+those of 400 x 400 images after 24 h on an RTX 2080 Ti. The networks here have four hidden layers (KiloNeRF's two) on
+both sides of each comparison, where a NeRF usually has eight. Values are means over the seeds, with their range; a gain
+is taken seed by seed, and "every seed" is said of one sitting, not of its repetition."""
 
 
 def load(out: Path) -> dict[str, dict[str, Any]]:
@@ -75,7 +75,9 @@ def conditions(described: Mapping[str, Any]) -> str:
         else f"{described['budget_seconds']:g} s a variant",
         f"{described['seeds']} seeds" if described["seeds"] > 1 else "one seed",
         f"{described['rays']} rays x {described['samples']} samples" if "rays" in described else "",
-        f"the best of {len(described['rates'])} learning rates for each" if len(described.get("rates", [])) > 1 else "",
+        f"for each the best of {len(described['rates'])} learning rates by final test PSNR"
+        if len(described.get("rates", [])) > 1
+        else "",
         *(described.get("options") or []),
         *(described.get("machines") or [f"{described['threads']} threads", described["machine"]]),
         *(f"failed: {failure}" for failure in described.get("failed", [])),
@@ -93,6 +95,8 @@ def write_experiment(name: str, outcome: Mapping[str, Any], out: Path) -> list[P
 def write_report(out: Path, page: Path) -> None:
     """Writes the page from all experiments in the output folder, and its pictures to images/NAME beside NAME.md.
 
+    Where the results are from a record and nothing can be drawn of them, the pictures of an earlier page stay.
+
     Raises:
         ValueError: When the folder holds no experiment.
     """
@@ -101,6 +105,7 @@ def write_report(out: Path, page: Path) -> None:
         raise ValueError(f"--out must hold results of experiments, got {out}")
     lines = [INTRODUCTION, "", "## What the paper claims, and what came out", ""]
     lines += all_claims_table(outcomes.values())
+    images = page.parent / "images" / page.stem
     missing = [name for name in ORDER if name not in outcomes]
     if missing:
         lines += ["", f"Not run: {', '.join(missing)}."]
@@ -109,9 +114,9 @@ def write_report(out: Path, page: Path) -> None:
         lines += [conditions(outcome["metadata"]) + ".", ""]
         lines += table_of(name, {**outcome, "claims": []})
         for picture in write_experiment(name, outcome, out):
-            small = page.parent / "images" / page.stem / picture.name
-            write_bytes(small, smaller(picture))
-            lines += ["", f"![{picture.stem}]({small.relative_to(page.parent).as_posix()})"]
+            write_bytes(images / picture.name, smaller(picture))
+        for picture in sorted(images.glob(f"{name}*.png"), key=lambda path: path.stem):
+            lines += ["", f"![{picture.stem}]({picture.relative_to(page.parent).as_posix()})"]
     write_text(page, "\n".join(lines) + "\n\n" + kept_notes(page))
 
 

@@ -278,9 +278,9 @@ def curve(trainer: Trainer) -> list[Row]:
 def results(runs: Sequence[Run]) -> list[Row]:
     """The results of runs that were trained, each with its variant's name, its scene, its seed and its folder.
 
-    Of several learning rates that with the best mean PSNR counts, for every scene and variant alike; "rates" has the
-    means of all. A rate at which a seed failed does not count, nor does one at which a training is still missing that a
-    variant of the scene has at another: no side is searched further than the others.
+    Of several learning rates that with the best mean PSNR of the final test views counts, for every scene and variant
+    alike; "rates" has the means of all. A rate at which a seed failed does not count, nor does one at which a training
+    is still missing that a variant of the scene has at another: no side is searched further than the others.
     """
     tried: dict[tuple[str, str], dict[float, list[Row]]] = {}
     searched = rates_of_all(runs)

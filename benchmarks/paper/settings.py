@@ -53,7 +53,8 @@ class Settings:
     cells: int = 12
     """Cells of the paper's comparison with one network."""
     rates: tuple[float, ...] = (1.0,)
-    """Factors on the learning rate: every variant is trained with each of them, and its best mean PSNR counts."""
+    """Factors on the learning rate: every variant is trained with each of them, and the one with the best mean PSNR
+    of the final test views counts; by default there is no search."""
     large: bool = False
     """Also what takes a larger machine: 16 x 16 cells among the numbers of cells."""
     backend: str = "auto"

@@ -1,21 +1,45 @@
 """benchmarks/paper.py: plots, the fit of a picture, the page and the command line."""
 
 import json
+import re
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers import read_json, refuses
+from helpers import python, read_json, refuses
 from paper import balance, figures, nested, report
 from paper import main as paper
 from paper.experiments import EXPERIMENTS
+from paper.runs import data_folder
 from paper_results import TINY, as_options, synthetic
 from PIL import Image
 
 from voronerf.training.config import ConfigError
 
 pytestmark = pytest.mark.usefixtures("steady_clock")
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+SMALL = "--budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10"
+LONG = "--scene lego ship --evaluations 8 --eval-views 3 --final-views 25"
+#: The committed pages: the record of each, how large its trainings are, what it does not show.
+COMMITTED = {
+    "paper": ("paper_16s", SMALL, {"balance", "nested-2d"}),
+    "paper-480s": ("paper_sampling_480s", LONG, set(report.ORDER) - {"convergence", "sampling"}),
+}
+#: Further records of docs/paper.md: what the tables of its notes are made of.
+FURTHER = {
+    "paper_30s_split_kinds_width_16": ("split-kinds", "--seeds 3 --budget 30 --options width=16"),
+    "paper_16s_temperature_0.05": ("seams", "--options temperature=0.05"),
+    "paper_16s_temperature_0.02": ("seams", "--seeds 4 --options temperature=0.02"),
+    "paper_16s_temperature_falling": ("seams", "--seeds 4 --options temperature=0.05 temperature_final=0.01"),
+}
+needs_scenes = pytest.mark.skipif(
+    not all((data_folder() / name).is_dir() for name in ("lego", "ship")), reason="lego and ship are not there"
+)
 
 
 def test_bands_hold_mean_and_range():
@@ -169,3 +193,78 @@ def test_the_command_line(settings, out, capsys):
     for name in (*paper.Table.__args__, *paper.Figure.__args__):
         assert name in paper.ORDER
     assert len(paper.ORDER) == len(paper.Table.__args__) + len(paper.Figure.__args__)
+
+
+def from_record(name, folder):
+    """The options that make tables of a committed record without a training."""
+    return ["--no-train", "--out", str(folder), "--record", str(shutil.copy(RESULTS / f"{name}.json", folder))]
+
+
+def table_rows(text):
+    """The cells of every line of the tables in a text."""
+    lines = (line.strip() for line in text.splitlines())
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+
+
+@needs_scenes
+@pytest.mark.parametrize("name", COMMITTED)
+def test_a_committed_page_is_what_the_program_writes(name, tmp_path):
+    """Apart from its notes, and from pictures, of which a record has none."""
+    record, size, absent = COMMITTED[name]
+    if name == "paper":
+        shutil.copy(RESULTS / "paper_balance_objects.json", tmp_path / "balance.json")
+    page = tmp_path / f"{name}.md"
+    shown = [experiment for experiment in report.ORDER if experiment not in absent]
+    options = [*size.split(), *from_record(record, tmp_path), "--page", str(page), "--only", *shown]
+    python(ROOT / "benchmarks" / "paper.py", "all", *options)
+    written, committed = (
+        [
+            line
+            for line in path.read_text().partition(report.NOTES)[0].splitlines()
+            if line and not line.startswith("![")
+        ]
+        for path in (page, ROOT / "docs" / page.name)
+    )
+    assert committed == written
+
+
+@needs_scenes
+def test_tables_in_the_notes_are_of_their_records(tmp_path, capsys):
+    notes = (ROOT / "docs" / "paper.md").read_text().partition(report.NOTES)[2]
+    made = []
+    for name, (experiment, options) in FURTHER.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        paper.main(
+            ["figure", experiment, *SMALL.split(), "--scene", "lego", *options.split(), *from_record(name, folder)]
+        )
+        made.append((folder / f"{experiment}.md").read_text())
+    rows = [[cell for cell in row[1:] if re.search(r"\d\.\d\d", cell)] for row in table_rows(notes)]
+    assert sum(map(bool, rows)) == 7
+    for row in rows:
+        assert any(all(f"| {cell} |" in text for cell in row) for text in made), row
+
+
+def test_leads_over_time_are_of_their_record():
+    """The table of docs/paper-480s.md: dB over one network of width 64, at each evaluation and at the end."""
+    rows = read_json(RESULTS / "paper_sampling_480s.json")["results"].items()
+
+    def points(scene, seed, field, sampling, cells):
+        (row,) = (
+            row
+            for name, row in rows
+            if name.startswith(f"{scene}-{seed}-") and (row["cells"], row["width"]) == (cells, 64)
+            if row["config"].get("field", "nerf") == field and "centres" not in row["config"]
+            if row["config"].get("sampling", "stratified") == sampling
+        )
+        return [*(entry["psnr"] for entry in row["curve"]), row["psnr"]]
+
+    expected = []
+    for scene in ("lego", "ship"):
+        for field in ("nerf", "mipnerf"):
+            for sampling in ("stratified", "hierarchical"):
+                for seed in (0, 1):
+                    cells, one = (points(scene, seed, field, sampling, count) for count in (12, 1))
+                    expected.append([f"{a - b:+.2f}" for a, b in zip(cells, one)])
+    notes = (ROOT / "docs" / "paper-480s.md").read_text().partition(report.NOTES)[2]
+    assert [row[1:] for row in table_rows(notes)[2:]] == expected

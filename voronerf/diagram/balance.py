@@ -2,7 +2,7 @@
 
 Letters: m samples, k centres, W [k] the total importance of the samples in each cell.
 
-Source: Elsner et al. 2023, "Adaptive Voronoi NeRFs", section 4. The figure of merit is the paper's: the standard
+Source: Elsner et al. 2023, "Adaptive Voronoi NeRFs", section 3.2. The figure of merit is the paper's: the standard
 deviation (of the population: divided by k, not k - 1) of `W / max W`; 0 is perfect balance.
 
 Everything runs on the CPU in a fixed order, so the same samples and the same generator give the same diagram on every

@@ -1,7 +1,7 @@
 """Keeps the samples at which the picture is still wrong.
 
 The importance of a sample is `w * E(r)`: its contribution to its ray times the squared error of the colour of the ray
-(Elsner et al. 2023, section 4). About 10,000 samples an epoch are kept: the heaviest of every batch, the same number
+(Elsner et al. 2023, section 3.1). About 10,000 samples an epoch are kept: the heaviest of every batch, the same number
 from each, so that no batch counts more than another.
 """
 

@@ -29,7 +29,7 @@ def balance_centres(
 ) -> tuple[Tensor, Tensor]:
     """Moves all centres `steps` times towards cells of equal mass; see ``voronerf.diagram.balance``.
 
-    ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i`` (Elsner et al. 2023, section 4). N(i)
+    ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i`` (Elsner et al. 2023, section 3.2). N(i)
     are the `neighbours` closest centres, or all others if there are fewer; at equal distance, the first ones. Updates
     are computed in float64 and stored in float32. The result is the same at every call. Not differentiable.
 
