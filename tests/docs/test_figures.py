@@ -1,0 +1,98 @@
+"""The figures of the pages are those of the files in benchmarks/results.
+
+A line ``<!-- figures of FILE.json -->`` says where those of the next table or paragraph are from. The pages of the
+paper are compared in tests/benchmarks/test_paper_pages.py.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers import python
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+MARKED = re.compile(r"<!-- figures of (\S+) -->\n\n((?:.+\n)+)")
+FIGURE = re.compile(r"[\d,]*\.?\d+")
+
+
+def marked() -> Iterator[Any]:
+    for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]:
+        for name, text in MARKED.findall(page.read_text()):
+            yield pytest.param(name, text, id=f"{page.stem}-{name}")
+
+
+def numbers(value: Any) -> Iterator[float]:
+    """All numbers within a JSON value."""
+    if isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from numbers(part)
+    elif isinstance(value, int | float):
+        yield value
+
+
+def entries(name: str) -> list[list[float]]:
+    """The numbers of each result in a file."""
+    results = json.loads((RESULTS / name).read_text())["results"]
+    groups = results.values() if isinstance(results, dict) else [results]
+    return [list(numbers(entry)) for group in groups for entry in group]
+
+
+def holds(entry: list[float], text: str) -> bool:
+    """Whether the figures of a text are numbers of an entry, rounded to the digits shown."""
+
+    def shown(figure: str) -> bool:
+        digits = figure.replace(",", "")
+        places = len(digits.partition(".")[2])
+        return any(abs(number - float(digits)) <= 0.5000001 * 10**-places for number in entry)
+
+    return all(map(shown, FIGURE.findall(text)))
+
+
+@pytest.mark.parametrize(("name", "text"), marked())
+def test_figures_are_those_of_the_file(name: str, text: str) -> None:
+    """Of a table, each row or each column is of one result, the first column and the head apart."""
+    found = entries(name)
+    if not text.startswith("|"):
+        decimals = re.findall(r"\d+\.\d+", text)
+        assert decimals and holds([number for entry in found for number in entry], " ".join(decimals))
+        return
+    rows = [re.findall(r"[^|]+", line.strip())[1:] for line in text.splitlines()[2:]]
+    absent = [
+        [cells for cells in parts if not any(holds(entry, " ".join(cells)) for entry in found)]
+        for parts in (rows, list(zip(*rows)))
+    ]
+    assert not all(absent), absent
+
+
+def test_the_table_of_balance_is_that_of_its_files() -> None:
+    sides = []
+    for name in ("balance_lego", "balance_objects"):
+        rows = json.loads((RESULTS / f"{name}.json").read_text())["results"]
+        sides.append({(row["cells"], row["method"]): row for row in rows})
+    lines = []
+    for cells in sorted({cells for cells, _ in sides[0]}):
+        line = [str(cells)]
+        for side in sides:
+            first, second = side[cells, "published"], side[cells, "transport"]
+            line += [f"{first['before']:.3f}", f"{first['after']:.4f} ({first['after_worst']:.3f})"]
+            line += [f"{second['after']:.4f} ({second['after_worst']:.4f})"]
+        lines.append(f"| {' | '.join(line)} |\n")
+    assert "".join(lines) in (ROOT / "docs" / "results.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["throughput.json", "throughput.json --targets", "foreign_fields.json --foreign", "foreign_shared.json --foreign"],
+)
+def test_tables_of_performance_are_those_of_the_program(arguments: str) -> None:
+    name, *options = arguments.split()
+    made = python(ROOT / "benchmarks" / "table.py", RESULTS / name, *options)
+    page = (ROOT / "docs" / "performance.md").read_text()
+    for table in made.strip().split("\n\n"):
+        assert f"{table}\n\n" in page
