@@ -26,9 +26,12 @@ MAX_COUNT = 2**31 - 1
 
 
 def check_tensor(op: str, name: str, value: object) -> None:
-    """Raises TypeError unless ``value`` is a tensor."""
+    """Raises TypeError unless ``value`` is a tensor whose elements lie at strides: not sparse, nested or quantized."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{op}: {name} must be a tensor, got {type(value).__name__}")
+    if value.layout is not torch.strided or value.is_nested or value.is_quantized:
+        kind = "nested" if value.is_nested else "quantized" if value.is_quantized else str(value.layout)
+        raise TypeError(f"{op}: {name} must be a dense tensor, got a {kind.removeprefix('torch.')} one")
 
 
 def check_shape(
@@ -115,12 +118,20 @@ def check_count(op: str, name: str, count: int) -> None:
         raise ValueError(f"{op}: {name} must have fewer than 2**31 rows, got {count}: split the batch")
 
 
-def check_integer(op: str, name: str, value: int, minimum: int) -> None:
-    """Raises TypeError unless ``value`` is an int, ValueError when it is below ``minimum``."""
+def check_integer(op: str, name: str, value: int, minimum: int, maximum: int = MAX_COUNT) -> None:
+    """Raises TypeError unless ``value`` is an int, ValueError when it is below ``minimum`` or above ``maximum``."""
     if isinstance(value, bool) or not isinstance(value, (int, torch.SymInt)):
         raise TypeError(f"{op}: {name} must be an integer, got {type(value).__name__}")
     if value < minimum:
         raise ValueError(f"{op}: {name} must be at least {minimum}, got {value}")
+    if value > maximum:
+        raise ValueError(f"{op}: {name} must be at most {maximum}, got {value}")
+
+
+def check_number(op: str, name: str, value: float) -> None:
+    """Raises TypeError unless ``value`` is a number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, torch.SymFloat, torch.SymInt)):
+        raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}")
 
 
 def check_choice(op: str, name: str, value: object, choices: Sequence[str]) -> None:

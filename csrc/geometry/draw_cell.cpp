@@ -9,6 +9,10 @@
 
 namespace voronerf {
 
+int64_t draw_cell_places(int64_t m, int threads) {
+  return threads * descent_stride(m);
+}
+
 int64_t draw_cell_sums(int64_t m, int threads) {
   return threads * m * kDrawLanes;
 }

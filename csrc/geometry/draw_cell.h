@@ -14,10 +14,9 @@
 
 namespace voronerf {
 
-// int32 and float32 elements of workspace for a number of threads and m centres.
-inline int64_t draw_cell_places(int64_t m, int threads) {
-  return threads * m;
-}
+// int32 and float32 elements of workspace for a number of threads and m centres, the former from an address that 8
+// divides.
+int64_t draw_cell_places(int64_t m, int threads);
 int64_t draw_cell_sums(int64_t m, int threads);
 
 // uniforms [n,depth]; weights [m] or null. The tables are sound (locate_cell_fault). False if a point is not at a leaf

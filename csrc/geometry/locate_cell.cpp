@@ -18,6 +18,10 @@ const char* locate_cell_fault(const int32_t* child_offsets, const int32_t* child
   return nullptr;
 }
 
+int64_t locate_cell_workspace(int64_t m, int threads) {
+  return threads * descent_stride(m);
+}
+
 template <typename T>
 bool locate_cell_cpu(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
                      const int32_t* child, int32_t* leaves, int32_t* workspace, int64_t n, int64_t m, int depth,

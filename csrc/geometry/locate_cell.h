@@ -14,10 +14,8 @@ namespace voronerf {
 // Null if the tables are sound, else the rule that they break, for an error after "locate_cell: ". g diagrams.
 const char* locate_cell_fault(const int32_t* child_offsets, const int32_t* child, int64_t g, int64_t m);
 
-// int32 elements of workspace for a number of threads and m centres.
-inline int64_t locate_cell_workspace(int64_t m, int threads) {
-  return threads * m;
-}
+// int32 elements of workspace for a number of threads and m centres, from an address that 8 divides.
+int64_t locate_cell_workspace(int64_t m, int threads);
 
 // The tables are sound (locate_cell_fault). False if a point is not at a leaf after `depth` levels.
 template <typename T>

@@ -35,12 +35,24 @@ struct DescentLevel {
   int num_groups;
 };
 
+// What a block works on, in the caller's workspace: stacks may be smaller.
+template <typename T>
+struct DescentBlock {
+  DescentLevel<T> levels[2];
+  int32_t found[kDescentBlock];
+};
+
+// int32 elements of workspace for each thread: a block of either dtype, and m counts.
+inline int64_t descent_stride(int64_t m) {
+  return static_cast<int64_t>(sizeof(DescentBlock<double>) / sizeof(int32_t)) + ceil_div<int64_t>(m, 16) * 16;
+}
+
 // One group: leaves are written, the other points appended to `next`. `place` holds one count a centre of the diagram.
 template <typename T, typename Find>
 void descend_group(const DescentTree& tree, const DescentLevel<T>& level, int depth, const DescentGroup& group,
-                   DescentLevel<T>& next, int32_t& filled, int32_t* place, int32_t* leaves, const Find& find) {
+                   DescentLevel<T>& next, int32_t& filled, int32_t* found, int32_t* place, int32_t* leaves,
+                   const Find& find) {
   const int32_t first = tree.child_offsets[group.diagram], size = tree.child_offsets[group.diagram + 1] - first;
-  int32_t found[kDescentBlock];
   find(level.points + 3 * group.begin, level.rows + group.begin, group.end - group.begin, first, size, depth, found);
   std::fill(place, place + size, 0);
   for (int32_t i = group.begin; i < group.end; ++i) {
@@ -69,9 +81,9 @@ void descend_group(const DescentTree& tree, const DescentLevel<T>& level, int de
 
 // False if a point is not at a leaf after the last level.
 template <typename T, typename Find>
-bool descend_block(const DescentTree& tree, const T* points, int32_t* leaves, int32_t n, int32_t* place,
-                   const Find& find) {
-  DescentLevel<T> levels[2];
+bool descend_block(const DescentTree& tree, const T* points, int32_t* leaves, int32_t n, DescentBlock<T>& block,
+                   int32_t* place, const Find& find) {
+  DescentLevel<T>* levels = block.levels;
   std::copy(points, points + 3 * n, levels[0].points);
   for (int32_t i = 0; i < n; ++i) levels[0].rows[i] = i;
   levels[0].groups[0] = {0, 0, n};
@@ -82,30 +94,34 @@ bool descend_block(const DescentTree& tree, const T* points, int32_t* leaves, in
     next.num_groups = 0;
     int32_t filled = 0;
     for (int i = 0; i < level.num_groups; ++i) {
-      descend_group(tree, level, d, level.groups[i], next, filled, place, leaves, find);
+      descend_group(tree, level, d, level.groups[i], next, filled, block.found, place, leaves, find);
     }
     if (filled == 0) return true;
   }
   return false;
 }
 
-// All n points to their leaves, blocks over threads; `place` holds m int32 a thread. find(points, rows, count, first,
-// size, level, found, start, thread) finds one of `size` centres from row `first` on for each of `count` points, rows
-// `start + rows[i]` of all. False if a point does not arrive at a leaf.
+// All n points to their leaves, blocks over threads; `workspace` holds descent_stride(m) int32 a thread, from an
+// address that 8 divides. find(points, rows, count, first, size, level, found, start, thread) finds one of `size`
+// centres from row `first` on for each of `count` points, rows `start + rows[i]` of all. False if a point does not
+// arrive at a leaf.
 template <typename T, typename Find>
-bool descend(const DescentTree& tree, const T* points, int32_t* leaves, int32_t* place, int64_t n, int64_t m,
+bool descend(const DescentTree& tree, const T* points, int32_t* leaves, int32_t* workspace, int64_t n, int64_t m,
              int threads, const Find& find) {
   const int64_t blocks = ceil_div<int64_t>(n, kDescentBlock);
   std::atomic<bool> arrived{true};
   Items items(blocks);
   parallel(static_cast<int>(std::min<int64_t>(threads, blocks)), [&](int thread) {
+    int32_t* own = workspace + thread * descent_stride(m);
+    auto& block = *reinterpret_cast<DescentBlock<T>*>(own);
+    int32_t* place = own + sizeof(DescentBlock<double>) / sizeof(int32_t);
     for (int64_t b, end; items.take(b, end);) {
       const int64_t start = b * kDescentBlock;
       const int32_t rows = static_cast<int32_t>(std::min<int64_t>(kDescentBlock, n - start));
       const auto in_block = [&](const T* at, const int32_t* which, int32_t count, int32_t first, int32_t size,
                                 int level,
                                 int32_t* found) { find(at, which, count, first, size, level, found, start, thread); };
-      if (!descend_block(tree, points + 3 * start, leaves + start, rows, place + thread * m, in_block)) {
+      if (!descend_block(tree, points + 3 * start, leaves + start, rows, block, place, in_block)) {
         arrived.store(false, std::memory_order_relaxed);
       }
     }

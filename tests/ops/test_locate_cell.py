@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import sys
+
 import pytest
 import torch
+from helpers import python
 from op_cases import refusals, strided
 
 from voronerf.ops import locate_cell, nearest_centre
@@ -87,3 +90,30 @@ def test_errors():
     refuses("child_offsets must have dtype int32, got int64", child_offsets=CHILD_OFFSETS.long())
     refuses("depth must be an integer, got float", depth=1.0)
     refuses("child must be on the device of points, cpu, got meta", child=CHILD.to("meta"))
+
+
+@pytest.mark.native
+@pytest.mark.skipif(sys.platform == "win32", reason="stacks have other sizes")
+def test_threads_may_have_small_stacks():
+    code = """
+import threading, torch, voronerf
+threading.stack_size(128 * 1024)
+torch.set_num_threads(1)
+x, c = torch.rand(3000, 3, dtype=torch.float64), torch.rand(4, 3, dtype=torch.float64)
+tree = torch.tensor([0, 2, 4], dtype=torch.int32), torch.tensor([1, -1, -2, -3], dtype=torch.int32)
+def run():
+    voronerf.locate_cell(x, c, *tree, depth=2, backend="native")
+    u = torch.rand(3000, 2)
+    voronerf.draw_cell(x.float(), c.float(), *tree, u, temperature=0.1, depth=2, backend="native")
+    print("found")
+thread = threading.Thread(target=run)
+thread.start()
+thread.join()
+"""
+    assert python("-c", code) == "found\n"
+
+
+def test_more_levels_than_a_tree_can_have_cost_no_time():
+    tree = torch.tensor([0, 2], dtype=torch.int32), torch.tensor([-1, -2], dtype=torch.int32)
+    points = torch.eye(3)[:2]
+    assert locate_cell(points, points, *tree, depth=2**31 - 1, backend="reference").tolist() == [0, 1]

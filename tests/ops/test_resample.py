@@ -110,3 +110,11 @@ def test_errors():
     refuses("edges must have the dtype of weights, float32, got float64", edges=edges.double())
     refuses("weights must have dtype ... or float64, got int64", weights=weights.long())
     refuses("edges must be on the device of weights, cpu, got meta", edges=edges.to("meta"))
+
+
+@pytest.mark.parametrize("scale", [3e38, 1e-45])
+def test_weights_at_the_ends_of_float32(backend, device, scale):
+    weights = torch.tensor([[scale, scale, 0.0, 0.0]], device=device)
+    edges = torch.arange(5.0, device=device)[None]
+    found = resample(weights, edges, 4, backend=backend).cpu()
+    torch.testing.assert_close(found, torch.tensor([[0.25, 0.75, 1.25, 1.75]]))

@@ -6,7 +6,15 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
+from voronerf.checks import (
+    INDEX,
+    check_count,
+    check_dtype,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+    check_tensor,
+)
 from voronerf.reference.composite import Composite
 
 _OP = backends.declare(
@@ -76,6 +84,7 @@ def composite(
         check_shape(_OP, "ray_offsets", ray_offsets, ("r+1",), sizes)
         check_dtype(_OP, "ray_offsets", ray_offsets, INDEX)
     if background is not None:
+        check_tensor(_OP, "background", background)
         check_shape(_OP, "background", background, ("c",) if background.dim() == 1 else ("r", "c"), sizes)
     check_same_dtype(_OP, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas, background=background)
     check_same_device(

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
+from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_number, check_same_device, check_shape
 
 _OP = backends.declare(
     "draw_cell",
@@ -100,6 +100,7 @@ def draw_cell(
         weights=weights,
     )
     check_count(_OP, "points", sizes["n"])
+    check_number(_OP, "temperature", temperature)
     if not 0.0 < temperature < float("inf"):
         raise ValueError(f"{_OP}: temperature must be positive and finite, got {temperature}")
     if sizes["m"] < 1 or sizes["g"] < 1:

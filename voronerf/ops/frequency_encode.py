@@ -44,7 +44,7 @@ def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, bac
     """
     check_shape(_OP, "x", x, ("n", "d"))
     check_dtype(_OP, "x", x)
-    check_integer(_OP, "octaves", octaves, 0)
+    check_integer(_OP, "octaves", octaves, 0, 127)  # 2^128 is beyond float32
     check_count(_OP, "x", x.shape[0])
     run = backends.resolve(_OP, backend=backend, device=x.device, dtype=x.dtype)
     encoded: Tensor = run(x, octaves, include_input=include_input)

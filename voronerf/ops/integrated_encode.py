@@ -51,7 +51,7 @@ def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend
     check_dtype(_OP, "means", means)
     check_same_dtype(_OP, means=means, variances=variances)
     check_same_device(_OP, means=means, variances=variances)
-    check_integer(_OP, "octaves", octaves, 0)
+    check_integer(_OP, "octaves", octaves, 0, 127)  # 2^128 is beyond float32
     check_count(_OP, "means", sizes["n"])
     run = backends.resolve(_OP, backend=backend, device=means.device, dtype=means.dtype)
     encoded: Tensor = run(means, variances, octaves)

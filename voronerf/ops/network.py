@@ -22,6 +22,8 @@ def check_network(
     sizes: dict[str, int],
 ) -> None:
     """Checks parameters and directions against a layer table; ``sizes`` holds n and p, and k where it is known."""
+    if not isinstance(layers, MLP):
+        raise TypeError(f"{op}: layers must be an MLP, got {type(layers).__name__}")
     _check_directions(op, directions, direction_index, layers, sizes)
     if layers.integrated and sizes["p"] != 6:
         p = sizes["p"]

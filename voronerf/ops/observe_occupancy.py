@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import check_count, check_dtype, check_same_device, check_same_dtype, check_shape
+from voronerf.checks import check_count, check_dtype, check_number, check_same_device, check_same_dtype, check_shape
 
 _OP = backends.declare("observe_occupancy", native=Implementation(("cpu",), (torch.float32,)))
 
@@ -81,6 +81,8 @@ def observe_occupancy(
             raise ValueError(f"{_OP}: {name} must be contiguous, got strides {grid.stride()}")
     if density.numel() < 1:
         raise ValueError(f"{_OP}: density must have at least one cell, got {list(density.shape)}")
+    for name, number in (("decay", decay), ("threshold", threshold), ("hidden", hidden)):
+        check_number(_OP, name, number)
     if not 0 <= decay <= 1:
         raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
     run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import check_count, check_dtype, check_same_device, check_same_dtype, check_shape
+from voronerf.checks import check_count, check_dtype, check_same_device, check_same_dtype, check_shape, check_tensor
 from voronerf.reference.pixel_rays import PixelRays
 
 _OP = backends.declare("pixel_rays", native=Implementation(("cpu",), (torch.float32,)))
@@ -77,6 +77,7 @@ def pixel_rays(
     if distortion is not None:
         check_shape(_OP, "distortion", distortion, ("c", 4), sizes)
     if background is not None:
+        check_tensor(_OP, "background", background)
         check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("b", 3), sizes)
     floats = {
         "poses": poses,

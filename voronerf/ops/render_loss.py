@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import FLOATS, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
+from voronerf.checks import INDEX, check_count, check_dtype, check_number, check_same_device, check_shape, check_tensor
 from voronerf.reference.render_loss import RenderLoss
 
 _OP = backends.declare("render_loss", native=Implementation(("cpu",), FLOATS))
@@ -73,10 +73,12 @@ def render_loss(
     check_dtype(_OP, "deltas", deltas, wide)
     check_dtype(_OP, "target", target, wide)
     if background is not None:
+        check_tensor(_OP, "background", background)
         check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
         check_dtype(_OP, "background", background, wide)
     check_same_device(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
     check_count(_OP, "raw", raw.numel())
+    check_number(_OP, "density_scale", density_scale)
     if not density_scale > 0:
         raise ValueError(f"{_OP}: density_scale must be positive, got {density_scale}")
     run = backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)

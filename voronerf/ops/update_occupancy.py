@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
+from voronerf.checks import INDEX, check_count, check_dtype, check_number, check_same_device, check_shape
 
 _OP = backends.declare(
     "update_occupancy",
@@ -60,6 +60,8 @@ def update_occupancy(
     check_same_device(_OP, density=density, cells=cells, values=values)
     check_count(_OP, "density", density.numel())
     check_count(_OP, "cells", cells.numel())
+    check_number(_OP, "decay", decay)
+    check_number(_OP, "threshold", threshold)
     if not 0 <= decay <= 1:
         raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
     run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)

@@ -21,7 +21,11 @@ def cast_solids(
     """Distance to and number of the first solid on each ray; see ``voronerf.ops.cast_solids``."""
     depths = torch.full_like(origins[:, 0], float("inf"))
     solids = torch.full_like(depths, -1, dtype=torch.int32)
-    for number, (kind, frame, size) in enumerate(zip(kinds.tolist(), frames, sizes)):
+    given = kinds.tolist()
+    for kind in given:
+        if kind not in _DISTANCES:
+            raise ValueError(f"cast_solids: kinds must be 0 (sphere) to 3 (torus), got {kind}")
+    for number, (kind, frame, size) in enumerate(zip(given, frames, sizes)):
         local = (origins - frame[3]) @ frame[:3], directions @ frame[:3]
         found = _DISTANCES[kind](*local, size)
         closer = found < depths

@@ -24,7 +24,7 @@ def locate_cell(
         far = distances(points, centres, weights)
         # `state` is the diagram a point is in, or (negative) the leaf it has reached.
         state = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
-        for _ in range(depth):
+        for _ in range(min(depth, child_offsets.shape[0] - 1)):  # a tree has no more levels than diagrams
             nearest = far.masked_fill(owner[None, :] != state[:, None], torch.inf).argmin(dim=1)
             state = torch.where(state < 0, state, child[nearest])
         return -state - 1

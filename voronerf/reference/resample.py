@@ -9,9 +9,11 @@ from torch import Tensor
 @torch.no_grad()
 def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None) -> Tensor:
     """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
-    wide = torch.promote_types(edges.dtype, torch.float32)
+    wide = torch.float64
     mass = torch.where(weights.isfinite(), weights, 0).to(wide).clamp(min=0)
-    mass = torch.where(mass.sum(dim=1, keepdim=True) > 0, mass, 1)
+    # At most 1, so that no sum overflows.
+    most = mass.amax(dim=1, keepdim=True)
+    mass = torch.where(most > 0, mass / most, 1)
     upper = mass.cumsum(dim=1)
     lower = upper - mass
     if uniforms is None:
