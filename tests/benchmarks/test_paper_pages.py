@@ -30,8 +30,11 @@ COMMITTED = {
     "paper": ("paper_16s", SMALL, {"balance", "nested-2d"}),
     "paper-480s": ("paper_sampling_480s", LONG, set(report.ORDER) - {"convergence", "sampling"}),
 }
-#: Further records of docs/paper.md: what the tables of its notes are made of.
+#: What the tables in the notes of docs/paper.md are made of: record, experiment and options.
 FURTHER = {
+    "paper_16s": ("convergence", ""),
+    "paper_16s_later": ("convergence", ""),
+    "paper_16s_split_kinds_ship": ("split-kinds", "--seeds 4 --scene ship"),
     "paper_30s_split_kinds_width_16": ("split-kinds", "--seeds 3 --budget 30 --options width=16"),
     "paper_16s_temperature_0.05": ("seams", "--options temperature=0.05"),
     "paper_16s_temperature_0.02": ("seams", "--seeds 4 --options temperature=0.02"),
@@ -240,7 +243,7 @@ def test_tables_in_the_notes_are_of_their_records(tmp_path, capsys):
         )
         made.append((folder / f"{experiment}.md").read_text())
     rows = [[cell for cell in row[1:] if re.search(r"\d\.\d\d", cell)] for row in table_rows(notes)]
-    assert sum(map(bool, rows)) == 7
+    assert sum(map(bool, rows)) == 12
     for row in rows:
         assert any(all(f"| {cell} |" in text for cell in row) for text in made), row
 
