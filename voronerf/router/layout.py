@@ -77,13 +77,20 @@ def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
     return rebuilt
 
 
-def tensors_of(value: Any, depth: int = 0) -> list[Tensor]:
+def tensors_of(value: Any) -> list[Tensor]:
     """All tensors of a structure, in the order of :func:`map_tree`."""
-    if isinstance(value, Tensor):
-        return [value]
+    found: list[Tensor] = []
+    _collect(value, found, 0)
+    return found
+
+
+def _collect(value: Any, found: list[Tensor], depth: int) -> None:
     # Every function of a grouped module comes here with its arguments: lists are not made dicts for it.
-    items = value if type(value) in (list, tuple) else (_items(value) or {}).values()
-    return [tensor for item in items for tensor in tensors_of(item, depth + 1)] if depth <= _DEEPEST else []
+    if isinstance(value, Tensor):
+        found.append(value)
+    elif depth <= _DEEPEST and value is not None and not isinstance(value, (int, float, str)):
+        for item in value if type(value) in (list, tuple) else (_items(value) or {}).values():
+            _collect(item, found, depth + 1)
 
 
 def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:
