@@ -68,7 +68,7 @@ class Options:
     """Steps of each."""
     downscale: int = 1
     """Factor by which the images are made smaller."""
-    rays: int = TrainConfig.rays
+    rays: int = 1024
     """Rays per step."""
     samples: int = 64
     """Samples per ray."""

@@ -63,7 +63,7 @@ class Options:
     """Whether samples in empty space are left out; times are then also given for each sample that is kept."""
     width: int | None = None
     """Channels of the networks' hidden layers; default that of the field."""
-    rays: int = TrainConfig.rays
+    rays: int = 1024
     """Rays per step."""
     samples: int | None = None
     """Samples per ray; default that of the sampling."""

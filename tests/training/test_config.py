@@ -109,7 +109,7 @@ def test_a_device_that_is_not_there(name, rule):
 def test_defaults_of_the_architectures():
     """Wide networks learn slower."""
     for settings, expected in (
-        ({}, (32, 1, 0.01)),
+        ({}, (32, 1, 0.02)),
         ({"field": "nerf"}, (64, 4, 0.02)),
         ({"field": "kilonerf"}, (32, 2, 0.02)),
         ({"field": "kilonerf", "width": 48, "depth": 3}, (48, 3, 0.02)),

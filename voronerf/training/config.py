@@ -119,8 +119,8 @@ class TrainConfig:
     min_cell_samples: int = 64
     """A cell with fewer kept samples is not split further."""
 
-    rays: int = 1024
-    """Rays per training step."""
+    rays: int | None = None
+    """Rays per training step; default 1024 where empty space is skipped, else 512."""
     sampling: SamplingName = "stratified"
     """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
     (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""
@@ -153,8 +153,7 @@ class TrainConfig:
     """On CUDA: capture a whole step in a graph and replay it; captured again after each split. Empty
     space is not skipped then."""
     lr: float | None = None
-    """Learning rate of Adam at the start; default: 0.01 for hashgrid; for the others 0.02 up to
-    width 64, in inverse proportion to the width beyond."""
+    """Learning rate of Adam at the start; default: 0.02 up to width 64, in inverse proportion to the width beyond."""
     lr_final: float = 0.05
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
     lr_split: float = 1.0
