@@ -40,10 +40,10 @@ from voronerf.training.trainer import Trainer
 
 PLACEMENTS: dict[str, dict[str, Any]] = {
     "single": {},
-    "published": {},
-    "transport": {"balance": "transport"},
-    "centroidal": {"centres": "centroidal"},
-    "centroidal-transport": {"centres": "centroidal", "balance": "transport"},
+    "published": {"centres": "balanced"},
+    "transport": {"centres": "balanced", "balance": "transport"},
+    "centroidal": {},
+    "centroidal-transport": {"balance": "transport"},
     "random": {"centres": "random"},
     "regular": {"centres": "uniform"},
 }

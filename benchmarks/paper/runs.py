@@ -152,6 +152,7 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: 
         "occupancy": False,
         "contraction": "none",
         "average": 0.0,
+        "centres": "balanced",
         **settings.further,
         **variant.changes,
     }

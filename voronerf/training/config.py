@@ -94,9 +94,9 @@ class TrainConfig:
     """With --split worst: split the worst cell again and again until there are this many cells. The first split makes
     the first number of --cells, each later one divides the worst cell into the last number; the splits are evenly
     spaced between the two times of --split-at."""
-    centres: Literal["balanced", "random", "uniform", "centroidal"] = "balanced"
-    """Centres of the new cells: balanced by importance, drawn from the samples, a regular grid, or centroids of their
-    cells, which makes cells compact (with --balance transport, of equal importance as well)."""
+    centres: Literal["balanced", "random", "uniform", "centroidal"] = "centroidal"
+    """Centres of the new cells: balanced by importance (as published), drawn from the samples, a regular grid, or
+    centroids of their cells, which makes cells compact (with --balance transport, of equal importance as well)."""
     uniform_scale: float = 1.0
     """Size of the grid of --centres uniform along each axis, relative to the box of the kept samples."""
     balance: Literal["published", "transport"] = "published"
@@ -119,8 +119,8 @@ class TrainConfig:
     min_cell_samples: int = 64
     """A cell with fewer kept samples is not split further."""
 
-    rays: int | None = None
-    """Rays per training step; default 1024 where empty space is skipped, else 512."""
+    rays: int = 512
+    """Rays per training step."""
     sampling: SamplingName = "stratified"
     """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
     (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""

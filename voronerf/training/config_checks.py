@@ -76,6 +76,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
     for name in (
         "downscale",
+        "rays",
         "fine_samples",
         "proposal_rounds",
         "reservoir",
@@ -86,8 +87,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     ):
         need(getattr(config, name) >= 1, name, "be at least 1")
     need(config.occupancy_resolution <= 512, "occupancy_resolution", "be at most 512")
-    for name in ("rays", "samples"):
-        need(getattr(config, name) is None or getattr(config, name) >= 1, name, "be at least 1")
+    need(config.samples is None or config.samples >= 1, "samples", "be at least 1")
     need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
     need(config.width is None or config.width >= 2, "width", "be at least 2")
     need(config.depth is None or 1 <= config.depth <= 1000, "depth", "be at least 1 and at most 1000")

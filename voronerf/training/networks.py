@@ -78,8 +78,8 @@ def space_of(config: TrainConfig, scene: Scene) -> tuple[tuple[float, ...], ...]
 def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Fills in the settings that depend on the scene.
 
-    They are the contraction, whether empty space is skipped, rays of a step, samples of a ray, octaves, options of the
-    field, and with ``parameters`` the width and learning rate.
+    They are the contraction, whether empty space is skipped, samples of a ray, octaves, options of the field, and with
+    ``parameters`` the width and learning rate.
 
     Raises:
         ConfigError: When the smallest networks have more parameters than asked for.
@@ -90,8 +90,6 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
         config = replace(config, contraction="sphere" if unbounded else "none")
     if config.occupancy and (scene.box is None or why_no_occupancy(config) is not None):
         config = replace(config, occupancy=False)
-    if config.rays is None:
-        config = replace(config, rays=1024 if config.occupancy else 512)
     if config.samples is None:
         config = replace(config, samples=samples_for(scene) if config.occupancy else 64)
     if config.position_octaves is None and "position_octaves" in kind.options:
@@ -157,9 +155,7 @@ def check_memory(config: TrainConfig) -> None:
     """
     there = _memory(config)
     parts = {
-        f"--rays {config.rays} with {config.samples} samples": SAMPLE_BYTES
-        * int(config.rays or 0)
-        * int(config.samples or 0),
+        f"--rays {config.rays} with {config.samples} samples": SAMPLE_BYTES * config.rays * int(config.samples or 0),
         f"--reservoir {config.reservoir}": 16 * config.reservoir,
     }
     for name, needed in parts.items():

@@ -230,7 +230,7 @@ class Trainer:
             if self.device.type == "cpu" or self.step % READ_EVERY == 0:
                 self._read(loss)
             if self.on_step is not None:
-                speed = self.step * int(self.config.rays or 0) / max(self.seconds, 1e-9)
+                speed = self.step * self.config.rays / max(self.seconds, 1e-9)
                 psnr = self.metrics[-1].get("psnr") if self.metrics else None
                 self.on_step(
                     Progress(self.step, self.seconds, self.fraction, self.loss, speed, self.router.num_cells, psnr)
@@ -308,7 +308,7 @@ class Trainer:
     def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Updates the parameters; returns the loss, and until the last split positions [n, 3] and importance [n]."""
         config = self.config
-        batch = self.batches.draw(int(config.rays or 0), self.draws, random_background=config.background == "random")
+        batch = self.batches.draw(config.rays, self.draws, random_background=config.background == "random")
         half = HALVES.get(config.precision)
         with torch.autocast(self.device.type, half, enabled=half is not None, cache_enabled=False):
             found = self.renderer.compare(
@@ -413,7 +413,7 @@ class Trainer:
             "complete": self.fraction >= 1 and not self.stopped,
             "seconds": self.seconds,
             "steps": self.step,
-            "rays_per_second": self.step * int(self.config.rays or 0) / max(self.seconds, 1e-9),
+            "rays_per_second": self.step * self.config.rays / max(self.seconds, 1e-9),
             "parameters": sum(p.numel() for router in self.routers.values() for p in router.parameters()),
             "cells": self.router.num_cells,
             "splits_left": len(self.plan) - self.level,
