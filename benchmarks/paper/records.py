@@ -66,7 +66,9 @@ def machine_name(made: Mapping[str, Any]) -> str:
 def changed_settings(config: Mapping[str, Any]) -> Row:
     """The settings of a configuration, as in its JSON, that differ from their defaults."""
     usual = json.loads(
-        TrainConfig(field="nerf", occupancy=False, contraction="none", average=0.0, centres="balanced", rays=1024).to_json()
+        TrainConfig(
+            field="nerf", occupancy=False, contraction="none", average=0.0, centres="balanced", rays=1024
+        ).to_json()
     )  # as in every training of the paper
     return {name: value for name, value in config.items() if name not in NOT_TOLD and value != usual.get(name)}
 
