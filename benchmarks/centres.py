@@ -207,13 +207,15 @@ def table(results: list[dict[str, Any]]) -> str:
         where = (row["scene"], row["field"], row["cells"])
         gains.setdefault(where, {}).setdefault(row["placement"], []).append(row["psnr"] - one)
         shapes.setdefault(row["placement"], []).append((row["imbalance"], row["radius_max"]))
-    heads = ["", *(f"{scene}, {field}, {cells} cells" for scene, field, cells in gains), "imbalance", "largest radius"]
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    for placement in (name for name in PLACEMENTS if name in shapes):
-        values = (found.get(placement) for found in gains.values())
+    names = [name for name in PLACEMENTS if name in shapes]
+    lines = [f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    for (scene, field, cells), found in gains.items():
+        values = (found.get(name) for name in names)
         texts = [f"{statistics.mean(v):+.2f} ({min(v):+.2f} to {max(v):+.2f})" if v else "-" for v in values]
-        shape = [f"{statistics.mean(part):.3f}" for part in zip(*shapes[placement])]
-        lines.append(f"| {' | '.join([placement, *texts, *shape])} |")
+        lines.append(f"| {scene}, {field}, {cells} cells | {' | '.join(texts)} |")
+    for i, what in enumerate(("imbalance", "largest radius")):
+        means = (f"{statistics.mean(shape[i] for shape in shapes[name]):.3f}" for name in names)
+        lines.append(f"| {what}, mean of all | {' | '.join(means)} |")
     return "\n".join(lines)
 
 
