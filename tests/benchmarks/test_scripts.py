@@ -186,3 +186,16 @@ def test_the_rival_learns_and_its_encoding_is_the_published_one():
     last = rival.run()
     assert rival.step == last["steps"] == 150 and last["psnr"] > rival.metrics[0]["psnr"] + 1
     assert not rival.occupied.all()
+
+
+def test_tables_of_centres_and_defaults_are_those_of_the_programs():
+    import centres
+    import defaults
+
+    for page, table, names in (
+        ("centres", lambda found: centres.table(found["results"]), ("centres_lego_ship", "centres_builtin_rich")),
+        ("defaults", defaults.table, ("defaults", "defaults_second")),
+    ):
+        text = (BENCHMARKS.parent / "docs" / f"{page}.md").read_text()
+        for name in names:
+            assert f"\n\n{table(read_json(BENCHMARKS / 'results' / f'{name}.json'))}\n\n" in text
