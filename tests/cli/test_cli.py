@@ -245,9 +245,16 @@ def test_signals_leave_a_usable_checkpoint(tmp_path):
     endless = TINY.replace("--steps 16", "--steps 100000 --checkpoint-every 0.2")
     command = [sys.executable, "-m", "voronerf.cli.main", *words("train --data builtin --out", tmp_path, endless)]
     steps = [0]
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+
+    def receive_signals():  # which nohup, and the background of a shell, have a process ignore
+        for number in signals:
+            signal.signal(number, signal.SIG_DFL)
+
+    for number in signals:
         before = last.stat().st_mtime_ns if last.exists() else None
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        process = subprocess.Popen(command, **streams, preexec_fn=receive_signals)
         deadline = time.monotonic() + 600
         while not last.exists() or last.stat().st_mtime_ns == before:
             assert time.monotonic() < deadline and process.poll() is None, process.stdout and process.stdout.read()
