@@ -196,6 +196,8 @@ class Trainer:
             OSError: When a checkpoint cannot be written.
         """
         self.advance()
+        while not self._check_moments():
+            self.advance()
         self.save()
         if self.fraction >= 1:
             self.stopped = False  # a stop that came in the last step has nothing to end
@@ -242,8 +244,6 @@ class Trainer:
                 self.save(wait=False)
         if loss is not None:
             self._read(loss)
-            if not self._check_moments():
-                self.advance(until)
         self.writer.wait()
 
     def _read(self, loss: Tensor) -> None:
