@@ -112,6 +112,18 @@ def check_same_device(op: str, **tensors: Tensor | None) -> None:
             raise ValueError(f"{op}: {name} must be on the device of {first[0]}, {first[1]}, got {tensor.device}")
 
 
+def check_no_inference(op: str, **tensors: Tensor | None) -> None:
+    """Raises TypeError where gradients are recorded and a named tensor was made in ``torch.inference_mode``, which
+    autograd cannot keep."""
+    if not torch.is_grad_enabled() or torch.compiler.is_compiling():
+        return
+    there = [(name, tensor) for name, tensor in tensors.items() if tensor is not None]
+    if any(tensor.requires_grad for _, tensor in there):
+        for name, tensor in there:
+            if tensor.is_inference():
+                raise TypeError(f"{op}: {name} must be a copy where gradients are recorded, got an inference tensor")
+
+
 def check_count(op: str, name: str, count: int) -> None:
     """Raises ValueError when a batch has more rows than an int32 index can number."""
     if count > MAX_COUNT:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads, same
+from helpers import on_any_number_of_threads, refuses, same
 from op_cases import refusals
 from torch import Tensor
 
@@ -175,6 +176,50 @@ def test_errors():
     refuses("weights must be finite, got NaN or infinity", weights=torch.full((5,), torch.nan))
     refuses("centres must have dtype ... or float64, got int64", centres=centres.long())
     refuses("weights must have shape [k] with k = 5, got [4]", weights=weights[:4])
+
+
+def write(tensor, at, value):
+    changed = tensor.clone()
+    changed[at] = value
+    return changed
+
+
+@native
+def test_forged_grids():
+    """They crashed, or their search never ended, where a query trusted them."""
+    torch.manual_seed(0)
+    centres = clustered(120)
+    grid = centre_grid(centres)
+    tables, pickled = grid.tables, pickle.dumps(grid)
+    cell = int((tables.entries >= 0).nonzero()[0])
+    root, place = 8**tables.bits, int(tables.entries[cell])
+    brick = -1 - int(tables.entries[:root].min())
+    assert brick >= root, "has no brick"
+    cases = [
+        ("tables.entries must name the start of a brick", {"entries": write(tables.entries, cell, -2)}),
+        ("tables.entries must name the start of a brick", {"entries": write(tables.entries, cell, -(2**31))}),
+        ("tables.entries must name each brick once", {"entries": write(tables.entries, brick, -1 - brick)}),
+        ("tables.entries must name each brick once", {"entries": write(tables.entries, slice(root), -1 - brick)}),
+        ("tables.entries must be 4096 and bricks", {"entries": tables.entries[:-1]}),
+        ("tables.entries must have dtype int32", {"entries": tables.entries.long()}),
+        ("tables.lists must have a list", {"entries": write(tables.entries, cell, 2**31 - 1)}),
+        ("tables.lists must have a list", {"lists": tables.lists[:place]}),
+        *(("tables.lists must have a list", {"lists": write(tables.lists, place, n)}) for n in (0, -3, 2**31 - 1)),
+        *(("tables.lists must hold centres", {"lists": write(tables.lists, place + 1, n)}) for n in (-1, 120, 2**30)),
+        ("tables.table must have shape [k, 4] with k = 120", {"table": tables.table[:-1]}),
+        ("tables.table must hold the centres", {"table": tables.table + 1}),
+        ("tables.bits must be 4 for 120 centres, got 12", {"bits": 12}),
+        ("tables.frame must have shape [2, 3]", {"frame": tables.frame[:1]}),
+    ]
+    for message, changed in cases:
+        forged = pickle.loads(pickled)
+        object.__setattr__(forged, "tables", tables._replace(**changed))
+        kinds = (ValueError, TypeError)
+        refuses(f"CentreGrid: {message}", CentreGrid, centres, None, forged.tables, error=kinds)
+        refuses(f"CentreGrid: {message}", pickle.loads, pickle.dumps(forged), error=kinds)
+    copy = pickle.loads(pickled)
+    points = points_around(centres)
+    assert torch.equal(nearest_centre(points, centres, grid=copy), nearest_centre(points, centres))
 
 
 @native

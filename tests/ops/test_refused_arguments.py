@@ -75,3 +75,17 @@ def test_the_argument_is_named(error, message, call):
 def test_tensors_that_are_not_dense(kind, make):
     message = f"nearest_centre: points must be a dense tensor, got a {kind} one"
     refuses(message, ops.nearest_centre, make(), POINTS, error=TypeError)
+
+
+def test_inference_tensors(backend):
+    """They are taken unless autograd would have to keep them."""
+    with torch.inference_mode():
+        weight, background = torch.rand(1, 2, 3), torch.ones(3)
+        offsets = torch.tensor([0, 4], dtype=torch.int32)
+        inside = composite(background=background, backend=backend)
+    assert inside.colour.isfinite().all() and composite(background=background).colour.isfinite().all()
+    points = POINTS.clone().requires_grad_()
+    message = "grouped_linear: offsets must be a copy where gradients are recorded, got an inference tensor"
+    refuses(message, ops.grouped_linear, points, offsets, weight.clone(), backend=backend, error=TypeError)
+    with torch.no_grad():
+        ops.grouped_linear(points, offsets, weight, backend=backend)

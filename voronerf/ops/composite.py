@@ -10,6 +10,7 @@ from voronerf.checks import (
     INDEX,
     check_count,
     check_dtype,
+    check_no_inference,
     check_same_device,
     check_same_dtype,
     check_shape,
@@ -87,9 +88,9 @@ def composite(
         check_tensor(_OP, "background", background)
         check_shape(_OP, "background", background, ("c",) if background.dim() == 1 else ("r", "c"), sizes)
     check_same_dtype(_OP, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas, background=background)
-    check_same_device(
-        _OP, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas, ray_offsets=ray_offsets, background=background
-    )
+    tensors = {"sigma": sigma, "rgb": rgb, "depths": depths, "deltas": deltas, "ray_offsets": ray_offsets}
+    check_same_device(_OP, **tensors, background=background)
+    check_no_inference(_OP, **tensors, background=background)
     check_count(_OP, "sigma", sigma.numel())
     run = backends.resolve(_OP, backend=backend, device=sigma.device, dtype=sigma.dtype)
     return Composite(*run(sigma, rgb, depths, deltas, ray_offsets=ray_offsets, background=background))

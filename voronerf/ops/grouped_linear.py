@@ -12,6 +12,7 @@ from voronerf.checks import (
     check_choice,
     check_count,
     check_dtype,
+    check_no_inference,
     check_same_device,
     check_same_dtype,
     check_shape,
@@ -77,6 +78,7 @@ def grouped_linear(
         check_shape(_OP, "bias", bias, ("k", "o"), sizes)
         check_dtype(_OP, "bias", bias)
     check_same_device(_OP, x=x, offsets=offsets, weight=weight, bias=bias)
+    check_no_inference(_OP, x=x, offsets=offsets, weight=weight, bias=bias)
     check_count(_OP, "x", sizes["n"])
     check_choice(_OP, "activation", activation, ACTIVATIONS)
     if min(sizes["k"], sizes["o"], sizes["i"]) < 1:

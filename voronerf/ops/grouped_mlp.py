@@ -8,7 +8,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
+from voronerf.checks import INDEX, check_count, check_dtype, check_no_inference, check_same_device, check_shape
 from voronerf.layers import MLP
 from voronerf.ops.network import check_network
 
@@ -83,16 +83,17 @@ def grouped_mlp(
     if sizes["k"] < 1:
         raise ValueError(f"{_OP}: offsets must have at least two entries, got [{sizes['k'] + 1}]")
     check_network(_OP, weights, biases, layers, directions, direction_index, features, sizes)
-    check_same_device(
-        _OP,
-        positions=positions,
-        offsets=offsets,
-        directions=directions,
-        direction_index=direction_index,
-        features=features,
+    tensors = {
+        "positions": positions,
+        "offsets": offsets,
+        "directions": directions,
+        "direction_index": direction_index,
+        "features": features,
         **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
         **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
-    )
+    }
+    check_same_device(_OP, **tensors)
+    check_no_inference(_OP, **tensors)
     check_count(_OP, "positions", sizes["n"])
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=weights[0].dtype)
     out: Tensor = run(

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_shape
+from voronerf.checks import INDEX, check_count, check_dtype, check_no_inference, check_same_device, check_shape
 from voronerf.grids import HashGrid
 
 _OP = backends.declare(
@@ -66,6 +66,7 @@ def hash_encode(
         check_shape(_OP, "cells", cells, ("n",), sizes)
         check_dtype(_OP, "cells", cells, INDEX)
     check_same_device(_OP, positions=positions, table=table, cells=cells)
+    check_no_inference(_OP, positions=positions, table=table, cells=cells)
     dtype = torch.promote_types(positions.dtype, table.dtype)
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=dtype)
     encoded: Tensor = run(positions, table, grid, cells=cells)

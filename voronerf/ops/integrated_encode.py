@@ -6,7 +6,15 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_same_dtype, check_shape
+from voronerf.checks import (
+    check_count,
+    check_dtype,
+    check_integer,
+    check_no_inference,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+)
 
 _OP = backends.declare(
     "integrated_encode",
@@ -51,6 +59,7 @@ def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend
     check_dtype(_OP, "means", means)
     check_same_dtype(_OP, means=means, variances=variances)
     check_same_device(_OP, means=means, variances=variances)
+    check_no_inference(_OP, means=means, variances=variances)
     check_integer(_OP, "octaves", octaves, 0, 127)  # 2^128 is beyond float32
     check_count(_OP, "means", sizes["n"])
     run = backends.resolve(_OP, backend=backend, device=means.device, dtype=means.dtype)

@@ -7,7 +7,16 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import FLOATS, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_number, check_same_device, check_shape, check_tensor
+from voronerf.checks import (
+    INDEX,
+    check_count,
+    check_dtype,
+    check_no_inference,
+    check_number,
+    check_same_device,
+    check_shape,
+    check_tensor,
+)
 from voronerf.reference.render_loss import RenderLoss
 
 _OP = backends.declare("render_loss", native=Implementation(("cpu",), FLOATS))
@@ -77,6 +86,7 @@ def render_loss(
         check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
         check_dtype(_OP, "background", background, wide)
     check_same_device(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
+    check_no_inference(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
     check_count(_OP, "raw", raw.numel())
     check_number(_OP, "density_scale", density_scale)
     if not density_scale > 0:

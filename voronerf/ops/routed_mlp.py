@@ -11,7 +11,15 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
+from voronerf.checks import (
+    INDEX,
+    check_count,
+    check_dtype,
+    check_integer,
+    check_no_inference,
+    check_same_device,
+    check_shape,
+)
 from voronerf.compiler import constant_result
 from voronerf.layers import MLP
 from voronerf.ops.network import check_network
@@ -109,21 +117,22 @@ def routed_mlp(
         check_dtype(_OP, "coords", coords)
     elif centres is not None and sizes["p"] < 3:
         raise ValueError(f"{_OP}: coords must be given for positions of less than 3 features, got {sizes['p']}")
-    check_same_device(
-        _OP,
-        positions=positions,
-        coords=coords,
-        centres=centres,
-        child_offsets=child_offsets,
-        child=child,
-        centre_weights=centre_weights,
-        cells=cells,
-        directions=directions,
-        direction_index=direction_index,
-        features=features,
+    tensors = {
+        "positions": positions,
+        "coords": coords,
+        "centres": centres,
+        "child_offsets": child_offsets,
+        "child": child,
+        "centre_weights": centre_weights,
+        "cells": cells,
+        "directions": directions,
+        "direction_index": direction_index,
+        "features": features,
         **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
         **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
-    )
+    }
+    check_same_device(_OP, **tensors)
+    check_no_inference(_OP, **tensors)
     if centres is not None:
         points = positions[:, :3] if coords is None else coords
         coords, centres, centre_weights = _one_dtype(points, centres, centre_weights)
