@@ -27,6 +27,7 @@ def _camera_rays_kernel(
     several: wp.bool,
     distortion: wp.array2d(dtype=wp.float32),
     distorted: wp.bool,
+    fisheye: wp.bool,
     origins: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.float32),
 ) -> None:
@@ -36,31 +37,59 @@ def _camera_rays_kernel(
         c = wp.clamp(camera[i], 0, poses.shape[0] - 1)
     u = (wp.float64(x[i]) - wp.float64(intrinsics[c, 2])) / wp.float64(intrinsics[c, 0])
     v = (wp.float64(y[i]) - wp.float64(intrinsics[c, 3])) / wp.float64(intrinsics[c, 1])
+    ahead = wp.float64(1.0)
     if distorted:
         k1 = wp.float64(distortion[c, 0])
         k2 = wp.float64(distortion[c, 1])
         p1 = wp.float64(distortion[c, 2])
         p2 = wp.float64(distortion[c, 3])
+        k3 = wp.float64(distortion[c, 4])
+        k4 = wp.float64(distortion[c, 5])
+        k5 = wp.float64(distortion[c, 6])
+        k6 = wp.float64(distortion[c, 7])
+        s1 = wp.float64(0.0)
+        s2 = wp.float64(0.0)
+        if fisheye:
+            s1 = k5
+            s2 = k6
         one = wp.float64(1.0)
         two = wp.float64(2.0)
+        three = wp.float64(3.0)
+        four = wp.float64(4.0)
         six = wp.float64(6.0)
         a = u
         b = v
         for _ in range(_STEPS):
             r2 = a * a + b * b
-            radial = one + r2 * (k1 + r2 * k2)
-            slope = two * k1 + two * two * k2 * r2
-            du = a * radial + two * p1 * a * b + p2 * (r2 + two * a * a) - u
-            dv = b * radial + p1 * (r2 + two * b * b) + two * p2 * a * b - v
-            aa = radial + a * a * slope + two * p1 * b + six * p2 * a
-            ab = a * b * slope + two * p1 * a + two * p2 * b
-            bb = radial + b * b * slope + six * p1 * b + two * p2 * a
-            determinant = aa * bb - ab * ab
+            radial = one
+            slope = one
+            if fisheye:
+                radial = one + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+                slope = two * (k1 + r2 * (two * k2 + r2 * (three * k3 + r2 * four * k4)))
+            else:
+                below = one + r2 * (k4 + r2 * (k5 + r2 * k6))
+                radial = (one + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+                fall = radial * (k4 + r2 * (two * k5 + r2 * three * k6))
+                slope = two * (k1 + r2 * (two * k2 + r2 * three * k3) - fall) / below
+            du = a * radial + two * p1 * a * b + p2 * (r2 + two * a * a) + s1 * r2 - u
+            dv = b * radial + p1 * (r2 + two * b * b) + two * p2 * a * b + s2 * r2 - v
+            shared = a * b * slope + two * p1 * a + two * p2 * b
+            aa = radial + a * a * slope + two * p1 * b + six * p2 * a + two * s1 * a
+            ab = shared + two * s1 * b
+            ba = shared + two * s2 * a
+            bb = radial + b * b * slope + six * p1 * b + two * p2 * a + two * s2 * b
+            determinant = aa * bb - ab * ba
             a = a - (bb * du - ab * dv) / determinant
-            b = b - (aa * dv - ab * du) / determinant
+            b = b - (aa * dv - ba * du) / determinant
         u = a
         v = b
-    along = wp.vec3(wp.float32(u), -wp.float32(v), -1.0)
+        if fisheye:
+            angle = wp.sqrt(u * u + v * v)
+            if angle > wp.float64(0.0):
+                u = u * wp.sin(angle) / angle
+                v = v * wp.sin(angle) / angle
+            ahead = wp.cos(angle)
+    along = wp.vec3(wp.float32(u), -wp.float32(v), -wp.float32(ahead))
     direction = wp.vec3(0.0, 0.0, 0.0)
     for axis in range(3):
         direction[axis] = poses[c, axis, 0] * along[0] + poses[c, axis, 1] * along[1] + poses[c, axis, 2] * along[2]
@@ -71,21 +100,34 @@ def _camera_rays_kernel(
 
 
 def camera_rays(
-    poses: Tensor, intrinsics: Tensor, x: Tensor, y: Tensor, *, camera: Tensor | None, distortion: Tensor | None
+    poses: Tensor,
+    intrinsics: Tensor,
+    x: Tensor,
+    y: Tensor,
+    *,
+    camera: Tensor | None,
+    distortion: Tensor | None,
+    fisheye: bool,
 ) -> tuple[Tensor, Tensor]:
     """Origins and unit directions; see ``voronerf.ops.camera_rays``."""
-    origins, directions = _camera_rays(poses, intrinsics, x, y, camera, distortion)
+    origins, directions = _camera_rays(poses, intrinsics, x, y, camera, distortion, fisheye)
     return origins, directions
 
 
 @torch.library.custom_op("voronerf::camera_rays_warp", mutates_args=())
 def _camera_rays(
-    poses: Tensor, intrinsics: Tensor, x: Tensor, y: Tensor, camera: Tensor | None, distortion: Tensor | None
+    poses: Tensor,
+    intrinsics: Tensor,
+    x: Tensor,
+    y: Tensor,
+    camera: Tensor | None,
+    distortion: Tensor | None,
+    fisheye: bool,
 ) -> tuple[Tensor, Tensor]:
     results = _allocate(poses, x)
     given = [array(tensor, poses) for tensor in (poses, intrinsics, x, y)]
-    lens = array(intrinsics[:0] if distortion is None else distortion, poses)
-    choice = [array(camera, poses, torch.int32), camera is not None, lens, distortion is not None]
+    lens = array(intrinsics.new_empty(0, 8) if distortion is None else distortion, poses)
+    choice = [array(camera, poses, torch.int32), camera is not None, lens, distortion is not None, fisheye]
     inputs = [*given, *choice, *(array(tensor, poses) for tensor in results)]
     launch(_camera_rays_kernel, x.shape[0], inputs, poses)
     return results
@@ -93,7 +135,13 @@ def _camera_rays(
 
 @_camera_rays.register_fake
 def _(
-    poses: Tensor, intrinsics: Tensor, x: Tensor, y: Tensor, camera: Tensor | None, distortion: Tensor | None
+    poses: Tensor,
+    intrinsics: Tensor,
+    x: Tensor,
+    y: Tensor,
+    camera: Tensor | None,
+    distortion: Tensor | None,
+    fisheye: bool,
 ) -> tuple[Tensor, Tensor]:
     return _allocate(poses, x)
 

@@ -90,8 +90,7 @@ class Run:
         if weights is None:
             check_stored_paths(self.path, lpips=self.config.lpips)
         weights = self.config.lpips if weights is None else Path(weights)
-        cameras = self.scene.test.cameras
-        return find_lpips(weights, self.config.data, (cameras.height, cameras.width))
+        return find_lpips(weights, self.config.data, self.scene.test.cameras.smallest[::-1])
 
     def evaluate(self, *, views: int | None = None, lpips: Lpips | Path | str | None = None) -> dict[str, Any]:
         """Scores of the test views, and their means.
@@ -188,7 +187,7 @@ def open_run(
         data=config.data if data is None else data,
         downscale=config.downscale if downscale is None else downscale,
     )
-    scene = load_scene(config.data, downscale=config.downscale, allow_outside=allow_outside) if scene is None else scene
+    scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     state = checkpoint.group("occupancy")
     if state:

@@ -9,7 +9,8 @@ namespace voronerf {
 struct PixelRaysInputs {
   const float* poses;       // [c,4,4], camera to world
   const float* intrinsics;  // [c,4]: fx, fy, cx, cy
-  const float* distortion;  // [c,4]: k1, k2, p1, p2; or null
+  const float* distortion;  // [c,8], voronerf/reference/camera_rays.py; or null
+  bool fisheye;
   const uint8_t* images;    // [c,h,w,channels]
   const int64_t* pixels;    // [b], numbered through all images
   const float* box;         // [2,3], or null for all of space

@@ -60,7 +60,7 @@ def test_downscale(tmp_path):
         fails("builtin", f"downscale must be >= 1, got {downscale}", downscale=downscale)
     fails("builtin", "leaves no pixel of 100 x 100", downscale=101)
     write_noise(tmp_path)
-    fails(tmp_path, "1.png", "downscaling by 7 leaves no pixel of 8 x 6", downscale=7)
+    fails(tmp_path, "0.png", "downscaling by 7 leaves no pixel of 8 x 6", downscale=7)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,6 @@ def test_downscale(tmp_path):
         ('{"frames": [{"file_path": 3}]}', "frame 0 has no file_path"),
         ('{"frames": [{"file_path": "a\\u0000"}]}', "frame 0 has no file_path"),
         ('{"frames": [{"file_path": "x.png"}]}', "frame 0 (x.png): transform_matrix"),
-        ('{"frames": [{"file_path": "x.png", "mask_path": "y.png"}]}', "frame 0 (x.png): mask_path is not supported"),
         ("[" * 100_000, "is not JSON: it is nested too deeply"),
     ],
 )
@@ -143,8 +142,6 @@ def test_images(tmp_path):
     ):
         path.write_bytes(broken)
         fails(tmp_path, f"2.png: {reason}")
-    Image.fromarray(np.zeros((5, 8, 3), dtype=np.uint8)).save(path)
-    fails(tmp_path, "2.png: is 8 x 5 pixels", "1.png is 8 x 6", "same size")
     for colour in (0, 2, 4, 6):  # grey, RGB, and both with alpha
         path.write_bytes(deep_png(8, 6, colour))
         fails(tmp_path, "2.png: has more than 8 bits a channel")
@@ -170,9 +167,9 @@ def test_images(tmp_path):
         ({"fl_x": None, "camera_angle_x": 3.5}, "camera_angle_x must be an angle between 0 and pi, got 3.5"),
         ({"w": 16}, "says w = 16"),
         ({"h": 8}, "says h = 8"),
-        ({"k3": 0.1}, "lens distortion k3 is not supported, only k1, k2, p1, p2"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera model OPENCV_FISHEYE is not supported"),
-        ({"is_fisheye": True}, "camera model fisheye is not supported"),
+        ({"k4": 0.1}, "lens distortion k4 is not supported, only k1, k2, k3, p1, p2"),
+        ({"is_fisheye": True, "p1": 0.1}, "lens distortion p1 is not supported, only k1, k2, k3, k4 of a fisheye"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera model EQUIRECTANGULAR is not supported"),
         ({"k1": -5.0}, "cannot be inverted inside the image"),
         ({"k1": math.inf}, "k1 must be a finite number up to 1e+09, got inf"),
         ({"k1": 10**400}, "k1 must be a finite number up to 1e+09, got 1000"),
@@ -185,8 +182,8 @@ def test_images(tmp_path):
             {"distortion_params": [0.1, 0, 0, 0]},
             "distortion_params must be six numbers, k1, k2, k3, k4, p1, p2, got [0.1",
         ),
-        ({"distortion_params": [0, 0, 0.1, 0, 0, 0]}, "lens distortion k3 is not supported"),
-        ({"distortion_params": ["0"] * 6}, "k3 must be a finite number up to 1e+09, got '0'"),
+        ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, "lens distortion k4 is not supported"),
+        ({"distortion_params": ["0"] * 6}, "k4 must be a finite number up to 1e+09, got '0'"),
         ({"test_filenames": "0.png"}, "test_filenames must be a list of file names, got '0.png'"),
         ({"test_filenames": ["9.png"]}, "test_filenames has 9.png, which is no file_path of a frame"),
         ({"train_filenames": ["0.png"], "test_filenames": ["./0.png"]}, "must differ, both have 0.png"),

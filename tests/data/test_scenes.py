@@ -12,7 +12,7 @@ from PIL import Image
 from scene_files import rewrite, write_blender, write_capture
 
 from voronerf.data import builtin_scene, load_scene
-from voronerf.data.capture import normalise_poses
+from voronerf.data.photographs import find_frame
 from voronerf.rendering.cameras import Cameras, focus_point, orbit_cameras
 from voronerf.rendering.volume import render_rays
 
@@ -134,7 +134,7 @@ def test_capture(tmp_path, caplog):
     cameras = scene.train.cameras
     torch.testing.assert_close(cameras.intrinsics[0], torch.tensor((20.0, 20.0, 5.5, 6.5)))
     assert cameras.distortion is not None
-    torch.testing.assert_close(cameras.distortion[0], torch.tensor((0.02, 0, 0, -0.001)))
+    torch.testing.assert_close(cameras.distortion[0], torch.tensor((0.02, 0, 0, -0.001, 0, 0, 0, 0)))
     torch.testing.assert_close(cameras.origins.norm(dim=-1), torch.ones(15), atol=1e-4, rtol=0)
     # neighbours of the orbit stay 18 degrees apart: the turn is rigid
     by_name = dict(zip(scene.train.names, cameras.forward))
@@ -241,10 +241,13 @@ def test_distortion_params_are_those_of_nerfstudio(tmp_path):
     for folder, lens in (
         ("named", {"k1": 0.02, "k2": -0.01, "p1": 0.001, "p2": 0.002}),
         ("listed", {"k1": 9, "distortion_params": [0.02, -0.01, 0, 0, 0.001, 0.002]}),
+        ("fisheye", {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": -0.2, "k3": 0.03, "k4": -0.04}),
     ):
         write_capture(tmp_path / folder, orbit_cameras(3, radius=2, elevation=5, width=8, height=8, focal=8), **lens)
-    named, listed = (load_scene(tmp_path / folder).train.cameras.distortion for folder in ("named", "listed"))
-    assert named is not None and torch.equal(named, listed)
+    named, listed, fisheye = (load_scene(tmp_path / name).train.cameras for name in ("named", "listed", "fisheye"))
+    assert named.distortion is not None and torch.equal(named.distortion, listed.distortion) and not named.fisheye
+    assert fisheye.fisheye
+    torch.testing.assert_close(fisheye.distortion[0], torch.tensor((0.1, -0.2, 0, 0, 0.03, -0.04, 0, 0)))
 
 
 def test_capture_with_alpha_is_an_object_on_white(tmp_path):
@@ -263,7 +266,7 @@ def test_normalise_poses():
     poses = orbit_cameras(9, radius=6, elevation=30, width=1, height=1, focal=1, centre=(1, 2, 3)).poses.double()
     moved = poses.clone()
     moved[:, :3] = turn @ moved[:, :3]
-    result = normalise_poses(moved)
+    result = find_frame(moved, "unbounded").poses(moved)
     cameras = Cameras(result.float(), torch.ones(9, 4), 1, 1)
     focus = focus_point(cameras)
     assert focus is not None and float(focus.abs().max()) < 1e-3
@@ -275,10 +278,10 @@ def test_normalise_poses():
 
 def test_normalise_degenerate_poses():
     one_place = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-    assert normalise_poses(one_place).isfinite().all()
+    assert find_frame(one_place, "unbounded").poses(one_place).isfinite().all()
     row = one_place.clone()
     row[:, 0, 3] = torch.arange(3)
-    assert float(normalise_poses(row)[:, :3, 3].norm(dim=-1).max()) == pytest.approx(1)
+    assert float(find_frame(row, "unbounded").poses(row)[:, :3, 3].norm(dim=-1).max()) == pytest.approx(1)
 
 
 @pytest.mark.data

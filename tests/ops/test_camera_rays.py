@@ -7,28 +7,30 @@ from op_cases import refusals, strided
 from voronerf.ops import camera_rays
 from voronerf.rendering.cameras import Cameras, look_at
 
+LENS = torch.tensor([0.05, 0.02, 0.005, 0.005, 0.01, 0.01, 0.005, 0.005])
 pytestmark = pytest.mark.op("camera_rays")
 
 
-def cameras(count, distorted):
+def cameras(count, lens):
     poses = look_at(torch.randn(count, 3) * 3, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     intrinsics = torch.tensor([[80.0, 75.0, 31.0, 25.0]]) + torch.rand(count, 4)
-    lens = torch.randn(count, 4) * torch.tensor([0.05, 0.02, 0.005, 0.005]) if distorted else None
-    return Cameras(poses, intrinsics, 64, 48, lens)
+    bent = None if lens is None else torch.randn(count, 8) * LENS
+    return Cameras(poses, intrinsics, 64, 48, bent, lens == "fisheye")
 
 
-@pytest.mark.parametrize("distorted", [False, True])
+@pytest.mark.parametrize("lens", [None, "bent", "fisheye"])
 @pytest.mark.parametrize("b", [0, 1, 300])
-def test_rays_pass_through_their_pixels(device, backend, b, distorted):
-    some = cameras(3, distorted)
+def test_rays_pass_through_their_pixels(device, backend, b, lens):
+    some = cameras(3, lens)
     camera = torch.randint(0, 3, (b,), dtype=torch.int32)
     x, y = 64 * torch.rand(b), 48 * torch.rand(b)
 
     def run(given, index):
         tensors = (strided(tensor.to(device)) for tensor in (given.poses, given.intrinsics, x, y))
-        lens = None if given.distortion is None else strided(given.distortion.to(device))
+        bent = None if given.distortion is None else strided(given.distortion.to(device))
         which = None if index is None else strided(index.to(device))
-        return [part.cpu() for part in camera_rays(*tensors, camera=which, distortion=lens, backend=backend)]
+        options = {"camera": which, "distortion": bent, "fisheye": given.fisheye, "backend": backend}
+        return [part.cpu() for part in camera_rays(*tensors, **options)]
 
     origins, directions = run(some, camera)
     assert origins.shape == directions.shape == (b, 3)
@@ -45,11 +47,12 @@ def test_rays_pass_through_their_pixels(device, backend, b, distorted):
 
 
 def test_refuses_what_makes_no_sense():
-    some, x = cameras(2, True), torch.rand(5)
+    some, x = cameras(2, "bent"), torch.rand(5)
     refuses = refusals(camera_rays, poses=some.poses, intrinsics=some.intrinsics, x=x, y=x)
     refuses("poses must have shape [c, 4, 4], got [2, 3, 4]", poses=some.poses[:, :3])
     refuses("y must have shape [b] with b = 5, got [4]", y=x[1:])
     refuses("camera must have dtype int32, got int64", camera=torch.zeros(5, dtype=torch.int64))
-    refuses("distortion must have shape [c, 4] with c = 2, got [1, 4]", distortion=torch.zeros(1, 4))
+    refuses("distortion must have shape [c, 8] with c = 2, got [1, 8]", distortion=torch.zeros(1, 8))
+    refuses("distortion must be given with fisheye, got None", fisheye=True)
     refuses("poses must have dtype float32, got float64", poses=some.poses.double())
     refuses("poses must hold at least one camera, got none", poses=some.poses[:0], intrinsics=some.intrinsics[:0])

@@ -10,23 +10,24 @@ from voronerf.rendering.cameras import Cameras, look_at
 
 pytestmark = pytest.mark.op("pixel_rays")
 HEIGHT, WIDTH = 12, 17
+LENS = torch.tensor([0.05, 0.02, 0.005, 0.005, 0.01, 0.01, 0.005, 0.005])
 BOX = torch.tensor([[-1.0, -0.8, -0.5], [0.9, 1.0, 0.7]])
 
 
-def scene(channels, distorted):
+def scene(channels, lens):
     poses = look_at(3 * torch.nn.functional.normalize(torch.randn(4, 3), dim=1), torch.zeros(3), torch.eye(3)[2])
     intrinsics = torch.tensor([[15.0, 16.0, 8.2, 6.1]]) + torch.rand(4, 4)
-    lens = torch.randn(4, 4) * torch.tensor([0.05, 0.02, 0.005, 0.005]) if distorted else None
+    bent = None if lens is None else torch.randn(4, 8) * LENS
     images = torch.randint(0, 256, (4, HEIGHT, WIDTH, channels), dtype=torch.uint8)
-    return Cameras(poses, intrinsics, WIDTH, HEIGHT, lens), images
+    return Cameras(poses, intrinsics, WIDTH, HEIGHT, bent, lens == "fisheye"), images
 
 
 @pytest.mark.parametrize("channels", [3, 4])
 @pytest.mark.parametrize("b", [0, 1, 63, 300])
 @pytest.mark.parametrize("background", [None, "one", "per ray"])
-@pytest.mark.parametrize(("distorted", "boxed"), [(False, True), (True, True), (True, False)])
-def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, channels, b, background, distorted, boxed):
-    cameras, images = scene(channels, distorted)
+@pytest.mark.parametrize(("lens", "boxed"), [(None, True), ("fisheye", True), ("bent", False)])
+def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, channels, b, background, lens, boxed):
+    cameras, images = scene(channels, lens)
     index = torch.randint(0, images[..., 0].numel(), (b,))
     behind = {None: None, "one": torch.rand(3), "per ray": torch.rand(b, 3)}[background]
     box = BOX if boxed else None
@@ -40,6 +41,7 @@ def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, chan
         far=4.0,
         box=on(box),
         distortion=on(cameras.distortion),
+        fisheye=cameras.fisheye,
         background=on(behind),
         backend=backend,
     )
@@ -67,7 +69,7 @@ def test_rays_along_an_axis_are_in_a_slab_or_not(device, backend):
 
 
 def test_refuses_what_makes_no_sense():
-    cameras, images = scene(4, True)
+    cameras, images = scene(4, "bent")
     index = torch.tensor([3, 0, 5])
     good = {"poses": cameras.poses, "intrinsics": cameras.intrinsics, "images": images, "index": index}
     last = images[..., 0].numel() - 1
@@ -84,5 +86,6 @@ def test_refuses_what_makes_no_sense():
     refuses("index must have dtype int64, got int32", index=index.int())
     refuses("box must have shape [2, 3], got [3, 2]", box=BOX.T)
     refuses("background must have shape [b, 3] with b = 3, got [2, 3]", background=torch.rand(2, 3))
-    refuses("distortion must have shape [c, 4] with c = 4, got [1, 4]", distortion=torch.zeros(1, 4))
+    refuses("distortion must have shape [c, 8] with c = 4, got [1, 8]", distortion=torch.zeros(1, 8))
+    refuses("distortion must be given with fisheye, got None", fisheye=True)
     refuses("near and far must satisfy 0 <= near < far, got 1.0 and 1.0", near=1.0)

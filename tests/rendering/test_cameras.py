@@ -17,8 +17,8 @@ from voronerf.rendering.cameras import (
     undistort,
 )
 
-FOX = (0.0578421, -0.0805099, -0.000980296, 0.00015575)
-STRONG = (-0.28, 0.09, 0.001, -0.002)
+FOX = (0.0578421, -0.0805099, -0.000980296, 0.00015575, 0, 0, 0, 0)
+STRONG = (-0.28, 0.09, 0.001, -0.002, 0, 0, 0, 0)
 
 
 def cameras(count=3, distortion=None):
@@ -71,7 +71,7 @@ def test_points_behind_have_negative_depth():
     torch.testing.assert_close(depth, torch.tensor([-2.0]), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("coefficients", [FOX, STRONG, (0.0, 0.0, 0.01, -0.02)])
+@pytest.mark.parametrize("coefficients", [FOX, STRONG, (0.0, 0.0, 0.01, -0.02, 0, 0, 0, 0)])
 def test_undistort_to_a_millionth_of_a_pixel(coefficients):
     focal = 1375.0
     sides = (torch.linspace(-end, end, 41, dtype=torch.float64) for end in (0.4, 0.7))
@@ -92,7 +92,7 @@ def test_distort_follows_opencv():
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
     )
-    found = distort(torch.tensor(x), torch.tensor(y), torch.tensor((k1, k2, p1, p2)))
+    found = distort(torch.tensor(x), torch.tensor(y), torch.tensor((k1, k2, p1, p2, 0, 0, 0, 0)))
     assert [float(value) for value in found] == pytest.approx(expected, abs=1e-6)
 
 
@@ -126,7 +126,7 @@ def test_indexing_and_no_rays():
     [
         ((2, 3, 4), (2, 4), None, 1, "poses must have shape [c, 4, 4], got [2, 3, 4]"),
         ((2, 4, 4), (1, 4), None, 1, "intrinsics must have shape [2, 4], got [1, 4]"),
-        ((2, 4, 4), (2, 4), (2, 5), 1, "distortion must have shape [2, 4], got [2, 5]"),
+        ((2, 4, 4), (2, 4), (2, 5), 1, "distortion must have shape [2, 8], got [2, 5]"),
         ((2, 4, 4), (2, 4), None, 0, "width and height must be >= 1, got 0 x 1"),
     ],
 )

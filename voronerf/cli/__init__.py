@@ -1,4 +1,4 @@
-"""The command line: ``voronerf train | eval | render | info | preload | demo``."""
+"""The command line: ``voronerf train | eval | render | info | preload | demo | process``."""
 
 from voronerf.cli.main import main
 

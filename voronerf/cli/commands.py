@@ -1,4 +1,4 @@
-"""The commands behind ``voronerf train | eval | render | info | preload``. Each returns the process's exit status."""
+"""The commands behind ``voronerf train | eval | render | info | preload | process``. Each returns the exit status."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from rich.table import Table
 from voronerf import backends
 from voronerf.cli.display import TrainingDisplay, printable
 from voronerf.data import Scene, load_scene
+from voronerf.data.process import process as make_scene
 from voronerf.evaluation.panels import write_panels
 from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
@@ -49,7 +50,7 @@ def train(config: TrainConfig) -> int:
     With --resume, options that are not given keep their value from the run in --out.
     """
     check_device(config.device)
-    scene = load_scene(config.data, downscale=config.downscale, allow_outside=config.allow_outside)
+    scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
     chosen = choose_directory(config, scene)
     assert chosen.out is not None
     try:
@@ -77,6 +78,8 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
 
 def _train_and_draw(config: TrainConfig, out: Path, scene: Scene) -> dict[str, Any]:
     with TrainingDisplay(console, scene.name) as display:
+        for note in scene.notes:
+            display.on_event(f"{scene.name}: {note}")
         trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
         if trainer.lpips is None:
             display.on_event(trainer.lpips_source)
@@ -286,6 +289,20 @@ def preload(device: str = "cpu") -> int:
     console.print(table)
     cache = kernels.describe()["cache"]
     say(f"{len(seconds)} files in {sum(seconds.values()):.1f} s, kept in {cache}")
+    return 0
+
+
+def process(source: Path, out: Path, /, frames: int = 150, fisheye: bool = False) -> int:
+    """Make a scene of a video or of images: COLMAP finds the cameras, by pycolmap or by its program.
+
+    Args:
+        source: A video, or a folder of PNG or JPEG images.
+        out: The folder to make; it gets images and sparse/0.
+        frames: Frames taken of a video, evenly spread.
+        fisheye: The lens is a fisheye.
+    """
+    check_counts(frames=frames)
+    make_scene(source, out, frames=frames, fisheye=fisheye, say=say)
     return 0
 
 

@@ -39,6 +39,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "info": commands.info,
     "preload": commands.preload,
     "demo": demo.demo,
+    "process": commands.process,
 }
 
 

@@ -1,29 +1,54 @@
-"""Scenes: loaders of Blender synthetic scenes and of real captures, and three scenes computed from formulas."""
+"""Scenes: loaders of Blender synthetic scenes and of photographs, and three scenes computed from formulas."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from voronerf.data.blender import load_blender
 from voronerf.data.builtin import builtin_scene, rich_scene, translucent_scene
 from voronerf.data.capture import load_capture
-from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.colmap import find_model, load_colmap
+from voronerf.data.llff import FILE, load_llff
+from voronerf.data.photographs import Reading
+from voronerf.data.scene import KINDS, Scene, SceneError, Split
 
 __all__ = ["Scene", "SceneError", "Split", "builtin_scene", "load_scene", "rich_scene", "translucent_scene"]
 
 BUILTIN_SIZE = 100
 BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene, "builtin-translucent": translucent_scene}
+#: In the order in which a folder is tried, with what shows each.
+FORMATS = {
+    "blender": "transforms_train.json",
+    "transforms": "transforms.json",
+    "colmap": "a COLMAP model in sparse/0",
+    "llff": FILE,
+}
 
 
-def load_scene(source: str | Path, *, downscale: int = 1, allow_outside: bool = False) -> Scene:
+def load_scene(
+    source: str | Path,
+    *,
+    downscale: int = 1,
+    allow_outside: bool = False,
+    format: str = "auto",
+    kind: str = "auto",
+    normalise: bool = True,
+) -> Scene:
     """Loads a scene.
 
     Args:
         source: "builtin", "builtin-rich" or "builtin-translucent", or a folder with `transforms_train.json` (Blender
-            synthetic) or `transforms.json` (capture).
+            synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, or LLFF's
+            `poses_bounds.npy`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
             or a link.
+        format: of a folder: "blender", "transforms", "colmap" or "llff"; "auto" is the first of them that it holds.
+        kind: of photographs: "object" (on white), "forward" (the cameras look the same way), "inside-out" or
+            "unbounded"; "auto" tells it by transparent pixels and by the cameras.
+        normalise: move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera
+            at distance 1; else the coordinates of the files are kept.
 
     Raises:
         SceneError: the data cannot be used; one line that names the file and what is wrong with it.
@@ -36,6 +61,9 @@ def load_scene(source: str | Path, *, downscale: int = 1, allow_outside: bool = 
     """
     if downscale < 1:
         raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")
+    for name, given, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
+        if given != "auto" and given not in known:
+            raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {given!r:.60}")
     if str(source) in BUILTIN:
         if downscale > BUILTIN_SIZE:
             raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
@@ -43,10 +71,24 @@ def load_scene(source: str | Path, *, downscale: int = 1, allow_outside: bool = 
     folder = Path(source)
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")
-    if (folder / "transforms_train.json").is_file():
-        return load_blender(folder, downscale, allow_outside)
-    if (folder / "transforms.json").is_file():
-        return load_capture(folder, downscale, allow_outside)
     if not folder.is_dir():
         raise SceneError(f"{folder}: is not a folder")
-    raise SceneError(f"{folder}: is not a scene, it has neither transforms_train.json (Blender) nor transforms.json")
+    there = {
+        "blender": (folder / FORMATS["blender"]).is_file(),
+        "transforms": (folder / FORMATS["transforms"]).is_file(),
+        "colmap": find_model(folder) is not None,
+        "llff": (folder / FORMATS["llff"]).is_file(),
+    }
+    held = [name for name in FORMATS if there[name]]
+    if not held:
+        raise SceneError(f"{folder}: is not a scene, it has none of {', '.join(FORMATS.values())}")
+    if format != "auto" and format not in held:
+        raise SceneError(f"{folder}: format must be {' or '.join(held)}, which it has, got {format}")
+    chosen = held[0] if format == "auto" else format
+    reading = Reading(downscale, allow_outside, kind, normalise)
+    others = tuple(f"--format {name} would read {FORMATS[name]}" for name in held if name != chosen)
+    scene = LOADERS[chosen](folder, reading)
+    return replace(scene, notes=(*scene.notes, *others))
+
+
+LOADERS = {"blender": load_blender, "transforms": load_capture, "colmap": load_colmap, "llff": load_llff}

@@ -14,6 +14,7 @@ import torch
 from voronerf.data.capture import Listed, capture_scene, has_lens
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images
+from voronerf.data.photographs import Reading
 from voronerf.data.scene import Scene, SceneError, Split
 from voronerf.data.transforms import Frame, distinct_names, focal_length, number, read_transforms
 from voronerf.rendering.cameras import Cameras
@@ -23,7 +24,7 @@ log = logging.getLogger(__name__)
 NEAR, FAR = 2.0, 6.0
 
 
-def load_blender(folder: Path, downscale: int, allow_outside: bool = False) -> Scene:
+def load_blender(folder: Path, reading: Reading) -> Scene:
     """Loads a Blender synthetic scene.
 
     The test views are those of `transforms_test.json`, or of `transforms_val.json` if the former is missing. Entries
@@ -32,8 +33,7 @@ def load_blender(folder: Path, downscale: int, allow_outside: bool = False) -> S
 
     Args:
         folder: holds `transforms_train.json`.
-        downscale: factor by which images are reduced, averaging areas of the composited image.
-        allow_outside: also read images that lie outside of the folder.
+        reading: how it is read; images are reduced by averaging areas of the composited image.
 
     Returns:
         The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
@@ -49,28 +49,41 @@ def load_blender(folder: Path, downscale: int, allow_outside: bool = False) -> S
         raise SceneError(
             f"{folder}: has transforms_train.json but neither transforms_test.json nor transforms_val.json"
         )
-    entries, train_frames = read_transforms(train_file, allow_outside)
-    test_entries, test_frames = read_transforms(test_file, allow_outside)
+    entries, train_frames = read_transforms(train_file, reading.allow_outside)
+    test_entries, test_frames = read_transforms(test_file, reading.allow_outside)
 
     if has_lens(entries, train_frames) or has_lens(test_entries, test_frames):
         files = ((train_file, entries, train_frames), (test_file, test_entries, test_frames))
         if "near" in entries or "far" in entries:
             log.warning("%s: near and far are not used, since the scene of a capture is moved and scaled", train_file)
         listed = [Listed(path, of_file, frame) for path, of_file, frames in files for frame in frames]
-        return capture_scene(folder, listed, torch.arange(len(listed)) >= len(train_frames), downscale)
+        return capture_scene(folder, listed, torch.arange(len(listed)) >= len(train_frames), reading)
 
+    if reading.kind not in ("auto", "object"):
+        raise SceneError(f"{train_file}: --kind must be auto or object for a Blender scene, got {reading.kind}")
     near = number(entries, "near", train_file, positive=True) or NEAR
     far = number(entries, "far", train_file, positive=True) or FAR
     if near >= far:
         raise SceneError(f"{train_file}: near must be below far, got {near} and {far}")
 
+    downscale = reading.downscale
     paths = [frame.path for frame in (*train_frames, *test_frames)]
-    images, size = read_images(paths, downscale)
+    images, sizes = read_images(paths, downscale)
     count = len(train_frames)
-    train = _split(entries, train_file, train_frames, images[:count], size, downscale)
-    test = _split(test_entries, test_file, test_frames, images[count:], size, downscale)
+    train = _split(entries, train_file, train_frames, images[:count], sizes[:count], downscale)
+    test = _split(test_entries, test_file, test_frames, images[count:], sizes[count:], downscale)
     box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
-    return Scene(folder.resolve().name, train, test, near, far, box, "linear", "white")
+    return Scene(
+        folder.resolve().name,
+        train,
+        test,
+        near,
+        far,
+        box,
+        "linear",
+        "white",
+        notes=("Blender scene, an object on white",),
+    )
 
 
 def _split(
@@ -78,14 +91,15 @@ def _split(
     path: Path,
     frames: list[Frame],
     images: torch.Tensor,
-    size: tuple[int, int],
+    sizes: torch.Tensor,
     downscale: int,
 ) -> Split:
-    width, height = size
-    focal = focal_length(entries, "camera_angle_x", width, path)
-    if focal is None:
-        raise SceneError(f"{path}: camera_angle_x must be an angle between 0 and pi, got None")
-    intrinsics = torch.tensor((focal, focal, width / 2, height / 2)).repeat(len(frames), 1)
+    intrinsics = []
+    for width, height in sizes.tolist():
+        focal = focal_length(entries, "camera_angle_x", width, path)
+        if focal is None:
+            raise SceneError(f"{path}: camera_angle_x must be an angle between 0 and pi, got None")
+        intrinsics.append((focal, focal, width / 2, height / 2))
     poses = torch.stack([frame.pose for frame in frames]).float()
-    cameras = Cameras(poses, intrinsics, width, height).downscaled(downscale)
+    cameras = Cameras.of_images(poses, torch.tensor(intrinsics), sizes).downscaled(downscale)
     return Split(cameras, images, tuple(distinct_names([frame.path for frame in frames], path.parent)))

@@ -1,7 +1,6 @@
-"""Real captures: `transforms.json` with intrinsics, lens distortion and poses (instant-ngp, nerfstudio).
+"""Captures as `transforms.json`, with intrinsics, lens distortion and poses (instant-ngp, nerfstudio).
 
-Poses are OpenGL's, as everywhere. The scene is moved, turned and scaled: the point that the cameras look at becomes the
-origin, their mean up direction the z axis, and the farthest camera is at distance 1.
+Poses are OpenGL's, as everywhere.
 """
 
 from __future__ import annotations
@@ -15,57 +14,47 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.data.carving import carve_box
-from voronerf.data.images import read_images
-from voronerf.data.scene import Scene, SceneError, Split
-from voronerf.data.transforms import Frame, distinct_names, focal_length, number, read_transforms
-from voronerf.rendering.cameras import Cameras, distort, focus_point, undistort
+from voronerf.data.images import read_header
+from voronerf.data.lenses import FISHEYE, PERSPECTIVE, Lens
+from voronerf.data.photographs import Photographs, Reading, View, hold_out, photograph_scene
+from voronerf.data.scene import Scene, SceneError
+from voronerf.data.transforms import Frame, focal_length, number, pose_of, read_transforms
 
 log = logging.getLogger(__name__)
 
-HOLD_OUT = 8
 SPLITS = ("train_filenames", "test_filenames", "val_filenames")
-# Near bound as a share of the distance from the focus to the nearest camera; closer things are rarely in focus.
-NEAR = 0.35
-# Smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
-NEAREST = 0.05
-FAR = 4.0
-PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
+PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
+FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "distortion_params", "camera_model", "is_fisheye")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's distortion_params
-UNSUPPORTED = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
+# k4 of a perspective camera belongs to r^8 in nerfstudio, and to the divisor in OpenCV.
+UNSUPPORTED = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 
 
-def load_capture(folder: Path, downscale: int, allow_outside: bool = False) -> Scene:
+def load_capture(folder: Path, reading: Reading) -> Scene:
     """Loads a capture; every 8th image in the order of their names is held out for testing.
 
     Where the file has nerfstudio's `train_filenames`, `test_filenames` or `val_filenames`, they decide instead.
     Validation images are for testing if there are no others, and are else left out.
 
-    Rays of an opaque capture end at four times the distance of the farthest camera and are sampled in disparity. A
-    plain network then learns the object and, coarsely, the room. The near bound is 0.35 of the distance to the nearest
-    camera and at least 0.05 of that to the farthest one, because cameras that look outwards or in parallel may stand at
-    the origin. A capture with alpha is an object on white, in a box carved from the masks.
-
     Args:
         folder: holds `transforms.json`.
-        downscale: factor by which images are reduced.
-        allow_outside: also read images that lie outside of the folder.
+        reading: how it is read.
 
     Raises:
         SceneError: the file is broken, its lens model is not supported, or it has fewer than two images.
     """
     path = folder / "transforms.json"
-    entries, frames = read_transforms(path, allow_outside)
+    entries, frames = read_transforms(path, reading.allow_outside)
     frames = sorted(frames, key=lambda frame: frame.path.as_posix())
     if len(frames) < 2:
         raise SceneError(f"{path}: one image is too few, one is held out for testing")
     declared = _declared_split(path, entries, frames)
     if declared is None:
-        held_out = torch.arange(len(frames)) % HOLD_OUT == 0
+        held_out = hold_out(len(frames))
     else:
         frames, held_out = declared
-    return capture_scene(folder, [Listed(path, entries, frame) for frame in frames], held_out, downscale)
+    return capture_scene(folder, [Listed(path, entries, frame) for frame in frames], held_out, reading)
 
 
 def _declared_split(path: Path, entries: dict[str, Any], frames: list[Frame]) -> tuple[list[Frame], Tensor] | None:
@@ -119,96 +108,42 @@ def has_lens(entries: dict[str, Any], frames: Sequence[Frame]) -> bool:
     return any(given.get(key) is not None for given in (entries, *(f.entries for f in frames)) for key in LENS)
 
 
-def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, downscale: int) -> Scene:
+def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, reading: Reading) -> Scene:
     """Makes the scene of a capture from its frames, see :func:`load_capture`.
 
     Args:
         folder: of the scene.
         listed: its c images.
         held_out: bool [c], the test views.
-        downscale: factor by which images are reduced.
+        reading: how it is read.
 
     Raises:
         SceneError: as :func:`load_capture`.
     """
-    frames = [entry.frame for entry in listed]
-    # Training views first, so that the images of either part are a slice and no copy.
-    order = torch.cat(((~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0])).tolist()
-    images, size = read_images([frames[index].path for index in order], downscale)
-    parts = images.split([int((~held_out).sum()), int(held_out.sum())])
-
-    intrinsics, distortion = [], []
-    for path, entries, frame in listed:
-        values = {**_named_distortion(entries, path), **_named_distortion(frame.entries, path)}
-        _check_lens_model(values, path)
-        intrinsics.append(_intrinsics(values, size, path, frame))
-        distortion.append([number(values, key, path) or 0.0 for key in ("k1", "k2", "p1", "p2")])
-    path = listed[0].path
-    bent = torch.tensor(distortion)
-    cameras = Cameras(
-        normalise_poses(torch.stack([frame.pose for frame in frames])).float(),
-        torch.tensor(intrinsics),
-        size[0],
-        size[1],
-        bent if bool(bent.any()) else None,
-    )
-    _check_lens_inverts(cameras, path)
-    cameras = cameras.downscaled(downscale)
-
-    nearest = float(cameras.origins.norm(dim=-1).min())
-    near, far, box, spacing, background = max(NEAR * nearest, NEAREST), FAR, None, "disparity", None
-    if images.shape[-1] == 4 and bool((images[..., 3] < 255).any()):
-        spacing, background = "linear", "white"
-        near, far = 0.05 * nearest, 2.0
-        box = carve_box(cameras[~held_out], parts[0][..., 3], near, far)
-    else:
-        parts = tuple(part[..., :3].contiguous() for part in parts)
-
-    names = distinct_names([frame.path for frame in frames], folder)
-    return Scene(
-        folder.resolve().name,
-        _split(cameras, parts[0], names, ~held_out),
-        _split(cameras, parts[1], names, held_out),
-        near,
-        far,
-        box,
-        spacing,
-        background,
+    path, entries, _ = listed[0]
+    notes = [f"{path.name} of {len(listed)} images"]
+    if any(entry.frame.entries.get("depth_file_path") is not None for entry in listed):
+        notes.append("its depth images are not used")
+    applied = entries.get("applied_transform")
+    transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
+    views = [_view(*entry, reading.downscale) for entry in listed]
+    return photograph_scene(
+        folder, Photographs(path, views, held_out, reading.downscale, tuple(notes), transform), reading
     )
 
 
-def normalise_poses(poses: Tensor) -> Tensor:
-    """Moves the cameras' focus to the origin, their mean up direction to +z, and the farthest camera to distance 1.
-
-    Cameras without a common focus (parallel axes, looking outwards) are centred on themselves.
-
-    Args:
-        poses: float64 [c, 4, 4].
-    """
-    cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
-    centre = focus_point(cameras)
-    if centre is None:
-        centre = cameras.origins.mean(0)
-    result = poses.clone()
-    result[:, :3, 3] -= centre
-    up = poses[:, :3, 1].mean(0)
-    if up.norm() > 0.1:
-        z = up / up.norm()
-        spare = torch.eye(3, dtype=poses.dtype)[int(z.abs().argmin())]
-        x = torch.nn.functional.normalize(torch.linalg.cross(spare, z), dim=0)
-        turn = torch.stack((x, torch.linalg.cross(z, x), z))
-        result[:, :3] = turn @ result[:, :3]
-    extent = float(result[:, :3, 3].norm(dim=-1).max())
-    result[:, :3, 3] /= extent if extent > 0 else 1.0
-    return result
+def _view(path: Path, entries: dict[str, Any], frame: Frame, downscale: int) -> View:
+    values = {**_named_distortion(entries, path), **_named_distortion(frame.entries, path)}
+    fisheye = _is_fisheye(values, path)
+    size = read_header(frame.path, downscale).size
+    given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
+    coefficients = tuple(given.get(key, 0.0) for key in (FISHEYE if fisheye else PERSPECTIVE))
+    return View(
+        frame.path, frame.pose, Lens(_intrinsics(values, size, path, frame), coefficients, fisheye), size, frame.mask
+    )
 
 
-def _split(cameras: Cameras, images: Tensor, names: list[str], chosen: Tensor) -> Split:
-    kept = tuple(name for name, wanted in zip(names, chosen.tolist()) if wanted)
-    return Split(cameras[chosen], images, kept)
-
-
-def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> list[float]:
+def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> tuple[float, ...]:
     """(fx, fy, cx, cy) in pixels."""
     width, height = size
     for key, actual in (("w", width), ("h", height)):
@@ -224,7 +159,7 @@ def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame
     fx, fy = fx or fy, fy or fx
     cx, cy = number(values, "cx", path), number(values, "cy", path)
     assert fx is not None and fy is not None
-    return [fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy]
+    return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -237,27 +172,16 @@ def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
     return {**entries, **dict(zip(DISTORTION, given))}
 
 
-def _check_lens_model(values: dict[str, Any], path: Path) -> None:
+def _is_fisheye(values: dict[str, Any], path: Path) -> bool:
+    """Whether a camera is a fisheye; checks that its model is known and all of it is used."""
     model = values.get("camera_model", "OPENCV")
-    if values.get("is_fisheye") or model not in PINHOLE_MODELS:
-        name = "fisheye" if values.get("is_fisheye") else model
-        raise SceneError(f"{path}: camera model {name!s:.60} is not supported, only {', '.join(PINHOLE_MODELS)}")
-    used = [key for key in UNSUPPORTED if number(values, key, path)]
+    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
+        names = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
+        raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {names}")
+    fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
+    refused = ("p1", "p2", *UNSUPPORTED[1:]) if fisheye else UNSUPPORTED
+    used = [key for key in refused if number(values, key, path)]
     if used:
-        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only k1, k2, p1, p2")
-
-
-def _check_lens_inverts(cameras: Cameras, path: Path) -> None:
-    """Checks that every pixel of the border has a ray; a lens model that folds over inside the image has none there."""
-    if cameras.distortion is None:
-        return
-    edge = torch.linspace(0, 1, 33, dtype=torch.float64)
-    x = torch.cat((edge, edge, torch.zeros(33), torch.ones(33)))[None] * cameras.width
-    y = torch.cat((torch.zeros(33), torch.ones(33), edge, edge))[None] * cameras.height
-    fx, fy, cx, cy = cameras.intrinsics.double()[:, :, None].unbind(1)
-    coefficients = cameras.distortion.double()[:, None, :]
-    u, v = (x - cx) / fx, (y - cy) / fy
-    again, and_again = distort(*undistort(u, v, coefficients), coefficients)
-    error = torch.maximum((again - u).abs() * fx, (and_again - v).abs() * fy)
-    if not bool((error < 1e-3).all()):
-        raise SceneError(f"{path}: the lens distortion k1, k2, p1, p2 cannot be inverted inside the image")
+        known = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2"
+        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only {known}")
+    return fisheye

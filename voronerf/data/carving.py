@@ -37,7 +37,7 @@ def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tenso
 
     Args:
         cameras: c cameras without lens distortion that look at the object from around it.
-        alpha: uint8 [c, h, w]; a pixel with alpha > 0 shows the object.
+        alpha: uint8 [c, h, w]; a pixel with alpha > 0 shows the object. Zero beside smaller images.
         near: distance before which there is nothing.
         far: distance behind which there is nothing; the search covers a cube of half side (far - near) / 2.
 
@@ -67,6 +67,8 @@ class _View:
     """One camera and its mask, widened by each of GROWTHS."""
 
     def __init__(self, cameras: Cameras, index: int, visible: NDArray[np.bool_], shrink: int) -> None:
+        width, height = cameras.size(index)
+        visible = visible[:height, :width]
         self.pose: Array = cameras.poses[index].numpy()
         self.fx, self.fy, self.cx, self.cy = (cameras.intrinsics[index] / shrink).tolist()
         mask = _block_any(visible, shrink)

@@ -28,7 +28,7 @@ PNG_DEPTH = 24  # offset of the bits a channel
 SHARE = 0.75
 #: Bytes for each pixel while a view is rendered and scored, most of them for SSIM.
 VIEW = 550
-#: Bytes for the number of each pixel whose ray meets the box, which images with alpha have.
+#: Bytes for the number of each pixel that is trained, where that is not all of them.
 NUMBER = 8
 #: Images are decoded by up to four threads while those in hand take at most this many bytes.
 THREADS, IN_HAND = 4, 2**26
@@ -117,48 +117,83 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
         return pixels
 
 
-def read_images(paths: Sequence[Path], factor: int) -> tuple[Tensor, tuple[int, int]]:
-    """Decodes images of one size; memory holds the result and one image, or several small ones.
+def read_images(paths: Sequence[Path], factor: int) -> tuple[Tensor, Tensor]:
+    """Decodes images; memory holds the result and one image, or several small ones.
 
     Args:
         paths: at least one file.
         factor: of the reduction, >= 1.
 
     Returns:
-        (uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel; (width, height) of the files).
+        (uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel, with the smaller ones in the upper
+        left corner and zeros around them; int64 [c, 2], (width, height) of the files).
 
     Raises:
-        SceneError: as `read_header` and `read_image`, images of different sizes, or more than fit into memory.
+        SceneError: as `read_header` and `read_image`, or more than fit into memory.
     """
     headers = [read_header(path, factor) for path in paths]
-    size = headers[0].size
-    for path, (other, _, _) in zip(paths, headers):
-        if other != size:
-            raise SceneError(
-                f"{path}: is {other[0]} x {other[1]} pixels but {paths[0]} is {size[0]} x {size[1]}; "
-                "all images of a scene must have the same size"
-            )
+    sizes = torch.tensor([header.size for header in headers])
+    size = sizes.amax(0).tolist()
+    differ = bool((sizes != sizes[:1]).any())
     channels = 4 if any(header.alpha for header in headers) else 3
     shape = (len(paths), size[1] // factor, size[0] // factor, channels)
     decoded = max(header.decoded for header in headers)
     pixels = shape[1] * shape[2]
-    each = pixels * (channels + (NUMBER if channels == 4 else 0))
+    each = pixels * (channels + (NUMBER if channels == 4 or differ else 0))
     needed, free = len(paths) * each + max(decoded, pixels * VIEW), available_memory()
     if needed > SHARE * free:
         raise SceneError(
-            f"{paths[0]}: {len(paths)} images of {size[0]} x {size[1]} need {needed / 2**30:.2f} GiB with --downscale "
-            f"{factor}, more than {SHARE:.0%} of the {free / 2**30:.2f} GiB that are free; use a larger --downscale, "
-            "fewer or smaller images"
+            f"{paths[0]}: {len(paths)} images of {'up to ' * differ}{size[0]} x {size[1]} need {needed / 2**30:.2f} "
+            f"GiB with --downscale {factor}, more than {SHARE:.0%} of the {free / 2**30:.2f} GiB that are free; use a "
+            "larger --downscale, fewer or smaller images"
         )
-    images = np.full(shape, 255, dtype=np.uint8)
+    images = np.zeros(shape, dtype=np.uint8)
 
     def fill(index: int) -> None:
         pixels = read_image(paths[index], factor)
-        images[index, ..., : pixels.shape[2]] = pixels
+        place = images[index, : pixels.shape[0], : pixels.shape[1]]
+        place[..., 3:] = 255
+        place[..., : pixels.shape[2]] = pixels
 
     with ThreadPoolExecutor(max(1, min(THREADS, IN_HAND // decoded))) as pool:
         list(pool.map(fill, range(len(paths))))
-    return torch.from_numpy(images), size
+    return torch.from_numpy(images), sizes
+
+
+def read_masks(masks: Sequence[Path | None], paths: Sequence[Path], sizes: Tensor, factor: int) -> Tensor | None:
+    """Decodes the masks of images: black pixels do not count, nor does a block that has one.
+
+    Args:
+        masks: the file of each image, or None where all of it counts.
+        paths: of the images.
+        sizes: int64 [c, 2], (width, height) of the images, and of their masks.
+        factor: of the reduction.
+
+    Returns:
+        bool [c, h, w], False around smaller images; None if no image has a mask.
+
+    Raises:
+        SceneError: as `read_image`, a mask of another size than its image, or one that leaves nothing.
+    """
+    if not any(masks):
+        return None
+    width, height = (sizes.amax(0) // factor).tolist()
+    found = torch.zeros(len(masks), height, width, dtype=torch.bool)
+    for place, mask, path, size in zip(found, masks, paths, sizes.tolist()):
+        width, height = (side // factor for side in size)
+        place[:height, :width] = True
+        if mask is None:
+            continue
+        with _opened(mask) as file:
+            if list(file.size) != size:
+                raise SceneError(
+                    f"{mask}: is {file.size[0]} x {file.size[1]} pixels, {path.name} is {size[0]} x {size[1]}"
+                )
+            kept = np.asarray(file.convert("L"))[: height * factor, : width * factor] > 0
+        place[:height, :width] = torch.from_numpy(kept.reshape(height, factor, width, factor).all(axis=(1, 3)))
+    if not bool(found.any()):
+        raise SceneError(f"{next(filter(None, masks))}: the masks of the scene leave no pixel")
+    return found
 
 
 @contextlib.contextmanager

@@ -11,6 +11,10 @@ import torch
 from torch import Tensor
 
 from voronerf.rendering.cameras import Cameras
+from voronerf.rendering.contraction import Contraction, Perspective
+
+#: An object on white; cameras that look the same way; that look outwards; that look at one place with surroundings.
+KINDS = ("object", "forward", "inside-out", "unbounded")
 
 
 class SceneError(ValueError):
@@ -23,8 +27,10 @@ class Split:
 
     Attributes:
         cameras: c cameras.
-        images: uint8 [c, h, w, 3] opaque, or [c, h, w, 4] with straight (not premultiplied) alpha.
+        images: uint8 [c, h, w, 3] opaque, or [c, h, w, 4] with straight (not premultiplied) alpha. Those that are
+            smaller than h x w, see `Cameras.size`, lie in the upper left corner, with zeros around them.
         names: of the images, for tables and file names.
+        masks: bool [c, h, w], False for pixels that are neither trained nor scored, or None.
 
     Examples:
         >>> from voronerf.data import load_scene
@@ -37,17 +43,24 @@ class Split:
     cameras: Cameras
     images: Tensor
     names: tuple[str, ...]
+    masks: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.names)
 
     def truth(self, index: int, background: Tensor | None) -> Tensor:
         """One image in 0..1 over `background` ([3]; None is black, as in rendering), float32 [h, w, 3]."""
-        image = self.images[index].float() / 255
+        width, height = self.cameras.size(index)
+        image = self.images[index, :height, :width].float() / 255
         if image.shape[-1] == 3:
             return image
         colour = image[..., :3] * image[..., 3:]
         return colour if background is None else colour + background.to(colour) * (1 - image[..., 3:])
+
+    def mask(self, index: int) -> Tensor | None:
+        """Which pixels of one image count, bool [h, w]; None for all."""
+        width, height = self.cameras.size(index)
+        return None if self.masks is None else self.masks[index, :height, :width]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +76,12 @@ class Scene:
         box: float32 [2, 3], lowest and highest corner of an axis-aligned box around everything, or None if unknown.
         spacing: of the samples along a ray, "linear" or "disparity".
         background: "white" behind transparent pixels; None for an opaque capture without a background.
+        kind: one of `KINDS`.
+        contraction: what makes the space of a scene without a box finite, or None: the sphere around the origin and all
+            cameras.
+        transform: float64 [4, 4], from the coordinates of the scene's files to those of the scene, or None if it was
+            not moved.
+        notes: lines about how the files were read.
 
     Examples:
         >>> from voronerf.data import load_scene
@@ -79,6 +98,10 @@ class Scene:
     box: Tensor | None
     spacing: str
     background: str | None
+    kind: str = "object"
+    contraction: Contraction | Perspective | None = None
+    transform: Tensor | None = None
+    notes: tuple[str, ...] = ()
 
     def background_colour(self, device: torch.device | str = "cpu") -> Tensor | None:
         """The background as float32 [3] in 0..1, or None."""

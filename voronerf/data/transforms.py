@@ -28,11 +28,12 @@ LONGEST = 1000
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of a transforms file: its path, its pose float64 [4, 4], and its entries."""
+    """One image of a transforms file: its path, its pose float64 [4, 4], its entries, and the path of its mask."""
 
     path: Path
     pose: Tensor
     entries: dict[str, Any]
+    mask: Path | None = None
 
 
 def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[Frame]]:
@@ -67,15 +68,10 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or "\0" in name:
             raise SceneError(f"{path}: frame {position} has no file_path")
-        if frame.get("mask_path") is not None:
-            raise SceneError(
-                f"{path}: frame {position} ({name}): mask_path is not supported, images are used whole; without the "
-                "mask_path of its frames the scene can be loaded"
-            )
-        pose = _pose(frame.get("transform_matrix"), f"{path}: frame {position} ({name})")
+        pose = pose_of(frame.get("transform_matrix"), f"{path}: frame {position} ({name})")
         image = _find_image(path.parent, name, allow_outside, f"{path}: frame {position} ({name})")
         if image is not None:
-            found.append(Frame(image, pose, frame))
+            found.append(Frame(image, pose, frame, _mask(path, frame, allow_outside, f"frame {position} ({name})")))
     if not found:
         raise SceneError(
             f"{path}: none of its {len(frames)} images exists, the first is {path.parent / frames[0]['file_path']}"
@@ -166,7 +162,24 @@ def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Pat
     return None
 
 
-def _pose(matrix: object, where: str) -> Tensor:
+def _mask(path: Path, entries: dict[str, Any], allow_outside: bool, where: str) -> Path | None:
+    """The mask of a frame; None without one."""
+    name = entries.get("mask_path")
+    if name is None:
+        return None
+    if not isinstance(name, str) or "\0" in name:
+        raise SceneError(f"{path}: {where}: mask_path must be a file name, got {name!r:.60}")
+    mask = path.parent / name.replace("\\", "/")
+    if not allow_outside and leads_outside(mask, path.parent):
+        raise SceneError(
+            f"{path}: {where}: mask_path must lead to a file in the folder of the scene; --allow-outside reads others"
+        )
+    if not mask.is_file():
+        raise SceneError(f"{path}: {where}: its mask {mask} does not exist")
+    return mask
+
+
+def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor:
     """Checks that rows of numbers are a rigid motion; float64 [4, 4]."""
     rows = matrix if isinstance(matrix, list) else [None]
     try:
@@ -174,20 +187,20 @@ def _pose(matrix: object, where: str) -> Tensor:
             raise TypeError
         values = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise SceneError(f"{where}: transform_matrix is not a matrix of numbers") from None
+        raise SceneError(f"{where}: {key} is not a matrix of numbers") from None
     if values.shape not in ((4, 4), (3, 4)):
-        raise SceneError(f"{where}: transform_matrix must be 4 x 4, got shape {list(values.shape)}")
+        raise SceneError(f"{where}: {key} must be 4 x 4, got shape {list(values.shape)}")
     if not (np.abs(values) <= LARGEST).all():
-        raise SceneError(f"{where}: transform_matrix has values that are not finite, or above {LARGEST:.0e}")
+        raise SceneError(f"{where}: {key} has values that are not finite, or above {LARGEST:.0e}")
     rotation = values[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > ORTHONORMAL or np.linalg.det(rotation) < 0:
         raise SceneError(
-            f"{where}: transform_matrix is not a pose, its upper left 3 x 3 is not a rotation "
+            f"{where}: {key} is not a pose, its upper left 3 x 3 is not a rotation "
             f"(determinant {np.linalg.det(rotation):.3g}, off orthonormal by {error:.2g})"
         )
     if values.shape[0] == 4 and np.abs(values[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise SceneError(f"{where}: transform_matrix is not a pose, its last row must be 0 0 0 1")
+        raise SceneError(f"{where}: {key} is not a pose, its last row must be 0 0 0 1")
     pose = np.eye(4)
     pose[:3] = values[:3]
     return torch.from_numpy(pose)

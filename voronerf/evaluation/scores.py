@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import torch
+
 from voronerf.data import Scene
 from voronerf.evaluation.lpips import Lpips
 from voronerf.evaluation.metrics import psnr, ssim
@@ -68,6 +70,8 @@ def evaluate(
 ) -> list[ViewScore]:
     """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all), until ``stop`` is true.
 
+    PSNR leaves out what a mask leaves out; there the others compare the truth with itself.
+
     Examples:
         >>> from voronerf import NeRF
         >>> from voronerf.data import load_scene
@@ -85,9 +89,16 @@ def evaluate(
         image = render_view(renderer, scene, view, heaviest=False)
         target = scene.test.truth(view, scene.background_colour()).to(renderer.device)
         colour = image.colour.clamp(0, 1)
+        kept = scene.test.mask(view)
+        if kept is None:
+            noise = psnr(colour, target)
+        else:
+            kept = kept.to(renderer.device)
+            colour = torch.where(kept[..., None], colour, target)
+            noise = psnr(colour[kept], target[kept])
         perceived = None if lpips is None else float(lpips(colour, target))
         name = scene.test.names[view]
-        scores.append(ViewScore(name, float(psnr(colour, target)), float(ssim(colour, target)), perceived))
+        scores.append(ViewScore(name, float(noise), float(ssim(colour, target)), perceived))
     return scores
 
 

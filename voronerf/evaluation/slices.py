@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.data import Scene
-from voronerf.rendering.contraction import Contraction
+from voronerf.rendering.contraction import Contraction, Perspective
 
 #: Half the side of a slice through a scene without a box, in scene units.
 EXTENT = 1.5
@@ -48,7 +48,7 @@ def slice_points(scene: Scene, *, axis: int = 2, at: float = 1 / 3, size: int = 
 
 @torch.no_grad()
 def slice_density(
-    field: nn.Module, points: Tensor, *, cones: bool = False, contraction: Contraction | None = None
+    field: nn.Module, points: Tensor, *, cones: bool = False, contraction: Contraction | Perspective | None = None
 ) -> Tensor:
     """Density [h, w] of a field in evaluation mode, so that a router with a `blend` blends.
 

@@ -21,10 +21,11 @@ def pixel_rays(
     far: float,
     box: Tensor | None,
     distortion: Tensor | None,
+    fisheye: bool,
     background: Tensor | None,
 ) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    return PixelRays(*_pixel_rays(poses, intrinsics, images, index, box, distortion, background, near, far))
+    return PixelRays(*_pixel_rays(poses, intrinsics, images, index, box, distortion, fisheye, background, near, far))
 
 
 @custom_op("pixel_rays_native", devices=("cpu",))
@@ -35,6 +36,7 @@ def _pixel_rays(
     index: Tensor,
     box: Tensor | None,
     distortion: Tensor | None,
+    fisheye: bool,
     background: Tensor | None,
     near: float,
     far: float,
@@ -49,6 +51,7 @@ def _pixel_rays(
         poses=poses,
         intrinsics=intrinsics,
         distortion=distortion,
+        fisheye=fisheye,
         images=images,
         pixels=index,
         box=box,

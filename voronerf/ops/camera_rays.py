@@ -23,6 +23,7 @@ def camera_rays(
     *,
     camera: Tensor | None = None,
     distortion: Tensor | None = None,
+    fisheye: bool = False,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Rays through positions in images. Lens distortion is undone by Newton's method in float64.
@@ -35,7 +36,9 @@ def camera_rays(
         x: float32 [b], to the right, in pixels; the centre of the first column is at 0.5.
         y: float32 [b], downwards.
         camera: int32 [b], the camera of each position, 0 to c - 1, not checked; None for the first camera.
-        distortion: float32 [c, 4], OpenCV's (k1, k2, p1, p2), or None.
+        distortion: float32 [c, 8], (k1, k2, p1, p2, k3, k4, k5, k6) of OpenCV's rational model, or None for none.
+        fisheye: the lenses are fisheyes, and distortion is (k1, k2, p1, p2, k3, k4, s1, s2) of COLMAP's
+            THIN_PRISM_FISHEYE, whose k1 to k4 are those of OpenCV's fisheye model.
         backend: "auto", "reference" or "warp".
 
     Returns:
@@ -67,7 +70,9 @@ def camera_rays(
         check_shape(_OP, "camera", camera, ("b",), sizes)
         check_dtype(_OP, "camera", camera, INDEX)
     if distortion is not None:
-        check_shape(_OP, "distortion", distortion, ("c", 4), sizes)
+        check_shape(_OP, "distortion", distortion, ("c", 8), sizes)
+    elif fisheye:
+        raise ValueError(f"{_OP}: distortion must be given with fisheye, got None")
     check_same_dtype(_OP, poses=poses, intrinsics=intrinsics, x=x, y=y, distortion=distortion)
     check_same_device(_OP, poses=poses, intrinsics=intrinsics, x=x, y=y, camera=camera, distortion=distortion)
     check_count(_OP, "x", sizes["b"])
@@ -75,5 +80,5 @@ def camera_rays(
         raise ValueError(f"{_OP}: poses must hold at least one camera, got none")
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
     tensors = (tensor.detach() for tensor in (poses, intrinsics, x, y))
-    origins, directions = run(*tensors, camera=camera, distortion=distortion)
+    origins, directions = run(*tensors, camera=camera, distortion=distortion, fisheye=fisheye)
     return origins, directions

@@ -23,6 +23,7 @@ def pixel_rays(
     far: float,
     box: Tensor | None = None,
     distortion: Tensor | None = None,
+    fisheye: bool = False,
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> PixelRays:
@@ -39,7 +40,8 @@ def pixel_rays(
         near: nearest distance of interest, >= 0.
         far: farthest.
         box: float32 [2, 3], lowest and highest corner, or None for all of space.
-        distortion: float32 [c, 4], OpenCV's (k1, k2, p1, p2), or None.
+        distortion: float32 [c, 8] of the lenses, see `camera_rays`, or None.
+        fisheye: the lenses are fisheyes.
         background: float32 [3] or [b, 3], the colour behind images with an alpha channel; None leaves their
             colours as they are.
         backend: "auto", "reference" or "native".
@@ -75,7 +77,9 @@ def pixel_rays(
     if box is not None:
         check_shape(_OP, "box", box, (2, 3))
     if distortion is not None:
-        check_shape(_OP, "distortion", distortion, ("c", 4), sizes)
+        check_shape(_OP, "distortion", distortion, ("c", 8), sizes)
+    elif fisheye:
+        raise ValueError(f"{_OP}: distortion must be given with fisheye, got None")
     if background is not None:
         check_tensor(_OP, "background", background)
         check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("b", 3), sizes)
@@ -103,6 +107,7 @@ def pixel_rays(
         far=float(far),
         box=None if box is None else box.detach(),
         distortion=None if distortion is None else distortion.detach(),
+        fisheye=fisheye,
         background=None if background is None else background.detach(),
     )
     return PixelRays(*found)

@@ -48,6 +48,7 @@ def pixel_rays(
     far: float,
     box: Tensor | None,
     distortion: Tensor | None,
+    fisheye: bool,
     background: Tensor | None,
 ) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
@@ -59,7 +60,7 @@ def pixel_rays(
     pixel = index % (h * w)
     x, y = ((place + 0.5).to(poses.dtype) for place in (pixel % w, pixel // w))
     camera = (index // (h * w)).to(torch.int32)
-    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion)
+    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion, fisheye=fisheye)
     if box is None:
         enter, leave = torch.full_like(x, near), torch.full_like(x, far)
     else:

@@ -2,7 +2,7 @@
 
 from voronerf.rendering.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
 from voronerf.rendering.comparison import Comparison
-from voronerf.rendering.contraction import Contraction
+from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
 from voronerf.rendering.occupancy import OccupancyGrid
@@ -18,6 +18,7 @@ __all__ = [
     "Field",
     "Marched",
     "OccupancyGrid",
+    "Perspective",
     "Rays",
     "Rendered",
     "RenderedImage",

@@ -1,11 +1,12 @@
-"""Pinhole cameras with lens distortion: pixels to rays, points to pixels.
+"""Cameras with lens distortion: pixels to rays, points to pixels.
 
 c cameras, r rays, b chosen pixels, n points.
 
 Frames. A pose maps camera to world coordinates; camera axes are OpenGL's: x right, y up, the camera looks along -z. The
 world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel
-is at (0.5, 0.5). Distortion is OpenCV's radial-tangential model with (k1, k2, p1, p2), on image-plane coordinates
-u = (x - cx) / fx, v = (y - cy) / fy.
+is at (0.5, 0.5). Distortion acts on image-plane coordinates u = (x - cx) / fx, v = (y - cy) / fy. It is OpenCV's
+rational model with (k1, k2, p1, p2, k3, k4, k5, k6), or for fisheyes COLMAP's THIN_PRISM_FISHEYE with (k1, k2, p1, p2,
+k3, k4, s1, s2); see `distort`.
 """
 
 from __future__ import annotations
@@ -68,14 +69,16 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """c cameras that share an image size.
+    """c cameras with lenses of one kind.
 
     Attributes:
         poses: float32 [c, 4, 4], camera to world.
         intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
-        width: of every image, in pixels.
-        height: of every image, in pixels.
-        distortion: float32 [c, 4], (k1, k2, p1, p2) as OpenCV defines them, or None for none.
+        width: of every image, in pixels; of the widest where they differ.
+        height: of every image, in pixels; of the highest where they differ.
+        distortion: float32 [c, 8], coefficients of the lenses, or None for none.
+        fisheye: whether the lenses are fisheyes, which need coefficients.
+        sizes: int64 [c, 2], (width, height) of each image, or None if they are of one size. See `size`.
 
     Examples:
         >>> import torch
@@ -97,6 +100,8 @@ class Cameras:
     width: int
     height: int
     distortion: Tensor | None = None
+    fisheye: bool = False
+    sizes: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.poses.dim() != 3 or self.poses.shape[1:] != (4, 4):
@@ -104,10 +109,30 @@ class Cameras:
         expected = [len(self.poses), 4]
         if list(self.intrinsics.shape) != expected:
             raise ValueError(f"Cameras: intrinsics must have shape {expected}, got {list(self.intrinsics.shape)}")
+        expected = [len(self.poses), 8]
         if self.distortion is not None and list(self.distortion.shape) != expected:
             raise ValueError(f"Cameras: distortion must have shape {expected}, got {list(self.distortion.shape)}")
+        if self.fisheye and self.distortion is None:
+            raise ValueError("Cameras: distortion must be given with fisheye, got None")
+        expected = [len(self.poses), 2]
+        if self.sizes is not None and list(self.sizes.shape) != expected:
+            raise ValueError(f"Cameras: sizes must have shape {expected}, got {list(self.sizes.shape)}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Cameras: width and height must be >= 1, got {self.width} x {self.height}")
+
+    @classmethod
+    def of_images(
+        cls,
+        poses: Tensor,
+        intrinsics: Tensor,
+        sizes: Tensor,
+        distortion: Tensor | None = None,
+        fisheye: bool = False,
+    ) -> Cameras:
+        """Cameras of images whose (width, height) `sizes` int64 [c, 2] may differ; at least one."""
+        width, height = sizes.amax(0).tolist()
+        differ = bool((sizes != sizes[:1]).any())
+        return cls(poses, intrinsics, width, height, distortion, fisheye, sizes if differ else None)
 
     def __len__(self) -> int:
         return self.poses.shape[0]
@@ -115,7 +140,25 @@ class Cameras:
     def __getitem__(self, index: Tensor | slice | Sequence[int]) -> Cameras:
         """The cameras chosen by a slice, a list or an index tensor."""
         distortion = None if self.distortion is None else self.distortion[index]
-        return replace(self, poses=self.poses[index], intrinsics=self.intrinsics[index], distortion=distortion)
+        sizes = None if self.sizes is None else self.sizes[index]
+        return replace(
+            self, poses=self.poses[index], intrinsics=self.intrinsics[index], distortion=distortion, sizes=sizes
+        )
+
+    def size(self, index: int) -> tuple[int, int]:
+        """(width, height) of one image."""
+        if self.sizes is None:
+            return self.width, self.height
+        width, height = self.sizes[index].tolist()
+        return width, height
+
+    @property
+    def smallest(self) -> tuple[int, int]:
+        """The least width and the least height of the images."""
+        if self.sizes is None:
+            return self.width, self.height
+        width, height = self.sizes.amin(0).tolist()
+        return width, height
 
     @property
     def origins(self) -> Tensor:
@@ -143,10 +186,14 @@ class Cameras:
         """
         if factor < 1:
             raise ValueError(f"downscaled: factor must be >= 1, got {factor}")
-        if factor > min(self.width, self.height):
-            raise ValueError(f"downscaled: factor {factor} leaves no pixel of {self.width} x {self.height}")
+        if factor > min(self.smallest):
+            raise ValueError("downscaled: factor {} leaves no pixel of {} x {}".format(factor, *self.smallest))
         return replace(
-            self, intrinsics=self.intrinsics / factor, width=self.width // factor, height=self.height // factor
+            self,
+            intrinsics=self.intrinsics / factor,
+            width=self.width // factor,
+            height=self.height // factor,
+            sizes=None if self.sizes is None else self.sizes // factor,
         )
 
     def rays(self, image_index: Tensor | int, x: Tensor, y: Tensor, *, cones: bool = False) -> Rays:
@@ -171,6 +218,7 @@ class Cameras:
             _position(y).to(self.poses.dtype),
             camera=camera,
             distortion=chosen.distortion,
+            fisheye=chosen.fisheye,
         )
         if not cones:
             return Rays(origins, directions)
@@ -184,11 +232,10 @@ class Cameras:
         return widths * (directions * axes).sum(-1)
 
     def image_rays(self, index: int, *, cones: bool = False) -> Rays:
-        """Rays through all pixel centres of one camera, row by row: [height * width]."""
+        """Rays through all pixel centres of one camera, row by row: [height * width], of its own image."""
         device = self.poses.device
-        y, x = torch.meshgrid(
-            torch.arange(self.height, device=device), torch.arange(self.width, device=device), indexing="ij"
-        )
+        width, height = self.size(index)
+        y, x = torch.meshgrid(torch.arange(height, device=device), torch.arange(width, device=device), indexing="ij")
         return self.rays(index, x.reshape(-1), y.reshape(-1), cones=cones)
 
     def project(self, points: Tensor, index: int) -> tuple[Tensor, Tensor]:
@@ -200,15 +247,20 @@ class Cameras:
 
         Returns:
             (pixels [n, 2], depth [n]): positions (x, y) in the image, and distance along the optical axis in world
-            units. Points with depth <= 0 are behind the camera, and their pixels are meaningless.
+            units. Points with depth <= 0 are behind the camera, and their pixels are meaningless but for a fisheye.
         """
         pose = self.poses[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         depth = -local[:, 2]
-        safe = torch.where(depth > 0, depth, torch.ones_like(depth))
-        u, v = local[:, 0] / safe, -local[:, 1] / safe
+        if self.fisheye:
+            across = local[:, :2].norm(dim=-1)
+            share = torch.atan2(across, depth) / across.clamp_min(1e-12)
+            u, v = local[:, 0] * share, -local[:, 1] * share
+        else:
+            safe = torch.where(depth > 0, depth, torch.ones_like(depth))
+            u, v = local[:, 0] / safe, -local[:, 1] / safe
         if self.distortion is not None:
-            u, v = distort(u, v, self.distortion[index])
+            u, v = distort(u, v, self.distortion[index], self.fisheye)
         fx, fy, cx, cy = self.intrinsics[index].unbind(-1)
         return torch.stack((u * fx + cx, v * fy + cy), dim=-1), depth
 
@@ -299,6 +351,8 @@ def orbit_cameras(
 def turntable_cameras(cameras: Cameras, count: int) -> Cameras:
     """An orbit like the given cameras: around their focus, at their mean distance, elevation and focal length.
 
+    The pictures have the size of the first camera's.
+
     Examples:
         >>> from voronerf.rendering import orbit_cameras, turntable_cameras
         >>> seen = orbit_cameras(3, radius=2.0, elevation=20.0, width=64, height=64, focal=70.0)
@@ -310,13 +364,14 @@ def turntable_cameras(cameras: Cameras, count: int) -> Cameras:
         centre = (cameras.origins + cameras.forward).mean(0)
     offset = cameras.origins - centre
     radius = float(offset.norm(dim=-1).mean())
+    width, height = cameras.size(0)
     climb = float((offset[:, 2] / offset.norm(dim=-1).clamp_min(1e-9)).mean().clamp(-0.95, 0.95))
     return orbit_cameras(
         count,
         radius=radius,
         elevation=math.degrees(math.asin(climb)),
-        width=cameras.width,
-        height=cameras.height,
+        width=width,
+        height=height,
         focal=float(cameras.intrinsics[:, :2].mean()),
         centre=centre.tolist(),
     ).to(cameras.poses.device)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from voronerf.rendering.cameras import Rays
-from voronerf.rendering.contraction import Contraction
+from voronerf.rendering.contraction import Contraction, Perspective
 
 
 def frustum_moments(edges: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -34,7 +34,7 @@ def frustum_moments(edges: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tenso
     return mean, along, across
 
 
-def frustum_gaussians(rays: Rays, edges: Tensor, contraction: Contraction | None = None) -> Tensor:
+def frustum_gaussians(rays: Rays, edges: Tensor, contraction: Contraction | Perspective | None = None) -> Tensor:
     """Gaussians with the moments of conical frustums (equations 8 and 16).
 
     Args:

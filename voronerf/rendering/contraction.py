@@ -1,14 +1,15 @@
-"""Contraction of unbounded space into a ball. n points.
+"""Contraction of unbounded space, into a ball or into a cube. n points.
 
-Source: Barron et al. 2022, "Mip-NeRF 360", equation 10. Space inside a sphere stays as it is. Space outside is mapped
+The ball: Barron et al. 2022, "Mip-NeRF 360", equation 10. Space inside a sphere stays as it is. Space outside is mapped
 into the shell between the sphere and one of twice its radius. Here the sphere has any centre and radius, in world
-units.
+units. The cube: Mildenhall et al. 2020, "NeRF", appendix C, for cameras that look the same way.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -49,6 +50,11 @@ class Contraction:
         offset, length = self._offset(points, centre)
         return centre + self.radius * offset * ((2 - 1 / length) / length)
 
+    @property
+    def cube(self) -> Tensor:
+        """The corners [2, 3] of a box around all of space."""
+        return torch.stack((self.centre - 2 * self.radius, self.centre + 2 * self.radius))
+
     def gaussians(self, means: Tensor, directions: Tensor, along: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
         """Maps Gaussians with covariance ``S = along d d^T + across (1 - d d^T)`` by the linearised map (equation 9):
         the new covariance is ``J S J^T``.
@@ -74,3 +80,57 @@ class Contraction:
     def _offset(self, points: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
         offset = (points - centre) / self.radius
         return offset, offset.norm(dim=-1, keepdim=True).clamp_min(1)
+
+
+@dataclass(frozen=True, eq=False)
+class Perspective:
+    """Normalised device coordinates: what a camera sees beyond its near plane becomes the cube [-1, 1]^3.
+
+    A point at (x, y) across and at depth z becomes (x / (z a), y / (z b), 1 - 2 near / z). Only the positions that the
+    fields see are mapped; distances along rays are those of the world.
+
+    Attributes:
+        centre: [3], the position of the camera.
+        axes: [3, 3], its rows are the directions right, up and ahead.
+        near: depth of the near plane, > 0.
+        slopes: (a, b), half the width and height of what is seen at depth 1.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Perspective
+        >>> ahead = Perspective(torch.zeros(3), torch.eye(3), near=1.0, slopes=(0.5, 0.5))
+        >>> ahead.points(torch.tensor([[0.0, 0.5, 1.0], [0.0, 0.0, 2.0], [1e6, 0.0, 2e6]])).round(decimals=4)
+        tensor([[ 0.,  1., -1.],
+                [ 0.,  0.,  0.],
+                [ 1.,  0.,  1.]])
+    """
+
+    centre: Tensor
+    axes: Tensor
+    near: float
+    slopes: tuple[float, float]
+
+    def points(self, points: Tensor) -> Tensor:
+        """Maps points [..., 3]; those before half the near plane as if they were on it."""
+        local, depth = self._local(points)
+        across = local[..., :2] / (depth * depth.new_tensor(self.slopes))
+        return torch.cat((across, 1 - 2 * self.near / depth), dim=-1)
+
+    @property
+    def cube(self) -> Tensor:
+        """The corners [2, 3] of a box around all that the camera sees."""
+        return self.centre.new_tensor([[-1.0], [1.0]]).expand(2, 3)
+
+    def gaussians(self, means: Tensor, directions: Tensor, along: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps Gaussians by the linearised map, as `Contraction.gaussians`."""
+        local, depth = self._local(means)
+        axes = self.axes.to(means)
+        slopes = depth.new_tensor(self.slopes)[:, None]
+        flat = (axes[:2] - (local[..., :2] / depth)[..., None] * axes[2]) / (depth[..., None] * slopes)
+        rows = torch.cat((flat, (2 * self.near / depth.square())[..., None] * axes[2:]), dim=-2)
+        along_rows = (rows @ directions.expand_as(means)[..., None])[..., 0].square()
+        return self.points(means), across * rows.square().sum(-1) + (along - across) * along_rows
+
+    def _local(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        local = (points - self.centre.to(points)) @ self.axes.to(points).T
+        return local, local[..., 2:].clamp_min(self.near / 2)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from voronerf.ops.resample import resample
 from voronerf.rendering.cameras import Cameras, Rays
 from voronerf.rendering.comparison import Comparison, compare_marched, compared
-from voronerf.rendering.contraction import Contraction
+from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
 from voronerf.rendering.occupancy import OccupancyGrid
@@ -113,7 +113,7 @@ class Renderer:
         samples: int,
         fine_samples: int = 0,
         cones: bool = False,
-        contraction: Contraction | None = None,
+        contraction: Contraction | Perspective | None = None,
         spacing: str = "linear",
         occupancy: OccupancyGrid | None = None,
         rounds: int = 1,
@@ -362,7 +362,7 @@ class Renderer:
             if heaviest:
                 top = part.weights.argmax(-1)
                 places[rows] = part.positions[torch.arange(len(rows), device=rows.device), top]
-        size = (cameras.height, cameras.width)
+        size = cameras.size(index)[::-1]
         return RenderedImage(
             colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3)
         )

@@ -14,7 +14,7 @@ from torch import Tensor
 from voronerf.ops.composite import composite
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.cones import frustum_gaussians
-from voronerf.rendering.contraction import Contraction
+from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
 from voronerf.rendering.sampling import stratified_depths
 
@@ -102,7 +102,7 @@ def render_samples(
     edges: Tensor,
     *,
     cones: bool = False,
-    contraction: Contraction | None = None,
+    contraction: Contraction | Perspective | None = None,
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> Rendered:

@@ -39,6 +39,7 @@ class RayBatches:
     """Draws rays uniformly from those pixels of the training views whose ray meets the box of the scene.
 
     A ray that misses the box shows the background whatever the networks are, so there is nothing to learn from it.
+    Pixels that a mask leaves out are not drawn either.
 
     Args:
         scene: The scene; its training views are used.
@@ -54,16 +55,25 @@ class RayBatches:
         self.images = scene.train.images.to(device)
         self.background = scene.background_colour(device)
         self.box = None if scene.box is None else scene.box.to(device)
-        self.useful = None if self.box is None else self._rays_that_meet(self.box)
+        self.useful = self._useful_pixels()
 
-    def _rays_that_meet(self, box: Tensor) -> Tensor | None:
-        """Flat indices of the pixels whose rays meet the box; None when that is all of them."""
+    def _useful_pixels(self) -> Tensor | None:
+        """Flat indices of the pixels to draw from; None when that is all of them."""
+        cameras, masks = self.cameras, self.scene.train.masks
+        if self.box is None and masks is None and cameras.sizes is None:
+            return None
         found = []
-        per_image = self.cameras.width * self.cameras.height
-        for image in range(self.cameras.poses.shape[0]):
-            rays = self.cameras.image_rays(image)
-            _, _, hit = intersect_box(rays.origins, rays.directions, box, self.scene.near, self.scene.far)
-            found.append(hit.nonzero()[:, 0] + image * per_image)
+        for image in range(len(cameras)):
+            width, height = cameras.size(image)
+            chosen = torch.ones(height, width, dtype=torch.bool, device=self.device)
+            if masks is not None:
+                chosen &= masks[image, :height, :width].to(self.device)
+            if self.box is not None:
+                rays = cameras.image_rays(image)
+                _, _, hit = intersect_box(rays.origins, rays.directions, self.box, self.scene.near, self.scene.far)
+                chosen &= hit.reshape(height, width)
+            row, column = chosen.nonzero(as_tuple=True)
+            found.append((image * cameras.height + row) * cameras.width + column)
         useful = torch.cat(found)
         if not 0 < useful.numel() < self.images[..., 0].numel():
             return None
@@ -94,6 +104,7 @@ class RayBatches:
             far=float(self.scene.far),
             box=self.box,
             distortion=cameras.distortion,
+            fisheye=cameras.fisheye,
             background=background,
         )
         radii = None

@@ -31,8 +31,16 @@ class TrainConfig:
     """
 
     data: str = "builtin"
-    """Scene folder (Blender synthetic or transforms.json), or a built-in scene: "builtin", "builtin-rich" with hundreds
-    of solids, or "builtin-translucent" with fog and glass."""
+    """Scene folder (Blender synthetic, transforms.json, COLMAP or LLFF), or a built-in scene: "builtin", "builtin-rich"
+    with hundreds of solids, or "builtin-translucent" with fog and glass."""
+    format: Literal["auto", "blender", "transforms", "colmap", "llff"] = "auto"
+    """What is read of a scene folder; auto is the first of them that it holds, in this order."""
+    kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"
+    """Kind of scene: an object on white; cameras that look the same way; that look outwards; or that look at one place
+    with surroundings. auto tells it by transparent pixels and by the cameras."""
+    normalise: bool = True
+    """Move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera at distance
+    1; the coordinates of the files are kept otherwise."""
     downscale: int = 1
     """Factor by which the images are made smaller when they are loaded."""
     allow_outside: bool = False
@@ -138,9 +146,10 @@ class TrainConfig:
     the proposal's weights to the power of b t / ((b - 1) t + 1), so evenly at first; 0 is off."""
     distortion: float = 0.0
     """Factor of a loss on weights that are spread along a ray (mip-NeRF 360; published: 0.01); 0 is off."""
-    contraction: Literal["auto", "none", "sphere"] = "auto"
-    """Space as the networks see it: unchanged, or with all points outside a sphere mapped into a shell of twice its
-    radius; auto is the sphere for a hash grid in a scene without a box, else none."""
+    contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
+    """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
+    radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for
+    fields without a grid, else ndc where the cameras face forward and the sphere elsewhere."""
     occupancy: bool = True
     """Skip samples in empty space, in training and in pictures, wherever that works: for points in a single pass, in a
     scene with a box, without contraction, --distortion and --cuda-graph."""
@@ -199,6 +208,11 @@ class TrainConfig:
     def field_type(self) -> FieldType:
         """The field's row in the table of fields."""
         return FIELDS[self.field]
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The settings that are arguments of ``load_scene``, but for ``allow_outside``."""
+        return {name: getattr(self, name) for name in ("downscale", "format", "kind", "normalise")}
 
     @property
     def network_options(self) -> dict[str, Any]:

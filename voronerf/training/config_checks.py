@@ -132,7 +132,7 @@ def why_no_occupancy(config: TrainConfig) -> str | None:
     obstacles = {
         f"--field {config.field}, which takes cones": config.field_type.cones,
         f"--sampling {config.sampling}": config.sampling != "stratified",
-        f"--contraction {config.contraction}": config.contraction == "sphere",
+        f"--contraction {config.contraction}": config.contraction in ("sphere", "ndc"),
         "--distortion": config.distortion > 0,
         "--cuda-graph": config.cuda_graph,
     }

@@ -15,6 +15,7 @@ from voronerf.checks import physical_memory
 from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import DensityField
+from voronerf.rendering.contraction import Perspective
 from voronerf.router import VoronoiRouter
 from voronerf.training.adam import Adam
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
@@ -28,21 +29,30 @@ PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
 SAMPLE_BYTES = 64
 
 
-def octaves_for(scene: Scene) -> int:
+def octaves_for(scene: Scene, contraction: str = "none") -> int:
     """Frequencies that positions need so that the finest wave spans two pixels of the training views.
 
     The wave of octave l has length 2 pi / 2^l. The 100 x 100 images of a Blender scene give 8, its 400 x 400 images the
     10 of the NeRF paper; finer waves would be noise to the images, and cost time.
     """
-    return min(max(1 + math.ceil(math.log2(math.pi / pixel_at_the_middle(scene))), 4), 14)
+    return min(max(1 + math.ceil(math.log2(math.pi / pixel_at_the_middle(scene, contraction))), 4), 14)
 
 
-def pixel_at_the_middle(scene: Scene) -> float:
-    """Width of a pixel of the training views at the middle of the scene: distance / focal length, in scene units."""
+def pixel_at_the_middle(scene: Scene, contraction: str = "none") -> float:
+    """Width of a pixel of the training views at the middle of the scene: distance / focal length, in scene units.
+
+    In normalised device coordinates it is the same at all distances.
+    """
     cameras = scene.train.cameras
-    centre = torch.zeros(3) if scene.box is None else scene.box.mean(0)
+    focal = float(cameras.intrinsics[:, :2].mean())
+    if contraction == "ndc" and isinstance(scene.contraction, Perspective):
+        return 1 / (focal * max(scene.contraction.slopes))
+    if scene.kind in ("forward", "inside-out"):
+        return 2 / (1 / scene.near + 1 / scene.far) / focal
+    centre = torch.zeros(3) if scene.contraction is None else scene.contraction.centre
+    centre = centre if scene.box is None else scene.box.mean(0)
     distance = float((cameras.origins - centre).norm(dim=-1).mean()) or scene.near  # of a panorama from one place
-    return distance / float(cameras.intrinsics[:, :2].mean())
+    return distance / focal
 
 
 def samples_for(scene: Scene) -> int:
@@ -62,9 +72,8 @@ def space_of(config: TrainConfig, scene: Scene) -> tuple[tuple[float, ...], ...]
     Raises:
         ConfigError: for a scene without a box that is not contracted.
     """
-    if config.contraction == "sphere":
-        sphere = make_contraction(scene)
-        box = torch.stack((sphere.centre - 2 * sphere.radius, sphere.centre + 2 * sphere.radius))
+    if config.contraction != "none":
+        box = make_contraction(scene, config.contraction).cube
     elif scene.box is not None:
         box = scene.box
     else:
@@ -86,17 +95,20 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     """
     kind = config.field_type
     if config.contraction == "auto":
-        unbounded = kind.scene_options is not None and scene.box is None
-        config = replace(config, contraction="sphere" if unbounded else "none")
+        if kind.scene_options is None or scene.box is not None:
+            config = replace(config, contraction="none")
+        else:
+            forward = isinstance(scene.contraction, Perspective)
+            config = replace(config, contraction="ndc" if forward else "sphere")
     if config.occupancy and (scene.box is None or why_no_occupancy(config) is not None):
         config = replace(config, occupancy=False)
     if config.samples is None:
         config = replace(config, samples=samples_for(scene) if config.occupancy else 64)
     if config.position_octaves is None and "position_octaves" in kind.options:
-        config = replace(config, position_octaves=kind.octaves(octaves_for(scene)))
+        config = replace(config, position_octaves=kind.octaves(octaves_for(scene, config.contraction)))
     if kind.scene_options is not None:
         contracted = config.contraction != "none"
-        found = kind.scene_options(pixel_at_the_middle(scene), space_of(config, scene), contracted)
+        found = kind.scene_options(pixel_at_the_middle(scene, config.contraction), space_of(config, scene), contracted)
         more = [f"{name}={value}" for name, value in found.items() if name not in config.network_options]
         config = replace(config, field_options=(*config.field_options, *more))
     if config.parameters is None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 
 from voronerf.data import Scene
-from voronerf.rendering.contraction import Contraction
+from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import DirectionPerSample, Field
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
@@ -46,7 +47,7 @@ def make_renderer(
         samples=int(config.samples or 0) if samples is None else samples,
         fine_samples=0 if config.sampling == "stratified" else fine_samples or config.fine_samples,
         cones=config.field_type.cones,
-        contraction=make_contraction(scene, device) if config.contraction == "sphere" else None,
+        contraction=None if config.contraction == "none" else make_contraction(scene, config.contraction, device),
         spacing=scene.spacing,
         occupancy=occupancy,
         rounds=config.proposal_rounds,
@@ -61,14 +62,26 @@ def as_field(router: VoronoiRouter) -> Field:
     return router if takes_rays else DirectionPerSample(router)
 
 
-def make_contraction(scene: Scene, device: torch.device | str = "cpu") -> Contraction:
-    """The sphere around a scene's box, or without one around the origin and all cameras.
+def make_contraction(
+    scene: Scene, name: str = "sphere", device: torch.device | str = "cpu"
+) -> Contraction | Perspective:
+    """The contraction "sphere" or "ndc" of a scene.
+
+    The sphere is that around a scene's box, or without one its own, or that around the origin and all cameras.
 
     Raises:
-        ConfigError: When all cameras are at the origin, so that there is no such sphere.
+        ConfigError: For ndc without forward-facing cameras, or when all cameras are at the origin, so that there is no
+            sphere.
     """
+    own = scene.contraction
+    if name == "ndc":
+        if not isinstance(own, Perspective):
+            raise ConfigError(f"--contraction ndc needs a forward-facing scene, {scene.name} is {scene.kind} (--kind)")
+        return replace(own, centre=own.centre.to(device), axes=own.axes.to(device))
     if scene.box is not None:
         return Contraction(scene.box.mean(0).to(device), float((scene.box[1] - scene.box[0]).norm()) / 2)
+    if own is not None:
+        return Contraction(own.centre.to(device), own.near if isinstance(own, Perspective) else own.radius)
     radius = float(scene.train.cameras.origins.norm(dim=-1).max())
     if radius == 0:
         raise ConfigError(f"--contraction sphere needs cameras in several places, those of {scene.name} are in one")

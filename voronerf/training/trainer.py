@@ -107,8 +107,7 @@ class Trainer:
         self.draws = self.generator
         if self.device.type == "cuda":
             self.draws = torch.Generator(self.device).manual_seed(config.seed)
-        size = (scene.test.cameras.height, scene.test.cameras.width)
-        self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, size)
+        self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
         self.batches = RayBatches(scene, self.device, cones=config.field_type.cones)
         self.routers = make_routers(config, self.device)
         for router in self.routers.values():

@@ -1,0 +1,262 @@
+"""Folders of photographs: COLMAP's, LLFF's and nerfstudio's readers, what they share, and what they refuse."""
+
+import json
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses
+from PIL import Image
+from scene_files import rewrite, write_capture, write_colmap, write_images, write_llff
+
+from voronerf.data import SceneError, load_scene
+from voronerf.rendering.cameras import Cameras, orbit_cameras
+from voronerf.training.batches import RayBatches
+
+DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
+COUNT, SIZE = 9, (12, 10)
+POSES = orbit_cameras(COUNT, radius=4, elevation=20, width=12, height=10, focal=20, centre=(1, 2, 3)).poses
+POINTS = np.random.default_rng(0).normal(size=(60, 3)) * 0.4 + (1, 2, 3)
+
+
+def needs(name):
+    if not (DATA / name).is_dir():
+        pytest.skip(f"{DATA / name} is not there; set VORONERF_DATA to a folder that holds {name}")
+    return DATA / name
+
+
+def write_both(folder, sizes=(SIZE,) * COUNT, *, binary=True, **save):
+    write_images(folder, sizes, **save)
+    write_colmap(folder, POSES, sizes, POINTS, binary=binary)
+    write_llff(folder, POSES, SIZE, 20.0, (2.5, 5.5))
+
+
+def every(scene):
+    """Names and poses of all views, in the order of the names."""
+    rows = [*zip(scene.train.names, scene.train.cameras.poses), *zip(scene.test.names, scene.test.cameras.poses)]
+    return [name for name, _ in sorted(rows)], torch.stack([pose for _, pose in sorted(rows)])
+
+
+@pytest.mark.parametrize(("format", "binary"), [("colmap", True), ("colmap", False), ("llff", True)])
+def test_a_folder_is_read_as_it_was_written(tmp_path, format, binary):
+    write_both(tmp_path, binary=binary)
+    scene = load_scene(tmp_path, format=format, normalise=False)
+    names, poses = every(scene)
+    assert names == [f"{index:02d}" for index in range(COUNT)] and scene.test.names == ("00", "08")
+    torch.testing.assert_close(poses, POSES, atol=1e-5, rtol=0)
+    for split in (scene.train, scene.test):
+        assert [int(image[0, 0, 0]) for image in split.images] == [int(name) for name in split.names]
+    lens = scene.train.cameras.intrinsics[0].tolist()
+    assert lens == pytest.approx([20, 20, 6, 5])
+    bent = scene.train.cameras.distortion
+    assert (bent is None) == (format == "llff") and (bent is None or float(bent[0, 0]) == pytest.approx(0.02))
+    depths = -(torch.from_numpy(POINTS)[None] - POSES[:, None, :3, 3].double()) @ POSES[:, :3, 2:3].double()
+    near, far = (2.5, 5.5) if format == "llff" else (float(depths.min()), float(depths.max()))
+    assert scene.near == pytest.approx(0.75 * near, rel=0.05)
+    assert scene.far == pytest.approx(max(1.5 * far, 4 * scene.contraction.radius), rel=0.05)
+    assert any(f"--format {'colmap' if format == 'llff' else 'llff'} would read" in note for note in scene.notes)
+
+
+def test_the_scene_is_normalised_by_a_similarity_that_it_keeps(tmp_path):
+    write_both(tmp_path)
+    scene, plain = load_scene(tmp_path), load_scene(tmp_path, normalise=False)
+    assert scene.kind == "unbounded" and scene.spacing == "disparity" and scene.box is None
+    _, poses = every(scene)
+    assert float(poses[:, :3, 3].norm(dim=-1).max()) == pytest.approx(1, abs=1e-5)
+    assert float(poses[:, :3, 3].mean(0)[:2].norm()) < 1e-5 and float(poses[0, 2, 3]) > 0  # around z, above
+    homogeneous = torch.cat((POSES[:, :3, 3], torch.ones(COUNT, 1)), dim=1).double()
+    torch.testing.assert_close((homogeneous @ scene.transform.T)[:, :3].float(), poses[:, :3, 3])
+    scale = float(torch.linalg.det(scene.transform[:3, :3])) ** (1 / 3)
+    assert scene.near == pytest.approx(scale * plain.near) and scene.far == pytest.approx(max(scale * plain.far, 4))
+    torch.testing.assert_close(plain.contraction.centre, torch.tensor([1.0, 2, 3]), atol=1e-3, rtol=0)
+    assert plain.contraction.radius == pytest.approx(1 / scale) and scene.contraction.radius == 1
+
+
+@pytest.mark.parametrize(("kind", "turn"), [("forward", 0.0), ("inside-out", 180.0), ("unbounded", 0.0)])
+def test_the_kind_is_told_by_the_cameras_and_can_be_set(tmp_path, kind, turn):
+    poses = POSES.clone()
+    if kind == "forward":
+        poses[:, :3, :3] = torch.eye(3)
+        poses[:, :3, 3] *= 0.1
+    elif kind == "inside-out":
+        poses[:, :3, [0, 2]] *= -1
+    write_images(tmp_path, [SIZE] * COUNT)
+    write_llff(tmp_path, poses, SIZE, 20.0, (2.0, 6.0))
+    scene = load_scene(tmp_path)
+    assert scene.kind == kind and any("--kind" in note for note in scene.notes)
+    if kind == "forward":  # y is ahead, the nearest depth at 1
+        torch.testing.assert_close(scene.train.cameras.forward, torch.tensor([[0.0, 1, 0]]).expand(7, 3))
+        assert scene.near == pytest.approx(0.75)
+    assert load_scene(tmp_path, kind="inside-out").kind == "inside-out"
+    refuses("--kind object needs images with transparent pixels", load_scene, tmp_path, kind="object", error=SceneError)
+
+
+def test_images_of_different_sizes_train_and_are_scored_as_they_are(tmp_path):
+    sizes = [SIZE if index % 2 else (8, 14) for index in range(COUNT)]
+    write_both(tmp_path, sizes)
+    scene = load_scene(tmp_path)
+    cameras = scene.train.cameras
+    assert scene.train.images.shape == (7, 14, 12, 3) and (cameras.width, cameras.height) == (12, 14)
+    for index, name in enumerate(scene.train.names):
+        width, height = sizes[int(name)]
+        assert cameras.size(index) == (width, height) and len(cameras.image_rays(index)) == width * height
+        assert scene.train.truth(index, None).shape == (height, width, 3)
+    batches = RayBatches(scene, torch.device("cpu"))
+    assert len(batches) == sum(w * h for number, (w, h) in enumerate(sizes) if number % 8)
+    batch = batches.draw(500, torch.Generator().manual_seed(0))
+    numbers = (batch.target * 255).round()
+    assert (numbers[:, :1] == numbers).all() and set(numbers[:, 0].tolist()) == {1, 2, 3, 4, 5, 6, 7}
+    for number in (1, 2):
+        origin = cameras.origins[scene.train.names.index(f"{number:02d}")]
+        torch.testing.assert_close(batch.rays.origins[numbers[:, 0] == number][0], origin)
+    assert load_scene(tmp_path, downscale=2).train.cameras.size(1) == (4, 7)
+
+
+def test_masks_leave_pixels_out_of_training_and_scores(tmp_path):
+    write_capture(tmp_path, orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=12))
+    mask = np.full((10, 12), 255, np.uint8)
+    mask[:, :6] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    rewrite(tmp_path, lambda contents: [frame.update(mask_path="mask.png") for frame in contents["frames"]])
+    scene = load_scene(tmp_path)
+    assert len(RayBatches(scene, torch.device("cpu"))) == 7 * 60
+    assert torch.equal(scene.test.mask(0), torch.from_numpy(mask > 0))
+    assert int(load_scene(tmp_path, downscale=4).train.masks[0].sum()) == 2  # a block with a black pixel is left out
+    for change, reason in (
+        ({"mask_path": "../mask.png"}, "mask_path must lead to a file in the folder of the scene"),
+        ({"mask_path": "none.png"}, "does not exist"),
+        ({"mask_path": 3}, "mask_path must be a file name, got 3"),
+        ({"mask_path": "small.png"}, "small.png: is 3 x 2 pixels"),
+    ):
+        Image.new("L", (3, 2), 255).save(tmp_path / "small.png")
+        rewrite(tmp_path, lambda contents, change=change: contents["frames"][1].update(change))
+        refuses(reason, load_scene, tmp_path, error=SceneError)
+
+
+def test_nerfstudio_files(tmp_path):
+    """Its applied_transform leads from the original coordinates to those of the file; depth is not used."""
+    write_capture(tmp_path, Cameras(POSES, torch.full((9, 4), 12.0), 12, 10))
+    applied = [[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 2]]
+    rewrite(tmp_path, lambda contents: contents.update(applied_transform=applied))
+    rewrite(tmp_path, lambda contents: [frame.update(depth_file_path="d.png") for frame in contents["frames"]])
+    scene = load_scene(tmp_path, normalise=False)
+    assert scene.transform[:3].tolist() == applied and "its depth images are not used" in scene.notes
+    rewrite(tmp_path, lambda contents: contents.update(applied_transform=[[2, 0, 0, 0]] * 3))
+    refuses("applied_transform is not a pose", load_scene, tmp_path, error=SceneError)
+
+
+@pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
+def test_pixels_are_taken_as_stored_whatever_the_orientation_tag_says(tmp_path, format):
+    """As COLMAP, LLFF and nerfstudio do: their cameras are those of the stored pixels."""
+    tag = Image.Exif()
+    tag[0x0112] = 6  # turned by a quarter
+    write_both(tmp_path, exif=tag)
+    if format == "transforms":
+        frames = [
+            {"file_path": f"images/{index:02d}.jpg", "transform_matrix": pose.tolist()}
+            for index, pose in enumerate(POSES)
+        ]
+        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
+    assert load_scene(tmp_path, format=format).train.images.shape == (7, 10, 12, 3)
+
+
+def test_which_folder_of_images(tmp_path):
+    write_images(tmp_path, [SIZE] * COUNT)
+    write_llff(tmp_path, POSES, (48, 40), 80.0, (2.5, 5.5))
+    (tmp_path / "images").rename(tmp_path / "images_4")
+    for downscale, width in ((1, 12), (4, 12), (8, 6)):
+        cameras = load_scene(tmp_path, downscale=downscale).train.cameras
+        assert cameras.width == width and float(cameras.intrinsics[0, 0]) == pytest.approx(20 * width / 12)
+    refuses("--downscale must be 1 or a multiple of 4, got 6", load_scene, tmp_path, downscale=6, error=SceneError)
+    (tmp_path / "images_4/00.jpg").unlink()
+    refuses("has poses of 9 images", load_scene, tmp_path, error=SceneError)
+
+
+def broken(path, at, layout, *values):
+    data = bytearray(path.read_bytes())
+    struct.pack_into(layout, data, at, *values)
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda model: broken(model / "images.bin", 0, "<Q", 2**60), "images.bin: is cut short or broken: 11529215"),
+        (lambda model: broken(model / "images.bin", 8 + 64 + 7, "<Q", 2**40), "sightings do not fit into"),
+        (lambda model: broken(model / "points3D.bin", 0, "<Q", 10**6), "points3D.bin: is cut short or broken: 1000000"),
+        (lambda model: broken(model / "images.bin", 12, "<d", np.nan), "image 08.jpg: its pose must be a unit"),
+        (lambda model: broken(model / "cameras.bin", 12, "<i", 77), "camera 1 has model number 77"),
+        (lambda model: broken(model / "cameras.bin", 12, "<i", 7), "camera 1: camera model FOV is not supported"),
+        (
+            lambda model: broken(model / "cameras.bin", 32, "<d", -1.0),
+            "camera 1 must have a size and finite parameters",
+        ),
+        (lambda model: broken(model / "images.bin", 8 + 60, "<I", 99), "has camera 99, which cameras.bin has not"),
+        (lambda model: broken(model / "images.bin", 8 + 64, "<6s", b"../../"), "must be a file in the folder"),
+        (lambda model: (model / "images.bin").write_bytes((model / "images.bin").read_bytes()[:90]), "is cut short"),
+        (lambda model: (model / "images.bin").write_bytes(bytes(8)), "images.bin: has no images"),
+        (lambda model: (model.parents[1] / "images/03.jpg").write_bytes(b"no"), "03.jpg: is not an image"),
+        (
+            lambda model: Image.new("RGB", (10, 12)).save(model.parents[1] / "images/03.jpg"),
+            "is 10 x 12 pixels as stored",
+        ),
+    ],
+)
+def test_broken_colmap_folders_are_one_line(tmp_path, damage, reason):
+    write_both(tmp_path)
+    damage(tmp_path / "sparse/0")
+    refuses(reason, load_scene, tmp_path, error=SceneError)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "reason"),
+    [
+        ("cameras", "1 PINHOLE 12 ten 20 20 6 5", "cameras.txt: line 1 is not that of a camera"),
+        ("cameras", "1 PINHOLE 12 10 20 20 6", "camera 1: PINHOLE must have 4 parameters, got 3"),
+        ("images", "1 1 0 0 0 0 0", "images.txt: line 1 is not that of an image"),
+        ("points3D", "7 one 2 3", "points3D.txt: line 1 is not that of a point"),
+    ],
+)
+def test_broken_text_is_one_line(tmp_path, file, text, reason):
+    write_both(tmp_path, binary=False)
+    (tmp_path / f"sparse/0/{file}.txt").write_text(text + "\n")
+    refuses(reason, load_scene, tmp_path, error=SceneError)
+
+
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        (np.zeros((9, 16)), "must have 17 numbers for each image, got shape [9, 16]"),
+        (np.full((9, 17), np.nan), "has values that are not finite"),
+        (np.ones((9, 17)), "row 0 is not a pose"),
+        (np.zeros((9, 17), dtype=object), "is no array of NumPy that can be read"),
+    ],
+)
+def test_broken_llff_is_one_line(tmp_path, rows, reason):
+    write_both(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", rows, allow_pickle=True)
+    refuses(reason, load_scene, tmp_path, format="llff", error=SceneError)
+
+
+def test_formats_and_kinds_are_named(tmp_path):
+    write_both(tmp_path)
+    refuses("format must be colmap or llff, which it has, got blender", load_scene, tmp_path, format="blender")
+    refuses("format must be auto, blender or", load_scene, tmp_path, format="nerf")
+    refuses("kind must be auto, object or", load_scene, tmp_path, kind="outdoor")
+
+
+@pytest.mark.data
+def test_colmap_and_llff_agree_on_beer():
+    colmap, llff = (every(load_scene(needs("beer"), downscale=16, format=format)) for format in ("colmap", "llff"))
+    assert colmap[0] == llff[0] and len(colmap[0]) == 71
+    torch.testing.assert_close(colmap[1], llff[1], atol=1e-5, rtol=0)
+
+
+@pytest.mark.data
+def test_fern_faces_forward():
+    scene = load_scene(needs("fern"), downscale=24)
+    assert scene.kind == "forward" and scene.train.images.shape == (17, 126, 168, 3)
+    assert scene.near == pytest.approx(0.75) and 5 < scene.far < 10

@@ -1,0 +1,77 @@
+"""The image files of COLMAP's and LLFF's folders: `images`, or `images_N`, which are smaller by N."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from voronerf.data.scene import SceneError
+from voronerf.files import leads_outside
+
+log = logging.getLogger(__name__)
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+class ImageFolder(NamedTuple):
+    """A folder of images, by how much they are still to be reduced, and a line about it, or none."""
+
+    path: Path
+    factor: int
+    notes: tuple[str, ...]
+
+
+def choose_images(folder: Path, downscale: int) -> ImageFolder:
+    """The folder of images that needs the least reduction.
+
+    With `downscale` N, `images_N` is read as it is, else `images`. Where there is no `images`, the largest `images_N`
+    is read, which a `downscale` of 1 takes as it is.
+
+    Raises:
+        SceneError: there is no folder of images, or `downscale` is none of what there is.
+    """
+    sizes = {1: folder / "images"} if (folder / "images").is_dir() else {}
+    for path in folder.glob("images_*"):
+        match = re.fullmatch(r"images_([1-9]\d{0,3})", path.name)
+        if match and path.is_dir():
+            sizes[int(match[1])] = path
+    if not sizes:
+        raise SceneError(f"{folder}: has neither a folder images nor images_2, images_4, ...")
+    if downscale in sizes:
+        return ImageFolder(sizes[downscale], 1, (f"{sizes[downscale].name} is read as it is",) * (downscale > 1))
+    largest = min(sizes)
+    if downscale == 1:
+        return ImageFolder(sizes[largest], 1, (f"{sizes[largest].name} is read, there is no folder images",))
+    if downscale % largest:
+        raise SceneError(f"{sizes[largest]}: --downscale must be 1 or a multiple of {largest}, got {downscale}")
+    return ImageFolder(sizes[largest], downscale // largest, ())
+
+
+def named_images(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
+    """The files of names in a folder, None for those that are missing; with a warning that says how many.
+
+    Raises:
+        SceneError: no file exists, or a name leads outside of the folder.
+    """
+    found: list[Path | None] = []
+    for name in names:
+        path = folder / name.replace("\\", "/")
+        if not allow_outside and leads_outside(path, folder.parent):
+            raise SceneError(
+                f"{source}: image {name!r:.60} must be a file in the folder of the scene; --allow-outside reads others"
+            )
+        found.append(path if path.is_file() else None)
+    missing = found.count(None)
+    if missing == len(found):
+        raise SceneError(f"{source}: none of its {len(found)} images exists, the first is {folder / names[0]}")
+    if missing:
+        log.warning("%s: %d of %d listed images are missing and are skipped", source, missing, len(found))
+    return found
+
+
+def listed_images(folder: Path) -> list[Path]:
+    """The image files of a folder in the order of their names."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())

@@ -1,0 +1,79 @@
+"""Lenses by the names of COLMAP's camera models, and whether a lens gives every pixel a ray.
+
+Source: COLMAP, "Camera Models", and `src/colmap/sensor/models.h`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.rendering.cameras import Cameras, distort, undistort
+
+
+class Lens(NamedTuple):
+    """Intrinsics (fx, fy, cx, cy) in pixels, and the coefficients of `Cameras.distortion`."""
+
+    intrinsics: tuple[float, ...]
+    coefficients: tuple[float, ...]
+    fisheye: bool
+
+
+#: COLMAP's number of each model, its name and what its parameters are. f stands for fx and fy.
+MODELS: dict[int, tuple[str, str]] = {
+    0: ("SIMPLE_PINHOLE", "f cx cy"),
+    1: ("PINHOLE", "fx fy cx cy"),
+    2: ("SIMPLE_RADIAL", "f cx cy k1"),
+    3: ("RADIAL", "f cx cy k1 k2"),
+    4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    5: ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
+    6: ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    7: ("FOV", "fx fy cx cy omega"),
+    8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
+    9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
+    10: ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s2"),
+}
+PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+FISHEYE = ("k1", "k2", "p1", "p2", "k3", "k4", "s1", "s2")
+#: Models whose distortion is none of the two that `distort` has.
+REFUSED = ("FOV",)
+
+
+def colmap_lens(model: str, parameters: Sequence[float]) -> Lens:
+    """The lens of a camera model of COLMAP, with its parameters in COLMAP's order.
+
+    Raises:
+        ValueError: an unknown model, or another number of parameters; a part of a line.
+    """
+    names = {name: text.split() for name, text in MODELS.values() if name not in REFUSED}
+    if model not in names:
+        raise ValueError(f"camera model {model!s:.60} is not supported, only {', '.join(names)}")
+    if len(parameters) != len(names[model]):
+        raise ValueError(f"{model} must have {len(names[model])} parameters, got {len(parameters)}")
+    given = dict(zip(names[model], parameters))
+    fisheye = "FISHEYE" in model
+    intrinsics = (given.get("fx", given.get("f", 0)), given.get("fy", given.get("f", 0)), given["cx"], given["cy"])
+    return Lens(intrinsics, tuple(given.get(key, 0.0) for key in (FISHEYE if fisheye else PERSPECTIVE)), fisheye)
+
+
+def lens_inverts(cameras: Cameras) -> Tensor:
+    """Which cameras have a ray for every pixel of the border, bool [c].
+
+    A lens model that folds over inside the image has none there.
+    """
+    if cameras.distortion is None:
+        return torch.ones(len(cameras), dtype=torch.bool)
+    edge = torch.linspace(0, 1, 33, dtype=torch.float64)
+    sizes = torch.tensor([cameras.size(index) for index in range(len(cameras))], dtype=torch.float64)
+    x = torch.cat((edge, edge, torch.zeros(33), torch.ones(33)))[None] * sizes[:, :1]
+    y = torch.cat((torch.zeros(33), torch.ones(33), edge, edge))[None] * sizes[:, 1:]
+    fx, fy, cx, cy = cameras.intrinsics.double()[:, :, None].unbind(1)
+    coefficients = cameras.distortion.double()[:, None, :]
+    u, v = (x - cx) / fx, (y - cy) / fy
+    a, b = undistort(u, v, coefficients, cameras.fisheye)
+    again, and_again = distort(a, b, coefficients, cameras.fisheye)
+    error = torch.maximum((again - u).abs() * fx, (and_again - v).abs() * fy)
+    return (error < 1e-3).all(-1)

@@ -1,0 +1,317 @@
+"""From photographs with known cameras to a scene: which kind it is, where it lies, and how near and far it reaches.
+
+c images, n sparse points. A scene is moved, turned and scaled so that the networks meet the same numbers whatever the
+units of its files: what the cameras look at becomes the origin, their mean up direction the z axis, and the farthest
+camera is at distance 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.data.carving import carve_box
+from voronerf.data.images import read_images, read_masks
+from voronerf.data.lenses import Lens, lens_inverts
+from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.transforms import distinct_names
+from voronerf.rendering.cameras import Cameras, focus_point
+from voronerf.rendering.contraction import Contraction, Perspective
+
+HOLD_OUT = 8
+# Near bound without bounds of the views, as a share of the distance from the focus to the nearest camera; closer things
+# are rarely in focus.
+NEAR = 0.35
+# Smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
+NEAREST = 0.05
+FAR = 4.0
+# Smallest near bound that points give.
+LEAST_NEAR = 1e-3
+# Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
+NEARER, FARTHER = 0.75, 1.5
+# Mean of the viewing directions, a unit vector each, from which on they count as one direction.
+PARALLEL = 0.95
+KIND_LINES = {
+    "object": "an object on white, from the images' alpha",
+    "forward": "forward facing, the cameras look the same way",
+    "inside-out": "inside-out, the cameras look away from each other",
+    "unbounded": "unbounded, the cameras look at one place with surroundings",
+}
+
+
+class View(NamedTuple):
+    """A photograph: its file, camera to world pose float64 [4, 4], lens with the image size that it is for, and where
+    known its mask file and the depths between which its points lie."""
+
+    path: Path
+    pose: Tensor
+    lens: Lens
+    size: tuple[float, float]
+    mask: Path | None = None
+    bounds: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a folder is read, the options of `load_scene`."""
+
+    downscale: int = 1
+    allow_outside: bool = False
+    kind: str = "auto"
+    normalise: bool = True
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """What a loader found.
+
+    Attributes:
+        source: the file to name in errors.
+        views: in the order of their names.
+        held_out: bool [c], the test views.
+        factor: by which the files are still to be reduced.
+        notes: what the loader has to say.
+        transform: float64 [4, 4], from the original coordinates to those of the poses.
+    """
+
+    source: Path
+    views: Sequence[View]
+    held_out: Tensor
+    factor: int
+    notes: tuple[str, ...] = ()
+    transform: Tensor | None = None
+
+
+def hold_out(count: int) -> Tensor:
+    """Every 8th of `count` images, from the first."""
+    return torch.arange(count) % HOLD_OUT == 0
+
+
+def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scene:
+    """Makes the scene of photographs.
+
+    Raises:
+        SceneError: an image cannot be read or has another shape than its camera, a lens cannot be inverted, or the kind
+            does not fit.
+    """
+    if len(found.views) < 2 or not bool(found.held_out.any()) or bool(found.held_out.all()):
+        raise SceneError(f"{found.source}: one image is too few, one is held out for testing")
+    # Training views first, so that the images of either part are a slice and no copy.
+    order = torch.cat(((~found.held_out).nonzero()[:, 0], found.held_out.nonzero()[:, 0])).tolist()
+    views, count = [found.views[index] for index in order], int((~found.held_out).sum())
+    paths = [view.path for view in views]
+    images, sizes = read_images(paths, found.factor)
+    masks = read_masks([view.mask for view in views], paths, sizes, found.factor)
+    alpha = images.shape[-1] == 4 and bool((images[..., 3] < 255).any())
+
+    poses = torch.stack([view.pose for view in views])
+    kind = _kind(poses, alpha, reading.kind, found.source)
+    if kind != "object":
+        images = images[..., :3].contiguous()
+    bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
+    frame = find_frame(poses, kind, bounds if len(bounds) else None)
+    if not reading.normalise:
+        frame = frame.undone()
+    cameras = _cameras(frame.poses(poses), views, sizes, found.source)
+    contraction = _contraction(kind, frame, cameras)
+    cameras = cameras.downscaled(found.factor)
+    near, far, box = frame.near, frame.far, None
+    if kind == "object":
+        box = carve_box(cameras[:count], images[:count, ..., 3], near, far)
+
+    names = tuple(distinct_names(paths, folder))
+    parts = [
+        Split(cameras[part], images[part], names[part], None if masks is None else masks[part])
+        for part in (slice(count), slice(count, None))
+    ]
+    to_scene = frame.matrix if found.transform is None else frame.matrix @ found.transform
+    return Scene(
+        folder.resolve().name,
+        parts[0],
+        parts[1],
+        near,
+        far,
+        box,
+        "linear" if kind == "object" else "disparity",
+        "white" if kind == "object" else None,
+        kind,
+        contraction,
+        to_scene,
+        (*found.notes, *_notes(kind, frame, reading)),
+    )
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where a scene lies: a similarity, and what is measured in the space behind it.
+
+    Attributes:
+        matrix: float64 [4, 4], from the coordinates of the files to those of the scene.
+        near: distance along a ray at which the scene begins.
+        far: distance along a ray at which it ends.
+        centre: float64 [3], the middle of the foreground.
+        radius: of the foreground.
+        axes: float64 [3, 3], its rows are the directions right, up and ahead.
+        measured: near and far come from the points.
+    """
+
+    matrix: Tensor
+    near: float
+    far: float
+    centre: Tensor
+    radius: float
+    axes: Tensor
+    measured: bool
+
+    @property
+    def scale(self) -> float:
+        """Lengths in the scene over those in the files."""
+        return float(torch.linalg.det(self.matrix[:3, :3])) ** (1 / 3)
+
+    def poses(self, poses: Tensor) -> Tensor:
+        """Poses float64 [c, 4, 4] in the scene, rigid as before."""
+        moved = self.matrix @ poses
+        moved[:, :3, :3] /= self.scale
+        return moved
+
+    def undone(self) -> Frame:
+        """The same space in the coordinates of the files."""
+        back = torch.linalg.inv(self.matrix)
+        return Frame(
+            torch.eye(4, dtype=torch.float64),
+            self.near / self.scale,
+            self.far / self.scale,
+            back[:3, :3] @ self.centre + back[:3, 3],
+            self.radius / self.scale,
+            self.axes @ self.matrix[:3, :3] / self.scale,
+            self.measured,
+        )
+
+
+def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None) -> Frame:
+    """Finds the coordinates of a scene.
+
+    The cameras' focus becomes the origin, or their middle where they have none in common; their mean up direction
+    becomes z, and for a forward-facing scene their mean direction becomes y. The farthest camera is at distance 1; with
+    bounds, the nearest near bound of a forward-facing scene, and the median far bound of one that is seen from within.
+
+    Args:
+        poses: float64 [c, 4, 4].
+        kind: of the scene.
+        bounds: float64 [m, 2], the least and the largest depth of the points of m views.
+    """
+    cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
+    outward = kind in ("forward", "inside-out")
+    centre = None if outward else focus_point(cameras)
+    if centre is None:
+        centre = cameras.origins.mean(0)
+    turn = _upright(poses[:, :3, 1].mean(0), cameras.forward.mean(0) if kind == "forward" else None)
+    distances = (cameras.origins - centre).norm(dim=-1)
+    length = float(distances.max())
+    if outward and bounds is not None:
+        length = float(bounds[:, 0].min() if kind == "forward" else bounds[:, 1].median())
+    length = length if length > 0 else 1.0
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = turn / length
+    matrix[:3, 3] = -turn @ centre / length
+    nearest = float(distances.min()) / length
+    near, far, measured = max(NEAR * nearest, NEAREST), FAR, False
+    if kind == "object":
+        near, far = 0.05 * nearest, 2.0
+    elif bounds is not None:
+        measured = True
+        near = max(NEARER * float(bounds[:, 0].min()) / length, LEAST_NEAR)
+        far = max(FARTHER * float(bounds[:, 1].max()) / length, FAR)
+    axes = torch.eye(3, dtype=torch.float64)[[0, 2, 1]]
+    return Frame(matrix, near, far, torch.zeros(3, dtype=torch.float64), 1.0, axes, measured)
+
+
+def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Perspective | None:
+    """Of a scene without a box: a cube around all that forward-facing cameras see, or a ball."""
+    centre = frame.centre.float()
+    if kind == "object":
+        return None
+    if kind != "forward":
+        return Contraction(centre, frame.radius)
+    slopes = torch.zeros(2)
+    axes = frame.axes.float()
+    for index in range(len(cameras)):
+        width, height = cameras.size(index)
+        rays = cameras.rays(index, torch.tensor([0.0, width, 0.0, width]), torch.tensor([0.0, 0.0, height, height]))
+        for distance in (frame.near, frame.far):
+            local = (rays.origins + distance * rays.directions - centre) @ axes.T
+            slopes = torch.maximum(slopes, (local[:, :2].abs() / local[:, 2:].clamp_min(frame.near / 2)).amax(0))
+    return Perspective(centre, axes, frame.near, (float(slopes[0]), float(slopes[1])))
+
+
+def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
+    """A rotation [3, 3] that turns `up` to z, and `forward`, if given, to y; leaves a direction of no length alone."""
+    if forward is not None and forward.norm() > 0.1:
+        y = torch.nn.functional.normalize(forward, dim=0)
+        x = torch.linalg.cross(y, up)
+        if x.norm() > 1e-3:
+            x = torch.nn.functional.normalize(x, dim=0)
+            return torch.stack((x, y, torch.linalg.cross(x, y)))
+    if up.norm() <= 0.1:
+        return torch.eye(3, dtype=up.dtype)
+    z = up / up.norm()
+    spare = torch.eye(3, dtype=up.dtype)[int(z.abs().argmin())]
+    x = torch.nn.functional.normalize(torch.linalg.cross(spare, z), dim=0)
+    return torch.stack((x, torch.linalg.cross(z, x), z))
+
+
+def _kind(poses: Tensor, alpha: bool, asked: str, source: Path) -> str:
+    """The kind that was asked for, or the one that alpha and cameras show."""
+    if asked == "object" and not alpha:
+        raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
+    if asked != "auto":
+        return asked
+    if alpha:
+        return "object"
+    cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
+    forward = cameras.forward
+    if float(forward.mean(0).norm()) > PARALLEL:
+        return "forward"
+    return "unbounded" if focus_point(cameras) is not None else "inside-out"
+
+
+def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) -> Cameras:
+    """Cameras of the image files, whose size may be another one of the same shape than the lens is for."""
+    if len({view.lens.fisheye for view in views}) > 1:
+        raise SceneError(f"{source}: has fisheyes and other cameras; the cameras of a scene must be of one kind")
+    intrinsics = []
+    for view, (width, height) in zip(views, sizes.tolist()):
+        across, down = width / view.size[0], height / view.size[1]
+        # Reduced images have sizes of whole pixels; exporters that scale images may write fractions.
+        if abs(across - down) * max(view.size) > 2:
+            raise SceneError(
+                f"{view.path}: is {width} x {height} pixels as stored, but {source} says {view.size[0]:g} x "
+                f"{view.size[1]:g}"
+            )
+        fx, fy, cx, cy = view.lens.intrinsics
+        intrinsics.append((fx * across, fy * down, cx * across, cy * down))
+    bent = torch.tensor([view.lens.coefficients for view in views])
+    fisheye = views[0].lens.fisheye
+    distortion = bent if fisheye or bool(bent.any()) else None
+    cameras = Cameras.of_images(poses.float(), torch.tensor(intrinsics), sizes, distortion, fisheye)
+    inverts = lens_inverts(cameras)
+    if not bool(inverts.all()):
+        name = views[int(inverts.int().argmin())].path.name
+        raise SceneError(f"{source}: the lens distortion of {name} cannot be inverted inside the image")
+    return cameras
+
+
+def _notes(kind: str, frame: Frame, reading: Reading) -> list[str]:
+    asked = "" if reading.kind == "auto" else ", as asked"
+    origin = "the sparse points" if frame.measured else "the cameras"
+    where = (
+        f"moved, turned and scaled by {frame.scale:.4g}"
+        if reading.normalise
+        else "in the coordinates of its files (--no-normalise)"
+    )
+    return [f"{KIND_LINES[kind]}{asked} (--kind); {where}; near {frame.near:.3g} and far {frame.far:.3g} from {origin}"]
