@@ -18,7 +18,9 @@ from __future__ import annotations
 import functools
 import importlib
 import platform
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -178,6 +180,35 @@ def _import(module: str) -> ModuleType:
         if error.name != "voronerf.kernels":
             raise
         raise BackendUnavailable("the Warp kernels are not installed; run `pip install -e .`") from None
+
+
+class _Kept(threading.local):
+    threads: int | None = None
+
+
+_kept = _Kept()
+
+
+def threads() -> int:
+    """Threads that share the work of an op: torch's for the calling thread, or what `torch_on_one_thread` keeps."""
+    return _kept.threads or torch.get_num_threads()
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Runs torch's own operators on the calling thread, while native ops keep its number of threads.
+
+    Results of native ops do not depend on that number. Those of torch do: a long sum is split among the threads, and
+    the last elements of each one's part are computed by other instructions than the rest.
+    """
+    before, of_torch = _kept.threads, torch.get_num_threads()
+    _kept.threads = threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(of_torch)
+        _kept.threads = before
 
 
 def table() -> list[Row]:

@@ -24,6 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf import backends
 from voronerf.backends import BackendUnavailable
 
 _REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
@@ -112,7 +113,7 @@ def stream(tensor: Tensor) -> tuple[int, int]:
 
 def cpu() -> compiled.Cpu:
     """The processor as compiled functions take it: instruction set and threads."""
-    return _cpu(_isa, torch.get_num_threads())
+    return _cpu(_isa, backends.threads())
 
 
 def machine(tensor: Tensor) -> compiled.Cpu | compiled.Cuda:

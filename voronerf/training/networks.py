@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from voronerf import backends
 from voronerf.checks import physical_memory
 from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
@@ -231,6 +232,13 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
         ).to(device)
         for name, network in networks.items()
     }
+
+
+def computes_natively(routers: Mapping[str, VoronoiRouter], config: TrainConfig) -> bool:
+    """Whether native CPU ops evaluate all networks, so that torch is left with little to do in a step."""
+    device = torch.device(config.device)
+    native = config.backend in ("auto", "native") and backends.missing("native", device) is None
+    return device.type == "cpu" and native and all(router.by_table for router in routers.values())
 
 
 def parameter_groups(

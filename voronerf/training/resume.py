@@ -40,6 +40,7 @@ class Stored:
     evaluated: int
     skipped: int
     rate_factor: float
+    threads: int
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
@@ -88,6 +89,7 @@ def training_state(trainer: Trainer) -> Checkpoint:
         "evaluated": trainer.evaluated,
         "skipped": int(trainer.guard.skipped),
         "rate_factor": trainer.rate_factor,
+        "threads": torch.get_num_threads(),
     }
     return Checkpoint(tensors, values)
 
@@ -133,6 +135,12 @@ def resume_training(trainer: Trainer, checkpoint: Checkpoint) -> None:
             trainer.draws.set_state(drawn)  # else the run began on another kind of device
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{path}: not a checkpoint of a training: {error}") from None
+    threads = torch.get_num_threads()
+    if stored.threads != threads and trainer.device.type == "cpu" and not trainer.any_threads:
+        trainer.say(
+            f"not bit for bit: {path} was written on {stored.threads} threads, now there are {threads}, and torch "
+            "computes these networks"
+        )
     trainer.step = stored.step
     trainer.seconds = stored.seconds
     trainer.stages = [Stage(**stage) for stage in stored.stages]

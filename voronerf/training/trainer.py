@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from typing import Any
 
@@ -35,7 +35,13 @@ from voronerf.training.divergence import (
     one_colour_psnr,
     why_scores_are_poor,
 )
-from voronerf.training.networks import check_memory, make_optimizer, make_routers, resolve_config
+from voronerf.training.networks import (
+    check_memory,
+    computes_natively,
+    make_optimizer,
+    make_routers,
+    resolve_config,
+)
 from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.renderers import make_renderer
@@ -112,6 +118,8 @@ class Trainer:
         self.routers = make_routers(config, self.device)
         for router in self.routers.values():
             router.generator = self.draws
+        #: Whether native ops compute the networks: then steps are the same bit for bit on any number of threads.
+        self.any_threads = computes_natively(self.routers, config)
         self.optimizer = make_optimizer(self.routers, config)
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=config.precision == "fp16")
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
@@ -202,7 +210,7 @@ class Trainer:
             self.stopped = False  # a stop that came in the last step has nothing to end
             left = len(self.plan) - self.level
             if left:
-                self._say(f"{left} of {len(self.plan)} planned splits not made: the run ended before")
+                self.say(f"{left} of {len(self.plan)} planned splits not made: the run ended before")
             for router in self.routers.values():
                 router.blend = self.config.blend
             self._evaluate(self.config.final_views, self.lpips)
@@ -281,7 +289,7 @@ class Trainer:
         self.rate_factor = 0.5
         self.saved_at = self.seconds
         self._compute = self._make_step()
-        self._say(f"{reason} at step {at}: back to step {self.step}, with half the learning rate")
+        self.say(f"{reason} at step {at}: back to step {self.step}, with half the learning rate")
 
     def _make_step(self) -> Callable[[], tuple[Tensor, Tensor | None, Tensor | None]]:
         """The function of a step: the plain one, or a new CUDA graph of it."""
@@ -289,6 +297,10 @@ class Trainer:
 
     def train_step(self) -> Tensor:
         """One step of :meth:`advance` without its count and clock; returns the loss, which may not be computed yet."""
+        with backends.torch_on_one_thread() if self.any_threads else nullcontext():
+            return self._train_step()
+
+    def _train_step(self) -> Tensor:
         set_learning_rate(self.optimizer, self.learning_rate())
         for router in self.routers.values():
             router.temperature = self.temperature()
@@ -348,7 +360,8 @@ class Trainer:
                 f"{self.step} steps; in another --out, split later or keep more a batch (--reservoir, "
                 "--reservoir-batches)"
             )
-        split = split_by_samples(config, planned, self.router.diagram, k, points, importance, self.generator)
+        with backends.torch_on_one_thread() if self.any_threads else nullcontext():
+            split = split_by_samples(config, planned, self.router.diagram, k, points, importance, self.generator)
         balances = [] if split is None else list(split.balances.values())
         if planned.most is not None and not balances:
             return  # the reservoir goes on collecting samples
@@ -367,10 +380,10 @@ class Trainer:
         self._compute = self._make_step()  # a graph would update the parameters from before the split
         when = f"at {self.seconds:.0f} s, step {self.step}"
         if balances:
-            self._say(f"{self.router.num_cells} cells {when}, std(W / max W) {before:.3f} -> {after:.4f}")
+            self.say(f"{self.router.num_cells} cells {when}, std(W / max W) {before:.3f} -> {after:.4f}")
         else:
             need = max(k, config.min_cell_samples)
-            self._say(f"no cell split {when}: none holds {need} of the {points.shape[0]} samples kept")
+            self.say(f"no cell split {when}: none holds {need} of the {points.shape[0]} samples kept")
 
     # --- evaluation and files --------------------------------------------------------------------------------------
 
@@ -395,7 +408,7 @@ class Trainer:
         }
         self.metrics = [m for m in self.metrics if m["step"] < self.step] + [now]
         write_text(self.out / "metrics.jsonl", "".join(json_text(m) + "\n" for m in self.metrics))
-        self._say(
+        self.say(
             f"{self.seconds:7.1f} s  step {self.step:6d}  {self.router.num_cells:4d} cells  "
             f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
         )
@@ -404,7 +417,7 @@ class Trainer:
         settled = self.step >= SETTLED and self.fraction >= 0.5
         poor = why_scores_are_poor(self.metrics, self.config, self.one_colour, settled=settled)
         if poor is not None:
-            self._say(poor)
+            self.say(poor)
 
     def _summarise(self) -> dict[str, Any]:
         summary = {
@@ -440,6 +453,7 @@ class Trainer:
         # Evaluations made after the checkpoint will be made again.
         self.metrics = [m for m in read_metrics(self.out) if m["step"] <= self.step]
 
-    def _say(self, line: str) -> None:
+    def say(self, line: str) -> None:
+        """Tells whoever listens, see ``on_event``."""
         if self.on_event is not None:
             self.on_event(line)
