@@ -19,6 +19,7 @@ from PIL import Image
 
 from voronerf.cli import commands, main
 from voronerf.data import builtin_scene
+from voronerf.rendering import CameraPath, orbit_cameras, write_camera_path
 from voronerf.training.checkpoint import load_checkpoint
 from voronerf.training.trainer import Trainer
 
@@ -68,6 +69,24 @@ def test_pictures_and_videos(run, tmp_path, options):
     succeeds("render", run, "--frames 3 --out", path, options)
     frames = imageio_ffmpeg.read_frames(str(path))
     assert next(frames)["size"] == (16, 16) and len(list(frames)) == 3
+
+
+def test_videos_along_a_path(run, tmp_path, fails):
+    succeeds("render", run, "--spiral --frames 2")
+    assert (run / "spiral.mp4").stat().st_size
+    frames = orbit_cameras(3, radius=3, elevation=10, width=24, height=20, focal=25)
+    file = tmp_path / "flight.json"
+    write_camera_path(file, CameraPath(frames, fps=5))
+    for options, size in (("", (24, 20)), ("--downscale 2", (12, 10))):
+        succeeds("render", run, "--path", file, options)
+        video = imageio_ffmpeg.read_frames(str(run / "flight.mp4"))
+        described = next(video)
+        assert (described["size"], described["fps"], len(list(video))) == (size, 5, 3)
+    fails("--spiral must be off with --path", "render", run, "--spiral --path", file)
+    fails("flight.json", "render", run, "--path", tmp_path / "no" / "flight.json")
+    fails("--fps must be 0.01 to 1000, got 0", "render", run, "--fps 0")
+    file.write_text("{}")
+    fails("flight.json: is not a camera path", "render", run, "--path", file)
 
 
 def test_info_names_every_backend(capsys):

@@ -128,8 +128,9 @@ def test_video(tmp_path, monkeypatch):
     assert next(reader)["source_size"] == (22, 18)
     assert len(list(reader)) == 5
     assert [entry.name for entry in path.parent.iterdir()] == ["turn.mp4"]
-    rule = "frames must have shape [f, h, w, 3] with pixels, got [0, 17, 21, 3]"
-    refuses(rule, write_video, path, frames[:0], 10)
+    rule = "frames must have shape [h, w, 3] with pixels, got "
+    refuses(rule + "no frame", write_video, path, frames[:0], 10)
+    refuses(rule + "[0, 21, 3]", write_video, path, frames[:, :0], 10)
     refuses("fps must be positive, got 0", write_video, path, frames, 0)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     refuses("pip install imageio-ffmpeg", write_video, path, frames, 10, error=ImportError)

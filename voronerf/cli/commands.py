@@ -25,6 +25,7 @@ from voronerf.evaluation.panels import write_panels
 from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
 from voronerf.rendering.cameras import turntable_cameras
+from voronerf.rendering.paths import read_camera_path, spiral_cameras
 from voronerf.run import open_run
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device, why_no_occupancy
@@ -189,8 +190,10 @@ def render(
     run: Path,
     /,
     out: Path | None = None,
+    path: Path | None = None,
+    spiral: bool = False,
     frames: int = 60,
-    fps: int = 24,
+    fps: float | None = None,
     data: str | None = None,
     downscale: int | None = None,
     allow_outside: bool = False,
@@ -201,16 +204,20 @@ def render(
     device: str = "cpu",
     backend: str = "auto",
 ) -> int:
-    """Render a turntable video of a trained run.
+    """Render a video of a trained run: a turntable, a spiral, or a camera path.
 
     Args:
         run: The run directory.
-        out: The video file, .mp4; default turntable.mp4 in the run directory.
-        frames: Frames of one turn.
-        fps: Frames per second.
+        out: The video file, .mp4; default turntable.mp4, spiral.mp4 or the name of the path in the run directory.
+        path: Camera path in nerfstudio's format, such as the viewer saves; it has the frames and their size.
+        spiral: Go where the training cameras are: up and down around an object, or a small spiral before a scene that
+            was taken from one side.
+        frames: Frames of a turntable or a spiral.
+        fps: Frames per second; default 24, or those of the path.
         data: Scene folder; default as in training, if that lies in the run directory, the working directory or
             VORONERF_DATA, since a run may be another person's.
-        downscale: Factor on the images, which decides the video's size; default as in training.
+        downscale: Factor on the images, or on the frames of the path, which decides the video's size; default as in
+            training, and 1 for a path.
         allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray in the first pass; default as in training.
         fine_samples: Samples per ray in the second pass; default as in training.
@@ -220,7 +227,12 @@ def render(
         device: Torch device.
         backend: Backend of the operations.
     """
-    check_counts(frames=frames, fps=fps, samples=samples, fine_samples=fine_samples, downscale=downscale)
+    check_counts(frames=frames, samples=samples, fine_samples=fine_samples, downscale=downscale)
+    if path is not None and spiral:
+        raise ConfigError("--spiral must be off with --path, which has the frames")
+    if fps is not None and not 0.01 <= fps <= 1000:
+        raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
+    read = None if path is None else read_camera_path(path)
     opened = open_run(
         run,
         data=data,
@@ -233,15 +245,20 @@ def render(
         device=device,
         backend=backend,
     )
-    path = out or run / "turntable.mp4"
-    check_video(path)
-    cameras = turntable_cameras(opened.scene.train.cameras, frames)
-    pictures = []
-    for frame in track(range(frames), description="rendering", console=console, disable=not console.is_terminal):
-        image = opened.render(cameras, frame, heaviest=False)
-        pictures.append((image.colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu())
-    write_video(path, torch.stack(pictures), fps)
-    say(f"wrote {path}")
+    name = path.stem if path is not None else "spiral" if spiral else "turntable"
+    out = out or run / f"{name}.mp4"
+    check_video(out)
+    scene = opened.scene
+    if read is not None:
+        cameras, fps = read.frames.downscaled(downscale or 1), fps or read.fps
+    elif spiral:
+        cameras = spiral_cameras(scene.train.cameras, frames, near=scene.near, far=scene.far)
+    else:
+        cameras = turntable_cameras(scene.train.cameras, frames)
+    numbers = track(range(len(cameras)), description="rendering", console=console, disable=not console.is_terminal)
+    pictures = (opened.render(cameras, number, heaviest=False).colour for number in numbers)
+    write_video(out, ((picture.clamp(0, 1) * 255).round().to(torch.uint8) for picture in pictures), fps or 24)
+    say(f"wrote {out}")
     return 0
 
 

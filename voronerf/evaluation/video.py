@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 
 from torch import Tensor
@@ -38,13 +40,13 @@ def _partial(path: Path) -> Path:
     return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
 
 
-def write_video(path: Path, frames: Tensor, fps: float) -> None:
+def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:
     """Writes an H.264 video that players everywhere show; makes its folder. The file appears when it is complete.
 
     Args:
         path: the file, .mp4, .m4v, .mov, .mkv or .avi.
-        frames: uint8 [f, h, w, 3], at least one. An odd size is padded by a copy of its last row or column, since the
-            format stores colour for pairs of pixels.
+        frames: uint8 [h, w, 3] each, at least one; they are taken one by one. An odd size is padded by a copy of its
+            last row or column, since the format stores colour for pairs of pixels.
         fps: frames a second.
 
     Raises:
@@ -52,35 +54,42 @@ def write_video(path: Path, frames: Tensor, fps: float) -> None:
         ImportError: imageio-ffmpeg is not installed.
         OSError: ffmpeg cannot write the file.
     """
-    if frames.dim() != 4 or frames.shape[-1] != 3 or 0 in frames.shape:
-        raise ValueError(f"write_video: frames must have shape [f, h, w, 3] with pixels, got {list(frames.shape)}")
     if fps <= 0:
         raise ValueError(f"write_video: fps must be positive, got {fps}")
     check_video(path)
     import imageio_ffmpeg
 
-    height, width = frames.shape[1:3]
-    even = pad(frames.permute(0, 3, 1, 2), (0, width % 2, 0, height % 2), mode="replicate").permute(0, 2, 3, 1)
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None or first.dim() != 3 or first.shape[-1] != 3 or 0 in first.shape:
+        got = "no frame" if first is None else list(first.shape)
+        raise ValueError(f"write_video: frames must have shape [h, w, 3] with pixels, got {got}")
+    height, width = first.shape[:2]
     partial = _partial(path)
     try:
         writer = imageio_ffmpeg.write_frames(
             str(partial),
-            (even.shape[2], even.shape[1]),
+            (width + width % 2, height + height % 2),
             fps=fps,
             macro_block_size=2,
             quality=8,
             ffmpeg_log_level="error",
         )
         writer.send(None)
-        for frame in even:
-            writer.send(frame.cpu().contiguous().numpy())
-        writer.close()
+        count = 0
+        try:
+            for frame in chain((first,), frames):
+                even = pad(frame.permute(2, 0, 1)[None], (0, width % 2, 0, height % 2), mode="replicate")[0]
+                writer.send(even.permute(1, 2, 0).cpu().contiguous().numpy())
+                count += 1
+        finally:
+            writer.close()
         try:  # imageio does not return the exit status of ffmpeg
             written, _ = imageio_ffmpeg.count_frames_and_secs(str(partial))
         except RuntimeError:
             written = 0
-        if written != len(frames):
-            raise OSError(f"{path}: ffmpeg could not write it, {written} of {len(frames)} frames")
+        if written != count:
+            raise OSError(f"{path}: ffmpeg could not write it, {written} of {count} frames")
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
