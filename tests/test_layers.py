@@ -27,6 +27,7 @@ LAYERS = (
     {"evaluation"},
     {"training"},
     {"run"},
+    {"export"},
     {"cli", "viewer"},
     {"__init__", "__main__"},
 )

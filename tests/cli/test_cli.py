@@ -89,6 +89,22 @@ def test_videos_along_a_path(run, tmp_path, fails):
     fails("flight.json: is not a camera path", "render", run, "--path", file)
 
 
+def test_exports_of_a_run(run, tmp_path, capsys, fails):
+    pytest.importorskip("trimesh", reason="trimesh is not installed")
+    pytest.importorskip("skimage", reason="scikit-image is not installed")
+    frames = orbit_cameras(2, radius=3, elevation=10, width=8, height=8, focal=9)
+    write_camera_path(tmp_path / "flight.json", CameraPath(frames, fps=5))
+    files = [tmp_path / name for name in ("mesh.glb", "cells.glb", "flight.mp4")]
+    options = f"--resolution 8 --density 0.01 --path {tmp_path / 'flight.json'}"  # of a run of a few steps
+    succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--video", files[2], options)
+    assert all(file.stat().st_size for file in files)
+    assert "3 of 3 cells" in capsys.readouterr().out
+    fails("the training views show no surface in the box", "export", run, "--points", tmp_path / "points.ply")
+    fails("export needs --points FILE.ply, --mesh", "export", run)
+    fails("the file must end in .glb", "export", run, "--cells cells.stl")
+    fails("--box must be x y z of a corner and of", "export", run, "--box 0 0 0 1 1 0 --mesh", files[0])
+
+
 def test_info_names_every_backend(capsys):
     succeeds("info")
     output = capsys.readouterr().out

@@ -7,6 +7,7 @@ import importlib
 import os
 import shlex
 import signal
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,12 +22,12 @@ from voronerf import backends
 from voronerf.cli.display import TrainingDisplay, printable
 from voronerf.data import Scene, load_scene
 from voronerf.data.process import process as make_scene
-from voronerf.evaluation.panels import write_panels
+from voronerf.evaluation.panels import picture_of_colour, write_panels
 from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
 from voronerf.rendering.cameras import turntable_cameras
-from voronerf.rendering.paths import read_camera_path, spiral_cameras
-from voronerf.run import open_run
+from voronerf.rendering.paths import CameraPath, read_camera_path, spiral_cameras
+from voronerf.run import Run, open_run
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device, why_no_occupancy
 from voronerf.training.run_directory import choose_directory, held, is_outside, write_curve
@@ -228,11 +229,9 @@ def render(
         backend: Backend of the operations.
     """
     check_counts(frames=frames, samples=samples, fine_samples=fine_samples, downscale=downscale)
-    if path is not None and spiral:
-        raise ConfigError("--spiral must be off with --path, which has the frames")
     if fps is not None and not 0.01 <= fps <= 1000:
         raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
-    read = None if path is None else read_camera_path(path)
+    given = given_path(path, spiral)
     opened = open_run(
         run,
         data=data,
@@ -248,18 +247,34 @@ def render(
     name = path.stem if path is not None else "spiral" if spiral else "turntable"
     out = out or run / f"{name}.mp4"
     check_video(out)
-    scene = opened.scene
-    if read is not None:
-        cameras, fps = read.frames.downscaled(downscale or 1), fps or read.fps
+    if given is not None:
+        given = replace(given, frames=given.frames.downscaled(downscale or 1))
+    write_flight(opened, out, given=given, spiral=spiral, frames=frames, fps=fps)
+    return 0
+
+
+def given_path(path: Path | None, spiral: bool) -> CameraPath | None:
+    """Reads the camera path of --path, if there is one."""
+    if path is not None and spiral:
+        raise ConfigError("--spiral must be off with --path, which has the frames")
+    return None if path is None else read_camera_path(path)
+
+
+def write_flight(
+    run: Run, out: Path, *, given: CameraPath | None, spiral: bool, frames: int = 60, fps: float | None = None
+) -> None:
+    """Renders a video along a path, a spiral or a turntable, and says so."""
+    scene = run.scene
+    if given is not None:
+        cameras, fps = given.frames, fps or given.fps
     elif spiral:
         cameras = spiral_cameras(scene.train.cameras, frames, near=scene.near, far=scene.far)
     else:
         cameras = turntable_cameras(scene.train.cameras, frames)
     numbers = track(range(len(cameras)), description="rendering", console=console, disable=not console.is_terminal)
-    pictures = (opened.render(cameras, number, heaviest=False).colour for number in numbers)
-    write_video(out, ((picture.clamp(0, 1) * 255).round().to(torch.uint8) for picture in pictures), fps or 24)
+    pictures = (picture_of_colour(run.render(cameras, number, heaviest=False).colour) for number in numbers)
+    write_video(out, pictures, fps or 24)
     say(f"wrote {out}")
-    return 0
 
 
 def info() -> int:

@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from voronerf.backends import BackendUnavailable
-from voronerf.cli import commands, demo
+from voronerf.cli import commands, demo, export
 from voronerf.cli.display import one_line
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
@@ -36,6 +36,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "train": commands.train,
     "eval": commands.evaluate_run,
     "render": commands.render,
+    "export": export.export,
     "info": commands.info,
     "preload": commands.preload,
     "demo": demo.demo,

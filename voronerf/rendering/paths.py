@@ -83,17 +83,18 @@ def read_camera_path(file: Path | str) -> CameraPath:
     kind = entries.get("camera_type", "perspective")
     if kind != "perspective":
         raise ValueError(f"{file}: camera_type must be perspective, got {kind!r:.60}")
-    sizes = []
+    sizes = {}
     for name in ("render_width", "render_height"):
         size = entries.get(name)
         if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= LONGEST_SIDE:
             raise ValueError(f"{file}: {name} must be an integer of 1 to {LONGEST_SIDE}, got {size!r:.60}")
-        sizes.append(size)
+        sizes[name] = size
+    size = sizes["render_width"], sizes["render_height"]
     fps = _number(entries.get("fps", 24), 0.01, 1000, f"{file}: fps")
-    frames = _read_cameras(entries["camera_path"], "camera_to_world", *sizes, f"{file}: camera_path")
+    frames = _read_cameras(entries["camera_path"], "camera_to_world", size, f"{file}: camera_path")
     keyframes = entries.get("keyframes") or None
     if keyframes is not None:
-        keyframes = _read_cameras(keyframes, "matrix", *sizes, f"{file}: keyframes")
+        keyframes = _read_cameras(keyframes, "matrix", size, f"{file}: keyframes")
     return CameraPath(frames, fps, keyframes, entries.get("is_cycle") is True)
 
 
@@ -214,11 +215,11 @@ def spiral_cameras(cameras: Cameras, count: int, *, near: float, far: float) -> 
     return Cameras(look_at(origins, target, up).float(), intrinsics, cameras.width, cameras.height)
 
 
-def _read_cameras(entries: Any, key: str, width: int, height: int, where: str) -> Cameras:
+def _read_cameras(entries: Any, key: str, size: tuple[int, int], where: str) -> Cameras:
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_FRAMES:
         got = f"{len(entries)} of them" if isinstance(entries, list) else f"{entries!r:.60}"
         raise ValueError(f"{where} must be a list of 1 to {MOST_FRAMES} frames, got {got}")
-    matrices, focals = [], []
+    (width, height), matrices, focals = size, [], []
     for number, entry in enumerate(entries):
         at = f"{where}[{number}]"
         matrix = entry.get(key) if isinstance(entry, dict) else None

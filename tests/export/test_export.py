@@ -1,0 +1,139 @@
+"""Points, meshes and cells of runs whose field is a formula, loaded again."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses, seeded
+
+from voronerf import VoronoiDiagram
+from voronerf.data import builtin_scene
+from voronerf.export import cell_meshes, export_cells, export_mesh, export_points
+from voronerf.rendering import Contraction, Renderer
+from voronerf.run import Run
+from voronerf.training.config import ConfigError
+
+trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
+pytest.importorskip("skimage", reason="scikit-image is not installed")
+
+RADIUS = 0.6
+BOX = torch.tensor([[-1.0, -1, -1], [1.0, 1, 0.8]])
+RED, BLUE = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])
+
+
+def shell(positions, directions, ray_index):
+    """A hollow ball, red above and blue below, and a speck beside it."""
+    apart = (positions.norm(dim=-1) - (RADIUS - 0.1)).abs() < 0.1
+    speck = (positions - torch.tensor([0.9, 0.9, 0.6])).norm(dim=-1) < 0.04
+    return torch.where(positions[:, 2:] > 0, RED, BLUE), 300.0 * (apart | speck)
+
+
+@pytest.fixture(scope="module")
+def run():
+    scene = replace(builtin_scene(24, train_views=20, test_views=1), box=BOX)
+    diagram = VoronoiDiagram(torch.rand(5, 3, generator=seeded()) - 0.5)
+    router = SimpleNamespace(diagram=diagram)
+    return Run(Path("unused"), SimpleNamespace(), scene, {"field": router}, Renderer({"field": shell}, samples=192))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
+def test_a_mesh_is_the_outer_surface_alone(run, tmp_path, suffix):
+    path = tmp_path / "deep" / f"ball{suffix}"
+    export_mesh(run, path, resolution=48)
+    mesh = trimesh.load(path, force="mesh", process=False)
+    assert mesh.is_watertight and mesh.body_count == 1  # neither the inside of the shell nor the speck
+    distance = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
+    assert distance.mean() < 0.02 and distance.max() < 0.06
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.05)
+    assert (mesh.vertex_normals * mesh.vertices).sum(-1).min() > 0
+    colours = mesh.visual.vertex_colors[:, :3]
+    for colour, where in ((RED, mesh.vertices[:, 2] > 0.05), (BLUE, mesh.vertices[:, 2] < -0.05)):
+        assert np.abs(np.median(colours[where], axis=0) - colour.numpy() * 255).max() < 2
+
+
+def test_a_mesh_of_an_unbounded_scene_is_what_the_cameras_see(run, tmp_path):
+    renderer = Renderer({"field": shell}, samples=192, contraction=Contraction(torch.zeros(3), 1.2))
+    unbounded = replace(run, scene=replace(run.scene, box=None), renderer=renderer)
+    mesh = export_mesh(unbounded, tmp_path / "ball.ply", resolution=48)
+    distance = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
+    assert distance.mean() < 0.03 and distance.max() < 0.12  # no walls where space is unknown
+    half = torch.tensor([[-1.0, -1, 0], [1.0, 1, 1]])
+    cut = export_mesh(run, tmp_path / "half.ply", resolution=48, box=half)
+    assert not cut.is_watertight and cut.vertices[:, 2].min() > -0.01
+
+
+def test_points_have_colours_and_normals(run, tmp_path):
+    export_points(run, tmp_path / "ball.ply", count=1000)
+    points = trimesh.load(tmp_path / "ball.ply", process=False)
+    assert len(points.vertices) == 1000
+    place = np.asarray(points.vertices)
+    ball = np.linalg.norm(place, axis=-1) < 0.8
+    assert np.abs(np.linalg.norm(place[ball], axis=-1) - RADIUS).max() < 0.05
+    text = (tmp_path / "ball.ply").read_bytes()[:400].decode(errors="ignore")
+    assert "property float nx" in text and "property uchar red" in text
+    normals = export_points(run, tmp_path / "again.ply", count=1000).vertex_normals
+    along = (normals[ball] * place[ball]).sum(-1) / np.linalg.norm(place[ball], axis=-1)
+    assert np.quantile(along, 0.05) > 0.9
+    assert (tmp_path / "ball.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
+
+
+def diagrams():
+    centres = 2 * torch.rand(8, 3, generator=seeded(1)) - 1
+    nested, _ = VoronoiDiagram(centres).refine({i: centres[i] + 0.2 * torch.randn(4, 3) for i in (1, 5)})
+    weights = 0.3 * torch.rand(8, generator=seeded(2))
+    far = torch.cat((centres, torch.tensor([[50.0, 0, 0]])))
+    return {
+        "nested": nested,
+        "power": VoronoiDiagram(centres, weights=weights),
+        "one": VoronoiDiagram(torch.zeros(1, 3)),
+        "far": VoronoiDiagram(far),
+    }
+
+
+@pytest.mark.parametrize("name", ["nested", "power", "one", "far"])
+def test_cells_fill_the_box_and_hold_their_points(name):
+    diagram = diagrams()[name]
+    meshes = cell_meshes(diagram, BOX)
+    assert sum(mesh.volume for mesh in meshes.values()) == pytest.approx(float((BOX[1] - BOX[0]).prod()))
+    points = torch.lerp(BOX[0], BOX[1], torch.rand(300, 3, generator=seeded()))
+    for cell, mesh in meshes.items():
+        assert mesh.is_watertight and mesh.is_convex
+        mine = points[diagram.locate(points) == cell].numpy()
+        planes = ((mine[:, None] - mesh.triangles[None, :, 0]) * mesh.face_normals).sum(-1)
+        assert not planes.size or planes.max() < 1e-5
+    assert (name != "far") == (len(meshes) == diagram.num_cells)
+
+
+def test_cells_are_objects_of_their_own_colour(run, tmp_path):
+    export_cells(run, tmp_path / "cells.glb")
+    scene = trimesh.load(tmp_path / "cells.glb")
+    assert sorted(scene.geometry) == [f"cell_{cell:04}" for cell in range(5)]
+    colours = {tuple(mesh.visual.material.baseColorFactor) for mesh in scene.geometry.values()}
+    assert len(colours) == 5
+
+
+def test_what_is_refused(run, tmp_path, monkeypatch):
+    path = tmp_path / "mesh.ply"
+    refuses("mesh.stl: the file must end in .ply or .glb or .obj", export_mesh, run, tmp_path / "mesh.stl")
+    refuses("cells.ply: the file must end in .glb", export_cells, run, tmp_path / "cells.ply")
+    refuses("points.xyz: the file must end in .ply", export_points, run, tmp_path / "points.xyz")
+    rule = "--resolution must be 8 to "
+    refuses(rule, export_mesh, run, path, resolution=7, error=ConfigError)
+    refuses(rule, export_mesh, run, path, resolution=10**6, error=ConfigError)
+    refuses("--density must be positive", export_mesh, run, path, density=0.0, error=ConfigError)
+    rule = "--density must be lower: nothing in the box is as dense as 1e+06"
+    refuses(rule, export_mesh, run, path, resolution=8, density=1e6, error=ConfigError)
+    unbounded = replace(run, scene=replace(run.scene, box=None))
+    for export in (export_points, export_mesh):
+        refuses("--box must be given", export, unbounded, path, error=ConfigError)
+        rule = "--box must be x y z of a corner and of a larger one"
+        refuses(rule, export, run, path, box=BOX.flip(0), error=ConfigError)
+    empty = torch.tensor([[5.0, 5, 5], [6.0, 6, 6]])
+    refuses("unused: the training views show no surface", export_points, run, path, box=empty, error=ConfigError)
+    monkeypatch.setitem(sys.modules, "skimage", None)
+    refuses("needs scikit-image: pip install 'voronerf[export]'", export_mesh, run, path, error=ImportError)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,7 @@
+"""Takes a trained run away: as coloured points, as a mesh, or as the cells of its diagram. Needs the extra `export`."""
+
+from voronerf.export.cells import cell_meshes, export_cells
+from voronerf.export.mesh import export_mesh
+from voronerf.export.points import export_points
+
+__all__ = ["cell_meshes", "export_cells", "export_mesh", "export_points"]

@@ -1,0 +1,147 @@
+"""The surface of a trained run as a coloured mesh.
+
+The density of the field on a grid gives the surface, by marching cubes. What no camera sees into, the field has not
+learnt: behind the first surface it may be empty or full. So space that lies behind a surface in every view counts as
+solid, and the mesh has an outside only. Parts that are small beside the largest, such as fog in the air, are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from voronerf.checks import available_memory
+from voronerf.export.files import check_export, write_geometry
+from voronerf.export.space import Nodes, ask, box_of, density_at, hidden_and_seen, training_views
+from voronerf.run import Run
+from voronerf.training.config import ConfigError
+
+SUFFIXES = (".ply", ".glb", ".obj")
+#: Cubes along the longest side of the box, where there is memory for them.
+RESOLUTION = 256
+#: Bytes of memory that a node takes at the most, in marching cubes.
+NODE = 40
+#: Volume of the smallest part that is kept, as a share of the largest.
+SMALLEST = 1e-3
+
+
+def export_mesh(
+    run: Run,
+    path: Path | str,
+    *,
+    resolution: int | None = None,
+    density: float | None = None,
+    box: Tensor | None = None,
+) -> Any:
+    """Writes the surface of a run as .ply, .glb or .obj, and returns it as a ``trimesh.Trimesh``.
+
+    Each vertex has a colour and a normal. The mesh of a scene with a box is watertight. That of an unbounded scene is
+    open: its surfaces end where the box ends, and where no camera looks.
+
+    Args:
+        run: the run.
+        path: the file.
+        resolution: cubes along the longest side of the box; default 256, or what fits into the memory.
+        density: of the surface, per scene unit; default that of which a cube lets half of the light pass.
+        box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
+
+    Raises:
+        ConfigError: a resolution that does not fit into the memory, a density that is none, no box, or a run that has
+            no surface there.
+        ImportError: trimesh, scikit-image or scipy is missing.
+        ValueError: another suffix.
+        OSError: the file cannot be written.
+
+    Examples:
+        >>> from voronerf import Run
+        >>> from voronerf.export import export_mesh
+        >>> def volume(run: Run) -> float:
+        ...     return export_mesh(run, "scene.glb", resolution=128).volume
+    """
+    path = Path(path)
+    check_export(path, SUFFIXES)
+    mesh = surface_mesh(run, resolution, density, box)
+    write_geometry(path, mesh)
+    return mesh
+
+
+def surface_mesh(run: Run, resolution: int | None, density: float | None, box: Tensor | None) -> Any:
+    """The mesh that :func:`export_mesh` writes."""
+    import trimesh
+    from scipy import ndimage
+    from skimage.measure import marching_cubes
+
+    closed = run.scene.box is not None and box is None
+    box = box_of(run, box)
+    nodes = Nodes.fill(box, _resolution(box, resolution))
+    level = math.log(2) / nodes.side if density is None else density
+    if not 0 < level < math.inf:
+        raise ConfigError(f"--density must be positive and finite, got {density}")
+    found = density_at(run, nodes)
+    dense = (found > level).numpy()
+    hidden, seen = _views_of(run, nodes)
+    # Free is what is empty, not hidden, and connected to what a camera sees to be free.
+    labels, _ = ndimage.label(~dense & ~hidden)
+    free = np.isin(labels, np.unique(labels[seen & (labels > 0)]))
+    solid = _largest_parts(~free, ndimage)
+    if not solid.any() or not dense.any():
+        raise ConfigError(f"--density must be lower: nothing in the box is as dense as {level:g}")
+    # Opacity of a cube of the level is 0.5; what was decided otherwise than by density gets the value of its side.
+    opacity = (1 - torch.exp(found * (-math.log(2) / level))).numpy()
+    opacity[solid & ~dense] = 1
+    opacity[~solid & dense] = 0
+    del labels, free, hidden, seen
+    if closed:
+        opacity = np.pad(opacity, 1)
+    vertices, faces, _, _ = marching_cubes(opacity, 0.5, gradient_direction="ascent")
+    vertices -= float(closed)
+    if not closed:
+        faces = faces[_of_density(vertices, dense, ndimage)[faces].all(-1)]
+    mesh: Any = trimesh.Trimesh(nodes.positions(torch.from_numpy(vertices.copy())).numpy(), faces, process=False)
+    mesh.remove_unreferenced_vertices()
+    normals = torch.from_numpy(np.ascontiguousarray(mesh.vertex_normals, dtype=np.float32))
+    points = torch.from_numpy(np.ascontiguousarray(mesh.vertices, dtype=np.float32))
+    colour, _ = ask(run, points, -normals, side=nodes.side)
+    mesh.visual.vertex_colors = (colour.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return mesh
+
+
+def _resolution(box: Tensor, wanted: int | None) -> int:
+    extent = box[1] - box[0]
+    share = float((extent / extent.max()).prod())
+    most = int((available_memory() / 2 / NODE / share) ** (1 / 3))
+    if wanted is None:
+        return max(min(RESOLUTION, most), 8)
+    if not 8 <= wanted <= most:
+        raise ConfigError(f"--resolution must be 8 to {most}, for which there is memory, got {wanted}")
+    return wanted
+
+
+def _views_of(run: Run, nodes: Nodes) -> tuple[Any, Any]:
+    views = list(training_views(run))
+    hidden, seen = np.empty(nodes.shape, dtype=bool), np.empty(nodes.shape, dtype=bool)
+    for first, last in nodes.slabs():
+        parts = hidden_and_seen(nodes.slab(first, last), views, nodes.side)
+        hidden[first:last], seen[first:last] = (part.view(last - first, *nodes.shape[1:]).numpy() for part in parts)
+    return hidden, seen
+
+
+def _largest_parts(solid: Any, ndimage: Any) -> Any:
+    labels, count = ndimage.label(solid)
+    if count == 0:
+        return solid
+    sizes = np.bincount(labels.reshape(-1))
+    sizes[0] = 0
+    return (sizes >= SMALLEST * sizes.max())[labels] & solid
+
+
+def _of_density(vertices: Any, dense: Any, ndimage: Any) -> Any:
+    """Which vertices lie beside a dense node, rather than where no camera has looked."""
+    near = ndimage.binary_dilation(dense, iterations=1)
+    whole = np.minimum(vertices.round().astype(np.int64), np.array(dense.shape) - 1)
+    return near[tuple(whole.T)]
