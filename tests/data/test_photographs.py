@@ -12,9 +12,15 @@ from helpers import refuses
 from PIL import Image
 from scene_files import rewrite, write_capture, write_colmap, write_images, write_llff
 
+from voronerf import open_run
 from voronerf.data import SceneError, load_scene
+from voronerf.evaluation.panels import write_panels
 from voronerf.rendering.cameras import Cameras, orbit_cameras
 from voronerf.training.batches import RayBatches
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.networks import resolve_config
+from voronerf.training.renderers import make_contraction
+from voronerf.training.trainer import Trainer
 
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 COUNT, SIZE = 9, (12, 10)
@@ -130,7 +136,9 @@ def test_masks_leave_pixels_out_of_training_and_scores(tmp_path):
         ({"mask_path": "none.png"}, "does not exist"),
         ({"mask_path": 3}, "mask_path must be a file name, got 3"),
         ({"mask_path": "small.png"}, "small.png: is 3 x 2 pixels"),
+        ({"mask_path": "black.png"}, "black.png: must leave a pixel"),
     ):
+        Image.new("L", (12, 10)).save(tmp_path / "black.png")
         Image.new("L", (3, 2), 255).save(tmp_path / "small.png")
         rewrite(tmp_path, lambda contents, change=change: contents["frames"][1].update(change))
         refuses(reason, load_scene, tmp_path, error=SceneError)
@@ -173,6 +181,56 @@ def test_which_folder_of_images(tmp_path):
     refuses("--downscale must be 1 or a multiple of 4, got 6", load_scene, tmp_path, downscale=6, error=SceneError)
     (tmp_path / "images_4/00.jpg").unlink()
     refuses("has poses of 9 images", load_scene, tmp_path, error=SceneError)
+
+
+def test_a_forward_facing_scene_fills_the_cube_of_its_contraction(tmp_path):
+    poses = POSES.clone()
+    poses[:, :3, :3] = torch.eye(3)
+    poses[:, :3, 3] *= 0.1
+    write_images(tmp_path, [SIZE] * COUNT)
+    write_llff(tmp_path, poses, SIZE, 20.0, (2.0, 6.0))
+    for normalise in (True, False):
+        scene = load_scene(tmp_path, normalise=normalise)
+        assert resolve_config(TrainConfig(), scene).contraction == "ndc"
+        space = make_contraction(scene, "ndc")
+        places = []
+        for index in range(7):
+            rays = scene.train.cameras.image_rays(index)
+            ends = torch.linspace(scene.near * 1.2, scene.far, 5)[:, None, None]
+            places.append(space.points(rays.origins + ends * rays.directions).reshape(-1, 3))
+        low, high = torch.cat(places).aminmax(dim=0)
+        assert (low > -1.001).all() and (high < 1.001).all() and (high - low > 1.4).all()
+    again = load_scene(tmp_path, downscale=5)  # drops pixels at the border
+    assert space.slopes == again.contraction.slopes
+    with pytest.raises(ConfigError, match="--contraction ndc needs a forward-facing scene, "):
+        make_contraction(load_scene(tmp_path, kind="unbounded"), "ndc")
+
+
+def test_a_folder_trains_is_scored_and_opened_again(tmp_path):
+    """With images of two sizes and a mask."""
+    rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=14, focal=12)
+    write_capture(tmp_path / "scene", rig)
+    mask = np.full((14, 12), 255, np.uint8)
+    mask[:7] = 0
+
+    def change(contents):
+        for frame in contents["frames"][::2]:
+            Image.new("RGB", (16, 12), (40, 50, 60)).save(tmp_path / "scene" / frame["file_path"])
+        Image.fromarray(mask).save(tmp_path / "scene/mask.png")
+        contents["frames"][1]["mask_path"] = "mask.png"
+
+    rewrite(tmp_path / "scene", change)
+    short = {"steps": 6, "cells": (2,), "split_at": (0.5,), "width": 8, "rays": 32, "samples": 8, "evaluations": 1}
+    config = TrainConfig(str(tmp_path / "scene"), out=tmp_path / "run", kind="inside-out", normalise=False, **short)
+    scene = load_scene(config.data, **config.reading)
+    trainer = Trainer(config, scene)
+    summary = trainer.run()
+    (path, *_) = write_panels(trainer.renderer, trainer.router.diagram, scene, tmp_path, views=2)
+    assert path.is_file()
+    run = open_run(config.out, data=config.data)
+    assert run.scene.kind == "inside-out" and run.scene.near == scene.near
+    assert run.evaluate()["psnr"] == pytest.approx(summary["psnr"])
+    assert run.render(0).colour.shape == scene.test.truth(0, None).shape
 
 
 def broken(path, at, layout, *values):

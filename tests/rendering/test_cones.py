@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import refuses, seeded
 
-from voronerf.rendering import Contraction, Rays, orbit_cameras
+from voronerf.rendering import Contraction, Perspective, Rays, orbit_cameras
 from voronerf.rendering.cones import frustum_gaussians, frustum_moments
 
 WIDE = torch.float64
@@ -107,11 +107,17 @@ def test_contraction_against_the_formula():
     assert 1 < int(inside.sum()) < 200
 
 
-def test_contracted_gaussians_against_the_jacobian():
-    space = Contraction(torch.tensor([0.2, 0, -0.1], dtype=WIDE), 1.2)
+@pytest.mark.parametrize(
+    "space",
+    [
+        Contraction(torch.tensor([0.2, 0, -0.1], dtype=WIDE), 1.2),
+        Perspective(torch.tensor([0.2, 0, -9.1], dtype=WIDE), torch.eye(3, dtype=WIDE)[[1, 0, 2]], 0.5, (0.6, 0.8)),
+    ],
+)
+def test_contracted_gaussians_against_the_jacobian(space):
     generator = seeded(2)
     means = 3 * torch.randn(40, 3, generator=generator, dtype=WIDE)
-    means[0] = space.centre
+    means[0] = torch.tensor([0.2, 0, -0.1], dtype=WIDE)  # in the middle of the sphere
     d = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator, dtype=WIDE), dim=1)
     along, across = torch.rand(2, 40, 1, generator=generator, dtype=WIDE)
     got_means, got = space.gaussians(means, d, along, across)

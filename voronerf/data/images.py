@@ -191,8 +191,8 @@ def read_masks(masks: Sequence[Path | None], paths: Sequence[Path], sizes: Tenso
                 )
             kept = np.asarray(file.convert("L"))[: height * factor, : width * factor] > 0
         place[:height, :width] = torch.from_numpy(kept.reshape(height, factor, width, factor).all(axis=(1, 3)))
-    if not bool(found.any()):
-        raise SceneError(f"{next(filter(None, masks))}: the masks of the scene leave no pixel")
+        if not bool(place.any()):
+            raise SceneError(f"{mask}: must leave a pixel, or with --downscale a block of pixels, of {path.name}")
     return found
 
 

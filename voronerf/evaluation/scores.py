@@ -95,7 +95,7 @@ def evaluate(
         else:
             kept = kept.to(renderer.device)
             colour = torch.where(kept[..., None], colour, target)
-            noise = psnr(colour[kept], target[kept])
+            noise = psnr(colour[kept][None], target[kept][None])
         perceived = None if lpips is None else float(lpips(colour, target))
         name = scene.test.names[view]
         scores.append(ViewScore(name, float(noise), float(ssim(colour, target)), perceived))
