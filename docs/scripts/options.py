@@ -31,7 +31,9 @@ def markdown() -> str:
     for name, function in COMMANDS.items():
         summary, _, arguments = inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")
         lines += [f"## voronerf {name}", "", summary, ""]
-        lines += train_tables() if name == "train" else table(function, arguments)
+        if name == "train":
+            lines += [*train_tables(), "### Viewer", ""]
+        lines += table(function, arguments)
     return "\n".join(lines) + "\n"
 
 
@@ -53,6 +55,8 @@ def table(function: Callable[..., Any], arguments: str) -> list[str]:
     texts, kinds = dict(argument_docs(arguments)), get_type_hints(function)
     lines = []
     for name, parameter in inspect.signature(function).parameters.items():
+        if kinds[name] is TrainConfig:
+            continue
         positional = parameter.kind is parameter.POSITIONAL_ONLY
         label = name.upper() if positional else f"--{dashed(name)}"
         lines.append(row(label, kinds[name], parameter.default, texts[name]))

@@ -9,7 +9,7 @@ import shlex
 import signal
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import Any
 
 import torch
@@ -30,6 +30,7 @@ from voronerf.rendering.paths import CameraPath, read_camera_path, spiral_camera
 from voronerf.run import Run, open_run
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device, why_no_occupancy
+from voronerf.training.progress import Progress
 from voronerf.training.run_directory import choose_directory, held, is_outside, write_curve
 from voronerf.training.trainer import Trainer
 
@@ -46,17 +47,25 @@ def say(line: str) -> None:
     console.print(printable(line), highlight=False, markup=False, emoji=False)
 
 
-def train(config: TrainConfig) -> int:
+def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", port: int = 8080) -> int:
     """Train a scene: coarse network, balanced Voronoi cells, cells trained further.
 
     With --resume, options that are not given keep their value from the run in --out.
+
+    Args:
+        config: The settings.
+        view: Show the training in a browser, and its result until Ctrl-C.
+        host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
+        port: Port that --view listens at; 0 is any that is free.
     """
     check_device(config.device)
+    if view:
+        import_viewer().check_address(host, port)
     scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
     chosen = choose_directory(config, scene)
     assert chosen.out is not None
     try:
-        summary = run_training(chosen, scene)
+        summary = run_training(chosen, scene, view=(host, port) if view else None)
     finally:
         if config.out is None:
             with contextlib.suppress(OSError):
@@ -64,8 +73,10 @@ def train(config: TrainConfig) -> int:
     return 0 if summary["complete"] else 130
 
 
-def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
+def run_training(config: TrainConfig, scene: Scene, *, view: tuple[str, int] | None = None) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
+
+    ``view`` is the address and the port where a viewer shows the training, and what came of it until Ctrl-C.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the step in hand: the checkpoint and the summary are written,
     the pictures are not. A second one ends the process at once.
@@ -75,47 +86,69 @@ def run_training(config: TrainConfig, scene: Scene) -> dict[str, Any]:
     if config.panels and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
     with held(config.out):
-        return _train_and_draw(config, config.out, scene)
+        return _train_and_draw(config, config.out, scene, view)
 
 
-def _train_and_draw(config: TrainConfig, out: Path, scene: Scene) -> dict[str, Any]:
-    with TrainingDisplay(console, scene.name) as display:
-        for note in scene.notes:
-            display.on_event(f"{scene.name}: {note}")
-        trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
-        if trainer.lpips is None:
-            display.on_event(trainer.lpips_source)
-        if config.occupancy and trainer.occupancy is None:
-            obstacle = why_no_occupancy(trainer.config) or "a scene without a box"
-            display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
-        # One that is ignored stays so, as under nohup or where a shell started it in the background.
-        before = {number: signal.getsignal(number) for number in STOPPING}
-        before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+def _train_and_draw(config: TrainConfig, out: Path, scene: Scene, view: tuple[str, int] | None) -> dict[str, Any]:
+    with contextlib.ExitStack() as stack:
+        with TrainingDisplay(console, scene.name) as display:
+            for note in scene.notes:
+                display.on_event(f"{scene.name}: {note}")
+            trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
+            if trainer.lpips is None:
+                display.on_event(trainer.lpips_source)
+            if config.occupancy and trainer.occupancy is None:
+                obstacle = why_no_occupancy(trainer.config) or "a scene without a box"
+                display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
+            viewer = None
+            if view is not None:
+                viewer = import_viewer().TrainingViewer(trainer, host=view[0], port=view[1])
+                stack.callback(viewer.close)
+                display.on_event(f"open {viewer.address} in a browser")
 
-        def restore() -> None:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+            def on_step(now: Progress) -> None:
+                display.on_step(now)
+                if viewer is not None:
+                    viewer.on_step(now)
 
-        def stop(number: int, frame: FrameType | None) -> None:
-            trainer.request_stop()
-            restore()
-
-        for number in before:
-            signal.signal(number, stop)
-        try:
-            summary = trainer.run()
-        finally:
-            restore()
-    if not summary["complete"]:
-        again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
-        say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
+            trainer.on_step = on_step
+            summary = _train(trainer)
+        if not summary["complete"]:
+            again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
+            say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
+            return summary
+        if config.panels:
+            with trainer.averaged():
+                write_panels(trainer.renderer, trainer.router.diagram, scene, out / "images", views=config.panels)
+        write_curve(out)
+        say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
+        if viewer is not None:
+            say(f"{viewer.address} shows the run until Ctrl-C")
+            with contextlib.suppress(KeyboardInterrupt):
+                viewer.serve()
         return summary
-    if config.panels:
-        with trainer.averaged():
-            write_panels(trainer.renderer, trainer.router.diagram, scene, out / "images", views=config.panels)
-    write_curve(out)
-    say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
-    return summary
+
+
+def _train(trainer: Trainer) -> dict[str, Any]:
+    """Runs a trainer that the signals of ``STOPPING`` stop; returns the summary."""
+    # One that is ignored stays so, as under nohup or where a shell started it in the background.
+    before = {number: signal.getsignal(number) for number in STOPPING}
+    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        trainer.request_stop()
+        restore()
+
+    for number in before:
+        signal.signal(number, stop)
+    try:
+        return trainer.run()
+    finally:
+        restore()
 
 
 def evaluate_run(
@@ -275,6 +308,14 @@ def write_flight(
     pictures = (picture_of_colour(run.render(cameras, number, heaviest=False).colour) for number in numbers)
     write_video(out, pictures, fps or 24)
     say(f"wrote {out}")
+
+
+def import_viewer() -> ModuleType:
+    """The viewer, which needs the extra."""
+    try:
+        return importlib.import_module("voronerf.viewer")
+    except ImportError as error:
+        raise ImportError(f"the viewer needs viser: pip install 'voronerf[viewer]' ({error})") from None
 
 
 def info() -> int:

@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from voronerf.backends import BackendUnavailable
-from voronerf.cli import commands, demo, export
+from voronerf.cli import commands, demo, export, view
 from voronerf.cli.display import one_line
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
@@ -37,6 +37,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "eval": commands.evaluate_run,
     "render": commands.render,
     "export": export.export,
+    "view": view.view,
     "info": commands.info,
     "preload": commands.preload,
     "demo": demo.demo,
@@ -104,8 +105,8 @@ def _train_command(args: list[str]) -> Callable[..., int]:
     elif length == {"budget"} and stored.steps is not None:
         stored = replace(stored, budget=sys.float_info.max, steps=None)
 
-    def train(config: TrainConfig = stored) -> int:
-        return commands.train(config)
+    def train(config: TrainConfig = stored, *, view: bool = False, host: str = "127.0.0.1", port: int = 8080) -> int:
+        return commands.train(config, view=view, host=host, port=port)
 
     train.__doc__ = commands.train.__doc__
     return train

@@ -1,0 +1,269 @@
+"""The viewer, asked as a browser's tab asks it."""
+
+from __future__ import annotations
+
+import io
+import socket
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses, same
+from PIL import Image
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+from tab import Tab
+
+from voronerf.cli import main
+from voronerf.evaluation.panels import palette
+from voronerf.rendering import read_camera_path
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.trainer import Trainer
+from voronerf.viewer import TrainingViewer, view_run
+
+
+@pytest.fixture
+def tab(viewer, scene):
+    tab = Tab(viewer, scene.test.cameras)
+    yield tab
+    tab.close()
+
+
+def apart(picture, colour):
+    """Mean difference of a JPEG and the colour [h, w, 3] that it shows, in levels."""
+    shown = (colour.clamp(0, 1) * 255).round().numpy()
+    assert picture.shape == shown.shape
+    return np.abs(picture.astype(float) - shown).mean()
+
+
+def larger(cameras, side):
+    """The same cameras with more pixels."""
+    factor = side / cameras.width
+    return replace(cameras, intrinsics=cameras.intrinsics * factor, width=side, height=side)
+
+
+def test_a_camera_at_rest_sees_what_render_gives(run, scene, tab) -> None:
+    tab.rest()
+    for index, side in ((1, 128), (0, 192)):
+        tab.look(scene.test.cameras, index)
+        tab.set("Pixels", side)
+        assert apart(tab.rest(), run.render(larger(scene.test.cameras, side), index).colour) < 1.5
+    assert min(len(picture) for picture in tab.pictures) < 128  # coarse ones came before
+
+
+def test_panes(run, scene, tab) -> None:
+    tab.rest()
+    image = run.render(larger(scene.test.cameras, 128), 0)
+    pictures = {}
+    for pane in ("depth", "opacity", "error", "cells"):
+        tab.set("Show", pane)
+        pictures[pane] = tab.rest()
+    assert apart(pictures["opacity"], image.opacity[..., None].expand(128, 128, 3)) < 1.5
+    solid, empty = image.opacity.numpy() > 0.95, image.opacity.numpy() < 0.01
+    assert pictures["depth"][empty].min() > 240 and pictures["depth"][solid].mean() < 200
+    # A pixel of the cells pane has the hue of its leaf.
+    hues = palette(run.diagram.num_cells).numpy().astype(float)
+    leaves = run.diagram.locate(image.heaviest).long().numpy()[solid]
+    shown = pictures["cells"][solid].astype(float)
+    cosine = (hues[leaves] * shown).sum(-1) / np.linalg.norm(hues[leaves], axis=-1) / np.linalg.norm(shown, axis=-1)
+    assert np.mean(cosine > 0.98) > 0.9
+
+
+def test_the_error_of_a_training_view_is_shown_where_the_view_is(run, scene, viewer) -> None:
+    tab = Tab(viewer, scene.train.cameras, 5)
+    tab.rest()
+    tab.set("Show", "error")
+    shown = tab.rest()
+    tab.close()
+    wrong = (run.render(scene.train.cameras, 5).colour.clamp(0, 1) - scene.train.truth(5, torch.ones(3))).abs().mean(-1)
+    brightness = torch.nn.functional.interpolate(
+        torch.from_numpy(shown.astype(np.float32)).mean(-1)[None, None], (24, 24), mode="area"
+    )[0, 0]
+    assert np.corrcoef(wrong.flatten(), brightness.flatten())[0, 1] > 0.8
+
+
+def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
+    tab.rest()
+    tab.set("Show", "cells")
+    tab.rest()
+    image = run.render(larger(scene.test.cameras, 128), 0)
+    y, x = divmod(int(torch.where(image.opacity > 0.99, 1 / image.depth, 0).argmax()), 128)
+    leaf = int(run.diagram.locate(image.heaviest[y, x]))
+    info = tab.gui["Click on a cell."]
+
+    def pick(x, y):
+        info["_markdown"] = None
+        tab.click((x + 0.5) / 128, (y + 0.5) / 128)
+        return tab.until(lambda: info["_markdown"])
+
+    text = pick(x, y)
+    assert (
+        f"**Cell {leaf}** of {run.diagram.num_cells}" in text and "samples of the last split" in text and "dB" in text
+    )
+    before = run.diagram.locate(image.heaviest) == leaf
+
+    def shares():
+        """Of the pixels that showed the cell, and of the others that showed something: how many still do."""
+        solid = (image.opacity > 0.95).numpy()
+        now = tab.rest().min(-1) < 235
+        mine = before.numpy() & solid
+        return now[mine].mean(), now[solid & ~mine].mean()
+
+    tab.set("Cell", "hide")
+    hidden = shares()
+    assert pick(x, y) != text
+    tab.set("Cell", "show all")
+    tab.rest()
+    assert pick(x, y) == text
+    tab.set("Cell", "only this")
+    alone = shares()
+    assert hidden[0] < 0.9 and alone[0] > 0.9 and alone[1] < hidden[1]
+    tab.set("Level", 1)
+    tab.rest()
+    assert f"of {int(run.diagram.paths()[:, 0].max()) + 1}" in pick(x, y)
+    assert pick(0, 0) == "Click on a cell."
+
+
+def test_a_crop_leaves_what_is_inside(run, scene, tab) -> None:
+    tab.rest()
+    tab.set("Crop", True)
+    whole = tab.rest()
+    low, high = scene.box[:, 2].tolist()
+    tab.set("z", [low, (low + high) / 2])
+    part = tab.rest()
+    assert (part[:40].min(-1) < 235).sum() < 0.3 * (whole[:40].min(-1) < 235).sum()
+    assert abs(part[-40:].astype(float) - whole[-40:]).mean() < 3
+
+
+def test_centres_and_cameras_are_drawn_into_the_scene(run, scene, tab) -> None:
+    tab.rest()
+    assert tab.depths[-1] is None
+    tab.set("Centres", True)
+    tab.rest()
+    tab.set("Cameras", True)
+    tab.rest()
+    assert "/centres" in tab.nodes and sum(name.startswith("/cameras/") for name in tab.nodes) == len(scene.train)
+    assert tab.nodes["/cameras/3"]["_image_data"] is not None
+    depth = np.array(Image.open(io.BytesIO(tab.depths[-1])))[..., :3].astype(np.int64)
+    depth = (depth * np.array((65536, 256, 1))).sum(-1) / 100_000
+    middle = float(run.render(scene.test.cameras, 0).depth[12, 12])
+    assert abs(np.median(depth[60:68, 60:68]) - middle) < 0.3 and depth.max() > 100
+    tab.set("Cameras", False)
+    tab.rest()
+    assert not any(name.startswith("/cameras/") for name in tab.nodes)
+
+
+def test_keyframes_become_a_path_that_render_takes(run, scene, tab, capsys) -> None:
+    tab.rest()
+    for index in (0, 1):
+        tab.look(scene.test.cameras, index)
+        tab.rest()
+        tab.set("Keyframes", "add")
+        tab.until(lambda index=index: f"{index + 1} keyframe" in str(tab.gui["No keyframes."]))
+    tab.set("Seconds", 1.0)
+    tab.set("Save path", True)
+    tab.until(lambda: tab.notes)
+    path = read_camera_path(run.path / "camera_paths" / "path-1.json")
+    assert (len(path.frames), path.fps, path.frames.width) == (24, 24, 128)
+    ends = path.frames.poses[[0, -1]]
+    assert torch.allclose(ends, scene.test.cameras.poses[:2], atol=1e-4)
+    assert torch.allclose(path.keyframes.intrinsics[:, 1] * 24 / 128, scene.test.cameras.intrinsics[:2, 1], rtol=1e-4)
+
+
+def test_a_screenshot_is_the_picture(tab) -> None:
+    tab.rest()
+    tab.set("Screenshot", True)
+    picture = tab.rest()
+    ((name, data),) = tab.until(lambda: [file for file in tab.files.items() if file[1]])
+    assert name.endswith("colour.png")
+    assert np.abs(np.array(Image.open(io.BytesIO(data))).astype(float) - picture).mean() < 1.5
+
+
+def test_each_tab_has_its_own_view_and_a_closed_one_costs_nothing(viewer, scene, tab) -> None:
+    first = tab.rest()
+    other = Tab(viewer, scene.test.cameras, 1, number=1)
+    other.rest()
+    other.set("Show", "opacity")
+    other.rest()
+    count = len(tab.pictures)
+    assert np.array_equal(first, tab.pictures[-1]) and not np.array_equal(first, other.pictures[-1])
+    tab.read()
+    assert len(tab.pictures) == count
+    other.look(scene.test.cameras, 0)
+    other.close()
+    tab.until(lambda: len(viewer.clients) == 1)
+    while viewer.render_next():
+        pass
+    assert not viewer.render_next()
+
+
+def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> None:
+    monkeypatch.setattr("voronerf.viewer.client.SHARP", 128)
+    settings = {"steps": 40, "cells": (3,), "split_at_steps": (20,), "rays": 128, "samples": 16, "evaluations": 2}
+    plain = Trainer(TrainConfig(out=tmp_path / "plain", **settings), scene)
+    plain.run()
+    watched = Trainer(TrainConfig(out=tmp_path / "watched", **settings), scene)
+    viewer = TrainingViewer(watched, port=0)
+    tab = Tab(
+        viewer,
+        scene.test.cameras,
+    )
+    tab.until(lambda: "Show" in tab.gui)
+
+    def on_step(now):
+        if now.step == 10:
+            tab.set("Show", "cells")
+        if now.step == 30:
+            tab.read()
+            tab.set("Pause", True)
+            tab.until(lambda: viewer.paused)
+            threading.Timer(0.3, tab.set, ("Pause", True)).start()
+        tab.look(scene.test.cameras, now.step % 2)
+        viewer.on_step(now)
+
+    watched.on_step = on_step
+    watched.run()
+    tab.read()
+    pictures = len(tab.pictures)
+    assert pictures > 5 and "3 cells" in str(tab.gui.values())
+    tab.close()
+    viewer.close()
+    for name, router in plain.routers.items():
+        assert same(dict(router.state_dict()), dict(watched.routers[name].state_dict()))
+    assert [line["psnr"] for line in plain.metrics] == [line["psnr"] for line in watched.metrics]
+
+
+def test_nothing_is_rendered_for_nobody(tmp_path, scene) -> None:
+    trainer = Trainer(TrainConfig(out=tmp_path, steps=4, cells=(), rays=64, samples=8, evaluations=1), scene)
+    viewer = TrainingViewer(trainer, port=0)
+    asked = []
+    trainer.renderer.image = lambda *args, **options: asked.append(args)
+    trainer.on_step = viewer.on_step
+    trainer.advance()
+    viewer.close()
+    assert trainer.step == 4 and not asked
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ({"port": 70_000}, "--port must be 0 to 65535, got 70000"),
+        ({"host": "192.0.2.1"}, "--host 192.0.2.1 --port 8080: cannot listen there"),
+        ({"host": "no such host"}, "--host no such host --port 8080: cannot listen there"),
+    ],
+)
+def test_bad_addresses(run, address, message) -> None:
+    refuses(message, view_run, run, error=ConfigError, **address)
+
+
+def test_a_port_in_use_is_one_line(run, tmp_path, capsys) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        for command in (["view", str(run.path)], ["train", "--view", "--out", str(tmp_path / "run")]):
+            assert main([*command, "--port", port]) == 1
+            lines = capsys.readouterr().err.splitlines()
+            assert len(lines) == 1 and f"--host 127.0.0.1 --port {port}: cannot listen there" in lines[0]
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,242 @@
+"""One browser: its camera, what it wants to see, and its panel."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+import viser
+from PIL import Image
+from torch import Tensor
+from viser.transforms import SO3
+
+from voronerf.evaluation.panels import palette
+from voronerf.rendering.cameras import Cameras
+from voronerf.viewer.cameras import FLIP, look_point, make_camera, scene_bounds
+from voronerf.viewer.cells import describe_cell
+from voronerf.viewer.path import Keyframes
+from voronerf.viewer.pictures import PANES, Look, cell_at, cells_of, groups_of
+
+if TYPE_CHECKING:
+    from voronerf.viewer.viewer import Viewer
+
+#: Pixels along the longer side of the sharp picture, at first and at most.
+SHARP, LARGEST = 512, 2048
+#: Training views that are drawn at most, evenly spread, and the longer side of their pictures.
+MOST_VIEWS, THUMBNAIL = 200, 96
+NO_CELL = "Click on a cell."
+
+
+class Client:
+    """A browser that has connected.
+
+    Attributes:
+        look: what it shows.
+        longest: pixels along the longer side of its sharp picture.
+        version: counts what changes its picture.
+        moved_at: when that was last.
+        wants_coarse: a picture now.
+        wants_sharp: a better one, when the camera rests.
+        drawn_at: when the last sharp picture was done.
+        cost: seconds that it took.
+        shows_nodes: whether something is drawn into the scene.
+    """
+
+    def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
+        self.handle, self.viewer = handle, viewer
+        self.look, self.longest = Look(level=viewer.subject.diagram.depth), SHARP
+        self.version, self.moved_at, self.drawn_at, self.cost = 0, 0.0, 0.0, 0.0
+        self.wants_coarse = self.wants_sharp = True
+        self.picked: int | None = None
+        self.wants_screenshot = False
+        self.nodes: dict[str, list[Any]] = {"centres": [], "cameras": []}
+        self._build()
+        handle.camera.on_update(self._moved)
+        handle.scene.on_click()(self._clicked)
+
+    # --- what it sees ----------------------------------------------------------------------------------------------
+
+    def camera(self, longest: int) -> Cameras:
+        """Its camera, with so many pixels along the longer side."""
+        seen = self.handle.camera
+        return make_camera(SO3(seen.wxyz).as_matrix(), seen.position, seen.fov, seen.aspect, longest)
+
+    @property
+    def shows_nodes(self) -> bool:
+        """Whether something is drawn into the scene."""
+        return any(self.nodes.values())
+
+    async def _moved(self, _: object) -> None:
+        self.change()
+
+    def change(self, **look: Any) -> None:
+        """Asks for new pictures, with other values of its `Look`."""
+        self.look = replace(self.look, **look)
+        self.version += 1
+        self.moved_at = time.perf_counter()
+        self.wants_coarse = self.wants_sharp = True
+        self.viewer.wake.set()
+
+    def on_diagram(self) -> None:
+        """Follows a split: cells have other numbers now."""
+        self.picked = None
+        depth = self.viewer.subject.diagram.depth
+        self.level.max, self.level.visible = max(depth, 2), depth > 1
+        self.level.value = depth  # type: ignore[misc]
+        self.info.content = NO_CELL
+        if self.nodes["centres"]:
+            self._show_centres(True)
+        self.change(level=depth, hidden=frozenset())
+
+    # --- the panel -------------------------------------------------------------------------------------------------
+
+    def _build(self) -> None:
+        gui, depth = self.handle.gui, self.viewer.subject.diagram.depth
+        pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
+        pane.on_update(lambda _: self.change(pane=pane.value))
+        size = gui.add_slider("Pixels", 128, LARGEST, 64, SHARP, hint="Along the longer side of a picture at rest.")
+        size.on_update(lambda _: self._resize(size.value))
+        with gui.add_folder("Cells", expand_by_default=False):
+            self.level = gui.add_slider("Level", 1, max(depth, 2), 1, depth, visible=depth > 1)
+            self.level.on_update(lambda _: self.change(level=self.level.value))
+            self.info = gui.add_markdown(NO_CELL)
+            hide = gui.add_button_group("Cell", ("hide", "only this", "show all"))
+            hide.on_click(lambda _: self._hide(hide.value))
+        with gui.add_folder("Scene", expand_by_default=False):
+            centres = gui.add_checkbox("Centres", False)
+            centres.on_update(lambda _: self._show_centres(centres.value))
+            cameras = gui.add_checkbox("Cameras", False, hint="The training views; click on one to stand there.")
+            cameras.on_update(lambda _: self._show_cameras(cameras.value))
+            crop = gui.add_checkbox("Crop", False, hint="Render the space inside of a box only.")
+            low, high = scene_bounds(self.viewer.subject.scene).tolist()
+            sides = [
+                gui.add_multi_slider(axis, a, b, (b - a) / 100, (a, b), visible=False)
+                for axis, a, b in zip("xyz", low, high)
+            ]
+
+            def cut(_: object) -> None:
+                for side in sides:
+                    side.visible = crop.value
+                corners = tuple(zip(*(side.value for side in sides)))
+                self.change(crop=corners if crop.value else None)
+
+            crop.on_update(cut)
+            for side in sides:
+                side.on_update(cut)
+        with gui.add_folder("Camera", expand_by_default=False):
+            self.keyframes = Keyframes(self, self.viewer.subject.folder)
+            shot = gui.add_button("Screenshot", icon=viser.Icon.CAMERA)
+            shot.on_click(lambda _: self._ask_screenshot())
+
+    def _resize(self, longest: int) -> None:
+        self.longest = longest
+        self.change()
+
+    def _ask_screenshot(self) -> None:
+        self.wants_screenshot = True
+        self.change()
+
+    def on_sharp(self, picture: Tensor) -> None:
+        """Takes a sharp picture, uint8 [h, w, 3]."""
+        if self.wants_screenshot:
+            self.wants_screenshot = False
+            data = io.BytesIO()
+            Image.fromarray(picture.numpy()).save(data, format="PNG")
+            name = f"{self.viewer.subject.name}-{self.look.pane}.png"
+            self.handle.send_file_download(name, data.getvalue(), save_immediately=True)
+
+    # --- cells -----------------------------------------------------------------------------------------------------
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        x, y = event.screen_pos
+        self.viewer.do(lambda: self.pick(x, y))
+
+    def pick(self, x: float, y: float) -> None:
+        """Describes the cell that is at a place of the picture, 0..1 from the left and from the top."""
+        subject, errors, camera = self.viewer.subject, self.viewer.errors, self.camera(self.longest)
+        self.picked = cell_at(subject, camera, self.look, x, y)
+        if self.picked is None:
+            self.info.content = NO_CELL
+            return
+        groups = groups_of(subject.diagram, self.look.level)
+        number = groups[self.picked]
+        psnr = errors.psnr(camera, lambda places: groups[cells_of(subject, places)] == number)
+        self.info.content = describe_cell(subject, self.picked, self.look.level, psnr)
+
+    def _hide(self, what: str) -> None:
+        if what == "show all":
+            self.change(hidden=frozenset())
+        elif self.picked is not None:
+            groups = groups_of(self.viewer.subject.diagram, self.look.level)
+            inside = groups == groups[self.picked]
+            chosen = frozenset((inside if what == "hide" else ~inside).nonzero()[:, 0].tolist())
+            self.change(hidden=self.look.hidden | chosen if what == "hide" else chosen)
+
+    # --- what is drawn into the scene ------------------------------------------------------------------------------
+
+    def _clear(self, kind: str) -> None:
+        for node in self.nodes[kind]:
+            node.remove()
+        self.nodes[kind] = []
+
+    def _show_centres(self, show: bool) -> None:
+        self._clear("centres")
+        if show:
+            diagram = self.viewer.subject.diagram
+            bounds = scene_bounds(self.viewer.subject.scene)
+            cloud = self.handle.scene.add_point_cloud(
+                "/centres",
+                diagram.leaf_centres.cpu().numpy(),
+                palette(diagram.num_cells).numpy(),
+                point_size=0.012 * float((bounds[1] - bounds[0]).norm()),
+                point_shape="circle",
+                precision="float32",
+            )
+            self.nodes["centres"] = [cloud]
+        self.change()
+
+    def _show_cameras(self, show: bool) -> None:
+        self._clear("cameras")
+        if show:
+            train = self.viewer.subject.scene.train
+            apart = float((train.cameras.origins - train.cameras.origins.mean(0)).norm(dim=-1).mean())
+            count = min(len(train), MOST_VIEWS)
+            with self.handle.atomic():
+                for view in (number * len(train) // count for number in range(count)):
+                    self.nodes["cameras"].append(self._frustum(view, 0.06 * max(apart, 1e-3)))
+        self.change()
+
+    def _frustum(self, view: int, scale: float) -> Any:
+        scene = self.viewer.subject.scene
+        cameras = scene.train.cameras
+        truth = scene.train.truth(view, scene.background_colour())
+        step = -(-max(truth.shape[:2]) // THUMBNAIL)
+        picture = (truth[::step, ::step] * 255).to(torch.uint8).numpy()
+        pose = cameras.poses[view].double().numpy()
+        width, height = cameras.size(view)
+        fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[view, 1]))
+        node = self.handle.scene.add_camera_frustum(
+            f"/cameras/{view}",
+            fov=fov,
+            aspect=width / height,
+            scale=scale,
+            thickness=1.5,
+            thickness_units="screen",
+            image=picture,
+            wxyz=SO3.from_matrix(pose[:3, :3] @ FLIP).wxyz,
+            position=pose[:3, 3],
+        )
+
+        @node.on_click
+        def _(_: object) -> None:
+            with self.handle.atomic():
+                self.handle.camera.position = pose[:3, 3]
+                self.handle.camera.look_at = look_point(scene, view).numpy()
+                self.handle.camera.up_direction = pose[:3, 1]
+                self.handle.camera.fov = fov
+
+        return node

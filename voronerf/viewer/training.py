@@ -1,0 +1,71 @@
+"""The viewer of a training: pictures between its steps, its curve, pause."""
+
+from __future__ import annotations
+
+import time
+
+from voronerf.training.progress import Progress
+from voronerf.training.trainer import Trainer
+from voronerf.viewer.pictures import Subject
+from voronerf.viewer.viewer import Viewer
+
+#: Seconds between two changes of the lines and the curve that tell of the training.
+TELL = 1.0
+
+
+class TrainingViewer(Viewer):
+    """Shows a training; its trainer calls :meth:`on_step` after every step.
+
+    Pictures have the averaged weights. Nothing is rendered while there is no browser, and the results of training are
+    the same bit for bit with and without a viewer.
+
+    Args:
+        trainer: what is viewed.
+        host: address to listen at.
+        port: to listen at; 0 is any that is free.
+    """
+
+    def __init__(self, trainer: Trainer, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        subject = Subject(
+            trainer.out.name, trainer.out, trainer.scene, trainer.router, trainer.renderer, trainer.averaged
+        )
+        super().__init__(subject, host=host, port=port)
+        self.trainer, self.diagram = trainer, trainer.router.diagram
+        self.paused = False
+        self.told_at = 0.0
+        gui = self.server.gui
+        self.line = gui.add_markdown("", order=-3)
+        self.button = gui.add_button("Pause", order=-2)
+        self.button.on_click(lambda _: self.pause(not self.paused))
+
+    def pause(self, paused: bool) -> None:
+        """Holds the training after the step in hand, or lets it go on."""
+        self.paused = paused
+        self.button.label = "Go on" if paused else "Pause"
+        self.wake.set()
+
+    def on_step(self, now: Progress) -> None:
+        """Shows the state after a step; returns when training shall go on."""
+        if not self.clients and not self.paused:
+            return
+        if self.trainer.router.diagram is not self.diagram:
+            self.diagram = self.trainer.router.diagram
+            for client in self.list_clients():
+                client.on_diagram()
+        if time.perf_counter() - self.told_at > TELL:
+            self.tell(now)
+        self.refresh()
+        self.render_next()
+        if self.paused:
+            self.tell(now)
+            self.serve(lambda: not self.paused or self.trainer.stopped)
+
+    def tell(self, now: Progress) -> None:
+        """Writes the lines about the training, and its curve."""
+        self.told_at = time.perf_counter()
+        self.line.content = (
+            f"step {now.step:,}, {now.seconds:.0f} s, {now.fraction:.0%}  \n"
+            f"{now.cells} cells, {now.rays_per_second / 1000:.1f} k rays/s  \n"
+            f"loss {now.loss:.5f}" + ("" if now.psnr is None else f", PSNR {now.psnr:.2f} dB")
+        )
+        self.show_curve([(line["seconds"], line["psnr"]) for line in self.trainer.metrics])

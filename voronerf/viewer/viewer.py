@@ -1,0 +1,228 @@
+"""The viewer: a server, its clients, and which picture is rendered next.
+
+One thread renders everything, that which calls :meth:`Viewer.render_next` or :meth:`Viewer.serve`: in a training it is
+the thread of the steps, so that a picture is never of half a step. The threads of the server only write down wishes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+import viser
+from torch import Tensor
+from viser.uplot import Scale, Series
+
+from voronerf.rendering.cameras import Cameras
+from voronerf.rendering.renderer import RenderedImage
+from voronerf.run import Run
+from voronerf.training.config import ConfigError
+from voronerf.training.run_directory import read_curve
+from voronerf.viewer.cameras import axial_depth, look_point
+from voronerf.viewer.client import Client
+from voronerf.viewer.errors import ViewErrors
+from voronerf.viewer.pictures import Look, Subject, picture_of, render_bands, render_look, stack_bands
+
+#: Seconds without a movement after which the sharp picture is begun.
+REST = 0.15
+#: Seconds that a picture may take while the camera moves, and a band of the sharp one, after which others have a turn.
+COARSE, BAND = 0.06, 0.1
+#: Pixels along the longer side of a coarse picture, at least.
+SMALLEST = 48
+#: Share of a training's time that goes into new pictures while nobody moves.
+REFRESH = 0.05
+#: Depth in scene units at which nothing is, the largest that viser takes.
+NOWHERE = 160.0
+
+
+class Viewer:
+    """Shows a subject to any number of browsers.
+
+    Args:
+        subject: what is viewed.
+        host: address to listen at.
+        port: to listen at; 0 is any that is free.
+
+    Raises:
+        ConfigError: the address cannot be listened at.
+    """
+
+    def __init__(self, subject: Subject, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        check_address(host, port)
+        self.subject = subject
+        self.clients: dict[int, Client] = {}
+        self.tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.wake = threading.Event()
+        self.rate = 100_000.0  # pixels a second
+        self.errors = ViewErrors(subject.scene, self._render_view)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser draws a box around its address
+            self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
+        self.host, self.port = host, self.server.get_port()
+        self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
+        start, cameras = self.server.initial_camera, subject.scene.train.cameras
+        start.position = cameras.origins[0].numpy()
+        start.look_at = look_point(subject.scene).numpy()
+        start.fov = 2 * math.atan(cameras.size(0)[1] / 2 / float(cameras.intrinsics[0, 1]))
+        self.curve: viser.GuiUplotHandle | None = None
+        self.server.on_client_connect(self._enter)
+        self.server.on_client_disconnect(self._leave)
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        return f"http://{self.host}:{self.port}"
+
+    def show_curve(self, points: Sequence[tuple[float, float]]) -> None:
+        """Draws PSNR in dB over training seconds, from the second evaluation on.
+
+        Args:
+            points: seconds and PSNR of each evaluation.
+        """
+        if len(points) < 2:
+            return
+        seconds, psnr = np.array(points, dtype=np.float64).T
+        if self.curve is not None:
+            self.curve.data = (seconds, psnr)
+            return
+        series = (Series(label="s"), Series(label="PSNR [dB]", stroke="#00897b", width=2))
+        self.curve = self.server.gui.add_uplot(
+            (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, order=-1
+        )
+
+    def close(self) -> None:
+        """Ends the server; its clients see that it is gone."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def _enter(self, handle: viser.ClientHandle) -> None:
+        self.clients[handle.client_id] = Client(handle, self)
+        self.wake.set()
+
+    async def _leave(self, handle: viser.ClientHandle) -> None:
+        self.clients.pop(handle.client_id, None)
+
+    def do(self, task: Callable[[], None]) -> None:
+        """Has something done by the thread that renders."""
+        self.tasks.put(task)
+        self.wake.set()
+
+    # --- rendering -------------------------------------------------------------------------------------------------
+
+    def serve(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Renders what is asked for, until a function says so or Ctrl-C."""
+        while not until():
+            if not self.render_next():
+                # A picture may wait for its camera to rest; without one there is nothing to look at.
+                waiting = any(client.wants_sharp for client in self.list_clients())
+                self.wake.wait(REST / 3 if waiting else 1.0)
+                self.wake.clear()
+
+    def list_clients(self) -> list[Client]:
+        """Those that are there now."""
+        return list(self.clients.values())
+
+    def render_next(self) -> bool:
+        """Does the task or renders the picture that is most urgent; returns whether there was one."""
+        with contextlib.suppress(queue.Empty):
+            self.tasks.get_nowait()()
+            return True
+        clients = self.list_clients()
+        for client in clients:
+            if client.wants_coarse:
+                self._draw_coarse(client)
+                return True
+        for client in clients:
+            if client.wants_sharp and time.perf_counter() - client.moved_at >= REST:
+                self._draw_sharp(client)
+                return True
+        return False
+
+    def refresh(self) -> None:
+        """Has pictures at rest rendered again, since the weights have changed; as often as `REFRESH` allows."""
+        now = time.perf_counter()
+        for client in self.list_clients():
+            if now - client.drawn_at > client.cost / REFRESH:
+                self.errors.forget()
+                client.wants_sharp = True
+
+    def _draw_coarse(self, client: Client) -> None:
+        client.wants_coarse = False
+        longest = int(max(SMALLEST, (self.rate * COARSE) ** 0.5))
+        camera = client.camera(min(longest, client.longest))
+        started = time.perf_counter()
+        image = render_look(self.subject, camera, client.look)
+        self._took(camera.width * camera.height, time.perf_counter() - started)
+        self._send(client, camera, image, client.look, quality=70)
+
+    def _draw_sharp(self, client: Client) -> None:
+        """Renders in bands; a movement ends it, and other clients get their coarse pictures in between."""
+        version, look, camera = client.version, client.look, client.camera(client.longest)
+        started, bands = time.perf_counter(), []
+        rows = max(1, int(self.rate * BAND / camera.width))
+        for band in render_bands(self.subject, camera, look, rows):
+            bands.append(band)
+            for other in self.list_clients():
+                if other is not client and other.wants_coarse:
+                    self._draw_coarse(other)
+            if client.version != version or client.handle.client_id not in self.clients:
+                return
+        client.wants_sharp = False
+        image = stack_bands(bands)
+        self._took(camera.width * camera.height, time.perf_counter() - started)
+        picture = self._send(client, camera, image, look, quality=95)
+        client.cost, client.drawn_at = time.perf_counter() - started, time.perf_counter()
+        client.on_sharp(picture)
+
+    def _send(self, client: Client, camera: Cameras, image: RenderedImage, look: Look, *, quality: int) -> Tensor:
+        picture = picture_of(self.subject, camera, image, look, self.errors)
+        depth = None
+        if client.shows_nodes:  # so that what is drawn into the scene vanishes behind it
+            solid = image.opacity > 0.5
+            depth = torch.where(solid, axial_depth(camera, image.depth), NOWHERE).clamp(max=NOWHERE).numpy()
+        client.handle.scene.set_background_image(picture.numpy(), format="jpeg", jpeg_quality=quality, depth=depth)
+        client.handle.flush()
+        return picture
+
+    def _took(self, pixels: int, seconds: float) -> None:
+        self.rate += 0.3 * (pixels / max(seconds, 1e-6) - self.rate)
+
+    def _render_view(self, camera: Cameras) -> RenderedImage:
+        return render_look(self.subject, camera, Look(pane="error"))
+
+
+def check_address(host: str, port: int) -> None:
+    """Raises ConfigError for an address that cannot be listened at."""
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"--port must be 0 to 65535, got {port}")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        raise ConfigError(f"--host {host} --port {port}: cannot listen there: {error.strerror}") from None
+
+
+def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+    """The viewer of a trained run; `Viewer.serve` renders for it.
+
+    Args:
+        run: such as `voronerf.open_run` opens.
+        host: address to listen at.
+        port: to listen at; 0 is any that is free.
+
+    Raises:
+        ConfigError: the address cannot be listened at.
+    """
+    subject = Subject(run.path.resolve().name, run.path, run.scene, run.router, run.renderer)
+    viewer = Viewer(subject, host=host, port=port)
+    viewer.show_curve(read_curve(run.path))
+    return viewer
