@@ -253,9 +253,10 @@ def broken(path, at, layout, *values):
             "camera 1 must have a size and finite parameters",
         ),
         (lambda model: broken(model / "images.bin", 8 + 60, "<I", 99), "has camera 99, which cameras.bin has not"),
-        (lambda model: broken(model / "images.bin", 8 + 64, "<6s", b"../../"), "must be a file in the folder"),
+        (lambda model: broken(model / "images.bin", 8 + 64, "<6s", b"../../"), "must lie in the folder"),
         (lambda model: (model / "images.bin").write_bytes((model / "images.bin").read_bytes()[:90]), "is cut short"),
         (lambda model: (model / "images.bin").write_bytes(bytes(8)), "images.bin: has no images"),
+        (lambda model: (model / "more.bin").symlink_to("/etc/passwd"), "more.bin: must lie in the folder of the scene"),
         (lambda model: (model.parents[1] / "images/03.jpg").write_bytes(b"no"), "03.jpg: is not an image"),
         (
             lambda model: Image.new("RGB", (10, 12)).save(model.parents[1] / "images/03.jpg"),
@@ -304,6 +305,7 @@ def test_formats_and_kinds_are_named(tmp_path):
     refuses("format must be colmap or llff, which it has, got blender", load_scene, tmp_path, format="blender")
     refuses("format must be auto, blender or", load_scene, tmp_path, format="nerf")
     refuses("kind must be auto, object or", load_scene, tmp_path, kind="outdoor")
+    refuses("builtin: format must be auto and kind auto or object", load_scene, "builtin", kind="forward")
 
 
 @pytest.mark.data

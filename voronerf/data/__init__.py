@@ -65,6 +65,8 @@ def load_scene(
         if given != "auto" and given not in known:
             raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {given!r:.60}")
     if str(source) in BUILTIN:
+        if format != "auto" or kind not in ("auto", "object"):
+            raise SceneError(f"{source}: format must be auto and kind auto or object, got {format} and {kind}")
         if downscale > BUILTIN_SIZE:
             raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
         return BUILTIN[str(source)](BUILTIN_SIZE // downscale)

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from voronerf.data.folders import choose_images, named_images
+from voronerf.data.folders import choose_images, named_images, stay_inside
 from voronerf.data.lenses import MODELS, Lens, colmap_lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, photograph_scene
 from voronerf.data.scene import Scene, SceneError
@@ -27,7 +27,7 @@ from voronerf.data.scene import Scene, SceneError
 Array = NDArray[Any]
 
 FILES = ("cameras", "images", "points3D")
-#: Bytes of a text file; a binary one of that size holds ten times as much.
+#: Bytes of a file.
 LARGEST = 2**31
 #: Points that fewer images than this have seen are too uncertain to tell where the scene is.
 LEAST_SEEN = 3
@@ -110,10 +110,16 @@ def read_model(folder: Path) -> ColmapModel:
     return ColmapModel(images_path, sorted(images, key=lambda image: image.name), numbers, points)
 
 
+def _check_size(path: Path) -> None:
+    if path.stat().st_size > LARGEST:
+        raise SceneError(f"{path}: must be at most {LARGEST / 2**30:g} GiB")
+
+
 class _Reader:
     """The values of a binary file, one after another."""
 
     def __init__(self, path: Path) -> None:
+        _check_size(path)
         self.path, self.data, self.at = path, path.read_bytes(), 0
 
     def count(self, least: int, what: str) -> int:
@@ -181,8 +187,7 @@ def _points(path: Path) -> Iterator[tuple[int, float, float, float, int]]:
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The words of each line that is no comment, empty ones too, with its number."""
-    if path.stat().st_size > LARGEST:
-        raise SceneError(f"{path}: must be at most {LARGEST / 2**30:g} GiB of text")
+    _check_size(path)
     with open(path, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
             if not line.startswith("#"):
@@ -270,6 +275,8 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     place = find_model(folder)
     if place is None:
         raise SceneError(f"{folder}: has no COLMAP model, cameras and images as .bin or .txt, in sparse/0 or sparse")
+    for file in place.iterdir():
+        stay_inside(file, folder, reading.allow_outside)
     model = read_model(place)
     chosen = choose_images(folder, reading.downscale)
     names = [image.name for image in model.images]

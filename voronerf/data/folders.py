@@ -50,6 +50,12 @@ def choose_images(folder: Path, downscale: int) -> ImageFolder:
     return ImageFolder(sizes[largest], downscale // largest, ())
 
 
+def stay_inside(path: Path, folder: Path, allow_outside: bool) -> None:
+    """Raises SceneError for a path that leads out of the folder of a scene by `..` or a link, unless that is allowed."""
+    if not allow_outside and leads_outside(path, folder):
+        raise SceneError(f"{path}: must lie in the folder of the scene; --allow-outside reads others")
+
+
 def named_images(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
     """The files of names in a folder, None for those that are missing; with a warning that says how many.
 
@@ -59,10 +65,7 @@ def named_images(source: Path, folder: Path, names: Sequence[str], allow_outside
     found: list[Path | None] = []
     for name in names:
         path = folder / name.replace("\\", "/")
-        if not allow_outside and leads_outside(path, folder.parent):
-            raise SceneError(
-                f"{source}: image {name!r:.60} must be a file in the folder of the scene; --allow-outside reads others"
-            )
+        stay_inside(path, folder.parent, allow_outside)
         found.append(path if path.is_file() else None)
     missing = found.count(None)
     if missing == len(found):

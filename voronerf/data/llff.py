@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from voronerf.data.folders import choose_images, listed_images
+from voronerf.data.folders import choose_images, listed_images, stay_inside
 from voronerf.data.lenses import Lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, photograph_scene
 from voronerf.data.scene import Scene, SceneError
 from voronerf.data.transforms import LARGEST, ORTHONORMAL
-from voronerf.files import leads_outside
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17
@@ -31,17 +30,16 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
         SceneError: the file is broken, or the images are not as many as its rows.
     """
     path = folder / FILE
+    stay_inside(path, folder, reading.allow_outside)
     rows = _read(path)
     chosen = choose_images(folder, reading.downscale)
-    if not reading.allow_outside and leads_outside(chosen.path, folder):
-        raise SceneError(f"{chosen.path}: must lie in the folder of the scene; --allow-outside reads others")
+    stay_inside(chosen.path, folder, reading.allow_outside)
     files = listed_images(chosen.path)
     if len(files) != len(rows):
         raise SceneError(f"{path}: has poses of {len(rows)} images, {chosen.path} has {len(files)} images")
     views = []
     for number, (file, row) in enumerate(zip(files, rows)):
-        if not reading.allow_outside and leads_outside(file, folder):
-            raise SceneError(f"{file}: must lie in the folder of the scene; --allow-outside reads others")
+        stay_inside(file, folder, reading.allow_outside)
         matrix, (near, far) = row[:15].reshape(3, 5), row[15:]
         height, width, focal = matrix[:, 4].tolist()
         pose = np.eye(4)
