@@ -51,7 +51,7 @@ def choose_images(folder: Path, downscale: int) -> ImageFolder:
 
 
 def stay_inside(path: Path, folder: Path, allow_outside: bool) -> None:
-    """Raises SceneError for a path that leads out of the folder of a scene by `..` or a link, unless that is allowed."""
+    """Raises SceneError for a path that leads out of the scene's folder by `..` or a link, unless that is allowed."""
     if not allow_outside and leads_outside(path, folder):
         raise SceneError(f"{path}: must lie in the folder of the scene; --allow-outside reads others")
 
