@@ -18,7 +18,7 @@ SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
-.PHONY: demo test bench paper docs check cuda-check gpu-check emulate-cuda sanitize clean
+.PHONY: demo test bench paper docs check cuda-check gpu-check emulate-cuda sanitize attack clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -64,6 +64,11 @@ emulate-cuda: $(VENV)/.built
 sanitize:
 	@tests/cpp/sanitize.sh
 	@tests/cpp/sanitize_ops.sh
+
+# Random calls of the operations, kills, damaged checkpoints and strangers' files, for about an hour. ATTACK_ARGS names
+# parts, seeds and counts: tests/attack --help.
+attack: $(VENV)/.built
+	@OMP_NUM_THREADS=1 $(BIN)/python tests/attack $(ATTACK_ARGS)
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info voronerf/_C.*.so .mypy_cache .pytest_cache .ruff_cache

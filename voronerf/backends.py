@@ -260,7 +260,7 @@ def _choose_once(op: str, backend: str, device_type: str, index: int | None, dty
     if (op, "reference") not in _TABLE:
         raise ValueError(f"resolve: op must be one of {_choices(ops())}, got {op!r}")
     if backend != "auto" and backend not in BACKENDS:
-        raise ValueError(f"{op}: backend must be one of {_choices(('auto', *BACKENDS))}, got {backend!r}")
+        raise ValueError(f"{op}: backend must be one of {_choices(('auto', *BACKENDS))}, got {backend!r:.60}")
     device = torch.device(device_type) if index is None else torch.device(device_type, index)
     if backend == "auto":
         order = ORDER.get(device_type, ("reference",))

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -141,15 +142,23 @@ def check_integer(op: str, name: str, value: int, minimum: int, maximum: int = M
 
 
 def check_number(op: str, name: str, value: float) -> None:
-    """Raises TypeError unless ``value`` is a number."""
+    """Raises TypeError unless ``value`` is a number, ValueError for an integer beyond those of floating point."""
     if isinstance(value, bool) or not isinstance(value, (int, float, torch.SymFloat, torch.SymInt)):
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}")
+    if isinstance(value, int) and abs(value) > sys.float_info.max:
+        raise ValueError(f"{op}: {name} must be at most {sys.float_info.max:.2g}, got an integer of more digits")
+
+
+def check_flag(op: str, name: str, value: bool) -> None:
+    """Raises TypeError unless ``value`` is True or False."""
+    if not isinstance(value, bool):
+        raise TypeError(f"{op}: {name} must be True or False, got {type(value).__name__}")
 
 
 def check_choice(op: str, name: str, value: object, choices: Sequence[str]) -> None:
     """Raises ValueError unless ``value`` is one of ``choices``."""
     if value not in choices:
-        raise ValueError(f"{op}: {name} must be one of {', '.join(choices)}, got {value!r}")
+        raise ValueError(f"{op}: {name} must be one of {', '.join(choices)}, got {value!r:.60}")
 
 
 def _short(dtype: torch.dtype) -> str:

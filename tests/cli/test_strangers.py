@@ -55,6 +55,15 @@ def test_files_that_are_links_are_replaced_and_not_followed(copied, tmp_path):
     assert mine.read_text() == "mine" and not (copied / "eval.json").is_symlink()
 
 
+def test_a_warning_is_one_line_however_long(copied, capsys):
+    path = copied / "checkpoints" / "last.safetensors"
+    shutil.copy(path, path.with_name("last-1.safetensors"))
+    path.write_bytes(path.read_bytes()[:-1])
+    assert main(words("eval --views 1 --panels 0", copied)) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and f"{path}: not a readable checkpoint" in lines[0], lines
+
+
 @pytest.mark.parametrize("option", ["data", "lpips"])
 def test_paths_in_the_settings_of_a_run(copied, tmp_path, fails, monkeypatch, option):
     outside = tmp_path / "outside"

@@ -6,7 +6,8 @@ import pytest
 import torch
 from helpers import refuses
 
-from voronerf import ops
+from voronerf import MLP, Layer, ops
+from voronerf.layers import POSITIONS
 
 POINTS, TREE = torch.rand(4, 3), (torch.tensor([0, 2], dtype=torch.int32), torch.tensor([-1, -2], dtype=torch.int32))
 GRID = torch.rand(2, 2, 2)
@@ -27,7 +28,8 @@ def balance(**given):
 
 
 def network(**given):
-    return ops.grouped_mlp(POINTS, torch.tensor([0, 4], dtype=torch.int32), [], [], **given)
+    options = {"weights": [], "biases": [], "layers": MLP((Layer((POSITIONS,), 1),), (0,)), **given}
+    return ops.grouped_mlp(POINTS, torch.tensor([0, 4], dtype=torch.int32), **options)
 
 
 @pytest.mark.parametrize(
@@ -54,6 +56,40 @@ def network(**given):
             "cast_solids: kinds must be 0 (sphere) to 3 (torus), got -5",
             lambda: ops.cast_solids(CELLS[:1] - 5, torch.rand(1, 4, 3), torch.rand(1, 3), POINTS, POINTS),
         ),
+        (
+            ValueError,
+            "update_occupancy: threshold must be at most 1.8e+308, got an integer of more digits",
+            lambda: ops.update_occupancy(GRID, CELLS, torch.rand(4), decay=0.5, threshold=10**400),
+        ),
+        (TypeError, "balance_centres: global_norm must be True or False, got str", lambda: balance(global_norm="x")),
+        (
+            TypeError,
+            "frequency_encode: include_input must be True or False, got list",
+            lambda: ops.frequency_encode(POINTS, octaves=3, include_input=[1]),
+        ),
+        (
+            TypeError,
+            "hash_encode: grid must be a HashGrid, got dict",
+            lambda: ops.hash_encode(POINTS, torch.rand(8, 2), {}),
+        ),
+        (
+            TypeError,
+            "pixel_rays: far must be a number, got NoneType",
+            lambda: ops.pixel_rays(
+                torch.eye(4)[None],
+                torch.ones(1, 4),
+                torch.zeros(1, 2, 2, 3, dtype=torch.uint8),
+                CELLS.long(),
+                near=0,
+                far=None,
+            ),
+        ),
+        (
+            TypeError,
+            "sparse_adam: learning_rate must be a number, got str",
+            lambda: ops.sparse_adam(*torch.zeros(4, 2), step=1, learning_rate="x"),
+        ),
+        (TypeError, "grouped_mlp: weights must be a list, got NoneType", lambda: network(weights=None)),
         (ValueError, "cell_sort: k must be at most 2147483647", lambda: ops.cell_sort(CELLS, 2**31)),
     ],
 )

@@ -113,7 +113,7 @@ def _train_command(args: list[str]) -> Callable[..., int]:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    Console(stderr=True).print(f"voronerf: {one_line(str(message))}", highlight=False, markup=False)
+    Console(stderr=True, soft_wrap=True).print(f"voronerf: {one_line(str(message))}", highlight=False, markup=False)
 
 
 if __name__ == "__main__":

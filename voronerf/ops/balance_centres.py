@@ -7,7 +7,15 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import check_count, check_dtype, check_integer, check_number, check_same_device, check_shape
+from voronerf.checks import (
+    check_count,
+    check_dtype,
+    check_flag,
+    check_integer,
+    check_number,
+    check_same_device,
+    check_shape,
+)
 
 _OP = backends.declare(
     "balance_centres",
@@ -73,6 +81,7 @@ def balance_centres(
     check_integer(_OP, "steps", steps, 0)
     check_integer(_OP, "neighbours", neighbours, 1)
     check_number(_OP, "alpha", alpha)
+    check_flag(_OP, "global_norm", global_norm)
     if sizes["k"] < 1:
         raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
     run = backends.resolve(_OP, backend=backend, device=samples.device, dtype=samples.dtype)

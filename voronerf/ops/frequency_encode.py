@@ -6,7 +6,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import check_count, check_dtype, check_integer, check_no_inference, check_shape
+from voronerf.checks import check_count, check_dtype, check_flag, check_integer, check_no_inference, check_shape
 
 _OP = backends.declare(
     "frequency_encode",
@@ -44,6 +44,7 @@ def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, bac
     """
     check_shape(_OP, "x", x, ("n", "d"))
     check_dtype(_OP, "x", x)
+    check_flag(_OP, "include_input", include_input)
     check_integer(_OP, "octaves", octaves, 0, 127)  # 2^128 is beyond float32
     check_no_inference(_OP, x=x)
     check_count(_OP, "x", x.shape[0])

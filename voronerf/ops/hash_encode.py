@@ -60,6 +60,8 @@ def hash_encode(
     check_shape(_OP, "positions", positions, ("n", 3), sizes)
     check_dtype(_OP, "positions", positions)
     check_count(_OP, "positions", sizes["n"])
+    if not isinstance(grid, HashGrid):
+        raise TypeError(f"{_OP}: grid must be a HashGrid, got {type(grid).__name__}")
     check_shape(_OP, "table", table, (() if cells is None else ("k",)) + grid.table_shape, sizes)
     check_dtype(_OP, "table", table)
     if cells is not None:

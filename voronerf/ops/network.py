@@ -33,6 +33,8 @@ def check_network(
     _check_features(op, features, layers, sizes)
     count = len(layers.layers)
     for name, parameters in (("weights", weights), ("biases", biases)):
+        if not isinstance(parameters, Sequence):
+            raise TypeError(f"{op}: {name} must be a list, got {type(parameters).__name__}")
         if len(parameters) != count:
             raise ValueError(f"{op}: {name} must have one entry for each of {count} layers, got {len(parameters)}")
     for source, width in ((POSITIONS, sizes["p"]), (DIRECTIONS, sizes["q"])):

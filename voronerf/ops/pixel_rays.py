@@ -7,7 +7,15 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import check_count, check_dtype, check_same_device, check_same_dtype, check_shape, check_tensor
+from voronerf.checks import (
+    check_count,
+    check_dtype,
+    check_number,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+    check_tensor,
+)
 from voronerf.reference.pixel_rays import PixelRays
 
 _OP = backends.declare("pixel_rays", native=Implementation(("cpu",), (torch.float32,)))
@@ -95,6 +103,8 @@ def pixel_rays(
     check_count(_OP, "index", sizes["b"])
     if sizes["channels"] not in (3, 4):
         raise ValueError(f"{_OP}: images must have 3 or 4 channels, got {sizes['channels']}")
+    check_number(_OP, "near", near)
+    check_number(_OP, "far", far)
     if not 0 <= near < far:
         raise ValueError(f"{_OP}: near and far must satisfy 0 <= near < far, got {near} and {far}")
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import check_dtype, check_integer, check_same_device, check_tensor
+from voronerf.checks import check_dtype, check_integer, check_number, check_same_device, check_tensor
 
 _OP = backends.declare("sparse_adam", native=Implementation(("cpu",), (torch.float32,)))
 
@@ -75,6 +75,8 @@ def sparse_adam(
             raise ValueError(f"{_OP}: {name} must be contiguous, got strides {tensor.stride()}")
     check_same_device(_OP, **tensors)
     check_integer(_OP, "step", step, 1)
+    check_number(_OP, "learning_rate", learning_rate)
+    check_number(_OP, "epsilon", epsilon)
     if not all(0 <= beta < 1 for beta in betas):
         raise ValueError(f"{_OP}: betas must lie in [0, 1), got {betas}")
     if not epsilon > 0:

@@ -65,5 +65,5 @@ def update_occupancy(
     if not 0 <= decay <= 1:
         raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
     run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)
-    remembered, occupied = run(density.detach(), cells, values.detach(), decay=decay, threshold=threshold)
+    remembered, occupied = run(density.detach(), cells, values.detach(), decay=float(decay), threshold=float(threshold))
     return remembered, occupied

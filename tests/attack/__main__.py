@@ -1,0 +1,69 @@
+"""Attacks the library with random calls, kills, damage and strangers' files: ``python tests/attack --help``.
+
+Each attempt comes from a seed of its own. The last line of a failure is the command that repeats it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+
+import given
+import op_attacks
+import run_attacks
+import scene_attacks
+import torch
+import training_attacks
+from attempts import FAILED, REFUSED, RIGHT, Part, Tally, run_part
+
+#: Each part with its attempts in the long form and in the short one.
+PARTS = {
+    part.name: (part, long, short)
+    for part, long, short in (
+        (Part("valid-calls", op_attacks.valid_call, 60, 200), 140_000, 400),
+        (Part("invalid-calls", op_attacks.invalid_call, 60, 200), 60_000, 400),
+        (Part("kills", training_attacks.killed_training, 300, 1, given.prepare_scenes), 20, 1),
+        (Part("bits", run_attacks.flipped_bit, 60, 20, given.prepare_runs), 500, 20),
+        (Part("scenes", scene_attacks.stranger_scene, 60, 1, given.prepare_scenes), 150, 8),
+        (Part("runs", run_attacks.stranger_run, 60, 1, given.prepare_runs), 150, 8),
+        (Part("stress", training_attacks.stressed_command, 60, 1, given.prepare_scenes), 150, 8),
+    )
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python tests/attack", description=__doc__)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)}; default all")
+    parser.add_argument("--short", action="store_true", help="the few attempts that the test suite makes")
+    parser.add_argument("--seed", type=int, default=0, help="of the first attempt of each part (default: 0)")
+    parser.add_argument("--count", type=int, help="attempts of each part; a chain of kills is one")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (default: one a core)")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="no attempt begins later")
+    options = parser.parse_args()
+    unknown = [name for name in options.parts if name not in PARTS]
+    if unknown:
+        parser.error(f"PART must be one of {', '.join(PARTS)}, got {unknown[0]}")
+
+    torch.set_num_threads(1)
+    until = time.monotonic() + 60 * options.minutes
+    tallies: dict[str, Tally] = {}
+    for name in options.parts or PARTS:
+        part, long, short = PARTS[name]
+        count = options.count or (short if options.short else long)
+        tallies[name] = run_part(part, range(options.seed, options.seed + count), jobs=options.jobs, until=until)
+        for seed, failure in tallies[name].failures:
+            print(f"{name}: {failure}\n    {sys.executable} tests/attack {name} --seed {seed} --count 1", flush=True)
+
+    print(f"{'part':14} {'tried':>8} {'refused clearly':>16} {'accepted and right':>19} {'failed':>8} {'seconds':>8}")
+    for name, tally in tallies.items():
+        counts = tally.counts
+        print(
+            f"{name:14} {tally.tried:8} {counts[REFUSED]:16} {counts[RIGHT]:19} {counts[FAILED]:8} {tally.seconds:8.0f}"
+        )
+    return int(any(tally.counts[FAILED] for tally in tallies.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

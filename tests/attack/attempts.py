@@ -1,0 +1,194 @@
+"""Attempts to break the library, each from a seed and in a forked process, so that a crash is a failure like another.
+
+A part of the attack is a function of a random generator and an empty folder. It returns what became of the attempt,
+and raises :class:`Failed` where the library broke a promise. Nothing before the forks may differentiate: torch does
+not work in the child of a process that has.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import selectors
+import shutil
+import signal
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+REFUSED, RIGHT, FAILED = "refused", "right", "failed"
+#: Memory in bytes that no attempt may exceed: what a stranger sends is refused before it takes more.
+MEMORY = 2 << 30
+
+
+class Failed(Exception):
+    """A promise that was broken; the message says which."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the attack.
+
+    Attributes:
+        name: In the table and on the command line.
+        attempt: What is tried; returns REFUSED or RIGHT, or how many of each there were.
+        seconds: Limit of an attempt.
+        batch: Attempts of a process.
+        prepare: Makes, in a process of its own, what the attempts of the part start from.
+    """
+
+    name: str
+    attempt: Callable[[random.Random, Path, Path], str | Counter[str]]
+    seconds: int
+    batch: int = 1
+    prepare: Callable[[Path], None] | None = None
+
+
+@dataclass
+class Tally:
+    """What became of the attempts of a part."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    failures: list[tuple[int, str]] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def tried(self) -> int:
+        return self.counts.total()
+
+
+def run_part(part: Part, seeds: Iterable[int], *, jobs: int, until: float = float("inf")) -> Tally:
+    """Makes the attempts of some seeds, ``jobs`` at a time; none begins after the time ``until``."""
+    tally, started = Tally(), time.monotonic()
+    waiting = list(seeds)[::-1]
+    with tempfile.TemporaryDirectory(prefix="attack-") as scratch:
+        given = Path(scratch) / "given"
+        given.mkdir()
+        if part.prepare is not None:
+            status, _ = _finish(_fork(lambda: part.prepare(given)))
+            if status != 0:
+                raise RuntimeError(f"{part.name} could not be prepared")
+        running = selectors.DefaultSelector()
+        while running.get_map() or (waiting and time.monotonic() < until):
+            while waiting and len(running.get_map()) < jobs and time.monotonic() < until:
+                batch = [waiting.pop() for _ in range(min(part.batch, len(waiting)))]
+                worker = _Worker(part, batch, given, Path(tempfile.mkdtemp(dir=scratch)))
+                running.register(worker.pipe, selectors.EVENT_READ, worker)
+            for key, _ in running.select():
+                worker = key.data
+                if worker.read():
+                    continue
+                running.unregister(worker.pipe)
+                waiting.extend(worker.end(tally)[::-1])
+    tally.seconds = time.monotonic() - started
+    return tally
+
+
+class _Worker:
+    """A process that makes some attempts and writes what became of each to a pipe."""
+
+    def __init__(self, part: Part, seeds: list[int], given: Path, folder: Path) -> None:
+        self.part, self.seeds, self.folder, self._text = part, seeds, folder, b""
+        self.pipe, write = os.pipe()
+        self.pid = _fork(lambda: _attempts(part, seeds, given, folder, write))
+        os.close(write)
+
+    def read(self) -> bool:
+        text = os.read(self.pipe, 1 << 16)
+        self._text += text
+        return bool(text)
+
+    def end(self, tally: Tally) -> list[int]:
+        """Adds what became of the attempts; returns the seeds that are left, since one of them ended the process."""
+        os.close(self.pipe)
+        status, peak = _finish(self.pid)
+        _stop_children(self.folder)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        found = [json.loads(line) for line in self._text.splitlines() if line.endswith(b"}")]
+        failures = [(one["seed"], one["failure"]) for one in found if "failure" in one]
+        for one in found:
+            tally.counts.update(one["counts"])
+        done = len(found)
+        if done < len(self.seeds):
+            long = f"took more than {self.part.seconds} s"
+            reason = long if status == signal.SIGALRM else f"ended by {_name(status)}"
+            failures.append((self.seeds[done], reason))
+            tally.counts[FAILED] += 1
+            done += 1
+        elif peak > MEMORY:
+            failures.append((self.seeds[0], f"took {peak / 2**30:.1f} GiB of memory"))
+            tally.counts[FAILED] += 1
+        tally.failures.extend(failures)
+        return self.seeds[done:]
+
+
+def _attempts(part: Part, seeds: list[int], given: Path, folder: Path, pipe: int) -> None:
+    (folder / "group").write_text(str(os.getpid()))
+    for seed in seeds:
+        place = folder / str(seed)
+        place.mkdir()
+        torch.manual_seed(seed)
+        signal.alarm(part.seconds)
+        result: dict[str, object] = {"seed": seed}
+        try:
+            found = part.attempt(random.Random(seed), place, given)
+            result["counts"] = found if isinstance(found, Counter) else {found: 1}
+        except Exception as error:
+            where = "" if isinstance(error, Failed) else f" ({traceback.format_exc().splitlines()[-3].strip()})"
+            result |= {"counts": {FAILED: 1}, "failure": f"{type(error).__name__}: {error}{where}"}
+        signal.alarm(0)
+        os.write(pipe, json.dumps(result).encode() + b"\n")
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _fork(run: Callable[[], object]) -> int:
+    """The number of a new process, which leads a group and runs a function."""
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        os.setpgid(0, 0)
+        torch.set_num_threads(1)
+        run()
+        os._exit(0)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(70)
+
+
+def fork_command(run: Callable[[], int]) -> int:
+    """The number of a new process of the same group, whose exit status a function returns."""
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        os._exit(run())
+    except BaseException:
+        os._exit(70)
+
+
+def _finish(pid: int) -> tuple[int, int]:
+    """The exit status of a process, or the signal that ended it, and the bytes of memory that it had at most."""
+    _, status, usage = os.wait4(pid, 0)
+    return (os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)), usage.ru_maxrss * 1024
+
+
+def _stop_children(folder: Path) -> None:
+    """Ends what an attempt has left running."""
+    with contextlib.suppress(OSError, ValueError):
+        os.killpg(int((folder / "group").read_text()), signal.SIGKILL)
+
+
+def _name(status: int) -> str:
+    try:
+        return signal.Signals(status).name
+    except ValueError:
+        return f"status {status}"

@@ -1,0 +1,64 @@
+"""What attempts start from: scenes of 16 x 16 pixels, a finished run of each field, and a folder outside of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+from pathlib import Path
+
+import commands
+import numpy as np
+from PIL import Image
+
+#: Options of a training of some steps.
+TINY = shlex.split(
+    "--steps 16 --cells 3 --split-at 0.5 --width 8 --depth 2 --rays 64 --samples 8 --evaluations 2 --eval-views 1 "
+    "--final-views 1 --panels 0 --lpips off --reservoir 200 --reservoir-batches 8 --min-cell-samples 2"
+)
+#: A field of plain networks, and the default one with a smaller hash grid.
+FIELDS = {
+    "nerf": shlex.split("--field nerf --no-occupancy"),
+    "hashgrid": shlex.split("--field-options log2_entries=10 levels=3 --occupancy-resolution 8"),
+}
+#: Of the cameras, which look at the middle from 4 units away.
+POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1]]
+SIDE = 16
+CAPTURE = {"fl_x": 20.0, "fl_y": 20.0, "cx": 8, "cy": 8, "w": SIDE, "h": SIDE, "k1": 0.0}
+
+
+def prepare_scenes(given: Path) -> None:
+    """The same images as a scene of Blender's and as a capture."""
+    noise = np.random.default_rng(0)
+    for name, files in (("blender", ("transforms_train", "transforms_test")), ("capture", ("transforms",))):
+        (given / name / "images").mkdir(parents=True)
+        for file in files:
+            frames = []
+            for number in range(9):
+                path = f"images/{file}_{number}.png"
+                Image.fromarray(noise.integers(0, 255, (SIDE, SIDE, 4), dtype=np.uint8)).save(given / name / path)
+                pose = [list(row) for row in POSE]
+                pose[0][3] = 0.1 * number
+                frames.append({"file_path": path, "transform_matrix": pose})
+            lens = {"camera_angle_x": 0.7} if name == "blender" else CAPTURE
+            (given / name / f"{file}.json").write_text(json.dumps({**lens, "frames": frames}))
+    (given / "outside").mkdir()
+    Image.fromarray(noise.integers(0, 255, (SIDE, SIDE, 3), dtype=np.uint8)).save(given / "outside" / "secret.png")
+
+
+def prepare_runs(given: Path) -> None:
+    """The scenes, and runs with three checkpoints whose settings name a scene by a relative path."""
+    prepare_scenes(given)
+    os.chdir(given)
+    for name, field in FIELDS.items():
+        options = ("--data", "blender", *TINY, *field, "--checkpoint-every", "1e-9")
+        status, _, err = commands.run("train", "--out", given / name, *options)
+        if status != 0:
+            raise RuntimeError(err)
+
+
+def copied_run(given: Path, name: str, folder: Path) -> Path:
+    """A run that an attempt may change."""
+    os.chdir(given)
+    return Path(shutil.copytree(given / name, folder / "run", symlinks=True))

@@ -1,0 +1,196 @@
+"""Fuzzed calls of the ops: a valid one gives what the reference gives, an invalid one is refused by name."""
+
+from __future__ import annotations
+
+import inspect
+import random
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import op_calls
+import torch
+from attempts import REFUSED, RIGHT, Failed
+from hostile import NUMBERS, TEXTS
+from torch import Tensor
+from torch.utils._pytree import tree_leaves, tree_map
+
+from voronerf import MLP, HashGrid, Layer, backends, ops, tolerances
+from voronerf.cli.main import NO_MEMORY
+from voronerf.ops import CentreGrid
+
+#: Ops that write into their arguments.
+IN_PLACE = ("observe_occupancy", "sparse_adam")
+DTYPES = (
+    torch.float16,
+    torch.float32,
+    torch.float64,
+    torch.bfloat16,
+    torch.int32,
+    torch.int64,
+    torch.uint8,
+    torch.bool,
+    torch.complex64,
+)
+DIFFERENTIABLE = (
+    *("composite", "frequency_encode", "integrated_encode", "spherical_harmonics", "hash_encode"),
+    *("grouped_linear", "grouped_mlp", "routed_mlp", "render_loss"),
+)
+
+
+def valid_call(rng: random.Random, folder: Path, given: Path) -> str:
+    """A call that keeps to the contract, with gradients now and then."""
+    op = rng.choice(list(op_calls.CALLS))
+    call = op_calls.CALLS[op](rng, rng.choice(op_calls.SIZES))
+    gradients = op in DIFFERENTIABLE and rng.random() < 0.3
+    found, expected = (results(op, call, backend, gradients) for backend in ("auto", "reference"))
+    if op == "draw_cell":
+        drawn_rightly(call, found[0], expected[0])
+        return RIGHT
+    for part, other in zip(found, expected, strict=True):
+        if not tolerances.agree(part, other):
+            raise Failed(f"{op}: not what the reference gives: {difference(part, other)}; {describe(call)}")
+    return RIGHT
+
+
+def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> list[Tensor]:
+    """The tensors that an op returns or has written into, and the gradients of their sum."""
+    own = tree_map(
+        lambda value: value.detach().clone() if isinstance(value, Tensor) and op in IN_PLACE else value, call
+    )
+    leaves = []
+    if gradients:
+
+        def leaf(value: Any) -> Any:
+            if not (isinstance(value, Tensor) and value.is_floating_point()):
+                return value
+            leaves.append(value.detach().requires_grad_())
+            return leaves[-1]
+
+        own = tree_map(leaf, own)
+    returned = getattr(ops, op)(**own, backend=backend)
+    found = [part for part in tree_leaves(own if op in IN_PLACE else returned) if isinstance(part, Tensor)]
+    if gradients:
+        smooth = [part for part in found if part.requires_grad and part.numel()]
+        if smooth:
+            total = sum(part.double().sum() for part in smooth)
+            asked = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+            found = [part.detach() for part in found] + list(asked)
+    return found
+
+
+def drawn_rightly(call: dict[str, Any], found: Tensor, expected: Tensor) -> None:
+    """Rounding may move a draw over the border of two cells, and then one of the two is next to the other."""
+    near = [expected]
+    for step in (-1e-4, 1e-4):
+        near.append(ops.draw_cell(**{**call, "uniforms": (call["uniforms"] + step).clamp(0, 1)}, backend="reference"))
+    if not torch.stack([found == one for one in near]).any(dim=0).all():
+        raise Failed(f"draw_cell: drawn far from what the reference draws; {describe(call)}")
+
+
+def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
+    """A call of which one argument is not what it must be; where it is one that the op takes, nothing may break."""
+    op = rng.choice(list(op_calls.CALLS))
+    call = op_calls.CALLS[op](rng, rng.choice(op_calls.SIZES[1:]))
+    name = rng.choice([name for name in (*call, "backend") if name in inspect.signature(getattr(ops, op)).parameters])
+    call.setdefault("backend", "auto")
+    if name == "backend":
+        call["backend"] = rng.choice(("", "cuda", None, 3, "warp", "Native"))
+    else:
+        call[name] = other_argument(rng, op, name, call[name])
+    try:
+        getattr(ops, op)(**call)
+    except (ValueError, TypeError, backends.BackendUnavailable) as error:
+        check_message(op, call, name, error)
+        return REFUSED
+    except (RuntimeError, MemoryError) as error:
+        if any(sign in str(error) for sign in NO_MEMORY) or isinstance(error, MemoryError):
+            return REFUSED
+        raise Failed(f"{op}: {name} is no argument for it: {type(error).__name__}: {error}; {describe(call)}") from None
+    return RIGHT
+
+
+def check_message(op: str, call: dict[str, Any], name: str, error: Exception) -> None:
+    """The error names the op and an argument, in a line of some length."""
+    text = str(error)
+    arguments = inspect.signature(getattr(ops, op)).parameters
+    named = re.match(rf"{op}(_grid)?(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
+    if not named or "\n" in text or len(text) > 500:
+        raise Failed(f"{op}: the error for {name} is not clear: {type(error).__name__}: {text:.300}; {describe(call)}")
+
+
+def other_argument(rng: random.Random, op: str, name: str, value: Any) -> Any:
+    """Something else in the place of an argument."""
+    if isinstance(value, Tensor):
+        return other_tensor(rng, value)
+    if isinstance(value, list):
+        kind = rng.randrange(5)
+        if kind == 0:
+            return value[:-1]
+        if kind == 1:
+            return [*value, value[-1]]
+        if kind == 2:
+            return rng.choice((None, value[0], "x", 3))
+        at = rng.randrange(len(value))
+        there = value[at] if isinstance(value[at], Tensor) else torch.ones(2)
+        return [*value[:at], other_tensor(rng, there), *value[at + 1 :]]
+    if isinstance(value, (MLP, HashGrid, CentreGrid)):
+        others = (None, "x", 3, op_calls.layer_table(rng), op_calls.hash_grid(rng), Layer((-1,), 3), {})
+        return rng.choice((*others, ops.centre_grid(torch.rand(4, 3))))
+    if isinstance(value, str):
+        return rng.choice((*TEXTS, None, 3, torch.ones(2)))
+    if value is None:
+        return rng.choice((3, "x", other_tensor(rng, torch.ones(2, 3)), [1.0]))
+    # A count of steps is worked off, however large.
+    numbers = [one for one in NUMBERS if name != "steps" or not isinstance(one, int) or one < 3]
+    return rng.choice((*numbers, None, "x", True, torch.ones(2), [1], 1j, np.float32(2), type(value)(2)))
+
+
+def other_tensor(rng: random.Random, tensor: Tensor) -> Any:
+    """A tensor of another kind, dtype, shape or place, or something that is none."""
+    kind = rng.randrange(12)
+    if kind == 0:
+        return rng.choice((None, "x", 3, tensor.tolist(), tensor.float().numpy(), torch.float32, object()))
+    if kind <= 3:
+        return tensor.to(rng.choice(DTYPES))
+    if kind == 4:
+        return tensor[None]
+    if kind == 5 and tensor.dim():
+        return tensor.select(rng.randrange(tensor.dim()), 0) if min(tensor.shape) else tensor[..., None]
+    if kind <= 7 and tensor.dim():
+        dim = rng.randrange(tensor.dim())
+        size = max(0, tensor.shape[dim] + rng.choice((-tensor.shape[dim], -1, 1, 5)))
+        shape = [*tensor.shape[:dim], size, *tensor.shape[dim + 1 :]]
+        return torch.zeros(shape, dtype=tensor.dtype)
+    if kind == 8:
+        return rng.choice(
+            (lambda: tensor.to_sparse(), lambda: tensor.to("meta"), lambda: tensor.expand(2, *tensor.shape))
+        )()
+    if kind == 9 and tensor.is_floating_point():
+        return tensor.masked_fill(
+            torch.rand(tensor.shape) < 0.3,
+            rng.choice((torch.nan, torch.inf, -torch.inf, 3e38 if tensor.dtype != torch.float16 else 6e4)),
+        )
+    if kind == 10 and not tensor.is_floating_point() and tensor.dtype not in (torch.bool, torch.uint8):
+        return tensor.masked_fill(torch.rand(tensor.shape) < 0.3, rng.choice((-1, -(2**31), 2**31 - 1, 100, 7)))
+    with torch.inference_mode():
+        return tensor.clone()
+
+
+def difference(found: Tensor, expected: Tensor) -> str:
+    if found.shape != expected.shape or found.dtype != expected.dtype:
+        return f"{list(found.shape)} {found.dtype} and {list(expected.shape)} {expected.dtype}"
+    apart = (found.detach().double() - expected.detach().double()).abs()
+    return f"up to {apart.nan_to_num(torch.inf).max().item():.3g} apart"
+
+
+def describe(call: dict[str, Any]) -> str:
+    """Shapes and dtypes of the arguments."""
+
+    def one(value: Any) -> str:
+        if isinstance(value, Tensor):
+            return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape) if not value.is_nested else ''}"
+        return f"[{', '.join(map(one, value))}]" if isinstance(value, list) else f"{value!r:.60}"
+
+    return ", ".join(f"{name}={one(value)}" for name, value in call.items() if value is not None)

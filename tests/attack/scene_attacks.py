@@ -1,0 +1,133 @@
+"""Scenes that a stranger made."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import random
+import shutil
+import struct
+import zlib
+from pathlib import Path
+
+from attempts import Failed
+from commands import judged
+from given import FIELDS, SIDE, TINY
+from hostile import damaged, json_text, mutated
+from PIL import Image
+
+
+def stranger_scene(rng: random.Random, folder: Path, given: Path) -> str:
+    """Two steps of training on a scene with other contents: refused in a line, or ends well."""
+    scene = Path(shutil.copytree(given / rng.choice(("blender", "capture")), folder / "scene"))
+    outside = Path(shutil.copytree(given / "outside", folder / "outside"))
+    change = rng.choice((contents, contents, contents, picture, picture, path, text))
+    change(rng, scene, outside)
+    field = FIELDS[rng.choice(list(FIELDS))]
+    out = folder / "run"
+    verdict = judged("train", "--data", scene, "--out", out, *TINY, *field, "--steps", "2")
+    if change is path and verdict != "refused":
+        raise Failed("an image outside of the scene was read")
+    if sorted(file.name for file in outside.iterdir()) != ["secret.png"]:
+        raise Failed("something was written outside")
+    if verdict == "refused" and out.exists():
+        raise Failed(f"{sorted(out.rglob('*'))} were written for a scene that was refused")
+    return verdict
+
+
+def transforms(rng: random.Random, scene: Path) -> Path:
+    return rng.choice(sorted(scene.glob("*.json")))
+
+
+def contents(rng: random.Random, scene: Path, outside: Path) -> None:
+    """One value of a transforms file is another."""
+    file = transforms(rng, scene)
+    value = mutated(rng, json.loads(file.read_text()))
+    if rng.random() < 0.2 and isinstance(value, dict):
+        value[
+            rng.choice(("near", "far", "k1", "k2", "p1", "camera_model", "aabb_scale", "train_filenames", "mask_path"))
+        ] = rng.choice((1e308, -1, "x", None, [], ["x"], 1e-300, "\x1b[2J"))
+    file.write_bytes(json_text(value))
+
+
+def text(rng: random.Random, scene: Path, outside: Path) -> None:
+    """A transforms file that is damaged, a folder, a pipe or a link to a device."""
+    file = transforms(rng, scene)
+    data, kind = file.read_bytes(), rng.randrange(6)
+    file.unlink()
+    if kind == 0:
+        file.mkdir()
+    elif kind == 1:
+        os.mkfifo(file)
+    elif kind == 2:
+        file.symlink_to("/dev/zero")
+    else:
+        file.write_bytes(damaged(rng, data))
+
+
+def path(rng: random.Random, scene: Path, outside: Path) -> None:
+    """A frame, or a folder, leads to an image outside."""
+    file = transforms(rng, scene)
+    value = json.loads(file.read_text())
+    frame = rng.choice(value["frames"])
+    kind = rng.randrange(5)
+    if kind == 0:
+        frame["file_path"] = "../outside/secret.png"
+    elif kind == 1:
+        frame["file_path"] = str(outside / "secret")
+    elif kind == 2:
+        frame["file_path"] = "images/../../outside/./secret.png"
+    elif kind == 3:
+        (scene / frame["file_path"]).unlink()
+        (scene / frame["file_path"]).symlink_to(outside / "secret.png")
+    else:
+        (scene / "more").symlink_to(outside)
+        frame["file_path"] = "more/secret.png"
+    file.write_text(json.dumps(value))
+
+
+def picture(rng: random.Random, scene: Path, outside: Path) -> None:
+    """One image, or all of them, are something else."""
+    images = sorted((scene / "images").iterdir())
+    data = other_picture(rng, images[0].read_bytes())
+    for image in images if rng.random() < 0.3 else [rng.choice(images)]:
+        image.unlink()
+        if data is None:
+            os.mkfifo(image)
+        else:
+            image.write_bytes(data)
+
+
+def other_picture(rng: random.Random, whole: bytes) -> bytes | None:
+    """Bytes in the place of a picture; None for a pipe, which a reader would wait for."""
+    kind = rng.randrange(9)
+    if kind == 0:
+        return None
+    if kind <= 3:
+        return damaged(rng, whole)
+    if kind == 4:  # other formats, of which EPS would start a program
+        file = io.BytesIO()
+        Image.new("RGB", (SIDE, SIDE)).save(file, rng.choice(("EPS", "GIF", "TIFF", "BMP", "PPM", "PDF", "ICO", "TGA")))
+        return file.getvalue()
+    if kind == 5:  # other kinds of a format that is read
+        file = io.BytesIO()
+        mode = rng.choice(("1", "L", "P", "CMYK", "I;16", "LA"))
+        Image.new(mode, (SIDE, SIDE)).save(file, "JPEG" if mode == "CMYK" else "PNG")
+        return file.getvalue()
+    if kind == 6:
+        return rng.randbytes(rng.choice((0, 1, 30, 3000)))
+    width, height = rng.choice(
+        ((30_000, 30_000), (13_000, 13_000), (5_000, 1), (2**31 - 1, 2**31 - 1), (0, 5), (SIDE, 10**6))
+    )
+    return bomb(width, height, rng.choice((1, 8, 16)), rng.choice((0, 2, 6)))
+
+
+def bomb(width: int, height: int, depth: int, colour: int) -> bytes:
+    """A PNG of any size whose data is a few zeros."""
+    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(100_000))), (b"IEND", b""))
+    parts = (
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)

@@ -1,0 +1,174 @@
+"""Trainings that are ended at any moment or find no memory and no room, and settings that nobody should give."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import random
+import resource
+import shutil
+import signal
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import torch
+from attempts import REFUSED, RIGHT, Failed, fork_command
+from commands import judged, run
+from given import FIELDS, TINY
+from hostile import NUMBERS, TEXTS
+
+from voronerf.files import read_json_lines
+from voronerf.training.checkpoint import checkpoint_path, checkpoint_paths, last_checkpoint
+from voronerf.training.config import CHOICES, TrainConfig
+
+#: The networks of a chain of interrupted trainings.
+VARIANTS = (
+    *FIELDS.values(),
+    ["--field", "mipnerf", "--no-occupancy"],
+    [*FIELDS["nerf"], "--sampling", "hierarchical", "--fine-samples", "6"],
+    [*FIELDS["nerf"], "--balance", "transport", "--assignment", "stochastic"],
+    [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6", "--init", "random"],
+)
+SIGNALS = (*[signal.SIGKILL] * 6, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT)
+#: Interruptions of a chain.
+KILLS = 5
+
+
+def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[str]:
+    """A training that is ended at random moments and resumed ends, to the bit, as one that is left alone."""
+    os.chdir(given)
+    options = [*("--data", "blender"), *TINY, *rng.choice(VARIANTS)]
+    options += ["--steps", str(rng.choice((30, 60))), "--checkpoint-every", rng.choice(("1e-9", "0.02", "0.1"))]
+    whole, part = folder / "whole", folder / "part"
+    began = time.monotonic()
+    _ends_well(_train(whole, options))
+    length = time.monotonic() - began
+    kills, full = 0, 0
+    while kills < KILLS:
+        limit = rng.choice((None, None, None, rng.randrange(1, 200_000)))
+        pid = _train(part, options, limit)
+        if limit is None:
+            time.sleep(rng.uniform(0, length))
+            number = rng.choice(SIGNALS)
+            os.kill(pid, number)
+            kills += 1
+            _ends(pid, number)
+        else:  # a disk that is full after so many bytes of a file
+            full += 1
+            _ends(pid, None)
+            kills += 1
+    _ends_well(_train(part, options))
+    _same_runs(whole, part)
+    return Counter({RIGHT: kills})
+
+
+def _train(out: Path, options: list[str], file_size: int | None = None) -> int:
+    """The number of a process that begins or continues a training; files may have so many bytes."""
+
+    def begin() -> int:
+        if file_size is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
+        status, _, err = run("train", "--out", out, *(["--resume"] if checkpoint_paths(out) else []), *options)
+        if status == 1:  # a disk that is full names a file
+            return 1 if "File too large: '" in err and err.startswith("voronerf: ") else 70
+        return status
+
+    return fork_command(begin)
+
+
+def _ends(pid: int, number: int | None) -> None:
+    """Waits for a training; ``number`` is the signal that it was sent."""
+    status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    # A signal that comes before the training has begun ends the process as it does any.
+    allowed = (0, 1) if number is None else (0, -number) if number == signal.SIGKILL else (0, 130, -number)
+    if status not in allowed:
+        raise Failed(f"a training that got {number or 'a full disk'} ended with status {status}")
+
+
+def _ends_well(pid: int) -> None:
+    status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    if status != 0:
+        raise Failed(f"a training that was left alone ended with status {status}")
+
+
+def _same_runs(whole: Path, part: Path) -> None:
+    first, second = last_checkpoint(whole), last_checkpoint(part)
+    names = first.tensors.keys() | second.tensors.keys()
+    for name in sorted(names):
+        a, b = first.tensors.get(name), second.tensors.get(name)
+        if a is None or b is None or not torch.equal(a.nan_to_num(), b.nan_to_num()):
+            raise Failed(f"{name} differs after a resume")
+    for key in ("step", "evaluated", "skipped", "rate_factor"):
+        if first.values[key] != second.values[key]:
+            raise Failed(f"{key} differs after a resume: {first.values[key]} and {second.values[key]}")
+    scores = [[(line["step"], line["psnr"]) for line in read_json_lines(at / "metrics.jsonl")] for at in (whole, part)]
+    if scores[0] != scores[1]:
+        raise Failed(f"scores differ after a resume: {scores}")
+    left = [path for path in part.rglob("*") if path.name.endswith(".partial")]
+    if left:
+        raise Failed(f"{left} were left behind")
+
+
+def stressed_command(rng: random.Random, folder: Path, given: Path) -> str:
+    """Settings that nobody should give, little memory, or a place where nothing can be written."""
+    os.chdir(given)
+    return rng.choice((settings, settings, settings, memory, places))(rng, folder)
+
+
+#: Settings that are a wish for more work, however much, or that choose what is tried.
+WORK = ("steps", "budget", "evaluations", "eval_views", "final_views", "proposal_rounds", "out", "resume", "device")
+
+
+def settings(rng: random.Random, folder: Path) -> str:
+    """One or two settings have extreme values."""
+    hints = get_type_hints(TrainConfig)
+    names = [entry.name for entry in dataclasses.fields(TrainConfig) if entry.name not in WORK]
+    options: list[str] = []
+    for name in rng.sample(names, k=rng.choice((1, 1, 2))):
+        option = f"--{name.replace('_', '-')}"
+        if hints[name] is bool:
+            options.append(option)
+        else:
+            options += [option, _value(rng, name, hints[name])]
+    out = folder / "run"
+    verdict = judged("train", "--data", "blender", "--out", out, *TINY, *rng.choice(list(FIELDS.values())), *options)
+    if verdict == REFUSED and out.exists() and not checkpoint_paths(out):
+        raise Failed(f"{[str(path) for path in out.rglob('*')]} were written before {options} were refused")
+    return verdict
+
+
+def _value(rng: random.Random, name: str, kind: Any) -> str:
+    if name in CHOICES and rng.random() < 0.7:
+        return rng.choice(CHOICES[name])
+    if rng.random() < 0.3:
+        return rng.choice((*TEXTS[:7], "1e5", "0x10", "1_000", " 3"))
+    return str(rng.choice([number for number in NUMBERS if "float" in str(kind) or isinstance(number, int)]))
+
+
+def memory(rng: random.Random, folder: Path) -> str:
+    """A limit of the address space, as by ``ulimit -v``, above what the process has."""
+    taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    limit = taken + rng.randrange(1 << 20, 1 << 29)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    large = rng.choice(
+        ("--width 64", "--width 2000", "--rays 20000", "--samples 500", "--reservoir 1000000", "--seed 1")
+    )
+    return judged("train", "--data", "blender", "--out", folder / "run", *TINY, *FIELDS["nerf"], *large.split())
+
+
+def places(rng: random.Random, folder: Path) -> str:
+    """An --out that is a file, a link, full of other things or in use by another training."""
+    out = folder / "run"
+    kinds: tuple[Callable[[], object], ...] = (
+        lambda: out.write_text("mine"),
+        lambda: out.symlink_to("/dev/full"),
+        lambda: out.symlink_to(out),
+        lambda: (out / "config.json").mkdir(parents=True),
+        lambda: shutil.copytree(Path.cwd() / "blender", out),
+        lambda: checkpoint_path(out).mkdir(parents=True),
+    )
+    rng.choice(kinds)()
+    return judged("train", "--data", "blender", "--out", out, *TINY, *FIELDS["nerf"])
