@@ -250,8 +250,9 @@ def broken(path, at, layout, *values):
         (lambda model: broken(model / "cameras.bin", 12, "<i", 7), "camera 1: camera model FOV is not supported"),
         (
             lambda model: broken(model / "cameras.bin", 32, "<d", -1.0),
-            "camera 1 must have a size and finite parameters",
+            "camera 1 must have a size, finite parameters",
         ),
+        (lambda model: broken(model / "images.bin", 44, "<d", 1e300), "its pose must be a unit quaternion and a"),
         (lambda model: broken(model / "images.bin", 8 + 60, "<I", 99), "has camera 99, which cameras.bin has not"),
         (lambda model: broken(model / "images.bin", 8 + 64, "<6s", b"../../"), "must lie in the folder"),
         (lambda model: (model / "images.bin").write_bytes((model / "images.bin").read_bytes()[:90]), "is cut short"),

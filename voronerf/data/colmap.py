@@ -23,12 +23,13 @@ from voronerf.data.folders import choose_images, named_images, stay_inside
 from voronerf.data.lenses import MODELS, Lens, colmap_lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, photograph_scene
 from voronerf.data.scene import Scene, SceneError
+from voronerf.data.transforms import LARGEST, LONGEST
 
 Array = NDArray[Any]
 
 FILES = ("cameras", "images", "points3D")
 #: Bytes of a file.
-LARGEST = 2**31
+MOST_BYTES = 2**31
 #: Points that fewer images than this have seen are too uncertain to tell where the scene is.
 LEAST_SEEN = 3
 #: Share of the points of a view that may be wrong, at either end, and how many it needs.
@@ -101,8 +102,8 @@ def read_model(folder: Path) -> ColmapModel:
             kept = sorted((number, x, y, z) for number, x, y, z, seen in rows if seen >= LEAST_SEEN)
             numbers = np.array([row[0] for row in kept], dtype=np.int64)
             points = np.array([row[1:] for row in kept], dtype=np.float64).reshape(-1, 3)
-            if not np.isfinite(points).all():
-                raise SceneError(f"{points_path}: has points that are not finite")
+            if not (np.abs(points) <= LARGEST).all():
+                raise SceneError(f"{points_path}: has points that are not finite, or beyond {LARGEST:.0e}")
     except OSError as error:
         raise SceneError(f"{error.filename}: cannot be read: {error.strerror}") from None
     if not images:
@@ -111,8 +112,8 @@ def read_model(folder: Path) -> ColmapModel:
 
 
 def _check_size(path: Path) -> None:
-    if path.stat().st_size > LARGEST:
-        raise SceneError(f"{path}: must be at most {LARGEST / 2**30:g} GiB")
+    if path.stat().st_size > MOST_BYTES:
+        raise SceneError(f"{path}: must be at most {MOST_BYTES / 2**30:g} GiB")
 
 
 class _Reader:
@@ -238,9 +239,12 @@ def _camera(path: Path, number: int, model: str, width: int, height: int, parame
         lens = colmap_lens(model, parameters)
     except ValueError as error:
         raise SceneError(f"{path}: camera {number}: {error}") from None
-    values = (*lens.intrinsics, *lens.coefficients)
-    if not (np.isfinite(values).all() and min(lens.intrinsics[:2]) > 0 and width > 0 and height > 0):
-        raise SceneError(f"{path}: camera {number} must have a size and finite parameters, focal lengths above 0")
+    finite = np.isfinite((*lens.intrinsics, *lens.coefficients)).all() and min(width, height) > 0
+    if not finite or not all(1 / LONGEST <= f / side <= LONGEST for f, side in zip(lens.intrinsics, (width, height))):
+        raise SceneError(
+            f"{path}: camera {number} must have a size, finite parameters, and a focal length of {1 / LONGEST:g} to "
+            f"{LONGEST} times its images"
+        )
     return ColmapCamera(model, lens, width, height)
 
 
@@ -248,8 +252,8 @@ def _pose(values: tuple[float, ...], where: str) -> Array:
     """The pose of a unit quaternion (w, x, y, z) and a translation, both world to camera."""
     found = np.array(values, dtype=np.float64)
     length = np.linalg.norm(found[:4]) if len(found) == 7 else 0.0
-    if not (np.isfinite(found).all() and abs(length - 1) < 0.01):
-        raise SceneError(f"{where}: its pose must be a unit quaternion and a translation, all finite")
+    if not ((np.abs(found) <= LARGEST).all() and abs(length - 1) < 0.01):
+        raise SceneError(f"{where}: its pose must be a unit quaternion and a translation of up to {LARGEST:.0e}")
     w, x, y, z = found[:4] / length
     turn = np.array(
         [

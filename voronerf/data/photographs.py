@@ -30,8 +30,8 @@ NEAR = 0.35
 # Smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
 NEAREST = 0.05
 FAR = 4.0
-# Smallest near bound that points give.
-LEAST_NEAR = 1e-3
+# Smallest near bound that points give; half of the samples lie before twice the near bound.
+LEAST_NEAR = 0.02
 # Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
 NEARER, FARTHER = 0.75, 1.5
 # Mean of the viewing directions, a unit vector each, from which on they count as one direction.
@@ -45,8 +45,8 @@ KIND_LINES = {
 
 
 class View(NamedTuple):
-    """A photograph: its file, camera to world pose float64 [4, 4], lens with the image size that it is for, and where
-    known its mask file and the depths between which its points lie."""
+    """A photograph: its file, its pose float64 [4, 4], camera to world, its lens and the (width, height) that this is
+    for; and where known its mask, and the depths between which its points lie."""
 
     path: Path
     pose: Tensor
@@ -236,7 +236,7 @@ def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Per
     centre = frame.centre.float()
     if kind == "object":
         return None
-    if kind != "forward":
+    if kind != "forward" or cameras.fisheye:  # which may see to the side, or behind
         return Contraction(centre, frame.radius)
     slopes = torch.zeros(2)
     axes = frame.axes.float()
