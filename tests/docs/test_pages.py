@@ -33,6 +33,12 @@ def test_linked_files_are_there(name: str) -> None:
         assert ((ROOT / name).parent / target).is_file(), f"{name} links {target}"
 
 
+def test_promises_name_tests_that_are_there() -> None:
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", (ROOT / "docs/reliability.md").read_text())
+    missing = [f"{file}::{name}" for file, name in named if f"def {name}(" not in (ROOT / file).read_text()]
+    assert len(named) > 20 and not missing, missing
+
+
 def test_every_option_of_every_command_is_on_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "docs/scripts"))
     import options
