@@ -1,9 +1,14 @@
-"""What tests of every room share: refusals, seeded generators, equal tensors, threads, scripts, files of JSON."""
+"""What tests of every room share: refusals, covering sets, seeds, equal tensors, threads, scripts, files of JSON."""
 
+import contextlib
+import io
+import itertools
 import json
+import runpy
 import subprocess
 import sys
 from collections.abc import Mapping
+from unittest import mock
 
 import pytest
 import torch
@@ -17,6 +22,27 @@ def refuses(message, call, *args, error=ValueError, **options):
         call(*args, **options)
     text = str(caught.value)
     assert message in text and "\n" not in text, text
+
+
+def pairwise(values):
+    """Arguments of ``parametrize``: any two values of different parameters meet in a row, in few of all the products.
+
+    A key of several names, such as "i, o", has tuples as values.
+    """
+    columns = [list(column) for column in values.values()]
+    numbers = [range(len(column)) for column in columns]
+
+    def pairs(row):
+        return set(itertools.combinations(enumerate(row), 2))
+
+    products = {row: pairs(row) for row in itertools.product(*numbers)}
+    missing, rows = set().union(*products.values()), []
+    while missing:
+        row = max(products, key=lambda row: len(products[row] & missing))
+        missing -= products.pop(row)
+        parts = [(column[i], "," in name) for name, column, i in zip(values, columns, row)]
+        rows.append(tuple(part for value, several in parts for part in (value if several else (value,))))
+    return ", ".join(values), rows
 
 
 def seeded(seed=0):
@@ -50,6 +76,21 @@ def python(*args, **options):
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, **options)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+def script(path, *args):
+    """What a Python script prints, run in this process, where torch is imported already."""
+    said = io.StringIO()
+    with (
+        contextlib.redirect_stdout(said),
+        mock.patch.object(sys, "argv", [str(path), *map(str, args)]),
+        mock.patch.object(sys, "path", [str(path.parent), *sys.path]),
+    ):
+        try:
+            runpy.run_path(str(path), run_name="__main__")
+        except SystemExit as end:
+            assert not end.code, end.code
+    return said.getvalue()
 
 
 def read_json(path):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import python, read_json, refuses
+from helpers import read_json, refuses, script
 from paper import balance, figures, nested, report
 from paper import main as paper
 from paper.experiments import EXPERIMENTS
@@ -219,7 +219,7 @@ def test_a_committed_page_is_what_the_program_writes(name, tmp_path):
     page = tmp_path / f"{name}.md"
     shown = [experiment for experiment in report.ORDER if experiment not in absent]
     options = [*size.split(), *from_record(record, tmp_path), "--page", str(page), "--only", *shown]
-    python(ROOT / "benchmarks" / "paper.py", "all", *options)
+    script(ROOT / "benchmarks" / "paper.py", "all", *options)
     written, committed = (
         [
             line

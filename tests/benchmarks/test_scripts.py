@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import python, read_json
+from helpers import read_json, script
 
 from voronerf.data import builtin_scene
 from voronerf.training.config import ConfigError, TrainConfig
@@ -16,12 +16,12 @@ from voronerf.training.trainer import Trainer
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
-def outcome(script, folder, options):
+def outcome(name, folder, options):
     """Metadata, results and what was printed."""
     path = folder / "results" / "outcome.json"
-    said = python(BENCHMARKS / f"{script}.py", *options.split(), "--json", path)
+    said = script(BENCHMARKS / f"{name}.py", *options.split(), "--json", path)
     found = read_json(path)
-    assert found["metadata"]["benchmark"] == script
+    assert found["metadata"]["benchmark"] == name
     return found["metadata"], found["results"], said
 
 
@@ -86,14 +86,14 @@ def test_defaults_make_only_the_scenes_that_are_missing(tmp_path):
     path = tmp_path / "defaults.json"
     sides = ("default: --rays 32 --samples 8", "more: --rays 64 --samples 8")
     options = ("--budget", "0.2", "--eval-views", "1", "--json", path, "--sides", *sides)
-    python(BENCHMARKS / "defaults.py", *options, "--scenes", "builtin", "--downscale", "10")
+    script(BENCHMARKS / "defaults.py", *options, "--scenes", "builtin", "--downscale", "10")
     first = read_json(path)["results"]
     assert [(row["scene"], row["downscale"], row["side"], len(row["psnr"])) for row in first] == [
         ("builtin", 10, "default", 2),
         ("builtin", 10, "more", 2),
     ]
     scenes = ("--scenes", "builtin", "builtin-translucent", "--downscale", "10", "10")
-    said = python(BENCHMARKS / "defaults.py", *options, *scenes)
+    said = script(BENCHMARKS / "defaults.py", *options, *scenes)
     rows = read_json(path)["results"]
     assert rows[:2] == first and [row["scene"] for row in rows[2:]] == ["builtin-translucent"] * 2
     gains = [[b - a for a, b in zip(*(row["psnr"] for row in pair))] for pair in (rows[:2], rows[2:])]
@@ -108,7 +108,7 @@ def test_sides_train_for_the_same_time(tmp_path):
     path = tmp_path / "outcome.json"
     options = "--downscale 10 --budget 0.3 --turn 0.1 --evaluations 3 --eval-views 1 --seeds 2 --clock cpu"
     common = "--common=--rays 64 --samples 8 --width 8 --depth 2 --cells 3"
-    said = python(BENCHMARKS / "time_to_quality.py", *options.split(), common, "--sides", *sides, "--json", path)
+    said = script(BENCHMARKS / "time_to_quality.py", *options.split(), common, "--sides", *sides, "--json", path)
     found = read_json(path)
     assert found["metadata"]["benchmark"] == "time_to_quality" and found["metadata"]["clock"] == "cpu"
     assert [(row["side"], row["seed"]) for row in found["results"]] == [

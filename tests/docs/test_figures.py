@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import python
+from helpers import script
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -92,7 +92,7 @@ def test_the_table_of_balance_is_that_of_its_files() -> None:
 )
 def test_tables_of_performance_are_those_of_the_program(arguments: str) -> None:
     name, *options = arguments.split()
-    made = python(ROOT / "benchmarks" / "table.py", RESULTS / name, *options)
+    made = script(ROOT / "benchmarks" / "table.py", RESULTS / name, *options)
     page = (ROOT / "docs" / "performance.md").read_text()
     for table in made.strip().split("\n\n"):
         assert f"{table}\n\n" in page

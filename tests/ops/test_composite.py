@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from helpers import pairwise
 from op_cases import FLOATS, need, offsets_of, refusals, strided
 from tolerances import assert_as_exact
 
@@ -49,9 +50,10 @@ def pack(tensors, counts):
     return tuple(torch.cat([tensor[ray, :count] for ray, count in enumerate(counts)]) for tensor in tensors)
 
 
-@pytest.mark.parametrize(("r", "s", "c"), [(1, 1, 3), (5, 33, 3), (3, 64, 1), (2, 7, 5)])
-@pytest.mark.parametrize("dtype", FLOATS)
-@pytest.mark.parametrize("form", ["dense", "packed"])
+SIZES = [(1, 1, 3), (5, 33, 3), (3, 64, 1), (2, 7, 5)]
+
+
+@pytest.mark.parametrize(*pairwise({"r, s, c": SIZES, "dtype": FLOATS, "form": ["dense", "packed"]}))
 def test_matches_a_slow_loop(device, backend, form, dtype, r, s, c):
     need("composite", backend, device, dtype)
     inputs = rays(r, s, c, dtype)

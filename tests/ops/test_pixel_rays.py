@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers import pairwise
 from op_cases import refusals, refused
 
 from voronerf.ops import pixel_rays
@@ -22,10 +23,11 @@ def scene(channels, lens):
     return Cameras(poses, intrinsics, WIDTH, HEIGHT, bent, lens == "fisheye"), images
 
 
-@pytest.mark.parametrize("channels", [3, 4])
-@pytest.mark.parametrize("b", [0, 1, 63, 300])
-@pytest.mark.parametrize("background", [None, "one", "per ray"])
-@pytest.mark.parametrize(("lens", "boxed"), [(None, True), ("fisheye", True), ("bent", False)])
+SIZES = {"b": [0, 1, 63, 300], "background": [None, "one", "per ray"], "channels": [3, 4]}
+LENSES = {"lens": [None, "bent", "fisheye"], "boxed": [False, True]}
+
+
+@pytest.mark.parametrize(*pairwise({**SIZES, **LENSES}))
 def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, channels, b, background, lens, boxed):
     cameras, images = scene(channels, lens)
     index = torch.randint(0, images[..., 0].numel(), (b,))
