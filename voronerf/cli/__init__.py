@@ -1,4 +1,4 @@
-"""The command line: ``voronerf train | eval | render | export | view | info | preload | demo | process``."""
+"""The command line: ``voronerf train | eval | render | export | view | compare | info | preload | demo | process``."""
 
 from voronerf.cli.main import main
 

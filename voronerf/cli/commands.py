@@ -19,6 +19,7 @@ from rich.progress import track
 from rich.table import Table
 
 from voronerf import backends
+from voronerf.cli.board import Board
 from voronerf.cli.display import TrainingDisplay, printable
 from voronerf.data import Scene, load_scene
 from voronerf.data.process import process as make_scene
@@ -101,6 +102,7 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene, view: tuple[st
                 obstacle = why_no_occupancy(trainer.config) or "a scene without a box"
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
             viewer = None
+            board = Board(out / "tensorboard", trainer) if config.tensorboard else None
             if view is not None:
                 viewer = import_viewer().TrainingViewer(trainer, host=view[0], port=view[1])
                 stack.callback(viewer.close)
@@ -110,9 +112,13 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene, view: tuple[st
                 display.on_step(now)
                 if viewer is not None:
                     viewer.on_step(now)
+                if board is not None:
+                    board.on_step(now)
 
             trainer.on_step = on_step
             summary = _train(trainer)
+            if board is not None:
+                board.close()
         if not summary["complete"]:
             again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
             say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
@@ -316,30 +322,6 @@ def import_viewer() -> ModuleType:
         return importlib.import_module("voronerf.viewer")
     except ImportError as error:
         raise ImportError(f"the viewer needs viser: pip install 'voronerf[viewer]' ({error})") from None
-
-
-def info() -> int:
-    """Show what this installation can use: build, instruction set, backends, and why something is missing."""
-    for name, value in backends.describe().items():
-        values = value if isinstance(value, dict) else {"": value}
-        for key, entry in values.items():
-            text = ", ".join(map(str, entry)) or "none" if isinstance(entry, list) else str(entry)
-            console.print(f"{f'{name} {key}'.strip():26} {text}", highlight=False, markup=False)
-    rows = {(row.op, row.backend): row for row in backends.table()}
-    missing = dict.fromkeys(row.reason for row in rows.values() if row.dtypes and row.reason)
-    numbers = {reason: number for number, reason in enumerate(missing, 1)}
-    table = Table("op", *backends.BACKENDS, title="where each implementation runs, and for which dtypes")
-    for op in backends.ops():
-        texts = []
-        for row in (rows[op, backend] for backend in backends.BACKENDS):
-            where = f"{', '.join(row.devices)}: {', '.join(row.dtypes)}" if row.devices else ""
-            note = f" [{numbers[row.reason]}]" if row.reason in numbers else ""
-            texts.append(escape((where + note).strip() or "-"))
-        table.add_row(op, *texts)
-    console.print(table)
-    for reason, number in numbers.items():
-        console.print(f"[{number}] {reason}", highlight=False, markup=False)
-    return 0
 
 
 def preload(device: str = "cpu") -> int:

@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from voronerf.backends import BackendUnavailable
-from voronerf.cli import commands, demo, export, view
+from voronerf.cli import commands, compare, demo, export, info, view
 from voronerf.cli.display import one_line
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
@@ -31,6 +31,14 @@ EXPECTED = (
 #: By which torch's plain RuntimeErrors tell that there is no memory left on a CPU, for tensors or for a thread.
 NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "can't start new thread")
 
+#: Said before a training that nothing was said about.
+WHAT_TO_TRY = """This trains the built-in scene for 480 s, into runs/. Ctrl-C stops it. Other things to try:
+  voronerf train --budget 60                the same for a minute
+  voronerf train --data DIR --downscale 4   your scene: Blender, transforms.json, COLMAP or LLFF
+  voronerf train --view                     watch it in a browser
+  voronerf demo                             one network against 16 cells, on the built-in scene
+  voronerf train --help                     every option"""
+
 #: What ``voronerf NAME`` runs; arguments and docstring of each function are its options and its help.
 COMMANDS: dict[str, Callable[..., int]] = {
     "train": commands.train,
@@ -38,7 +46,8 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "render": commands.render,
     "export": export.export,
     "view": view.view,
-    "info": commands.info,
+    "compare": compare.compare,
+    "info": info.info,
     "preload": commands.preload,
     "demo": demo.demo,
     "process": commands.process,
@@ -84,6 +93,9 @@ def main(args: list[str] | None = None) -> int:
 
 def _train_command(args: list[str]) -> Callable[..., int]:
     """The function behind ``train``; with --resume the settings of the run in --out are its defaults."""
+    if args == ["train"]:
+        for line in WHAT_TO_TRY.splitlines():
+            commands.say(line)
     if "train" not in args[:1] or "--resume" not in args:
         return commands.train
     out = next((after for word, after in itertools.pairwise(args) if word == "--out"), None)

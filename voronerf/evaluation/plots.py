@@ -16,10 +16,26 @@ def plot_curves(
     splits: Mapping[str, Sequence[float]] | None = None,
     title: str = "",
 ) -> None:
-    """Test PSNR over training time, one line per run, as a PNG.
+    """Writes the picture of :func:`draw_curves`, whose arguments the others are.
 
     Args:
         path: Where the picture goes.
+        curves: As there, like the next two.
+        splits: For each label.
+        title: Above the axes.
+    """
+    write_bytes(path, draw_curves(curves, splits=splits, title=title))
+
+
+def draw_curves(
+    curves: Mapping[str, Sequence[tuple[float, float]]],
+    *,
+    splits: Mapping[str, Sequence[float]] | None = None,
+    title: str = "",
+) -> bytes:
+    """Test PSNR over training time, one line per run, as a PNG.
+
+    Args:
         curves: For each label the points (seconds, PSNR in dB).
         splits: For each label the seconds at which its cells were split, drawn as dotted lines.
         title: Above the axes.
@@ -42,4 +58,4 @@ def plot_curves(
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=130)
     pyplot.close(figure)
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()

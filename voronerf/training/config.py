@@ -187,6 +187,8 @@ class TrainConfig:
     """How many checkpoints are kept. If the last one is damaged, the one before takes its place."""
     panels: int = 4
     """Test views drawn as panels at the end: truth, render, error, depth, cells."""
+    tensorboard: bool = False
+    """Also write loss, speed, cells and scores for TensorBoard, into the folder tensorboard of the run."""
     lpips: Path | None = None
     """LPIPS weights for the final evaluation, a file or folder, or "off"; default: VORONERF_LPIPS, the folder lpips of
     VORONERF_DATA or beside the scene, the installed lpips package."""
@@ -303,7 +305,7 @@ RESUMABLE = frozenset(
         "eval_views",
         "final_views",
     }
-    | {"checkpoint_every", "keep_checkpoints", "panels", "blend", "lpips"}
+    | {"checkpoint_every", "keep_checkpoints", "panels", "tensorboard", "blend", "lpips"}
 )
 
 

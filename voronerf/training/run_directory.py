@@ -20,7 +20,7 @@ from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
 
 #: The folders of a run, in which files are written.
-FOLDERS = ("camera_paths", "checkpoints", "images", "plots", "samples")
+FOLDERS = ("camera_paths", "checkpoints", "images", "plots", "samples", "tensorboard")
 
 
 def check_folders(run: Path) -> None:
