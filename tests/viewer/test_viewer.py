@@ -17,7 +17,9 @@ pytest.importorskip("viser", reason="viser is not installed")
 
 from tab import Tab
 
+from voronerf import open_run
 from voronerf.cli import main
+from voronerf.data.record import read_scene
 from voronerf.evaluation.panels import palette
 from voronerf.rendering import read_camera_path
 from voronerf.training.config import ConfigError, TrainConfig
@@ -267,3 +269,21 @@ def test_a_port_in_use_is_one_line(run, tmp_path, capsys) -> None:
             lines = capsys.readouterr().err.splitlines()
             assert len(lines) == 1 and f"--host 127.0.0.1 --port {port}: cannot listen there" in lines[0]
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_shown_before_its_images_are_there(run, scene, monkeypatch) -> None:
+    monkeypatch.setattr("voronerf.viewer.client.SHARP", 128)
+    record = read_scene(run.path / "scene.json")
+    viewer = view_run(open_run(run.path, scene=record), port=0)
+    tab = Tab(viewer, scene.test.cameras)
+    assert apart(tab.rest(), run.render(larger(scene.test.cameras, 128), 0).colour) < 1.5
+    tab.set("Show", "error")
+    grey = tab.rest()
+    tab.set("Cameras", True)
+    tab.rest()
+    assert tab.nodes["/cameras/0"]["_image_data"] is None and grey.std() < 12
+    viewer.do(lambda: viewer.take_images(scene))
+    tab.until(lambda: tab.nodes["/cameras/0"]["_image_data"])
+    assert tab.rest().std() > 20
+    tab.close()
+    viewer.close()

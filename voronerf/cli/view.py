@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from pathlib import Path
 
 from voronerf.cli.commands import check_counts, import_viewer, say
+from voronerf.data import load_scene
+from voronerf.data.record import read_scene
 from voronerf.run import open_run
+from voronerf.training.config import ConfigError
+from voronerf.training.run_directory import check_stored_paths
 
 
 def view(
@@ -45,8 +50,11 @@ def view(
     check_counts(samples=samples, fine_samples=fine_samples, downscale=downscale)
     viewers = import_viewer()
     viewers.check_address(host, port)
+    record = run / "scene.json"
+    scene = read_scene(record) if record.is_file() else None
     opened = open_run(
         run,
+        scene=scene,
         data=data,
         downscale=downscale,
         allow_outside=allow_outside,
@@ -59,6 +67,19 @@ def view(
     )
     viewer = viewers.view_run(opened, host=host, port=port)
     say(f"open {viewer.address} in a browser; Ctrl-C ends")
+
+    def read_images() -> None:
+        try:
+            if data is None:
+                check_stored_paths(run, data=opened.config.data)
+            whole = load_scene(opened.config.data, allow_outside=allow_outside, **opened.config.reading)
+        except (ConfigError, ValueError, OSError) as error:
+            say(f"without the images of the scene: {error}")
+        else:
+            viewer.do(lambda: viewer.take_images(whole))
+
+    if scene is not None:
+        threading.Thread(target=read_images, daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(viewer):
         viewer.serve()
     return 0

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.data import Scene
+from voronerf.data.record import write_scene
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import evaluate, mean_scores
@@ -440,6 +441,7 @@ class Trainer:
         """Writes ``checkpoints/last.safetensors``; without ``wait`` it is begun, and :attr:`writer` ends it."""
         if not self.described:  # not earlier: a run whose first step fails leaves nothing
             write_text(self.out / "config.json", self.config.to_json())
+            write_scene(self.out / "scene.json", self.scene)
             self.described = True
         self.writer.write(training_state(self))
         self.saved_at = self.seconds

@@ -26,14 +26,14 @@ def read_samples(folder: Path) -> tuple[Tensor, Tensor] | None:
     return (points, importance) if points.shape == (len(importance), 3) else None
 
 
-def describe_cell(subject: Subject, leaf: int, level: int, psnr: tuple[str, float | None]) -> str:
+def describe_cell(subject: Subject, leaf: int, level: int, psnr: tuple[str, float | None] | None) -> str:
     """A cell of a level: its number, where it is, its samples and their importance at the last split, its PSNR.
 
     Args:
         subject: what is viewed.
         leaf: any leaf in the cell.
         level: 1 is the coarsest.
-        psnr: the name of the nearest view, and the PSNR of its pixels that the cell shows.
+        psnr: the name of the nearest view, and the PSNR of its pixels that the cell shows; None without images.
     """
     diagram = subject.diagram
     groups = groups_of(diagram, level)
@@ -52,6 +52,7 @@ def describe_cell(subject: Subject, leaf: int, level: int, psnr: tuple[str, floa
         mine = inside[diagram.locate(points.to(diagram.centres.device)).cpu().long()]
         share = float(importance[mine].sum() / importance.sum().clamp_min(1e-30))
         lines.append(f"{int(mine.sum())} of the {len(points)} samples of the last split, {share:.1%} of the importance")
-    view, value = psnr
-    lines.append(f"not in the nearest view, {view}" if value is None else f"PSNR {value:.2f} dB in {view}")
+    if psnr is not None:
+        view, value = psnr
+        lines.append(f"not in the nearest view, {view}" if value is None else f"PSNR {value:.2f} dB in {view}")
     return "  \n".join(lines)

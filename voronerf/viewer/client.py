@@ -92,6 +92,12 @@ class Client:
             self._show_centres(True)
         self.change(level=depth, hidden=frozenset())
 
+    def on_images(self) -> None:
+        """Shows what needs the images of the scene, which are there now."""
+        if self.nodes["cameras"]:
+            self._show_cameras(True)
+        self.change()
+
     # --- the panel -------------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
@@ -213,9 +219,11 @@ class Client:
     def _frustum(self, view: int, scale: float) -> Any:
         scene = self.viewer.subject.scene
         cameras = scene.train.cameras
-        truth = scene.train.truth(view, scene.background_colour())
-        step = -(-max(truth.shape[:2]) // THUMBNAIL)
-        picture = (truth[::step, ::step] * 255).to(torch.uint8).numpy()
+        picture = None
+        if len(scene.train.images):
+            truth = scene.train.truth(view, scene.background_colour())
+            step = -(-max(truth.shape[:2]) // THUMBNAIL)
+            picture = (truth[::step, ::step] * 255).to(torch.uint8).numpy()
         pose = cameras.poses[view].double().numpy()
         width, height = cameras.size(view)
         fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[view, 1]))

@@ -59,8 +59,10 @@ class ViewErrors:
         """Compares anew at the next use: the weights have changed."""
         self.last = None
 
-    def nearest(self, camera: Cameras) -> ViewError:
-        """The comparison of the training view that is nearest to a camera."""
+    def nearest(self, camera: Cameras) -> ViewError | None:
+        """The comparison of the training view that is nearest to a camera; None while there are no images."""
+        if not len(self.scene.train.images):
+            return None
         number = nearest_view(self.scene.train.cameras, camera.origins[0], camera.forward[0])
         if self.last is None or self.last.number != number:
             self.last = self._compare(number)
@@ -84,6 +86,8 @@ class ViewErrors:
             image: what it sees.
         """
         view = self.nearest(camera)
+        if view is None:
+            return torch.tensor(UNSEEN, dtype=torch.uint8).repeat(*image.opacity.shape, 1)
         rays = camera.image_rays(0)
         places = rays.origins + self._depth(image).reshape(-1, 1) * rays.directions
         pixels, ahead = view.camera.project(places, 0)
@@ -101,7 +105,7 @@ class ViewErrors:
         """Distances [h, w]; where next to nothing is, that of the scene's end."""
         return torch.where(image.opacity > 0.5, image.depth, self.scene.far)
 
-    def psnr(self, camera: Cameras, shows: Callable[[Tensor], Tensor]) -> tuple[str, float | None]:
+    def psnr(self, camera: Cameras, shows: Callable[[Tensor], Tensor]) -> tuple[str, float | None] | None:
         """The PSNR in dB of some pixels of the nearest view.
 
         Args:
@@ -109,9 +113,11 @@ class ViewErrors:
             shows: which of the places [h, w, 3] of pixels count, bool [h, w].
 
         Returns:
-            The name of the view, and the PSNR; None if none of its pixels counts.
+            The name of the view, and the PSNR, which is None if none of its pixels counts; None without images.
         """
         view = self.nearest(camera)
+        if view is None:
+            return None
         counted = shows(view.image.heaviest) & (view.image.opacity > 0.5)
         name = self.scene.train.names[view.number]
         if not counted.any():

@@ -21,6 +21,7 @@ import viser
 from torch import Tensor
 from viser.uplot import Scale, Series
 
+from voronerf.data import Scene
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.renderer import RenderedImage
 from voronerf.run import Run
@@ -62,6 +63,7 @@ class Viewer:
         self.tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.wake = threading.Event()
         self.rate = 100_000.0  # pixels a second
+        self.warm = False
         self.errors = ViewErrors(subject.scene, self._render_view)
         with contextlib.redirect_stdout(io.StringIO()):  # viser draws a box around its address
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
@@ -97,6 +99,13 @@ class Viewer:
             (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, order=-1
         )
 
+    def take_images(self, scene: Scene) -> None:
+        """Takes the scene with its images, which a viewer can do without at first."""
+        self.subject.scene = self.errors.scene = scene
+        self.errors.forget()
+        for client in self.list_clients():
+            client.on_images()
+
     def close(self) -> None:
         """Ends the server; its clients see that it is gone."""
         with contextlib.redirect_stdout(io.StringIO()):
@@ -118,12 +127,22 @@ class Viewer:
 
     def serve(self, until: Callable[[], bool] = lambda: False) -> None:
         """Renders what is asked for, until a function says so or Ctrl-C."""
+        self.warm_up()
         while not until():
             if not self.render_next():
                 # A picture may wait for its camera to rest; without one there is nothing to look at.
                 waiting = any(client.wants_sharp for client in self.list_clients())
                 self.wake.wait(REST / 3 if waiting else 1.0)
                 self.wake.clear()
+
+    def warm_up(self) -> None:
+        """Renders something small, since the first call of the operations loads much of torch."""
+        if self.warm:
+            return
+        self.warm = True
+        cameras = self.subject.scene.train.cameras
+        camera = Cameras(cameras.poses[:1], cameras.intrinsics[:1] * (SMALLEST / cameras.width), SMALLEST, SMALLEST)
+        render_look(self.subject, camera, Look())
 
     def list_clients(self) -> list[Client]:
         """Those that are there now."""

@@ -1,0 +1,106 @@
+"""A scene without its images, as the file ``scene.json`` of a run directory: cameras and space.
+
+With it a run is rendered before the images are read, or where they are not. Fields as in `Scene` and `Cameras`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.data.scene import KINDS, Scene, SceneError, Split
+from voronerf.files import json_text, read_json, write_text
+from voronerf.rendering.cameras import Cameras
+from voronerf.rendering.contraction import Contraction, Perspective
+
+CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
+#: What a text of a scene may be.
+WORDS = {"spacing": ("linear", "disparity"), "background": ("white", None), "kind": KINDS}
+INTEGERS = {"sizes": torch.int64}
+
+
+def write_scene(path: Path, scene: Scene) -> None:
+    """Writes a scene without its images.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    values = {name: getattr(scene, name) for name in ("name", "near", "far", *WORDS)}
+    for name in ("box", "transform"):
+        values[name] = _plain(getattr(scene, name))
+    if scene.contraction is not None:
+        kind = next(name for name, its in CONTRACTIONS.items() if isinstance(scene.contraction, its))
+        values["contraction"] = {"kind": kind, **_of_fields(scene.contraction)}
+    for part in ("train", "test"):
+        split = getattr(scene, part)
+        values[part] = {"names": list(split.names), **_of_fields(split.cameras)}
+    write_text(path, json_text(values) + "\n")
+
+
+def read_scene(path: Path) -> Scene:
+    """Reads what :func:`write_scene` has written: a scene whose splits have no images.
+
+    Raises:
+        SceneError: the file is none of these; it names the file.
+        OSError: it cannot be read.
+    """
+    try:
+        values = read_json(path)
+        words = {name: values[name] for name in WORDS}
+        for name, word in words.items():
+            if word not in WORDS[name]:
+                raise ValueError(f"{name} must be one of {WORDS[name]}, got {word!r:.60}")
+        near, far = float(values["near"]), float(values["far"])
+        if not 0 <= near < far < float("inf"):
+            raise ValueError(f"near and far must satisfy 0 <= near < far, got {near} and {far}")
+        kinds = values.get("contraction")
+        contraction = None if kinds is None else _made(CONTRACTIONS[kinds.pop("kind")], kinds)
+        box = _tensor("box", values["box"])
+        if box is not None and (box.shape != (2, 3) or not bool((box[0] < box[1]).all())):
+            raise ValueError("box must be its lowest and highest corner")
+        transform = _tensor("transform", values["transform"], torch.float64)
+        train, test = _split(values["train"]), _split(values["test"])
+        return Scene(
+            str(values["name"]), train, test, near, far, box, contraction=contraction, transform=transform, **words
+        )
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RuntimeError) as error:
+        raise SceneError(f"{path}: is not the record of a scene: {error}") from None
+
+
+def _split(values: dict[str, Any]) -> Split:
+    names = tuple(map(str, values.pop("names")))
+    if not all(isinstance(values[side], int) for side in ("width", "height")):
+        raise ValueError(f"width and height must be integers, got {values['width']!r:.60}, {values['height']!r:.60}")
+    cameras = _made(Cameras, values)
+    if len(names) != len(cameras) or not names:
+        raise ValueError(f"names must be as many as poses and at least one, got {len(names)} and {len(cameras)}")
+    return Split(cameras, torch.empty(0, 1, 1, 3, dtype=torch.uint8), names)
+
+
+def _of_fields(value: Any) -> dict[str, Any]:
+    return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, Tensor) else value
+
+
+def _made(kind: type, values: dict[str, Any]) -> Any:
+    """A dataclass of tensors and numbers."""
+    given = {name: _tensor(name, value) if isinstance(value, list) else value for name, value in values.items()}
+    if "slopes" in given:
+        given["slopes"] = tuple(values["slopes"])
+    return kind(**given)
+
+
+def _tensor(name: str, value: Any, dtype: torch.dtype = torch.float32) -> Tensor | None:
+    if value is None:
+        return None
+    tensor = torch.tensor(value, dtype=INTEGERS.get(name, dtype))
+    if not bool(tensor.isfinite().all()):
+        raise ValueError(f"{name} must be finite")
+    return tensor
