@@ -251,7 +251,7 @@ def render(
         out: The video file, .mp4; default turntable.mp4, spiral.mp4 or the name of the path in the run directory.
         path: Camera path in nerfstudio's format, such as the viewer saves; it has the frames and their size.
         spiral: Go where the training cameras are: up and down around an object, or a small spiral before a scene that
-            was taken from one side.
+            was taken from one side, for which it is the default.
         frames: Frames of a turntable or a spiral.
         fps: Frames per second; default 24, or those of the path.
         data: Scene folder; default as in training, if that lies in the run directory, the working directory or
@@ -283,6 +283,7 @@ def render(
         device=device,
         backend=backend,
     )
+    spiral = spiral or opened.scene.kind == "forward"
     name = path.stem if path is not None else "spiral" if spiral else "turntable"
     out = out or run / f"{name}.mp4"
     check_video(out)
@@ -306,7 +307,7 @@ def write_flight(
     scene = run.scene
     if given is not None:
         cameras, fps = given.frames, fps or given.fps
-    elif spiral:
+    elif spiral or scene.kind == "forward":
         cameras = spiral_cameras(scene.train.cameras, frames, near=scene.near, far=scene.far)
     else:
         cameras = turntable_cameras(scene.train.cameras, frames)

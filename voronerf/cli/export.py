@@ -50,7 +50,7 @@ def export(
         box: What is exported, x y z of the lowest and of the highest corner; default the scene's box, or that around
             the sphere of a contraction.
         path: Camera path in nerfstudio's format, for the video.
-        spiral: Go where the training cameras are, in the video.
+        spiral: Go where the training cameras are, in the video; default for a forward-facing scene.
         data: Scene folder; default as in training, if that lies in the run directory, the working directory or
             VORONERF_DATA, since a run may be another person's.
         downscale: Factor on the images; default as in training.
