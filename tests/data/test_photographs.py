@@ -13,7 +13,7 @@ from PIL import Image
 from scene_files import rewrite, write_capture, write_colmap, write_images, write_llff
 
 from voronerf import open_run
-from voronerf.data import SceneError, load_scene
+from voronerf.data import SceneError, load_scene, photographs
 from voronerf.evaluation.panels import write_panels
 from voronerf.rendering.cameras import Cameras, orbit_cameras
 from voronerf.training.batches import RayBatches
@@ -171,13 +171,16 @@ def test_pixels_are_taken_as_stored_whatever_the_orientation_tag_says(tmp_path, 
     assert load_scene(tmp_path, format=format).train.images.shape == (7, 10, 12, 3)
 
 
-def test_which_folder_of_images(tmp_path):
+def test_which_folder_of_images_and_by_how_much_they_are_reduced(tmp_path, monkeypatch):
     write_images(tmp_path, [SIZE] * COUNT)
     write_llff(tmp_path, POSES, (48, 40), 80.0, (2.5, 5.5))
     (tmp_path / "images").rename(tmp_path / "images_4")
     for downscale, width in ((1, 12), (4, 12), (8, 6)):
         cameras = load_scene(tmp_path, downscale=downscale).train.cameras
         assert cameras.width == width and float(cameras.intrinsics[0, 0]) == pytest.approx(20 * width / 12)
+    monkeypatch.setattr(photographs, "LONGEST_SIDE", 5)  # the images have 12 pixels a side, images_4 says 48
+    scene = load_scene(tmp_path)
+    assert scene.train.cameras.width == 4 and any("images are reduced by 3, to 4 x 3" in note for note in scene.notes)
     refuses("--downscale must be 1 or a multiple of 4, got 6", load_scene, tmp_path, downscale=6, error=SceneError)
     (tmp_path / "images_4/00.jpg").unlink()
     refuses("has poses of 9 images", load_scene, tmp_path, error=SceneError)

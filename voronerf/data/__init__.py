@@ -29,7 +29,7 @@ FORMATS = {
 def load_scene(
     source: str | Path,
     *,
-    downscale: int = 1,
+    downscale: int | None = None,
     allow_outside: bool = False,
     format: str = "auto",
     kind: str = "auto",
@@ -41,7 +41,8 @@ def load_scene(
         source: "builtin", "builtin-rich" or "builtin-translucent", or a folder with `transforms_train.json` (Blender
             synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, or LLFF's
             `poses_bounds.npy`.
-        downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it.
+        downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
+            and for photographs the least factor that leaves at most 512 pixels a side.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
             or a link.
         format: of a folder: "blender", "transforms", "colmap" or "llff"; "auto" is the first of them that it holds.
@@ -59,7 +60,7 @@ def load_scene(
         >>> scene.name, len(scene.train), len(scene.test), scene.train.images.shape[1:]
         ('builtin', 100, 25, torch.Size([5, 5, 4]))
     """
-    if downscale < 1:
+    if downscale is not None and downscale < 1:
         raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")
     for name, given, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
         if given != "auto" and given not in known:
@@ -67,6 +68,7 @@ def load_scene(
     if str(source) in BUILTIN:
         if format != "auto" or kind not in ("auto", "object"):
             raise SceneError(f"{source}: format must be auto and kind auto or object, got {format} and {kind}")
+        downscale = downscale or 1
         if downscale > BUILTIN_SIZE:
             raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
         return BUILTIN[str(source)](BUILTIN_SIZE // downscale)

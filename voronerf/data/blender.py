@@ -66,7 +66,7 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     if near >= far:
         raise SceneError(f"{train_file}: near must be below far, got {near} and {far}")
 
-    downscale = reading.downscale
+    downscale = reading.downscale or 1
     paths = [frame.path for frame in (*train_frames, *test_frames)]
     images, sizes = read_images(paths, downscale)
     count = len(train_frames)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from voronerf.data.images import read_header
 from voronerf.data.lenses import FISHEYE, PERSPECTIVE, Lens
-from voronerf.data.photographs import Photographs, Reading, View, hold_out, photograph_scene
+from voronerf.data.photographs import Photographs, Reading, View, hold_out, least_factor, photograph_scene
 from voronerf.data.scene import Scene, SceneError
 from voronerf.data.transforms import Frame, focal_length, number, pose_of, read_transforms
 
@@ -126,10 +126,9 @@ def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, read
         notes.append("its depth images are not used")
     applied = entries.get("applied_transform")
     transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
-    views = [_view(*entry, reading.downscale) for entry in listed]
-    return photograph_scene(
-        folder, Photographs(path, views, held_out, reading.downscale, tuple(notes), transform), reading
-    )
+    views = [_view(*entry, reading.downscale or 1) for entry in listed]
+    factor = reading.downscale or least_factor(max(max(view.size) for view in views))
+    return photograph_scene(folder, Photographs(path, views, held_out, factor, tuple(notes), transform), reading)
 
 
 def _view(path: Path, entries: dict[str, Any], frame: Frame, downscale: int) -> View:

@@ -282,7 +282,8 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     for file in place.iterdir():
         stay_inside(file, folder, reading.allow_outside)
     model = read_model(place)
-    chosen = choose_images(folder, reading.downscale)
+    longest = max(max(image.camera.width, image.camera.height) for image in model.images)
+    chosen = choose_images(folder, reading.downscale, longest)
     names = [image.name for image in model.images]
     views = []
     for file, image in zip(named_images(model.path, chosen.path, names, reading.allow_outside), model.images):

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from voronerf.data.photographs import least_factor
 from voronerf.data.scene import SceneError
 from voronerf.files import leads_outside
 
@@ -24,11 +25,12 @@ class ImageFolder(NamedTuple):
     notes: tuple[str, ...]
 
 
-def choose_images(folder: Path, downscale: int) -> ImageFolder:
+def choose_images(folder: Path, downscale: int | None, longest: float) -> ImageFolder:
     """The folder of images that needs the least reduction.
 
     With `downscale` N, `images_N` is read as it is, else `images`. Where there is no `images`, the largest `images_N`
-    is read, which a `downscale` of 1 takes as it is.
+    is read, which a `downscale` of 1 takes as it is. None reduces the images as far as `least_factor` says; `longest`
+    is the longest side of those in `images`.
 
     Raises:
         SceneError: there is no folder of images, or `downscale` is none of what there is.
@@ -40,14 +42,20 @@ def choose_images(folder: Path, downscale: int) -> ImageFolder:
             sizes[int(match[1])] = path
     if not sizes:
         raise SceneError(f"{folder}: has neither a folder images nor images_2, images_4, ...")
+    if downscale is None:
+        return ImageFolder(sizes[min(sizes)], least_factor(longest / min(sizes)), _reduced(sizes[min(sizes)]))
     if downscale in sizes:
-        return ImageFolder(sizes[downscale], 1, (f"{sizes[downscale].name} is read as it is",) * (downscale > 1))
+        return ImageFolder(sizes[downscale], 1, _reduced(sizes[downscale]))
     largest = min(sizes)
     if downscale == 1:
-        return ImageFolder(sizes[largest], 1, (f"{sizes[largest].name} is read, there is no folder images",))
+        return ImageFolder(sizes[largest], 1, _reduced(sizes[largest]))
     if downscale % largest:
         raise SceneError(f"{sizes[largest]}: --downscale must be 1 or a multiple of {largest}, got {downscale}")
-    return ImageFolder(sizes[largest], downscale // largest, ())
+    return ImageFolder(sizes[largest], downscale // largest, _reduced(sizes[largest]))
+
+
+def _reduced(folder: Path) -> tuple[str, ...]:
+    return () if folder.name == "images" else (f"{folder.name} is read, and not images",)
 
 
 def stay_inside(path: Path, folder: Path, allow_outside: bool) -> None:

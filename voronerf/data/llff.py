@@ -32,7 +32,7 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
     path = folder / FILE
     stay_inside(path, folder, reading.allow_outside)
     rows = _read(path)
-    chosen = choose_images(folder, reading.downscale)
+    chosen = choose_images(folder, reading.downscale, float(rows[:, [4, 9]].max()))
     stay_inside(chosen.path, folder, reading.allow_outside)
     files = listed_images(chosen.path)
     if len(files) != len(rows):

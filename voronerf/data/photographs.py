@@ -7,6 +7,7 @@ camera is at distance 1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,8 @@ from voronerf.rendering.cameras import Cameras, focus_point
 from voronerf.rendering.contraction import Contraction, Perspective
 
 HOLD_OUT = 8
+# To which images are reduced where nobody says by how much: about what minutes of training can learn.
+LONGEST_SIDE = 512
 # Near bound without bounds of the views, as a share of the distance from the focus to the nearest camera; closer things
 # are rarely in focus.
 NEAR = 0.35
@@ -60,7 +63,7 @@ class View(NamedTuple):
 class Reading:
     """How a folder is read, the options of `load_scene`."""
 
-    downscale: int = 1
+    downscale: int | None = None
     allow_outside: bool = False
     kind: str = "auto"
     normalise: bool = True
@@ -85,6 +88,11 @@ class Photographs:
     factor: int
     notes: tuple[str, ...] = ()
     transform: Tensor | None = None
+
+
+def least_factor(longest: float) -> int:
+    """The factor that leaves a side of so many pixels at most `LONGEST_SIDE`."""
+    return max(math.ceil(longest / LONGEST_SIDE), 1)
 
 
 def hold_out(count: int) -> Tensor:
@@ -129,6 +137,10 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
         Split(cameras[part], images[part], names[part], None if masks is None else masks[part])
         for part in (slice(count), slice(count, None))
     ]
+    notes = [*found.notes, _note(kind, frame, reading)]
+    if reading.downscale is None and found.factor > 1:
+        size = f"{cameras.width} x {cameras.height}"
+        notes.append(f"images are reduced by {found.factor}, to {size} (--downscale 1 keeps their size)")
     to_scene = frame.matrix if found.transform is None else frame.matrix @ found.transform
     return Scene(
         folder.resolve().name,
@@ -142,7 +154,7 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
         kind,
         contraction,
         to_scene,
-        (*found.notes, *_notes(kind, frame, reading)),
+        tuple(notes),
     )
 
 
@@ -306,7 +318,7 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
     return cameras
 
 
-def _notes(kind: str, frame: Frame, reading: Reading) -> list[str]:
+def _note(kind: str, frame: Frame, reading: Reading) -> str:
     asked = "" if reading.kind == "auto" else ", as asked"
     origin = "the sparse points" if frame.measured else "the cameras"
     where = (
@@ -314,4 +326,4 @@ def _notes(kind: str, frame: Frame, reading: Reading) -> list[str]:
         if reading.normalise
         else "in the coordinates of its files (--no-normalise)"
     )
-    return [f"{KIND_LINES[kind]}{asked} (--kind); {where}; near {frame.near:.3g} and far {frame.far:.3g} from {origin}"]
+    return f"{KIND_LINES[kind]}{asked} (--kind); {where}; near {frame.near:.3g} and far {frame.far:.3g} from {origin}"

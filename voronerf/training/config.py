@@ -41,8 +41,9 @@ class TrainConfig:
     normalise: bool = True
     """Move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera at distance
     1; the coordinates of the files are kept otherwise."""
-    downscale: int = 1
-    """Factor by which the images are made smaller when they are loaded."""
+    downscale: int | None = None
+    """Factor by which the images are made smaller when they are loaded; default 1, and for photographs the least that
+    leaves at most 512 pixels a side."""
     allow_outside: bool = False
     """Also read images that lie outside of the scene folder, which it may name by .., an absolute path or a link."""
     out: Path | None = None

@@ -75,7 +75,6 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
     need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
     for name in (
-        "downscale",
         "rays",
         "fine_samples",
         "proposal_rounds",
@@ -86,6 +85,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
         "occupancy_resolution",
     ):
         need(getattr(config, name) >= 1, name, "be at least 1")
+    need(config.downscale is None or config.downscale >= 1, "downscale", "be at least 1")
     need(config.occupancy_resolution <= 512, "occupancy_resolution", "be at most 512")
     need(config.samples is None or config.samples >= 1, "samples", "be at least 1")
     need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
