@@ -4,14 +4,10 @@
 //
 // Numbers are compared in Python (tests/test_native_mlp.py); here every array has exactly its size, outputs start
 // poisoned and must come out finite, and one and three threads must agree bit for bit.
+#include "sanitize.h"
+
 #include <algorithm>
-#include <cmath>
-#include <cstdio>
-#include <cstdlib>
-#include <cstring>
 #include <memory>
-#include <random>
-#include <vector>
 
 #include "network/grouped_mlp.h"
 #include "network/grouped_mlp_layout.h"
@@ -22,26 +18,6 @@ using voronerf::Activation;
 using voronerf::encoded_width;
 using voronerf::MlpEncodingKind;
 using voronerf::MlpTable;
-using Array = std::vector<float>;
-
-std::mt19937 generator(0);
-
-int64_t below(int64_t n) {
-  return static_cast<int64_t>(generator() % static_cast<uint32_t>(n));
-}
-
-Array uniform(int64_t size) {
-  Array values(size);
-  for (float& value : values) value = static_cast<float>(generator()) / 4294967296.0f * 2.0f - 1.0f;
-  return values;
-}
-
-// Heap memory of exactly this size, so that AddressSanitizer guards its ends.
-Array poisoned(int64_t size) {
-  Array values(size, std::nanf(""));
-  values.shrink_to_fit();
-  return values;
-}
 
 // Up to five levels, the first of which have an entry for each corner.
 voronerf::HashGrid random_grid() {
@@ -91,11 +67,11 @@ MlpTable random_table() {
 }
 
 struct Result {
-  Array out, positions, directions, features;
-  std::vector<Array> weights, biases;
+  Array<float> out, positions, directions, features;
+  std::vector<Array<float>> weights, biases;
 
   bool finite() const {
-    for (const Array* array : all()) {
+    for (const Array<float>* array : all()) {
       for (const float value : *array) {
         if (!std::isfinite(value)) return false;
       }
@@ -114,10 +90,10 @@ struct Result {
     return true;
   }
 
-  std::vector<const Array*> all() const {
-    std::vector<const Array*> arrays = {&out, &positions, &directions, &features};
-    for (const Array& array : weights) arrays.push_back(&array);
-    for (const Array& array : biases) arrays.push_back(&array);
+  std::vector<const Array<float>*> all() const {
+    std::vector<const Array<float>*> arrays = {&out, &positions, &directions, &features};
+    for (const Array<float>& array : weights) arrays.push_back(&array);
+    for (const Array<float>& array : biases) arrays.push_back(&array);
     return arrays;
   }
 };
@@ -125,8 +101,8 @@ struct Result {
 struct Case {
   MlpTable table = random_table();
   std::vector<int32_t> offsets, index, order;
-  Array positions, directions, gradient, features;
-  std::vector<Array> weights, biases;
+  Array<float> positions, directions, gradient, features;
+  std::vector<Array<float>> weights, biases;
   int64_t n, rays, k, width = 0, tables = 1;
   bool bias = below(3) > 0;
 
@@ -145,11 +121,11 @@ struct Case {
     const bool ordered = below(2) == 0;
     for (int64_t i = 0; ordered && i < n; ++i) order.push_back(static_cast<int32_t>(i));
     std::shuffle(order.begin(), order.end(), generator);
-    positions = uniform(n * table.positions);
-    directions = uniform(rays * table.directions);
+    positions = uniform<float>(n * table.positions);
+    directions = uniform<float>(rays * table.directions);
     tables = below(2) == 0 ? 1 : k;
     for (const voronerf::GridLevel& level : table.grid.levels) {
-      const Array more = uniform(tables * level.entries * table.grid.features);
+      const Array<float> more = uniform<float>(tables * level.entries * table.grid.features);
       features.insert(features.end(), more.begin(), more.end());
     }
     features.shrink_to_fit();
@@ -160,12 +136,12 @@ struct Case {
                  : from == voronerf::kFromPositions ? encoded_width(table.positions, table.position)
                                                     : encoded_width(table.directions, table.direction);
       }
-      weights.push_back(uniform(k * layer.width * depth));
+      weights.push_back(uniform<float>(k * layer.width * depth));
       for (float& weight : weights.back()) weight /= static_cast<float>(depth);
-      biases.push_back(uniform(bias ? k * layer.width : 0));
+      biases.push_back(uniform<float>(bias ? k * layer.width : 0));
     }
     for (const int output : table.outputs) width += table.layers[output].width;
-    gradient = uniform(n * width);
+    gradient = uniform<float>(n * width);
   }
 
   Result run(voronerf::Isa isa, int threads, bool parameters, bool inputs) const {
@@ -184,7 +160,7 @@ struct Case {
     result.positions = poisoned(inputs ? positions.size() : 0);
     result.directions = poisoned(inputs ? directions.size() : 0);
     result.features = poisoned(inputs ? features.size() : 0);
-    Array hashed = poisoned(table.grid.levels.empty() ? 0 : n * ((table.position.size + 15) / 16 * 16));
+    Array<float> hashed = poisoned(table.grid.levels.empty() ? 0 : n * ((table.position.size + 15) / 16 * 16));
     const voronerf::MlpInputs in{positions.data(),
                                  directions.data(),
                                  index.empty() ? nullptr : index.data(),

@@ -5,14 +5,10 @@
 // Numbers are compared in Python (tests/); here every array has exactly its size, so that its ends are guarded, outputs
 // start poisoned, every eighth case has NaN and infinity among its inputs, and one and three threads must agree bit for
 // bit.
-#include <cmath>
+#include "sanitize.h"
+
 #include <cstdio>
 #include <cstdlib>
-#include <cstring>
-#include <limits>
-#include <random>
-#include <string>
-#include <vector>
 
 #include "geometry/cell_sort.h"
 #include "geometry/centre_grid.h"
@@ -28,70 +24,6 @@
 namespace {
 
 using voronerf::Isa;
-template <typename T>
-using Array = std::vector<T>;
-
-std::mt19937 generator(0);
-bool wild = false;  // NaN and infinity among the inputs
-
-int64_t below(int64_t n) {
-  return static_cast<int64_t>(generator() % static_cast<uint32_t>(n));
-}
-
-template <typename T>
-Array<T> uniform(int64_t size) {
-  Array<T> values(size);
-  for (T& value : values) {
-    value = static_cast<T>(generator()) / static_cast<T>(4294967296.0) * 2 - 1;
-    if (wild && below(9) == 0) {
-      const T odd[] = {std::numeric_limits<T>::quiet_NaN(), std::numeric_limits<T>::infinity(),
-                       -std::numeric_limits<T>::infinity(), std::numeric_limits<T>::max(),
-                       std::numeric_limits<T>::denorm_min()};
-      value = odd[below(5)];
-    }
-  }
-  return values;
-}
-
-// Points on a coarse lattice too, so that there are ties.
-template <typename T>
-Array<T> lattice(int64_t size) {
-  Array<T> values(size);
-  for (T& value : values) value = static_cast<T>(below(7) - 3) / 2;
-  return values;
-}
-
-Array<float> poisoned(int64_t size) {
-  return Array<float>(size, std::nanf(""));
-}
-
-void fail(const std::string& what) {
-  std::fprintf(stderr, "%s\n", what.c_str());
-  std::exit(1);
-}
-
-template <typename T>
-void same(const Array<T>& a, const Array<T>& b, const char* what) {
-  if (a.size() != b.size() || (!a.empty() && std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) != 0)) {
-    fail(std::string(what) + ": results depend on the number of threads");
-  }
-}
-
-void within(const Array<int32_t>& cells, int64_t k, const char* what) {
-  for (const int32_t cell : cells) {
-    if (cell < 0 || cell >= k) fail(std::string(what) + ": cell " + std::to_string(cell) + " of " + std::to_string(k));
-  }
-}
-
-int64_t some_rows() {
-  const int64_t sizes[] = {0, 1, below(20), 15 + below(4), 2047 + below(4), below(9000)};
-  return sizes[below(6)];
-}
-
-template <typename T>
-const T* or_null(const Array<T>& array) {
-  return array.empty() ? nullptr : array.data();
-}
 
 template <typename T>
 void search(Isa isa) {

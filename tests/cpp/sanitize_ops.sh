@@ -18,14 +18,14 @@ check() { # name, cases, flags
   local name=$1 cases=$2 objects=() jobs=()
   shift 2
   for source in "${plain[@]}"; do
-    jobs+=("$(find csrc -name "$source.cpp") $build/$source.$name.o")
+    jobs+=("$(find csrc -name "$source.cpp" -not -path "*/bindings/*") $build/$source.$name.o")
     objects+=("$build/$source.$name.o")
   done
   jobs+=("tests/cpp/ops_sanitize.cpp $build/test.$name.o")
   objects+=("$build/test.$name.o")
   for source in "${per_isa[@]}"; do
     for isa in "${isas[@]}"; do
-      jobs+=("$(find csrc -name "$source.cpp") $build/$source.${isa%% *}.$name.o ${isa#* }")
+      jobs+=("$(find csrc -name "$source.cpp" -not -path "*/bindings/*") $build/$source.${isa%% *}.$name.o ${isa#* }")
       objects+=("$build/$source.${isa%% *}.$name.o")
     done
   done

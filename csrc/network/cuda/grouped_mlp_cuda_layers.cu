@@ -3,6 +3,7 @@
 // the gradients of the weights that read them.
 #include <algorithm>
 
+#include "network/cuda/grouped_mlp_cuda_layers_epilogue.h"
 #include "network/cuda/grouped_mlp_cuda_product.h"
 #include "network/cuda/grouped_mlp_cuda_tasks.h"
 
@@ -97,67 +98,6 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// What a layer does with its sums.
-template <typename Products>
-struct Forward {
-  using Element = typename Products::Element;
-  const float* bias;       // [k][width] or null
-  Element *value, *slope;  // [rows][padded]; slope null unless kept
-  float* out;              // null: no output
-  const int32_t* order;
-  int64_t first, out_features, width, padded;
-  int64_t columns[kLayersOutputs];
-  int outputs, activation;
-
-  __device__ void operator()(int64_t cell, int64_t row, int64_t column, float x, float y) const {
-    float pair[2] = {x, y};
-    for (int part = 0; part < 2; ++part) {
-      if (bias != nullptr && column + part < width) pair[part] += bias[cell * width + column + part];
-    }
-    if (slope != nullptr) Products::store(slope + row * padded + column, cosf(pair[0]), cosf(pair[1]));
-    pair[0] = mlp_activate(activation, pair[0]);
-    pair[1] = mlp_activate(activation, pair[1]);
-    Products::store(value + row * padded + column, pair[0], pair[1]);
-    if (out == nullptr) return;
-    float* to = out + (order == nullptr ? first + row : order[first + row]) * out_features;
-    for (int o = 0; o < outputs; ++o) {
-      for (int part = 0; part < 2; ++part) {
-        if (column + part < width) to[columns[o] + column + part] = pair[part];
-      }
-    }
-  }
-};
-
-// What a value does with the sums of what comes back from its readers: adds what comes from outside, and puts the
-// gradient of the layer's sums where the value was.
-template <typename Products>
-struct Backward {
-  using Element = typename Products::Element;
-  Element* value;
-  const Element* slope;  // the value, or a sine's derivative
-  const float* grad_out;
-  const int32_t* order;
-  int64_t first, out_features, width, padded;
-  int64_t columns[kLayersOutputs];
-  int outputs, activation;
-
-  __device__ void operator()(int64_t, int64_t row, int64_t column, float x, float y) const {
-    float pair[2] = {x, y};
-    if (outputs > 0) {
-      const float* from = grad_out + (order == nullptr ? first + row : order[first + row]) * out_features;
-      for (int o = 0; o < outputs; ++o) {
-        for (int part = 0; part < 2; ++part) {
-          if (column + part < width) pair[part] += from[columns[o] + column + part];
-        }
-      }
-    }
-    const int64_t at = row * padded + column;
-    const float low = Products::load(slope + at), high = Products::load(slope + at + 1);
-    Products::store_gradient(value + at, mlp_times_slope(activation, pair[0], low),
-                             mlp_times_slope(activation, pair[1], high));
-  }
-};
-
 // Sums the parts of a layer's gradients, [splits][k] of them; a layer that is not live has none.
 __global__ void __launch_bounds__(kThreads)
     layers_reduce_kernel(const float* partials, const PackedSources sources, float* weights, float* biases, int64_t k,
@@ -218,13 +158,13 @@ class Call {
         parts.parts[parts.count++] = {value_of(source.from), weights_of(layer, source),   source.padded,
                                       layer.stride,          layer.padded * layer.stride, source.padded};
       }
-      Forward<Products> finish{};
+      LayersForward<Products> finish{};
       finish.bias = parameters_.biases[l];
       finish.value = place(layer.value);
       finish.slope = layer.slope < 0 ? nullptr : place(layer.slope);
       finish.out = layer.outputs.empty() ? nullptr : out;
       outside(layer, finish);
-      VN_LAUNCH((mlp_product_kernel<Products, false, Forward<Products>>), grid(layer.padded), kLayersThreads,
+      VN_LAUNCH((mlp_product_kernel<Products, false, LayersForward<Products>>), grid(layer.padded), kLayersThreads,
                 MlpChunk<Element>::kBytes, stream_, slab_, parts, finish);
     }
   }
@@ -327,13 +267,13 @@ class Call {
                                       reader.stride,       reader.padded * reader.stride, reader.padded};
       }
     }
-    Backward<Products> finish{};
+    LayersBackward<Products> finish{};
     finish.value = place(layer.value);
     finish.slope = place(slope);
     finish.grad_out = data_.grad_out;
     outside(layer, finish);
     finish.activation = activation;
-    VN_LAUNCH((mlp_product_kernel<Products, true, Backward<Products>>), grid(layer.padded), kLayersThreads,
+    VN_LAUNCH((mlp_product_kernel<Products, true, LayersBackward<Products>>), grid(layer.padded), kLayersThreads,
               MlpChunk<Element>::kBytes, stream_, slab_, parts, finish);
   }
 
