@@ -10,9 +10,10 @@ from __future__ import annotations
 import contextlib
 import copy
 import fnmatch
+import functools
 import warnings
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -20,11 +21,13 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrizations
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
+from voronerf.backends import BackendUnavailable
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.router.layout import tensors_of
 
 _OP = "VoronoiRouter"
+_LARGE = 1 << 22  # bytes
 _SHARED = "_voronerf_shared"  # where a part of a routed module keeps the names of parameters that all cells share
 
 
@@ -50,6 +53,52 @@ def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
 def is_shared(owner: nn.Module, name: str) -> bool:
     """Whether a parameter is one for all cells."""
     return name in vars(owner).get(_SHARED, ())
+
+
+@functools.cache
+def _on_huge_pages() -> Callable[[Tensor], None]:
+    try:
+        from voronerf.native.custom_op import on_huge_pages
+    except BackendUnavailable:
+        return lambda result: None
+    return on_huge_pages
+
+
+def empty_like(tensor: Tensor) -> Tensor:
+    """``torch.empty_like``, on huge pages where it is large: page faults cost more than what is written there."""
+    result = torch.empty_like(tensor)
+    _on_huge_pages()(result)
+    return result
+
+
+def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
+    """[k, ...] -> the tensor of each cell."""
+    large = stacked.nbytes >= _LARGE and stacked.requires_grad and torch.is_grad_enabled()
+    found: tuple[Tensor, ...] = _Cells.apply(stacked) if large else stacked.unbind(0)
+    return found
+
+
+class _Cells(torch.autograd.Function):
+    """The tensors of cells, whose gradients are put together in memory of :func:`empty_like`."""
+
+    @staticmethod
+    def forward(stacked: Tensor) -> tuple[Tensor, ...]:
+        return stacked.unbind(0)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Any) -> None:
+        ctx.save_for_backward(*inputs)
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> Tensor:
+        (stacked,) = ctx.saved_tensors
+        if torch.is_grad_enabled():  # these are differentiated again
+            return torch.stack([torch.zeros_like(stacked[0]) if own is None else own for own in gradients])
+        result = empty_like(stacked)
+        for own, gradient in zip(result.unbind(0), gradients, strict=True):
+            own.zero_() if gradient is None else own.copy_(gradient)
+        return result
 
 
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:

@@ -80,17 +80,17 @@ def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
 def tensors_of(value: Any) -> list[Tensor]:
     """All tensors of a structure, in the order of :func:`map_tree`."""
     found: list[Tensor] = []
-    _collect(value, found, 0)
+    _collect((value,), found, 0)
     return found
 
 
-def _collect(value: Any, found: list[Tensor], depth: int) -> None:
+def _collect(items: Iterable[Any], found: list[Tensor], depth: int) -> None:
     # Every function of a grouped module comes here with its arguments: lists are not made dicts for it.
-    if isinstance(value, Tensor):
-        found.append(value)
-    elif depth <= _DEEPEST and value is not None and not isinstance(value, (int, float, str)):
-        for item in value if type(value) in (list, tuple) else (_items(value) or {}).values():
-            _collect(item, found, depth + 1)
+    for item in items:
+        if isinstance(item, Tensor):
+            found.append(item)
+        elif item is not None and depth <= _DEEPEST and not isinstance(item, (int, float, str)):
+            _collect(item if type(item) in (list, tuple) else (_items(item) or {}).values(), found, depth + 1)
 
 
 def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from voronerf.backends import BackendUnavailable
-from voronerf.router.cells import cell_parameters, clone_module, in_place_of_parameters
+from voronerf.router.cells import cell_parameters, cells_of, clone_module, in_place_of_parameters
 from voronerf.router.fused import ROWS, Program, Unfusable
 from voronerf.router.grouped import RANDOM, Ungroupable, run_grouped
 from voronerf.router.grouping import Grouping
@@ -35,7 +35,7 @@ def run_cells(call: Call, given: list[Tensor], bounds: list[tuple[int, int, int]
     module, which keeps the cell's parameters.
     """
     module, counts = call.module, [last - first for _, first, last in bounds]
-    pieces = {id(p): p.unbind(0) for p in cell_parameters(module)}
+    pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
     values = []
     for (cell, _, _), part in zip(bounds, split_rows(given, counts), strict=True):
         own: dict[int, Any] = {key: piece[cell] for key, piece in pieces.items()}

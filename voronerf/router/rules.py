@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops import grouped_linear
+from voronerf.router.cells import cells_of, empty_like
 from voronerf.router.grouped import GroupedRun, PerCell, register, writes_in_place
 from voronerf.router.layout import map_tensors, tensors_of
 
@@ -278,7 +279,7 @@ class _LookUp(torch.autograd.Function):
         if torch.is_grad_enabled():  # the gradient has a gradient itself, which a buffer would lose
             return torch.zeros_like(table).index_add(0, index + ctx.first, gradient), None, None, None
         if not ctx.buffer:
-            ctx.buffer.append(torch.zeros_like(table))
+            ctx.buffer.append(empty_like(table).zero_())
         sums, rows = _as_moved(ctx.buffer[0][ctx.first :]), _as_moved(gradient.contiguous())
         if sums.is_complex():
             sums.scatter_add_(0, index, rows)
@@ -317,7 +318,7 @@ def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) ->
     places = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
     if not isinstance(input, PerCell) or not run.is_rows(grid) or len(places) != 1 or grid.shape[0] != 1:
         return NotImplemented
-    occupied, planes = run.grouping.occupied, input.stacked.unbind(0)
+    occupied, planes = run.grouping.occupied, cells_of(input.stacked)
     points = grid.split([last - first for _, first, last in occupied], places[0])
     found = [F.grid_sample(planes[cell], own, **options) for (cell, _, _), own in zip(occupied, points, strict=True)]
     return torch.cat(found, places[0] + 1)
