@@ -1,6 +1,6 @@
 """VoronoiRouter: any module as one network per Voronoi cell."""
 
-from voronerf.router.evaluate import LayeredField
+from voronerf.router.fused import LayeredField
 from voronerf.router.grouped import register
 from voronerf.router.router import VoronoiRouter
 

@@ -10,95 +10,24 @@ from __future__ import annotations
 import contextlib
 import copy
 import fnmatch
-import functools
 import warnings
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import parametrizations
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from voronerf.backends import BackendUnavailable
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
+from voronerf.router.grouping import SHARED, cell_parameters, owned_parameters
 from voronerf.router.layout import tensors_of
 
 _OP = "VoronoiRouter"
-_LARGE = 1 << 22  # bytes
-_SHARED = "_voronerf_shared"  # where a part of a routed module keeps the names of parameters that all cells share
 
 
 # Parameters -----------------------------------------------------------------------------------------------------------
-
-
-def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parameter]]:
-    """(owner, name, parameter) of every parameter of a module tree; one that is used twice comes twice."""
-    return [
-        (owner, name, parameter)
-        for owner in module.modules()
-        for name, parameter in list(owner._parameters.items())
-        if parameter is not None
-    ]
-
-
-def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
-    """The parameters that are stacked, [k, ...]; not those that all cells share."""
-    owned = [parameter for owner, name, parameter in owned_parameters(module) if not is_shared(owner, name)]
-    return list({id(parameter): parameter for parameter in owned}.values())
-
-
-def is_shared(owner: nn.Module, name: str) -> bool:
-    """Whether a parameter is one for all cells."""
-    return name in vars(owner).get(_SHARED, ())
-
-
-@functools.cache
-def _on_huge_pages() -> Callable[[Tensor], None]:
-    try:
-        from voronerf.native.custom_op import on_huge_pages
-    except BackendUnavailable:
-        return lambda result: None
-    return on_huge_pages
-
-
-def empty_like(tensor: Tensor) -> Tensor:
-    """``torch.empty_like``, on huge pages where it is large: page faults cost more than what is written there."""
-    result = torch.empty_like(tensor)
-    _on_huge_pages()(result)
-    return result
-
-
-def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
-    """[k, ...] -> the tensor of each cell."""
-    large = stacked.nbytes >= _LARGE and stacked.requires_grad and torch.is_grad_enabled()
-    found: tuple[Tensor, ...] = _Cells.apply(stacked) if large else stacked.unbind(0)
-    return found
-
-
-class _Cells(torch.autograd.Function):
-    """The tensors of cells, whose gradients are put together in memory of :func:`empty_like`."""
-
-    @staticmethod
-    def forward(stacked: Tensor) -> tuple[Tensor, ...]:
-        return stacked.unbind(0)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.set_materialize_grads(False)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> Tensor:
-        (stacked,) = ctx.saved_tensors
-        if torch.is_grad_enabled():  # these are differentiated again
-            return torch.stack([torch.zeros_like(stacked[0]) if own is None else own for own in gradients])
-        result = empty_like(stacked)
-        for own, gradient in zip(result.unbind(0), gradients, strict=True):
-            own.zero_() if gradient is None else own.copy_(gradient)
-        return result
 
 
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
@@ -132,8 +61,7 @@ def _refusal(part: nn.Module) -> str:
         return "mixes the samples of a batch (use LayerNorm or GroupNorm)"
     if isinstance(part, nn.RNNBase):
         return "is recurrent, with weights that cannot be one set for each cell"
-    hooks = part._forward_pre_hooks.values()
-    if isinstance(part, parametrizations._SpectralNorm) or any(type(hook).__name__ == "SpectralNorm" for hook in hooks):
+    if any(type(one).__name__.endswith("SpectralNorm") for one in (part, *part._forward_pre_hooks.values())):
         return "keeps a state for each weight (spectral norm) that cells cannot share"
     for name, value in vars(part).items():
         plain = isinstance(value, (list, tuple, dict)) and name != "_parameters"
@@ -155,7 +83,7 @@ def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
     stacked: dict[int, nn.Parameter] = {}
     for owner, name, parameter in owned_parameters(module):
         if id(parameter) in shared:
-            vars(owner)[_SHARED] = (*vars(owner).get(_SHARED, ()), name)
+            vars(owner)[SHARED] = (*vars(owner).get(SHARED, ()), name)
             continue
         if id(parameter) not in stacked:
             values = parameter.detach().expand(k, *parameter.shape).clone()
@@ -182,30 +110,11 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
             own[index] = theirs[name].to(own)
 
 
-@contextlib.contextmanager
-def in_place_of_parameters(module: nn.Module, values: Mapping[int, Any]) -> Iterator[None]:
-    """Lets a module find other tensors where its parameters are; ``values`` by the id of the parameter."""
-    owned = [one for one in owned_parameters(module) if id(one[2]) in values]
-    # Hooks such as that of torch.nn.utils.weight_norm leave tensors made of parameters behind.
-    attributes = [(part, dict(vars(part))) for part in module.modules() if part._forward_pre_hooks]
-    for owner, name, parameter in owned:
-        owner._parameters[name] = values[id(parameter)]
-    try:
-        yield
-    finally:
-        for owner, name, parameter in owned:
-            owner._parameters[name] = parameter
-        for owner, before in attributes:
-            for name, value in list(vars(owner).items()):
-                if isinstance(value, Tensor) and value is not before.get(name):
-                    vars(owner)[name] = before.get(name)
-
-
 def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
     """Gives a parameter values of another shape.
 
-    A graph of an earlier call that is still held remembers the old shape, and would have the gradients of the new cells
-    summed to it. With another dtype in between torch forgets it.
+    A graph of an earlier call that is still held would sum the gradients of the new cells to the old shape. With
+    another dtype in between torch forgets it.
     """
     if values.is_floating_point():
         other = torch.float32 if values.dtype == torch.float64 else torch.float64
@@ -216,43 +125,36 @@ def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
 def _draw_parameters(template: nn.Module, k: int, generator: torch.Generator | None) -> dict[str, Tensor]:
     """Newly drawn parameters [k, ...] of a plain module, by name."""
     parts = {"": template} if hasattr(template, "reset_parameters") else dict(template.named_modules())
-    resets = [part for part in parts.values() if hasattr(part, "reset_parameters")]
     for name, part in parts.items():
-        if part not in resets and any(parameter is not None for parameter in part._parameters.values()):
+        if not hasattr(part, "reset_parameters") and any(p is not None for p in part._parameters.values()):
             raise ValueError(
                 f"{_OP}.subdivide: inherit=False needs a field with reset_parameters(), or layers that have it; "
                 f"`{name}`, a {type(part).__name__}, has not"
             )
-    drawn = []
+    drawn: dict[str, list[Tensor]] = {name: [] for name, _ in template.named_parameters()}
     # Of GPUs as well, which manual_seed reaches. Without a generator torch's own goes on.
     with torch.random.fork_rng() if generator is not None else contextlib.nullcontext():
         if generator is not None:
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device=generator.device)))
         for _ in range(k):
-            for part in resets:
-                part.reset_parameters()  # type: ignore[operator]
-            drawn.append({name: p.detach().clone() for name, p in template.named_parameters()})
-    return {name: torch.stack([values[name] for values in drawn]) for name in drawn[0]}
+            for part in parts.values():
+                if hasattr(part, "reset_parameters"):
+                    part.reset_parameters()  # type: ignore[operator]
+            for name, parameter in template.named_parameters():
+                drawn[name].append(parameter.detach().clone())
+    return {name: torch.stack(values) for name, values in drawn.items()}
 
 
 # Cells ----------------------------------------------------------------------------------------------------------------
 
 
 class CellModules(nn.Module):
-    """k modules, one for each cell of a diagram, as one module with stacked parameters.
-
-    Args:
-        module: Copied, never changed.
-        diagram: Of k cells.
-        share: Names of parameters that all cells have in common, as patterns.
-    """
+    """k modules, one for each cell of a diagram, as one module with stacked parameters."""
 
     def __init__(self, module: nn.Module, diagram: VoronoiDiagram, share: Sequence[str]) -> None:
         super().__init__()
-        self.diagram = diagram
         first = next(module.parameters(), None)
-        if first is not None and not first.is_meta:
-            self.diagram.to(first.device)
+        self.diagram = diagram if first is None or first.is_meta else diagram.to(first.device)
         self.generator: torch.Generator | None = None
         self.backend = "auto"
         self.share = tuple(share)
@@ -274,11 +176,11 @@ class CellModules(nn.Module):
         Raises:
             IndexError: If there is no such cell.
         """
-        self._check_index("cell", index)
+        index = self._check_index("cell", index)
         own = {id(p): nn.Parameter(p.detach()[index].clone(), p.requires_grad) for p in cell_parameters(self.module)}
         plain: nn.Module = clone_module(self.module, own)
         for part in plain.modules():
-            vars(part).pop(_SHARED, None)
+            vars(part).pop(SHARED, None)
         return plain
 
     def load_cell(self, index: int, module: nn.Module) -> None:
@@ -286,7 +188,7 @@ class CellModules(nn.Module):
 
         Raises:
             IndexError: If there is no such cell.
-            ValueError: For parameters of other names or shapes, or buffers that differ from those shared by the cells.
+            ValueError: For parameters of other names or shapes, or buffers that differ from the shared ones.
         """
         fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
 
@@ -344,19 +246,12 @@ class CellModules(nn.Module):
             >>> router.num_cells, router.module.weight.shape
             (8, torch.Size([8, 1, 3]))
         """
-        diagram, parents = finer_diagram(
-            self.diagram,
-            diagram,
-            parents,
-            points,
-            weights,
-            {"backend": self.backend, "generator": self.generator, **split},
-        )
+        split = {"backend": self.backend, "generator": self.generator, **split}
+        diagram, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
         # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
         new = torch.bincount(parents, minlength=self.num_cells)[parents] > 1
         fresh = None if inherit else _draw_parameters(self.cell(0), diagram.num_cells, self.generator)
-        if optimizer is not None:
-            _check_optimizer(optimizer, self.module, "subdivide")
+        _check_optimizer(optimizer, self.module, "subdivide")
         before = self.num_cells
         stacked = {id(parameter) for parameter in cell_parameters(self.module)}
         for name, parameter in self.module.named_parameters():
@@ -415,10 +310,9 @@ class CellModules(nn.Module):
             Missing and unexpected keys.
 
         Raises:
-            ValueError: When the optimiser holds none of the router's parameters.
+            ValueError: If the optimiser holds none of the router's parameters.
         """
-        if optimizer is not None:
-            _check_optimizer(optimizer, self.module, "load_state_dict")
+        _check_optimizer(optimizer, self.module, "load_state_dict")
         result = super().load_state_dict(state_dict, strict, assign)
         if optimizer is not None:
             _drop_state(optimizer)
@@ -441,8 +335,7 @@ class CellModules(nn.Module):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
         detach_results(self, memo)
-        copied = type(self).__new__(type(self))
-        memo[id(self)] = copied
+        copied = memo[id(self)] = type(self).__new__(type(self))
         copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
         return copied
 
@@ -450,10 +343,10 @@ class CellModules(nn.Module):
 # Optimisers -----------------------------------------------------------------------------------------------------------
 
 
-def _check_optimizer(optimizer: torch.optim.Optimizer, module: nn.Module, method: str) -> None:
+def _check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, method: str) -> None:
     """Raises ValueError for an optimiser that holds none of a module's parameters."""
-    ours = {id(parameter) for parameter in module.parameters()}
-    if ours and not any(id(parameter) in ours for group in optimizer.param_groups for parameter in group["params"]):
+    ours, groups = set(map(id, module.parameters())), [] if optimizer is None else optimizer.param_groups
+    if groups and ours and ours.isdisjoint(id(parameter) for group in groups for parameter in group["params"]):
         raise ValueError(f"{_OP}.{method}: optimizer must hold the router's parameters, got one of others")
 
 
@@ -466,14 +359,14 @@ def _move_state(
     """
     lost = False
     for parameter in cell_parameters(module):
-        old, state = (k, *parameter.shape[1:]), optimizer.state.get(parameter, {})
-        if any(isinstance(v, list) or (isinstance(v, Tensor) and v.dim() and v.shape != old) for v in state.values()):
-            lost = True
+        state = optimizer.state.get(parameter, {})
         for key, value in state.items():
-            if isinstance(value, Tensor) and value.shape == old:
+            if isinstance(value, Tensor) and value.shape == (k, *parameter.shape[1:]):
                 state[key] = value[parents.to(value.device)]
                 if fresh is not None:
                     state[key][fresh.to(value.device)] = 0
+            else:
+                lost |= isinstance(value, list) or (isinstance(value, Tensor) and value.dim() > 0)
     if lost:
         _begin_anew(optimizer)
         warnings.warn(

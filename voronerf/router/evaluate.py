@@ -1,49 +1,64 @@
 """How a routed call is carried out: chosen once for a kind of call, and admitted by one comparison with the loop.
 
-The loop over cells (:mod:`voronerf.router.loop`) defines the result. The faster ways are the module's own ``forward``
-once for the rows of all cells (:mod:`voronerf.router.grouped`) and, where the user said ``fuse=True``, one operation
-(:mod:`voronerf.router.fused`). A field that describes itself by a layer table needs none of this.
+The loop over cells defines the result. The faster ways are the module's own ``forward`` once for the rows of all cells
+(:mod:`voronerf.router.grouped`) and, where the user said ``fuse=True``, one operation (:mod:`voronerf.router.fused`).
+A faster way is admitted if it gives what the loop gives: both run once on a few samples of the batch, in a copy of the
+module whose cells have parameters of their own, and results and gradients are compared.
 """
 
 from __future__ import annotations
 
 import inspect
+import math
 import os
 import threading
 import warnings
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.backends import BackendUnavailable
 from voronerf.diagram.blending import Mixture
-from voronerf.layers import MLP
 from voronerf.router import rules  # noqa: F401  registers the rules
-from voronerf.router.grouped import Ungroupable, run_grouped
-from voronerf.router.grouping import Grouping
-from voronerf.router.layout import Call, Results, rebuild, tensors_of
-from voronerf.router.loop import Choice, Trial, admitted, flattened, run_cells
+from voronerf.router.cells import clone_module
+from voronerf.router.fused import Program
+from voronerf.router.grouped import NoRandomness, Ungroupable, run_cells, run_grouped
+from voronerf.router.grouping import Grouping, cell_parameters, in_place_of_parameters
+from voronerf.router.layout import RAY, Call, Results, map_tensors, rebuild, tensors_of
+from voronerf.router.trace import ROWS, Unfusable
+from voronerf.tolerances import agree, agree_gradients
 
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs
-_GAIN = "about 1.5 times as fast at width 64 and 65,536 samples"
+_TRIED, _CELLS = 41, 3  # samples of a comparison, unlike any number of features, and their cells
+_PIECE = 4 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
 _KINDS = 256  # kinds of calls that are remembered
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
 
 
-class Choices:
-    """What a router has found out about its module. Copies of a router begin anew.
+@dataclass
+class Choice:
+    """How calls of a kind are carried out."""
 
-    Attributes:
-        lock: Held during a call: stand-ins are in the place of the module's parameters.
-        kinds: What was found for each kind of call.
-    """
+    way: str  # "fused", "grouped" or "cell by cell"
+    why: str = ""  # what stands in the way of a faster one
+    flat: tuple[bool, ...] = ()  # of the tensors of a result: the module itself makes them [rays * samples, ...]
+    piece: int = 1 << 16  # rows that a grouped module runs on at once on a CPU
+    again: bool = False  # the module's code runs again in the backward pass
+    open: bool = False  # another batch may be carried out in a faster way
+    fusable: bool = False  # ``fuse=True`` would serve
+    program: Program | None = None  # the fused network
+
+
+class Choices:
+    """What a router has found out about its module. Copies of a router begin anew."""
 
     def __init__(self) -> None:
-        self.lock = threading.RLock()
+        self.lock = threading.RLock()  # held during a call: stand-ins are in the place of the module's parameters
         self.forget()
 
     def forget(self) -> None:
@@ -52,59 +67,50 @@ class Choices:
         self._said: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
-    def kind(self, call: Call, device: torch.device, fuse: bool) -> Any:
-        """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
-
-        Numbers count by what they are only where they would go into a fused network.
-        """
-        autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
-        modes = (call.method, call.module.training, torch.is_grad_enabled(), autocast)
-        d, values = len(call.layout.lead), (*call.args, *call.kwargs.values())
-        return *modes, tuple(call.kwargs), d, *[_description(value, d, fuse) for value in values]
-
     def note(self, call: Call, choice: Choice) -> None:
         """For :meth:`explain`: how a method was carried out."""
         self._latest.setdefault(call.method, {})[choice.way] = choice.why
 
     def explain(self, methods: tuple[str, ...]) -> str:
         """How each method has been carried out so far, and why."""
-        lines = []
-        for method in methods:
-            ways = self._latest.get(method, {"not called yet": ""})
-            lines += [f"{method}: {way}{f': {why}' if why else ''}" for way, why in ways.items()]
-        return "\n".join(lines)
+        ways = [(method, way) for method in methods for way in self._latest.get(method, {"not called yet": ""}).items()]
+        return "\n".join(f"{method}: {way}{f': {why}' if why else ''}" for method, (way, why) in ways)
 
     def say_once(self, topic: str, message: str) -> None:
         """Warns, the first time that a topic comes up, at the line that called the router."""
-        if topic in self._said:
-            return
+        if topic not in self._said:
+            files = [frame.filename for frame in inspect.stack(context=0)]
+            level = next((i for i, file in enumerate(files) if not file.startswith(_OWN)), len(files))
+            warnings.warn(f"{_OP}: {message}", stacklevel=level + 1)
         self._said.add(topic)
-        level, frame = 1, inspect.currentframe()
-        while frame is not None and frame.f_code.co_filename.startswith(_OWN):
-            level, frame = level + 1, frame.f_back
-        warnings.warn(f"{_OP}: {message}", stacklevel=level)
 
     def __reduce__(self) -> tuple[type[Choices], tuple[()]]:
         return Choices, ()
 
 
-def _description(value: Any, d: int, fuse: bool) -> Any:
-    if isinstance(value, Tensor):
-        ones = tuple(size == 1 for size in value.shape[:d])
-        return tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad, ones
-    if value is None or isinstance(value, (bool, str)) or (fuse and isinstance(value, (int, float))):
-        return value
-    return type(value)
+def _kind(call: Call, device: torch.device, fuse: bool) -> Any:
+    """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
+
+    Numbers count by what they are only where they would go into a fused network.
+    """
+    autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
+    d = len(call.layout.lead)
+    kind = [call.method, call.module.training, torch.is_grad_enabled(), autocast, tuple(call.kwargs), d]
+    for value in (*call.args, *call.kwargs.values()):
+        if isinstance(value, Tensor):
+            ones = tuple(size == 1 for size in value.shape[:d])
+            kind.append((tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad, ones))
+        else:
+            by_value = (type(None), bool, str, int, float) if fuse else (type(None), bool, str)
+            kind.append(value if isinstance(value, by_value) else type(value))
+    return tuple(kind)
 
 
 # Carrying out ---------------------------------------------------------------------------------------------------------
 
 
 def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, *, fuse: bool) -> Any:
-    """What a method of a module returns for the samples of all cells, mixed with what other cells return for some.
-
-    Where there are no samples, ``grouping`` is of two placeholders.
-    """
+    """What a method returns for the samples of all cells (or two placeholders), some mixed with those of others."""
     choice = _choose(call, grouping, choices, fuse)
     results, choice = _carry_out(call, grouping, choices, choice)
     order = grouping if choice.program is None or not call.layout.n else None
@@ -143,23 +149,23 @@ def _carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice)
         if hasattr(error, "add_note") and len(call.layout.lead) > 1 and not call.layout.flat:  # since Python 3.11
             error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
         raise
-    one = Choice("the module itself", "there is one cell")
-    choices.note(call, choice if grouping.k > 1 or choice.way != "grouped" else one)
+    if grouping.k == 1 and choice.way == "grouped":
+        choice = replace(choice, way="the module itself", why="there is one cell")
+    choices.note(call, choice)
     if grouping.k > 1 and choice.why and call.layout.n >= _FEWEST:
         choices.say_once(f"cells {call.method}", f"{call.name} runs cell by cell: {choice.why}")
     return results, choice
 
 
 def _choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
-    layout, kind = call.layout, choices.kind(call, grouping.device, fuse)
+    layout, kind = call.layout, _kind(call, grouping.device, fuse)
     choice = choices.kinds.get(kind)
     if choice is not None and not choice.open:
         return choice
     if layout.n < _FEWEST:
         return Choice("cell by cell", f"for fewer than {_FEWEST} samples") if choice is None else choice
     call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is found out
-    devices = [grouping.device] if grouping.device.type == "cuda" else []
-    with torch.random.fork_rng(devices):
+    with torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else []):
         rays = len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat
         flat = choice.flat if choice is not None else flattened(call) if rays else ()
         trial = Trial(call, grouping)
@@ -173,64 +179,221 @@ def _choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Cho
         choices.say_once(
             f"fuse {call.method}",
             f"{call.name} runs grouped; its network is a layer table, and VoronoiRouter(..., fuse=True) runs it as one "
-            f"operation, {_GAIN}, if its forward does the same in every call",
+            "operation, about 1.5 times as fast at width 64 and 65,536 samples, if its forward does the same in every "
+            "call",
         )
     return found
 
 
-# Fields with a layer table --------------------------------------------------------------------------------------------
+# Comparison -----------------------------------------------------------------------------------------------------------
 
 
-@runtime_checkable
-class LayeredField(Protocol):
-    """A field that describes its network by a layer table, like :class:`voronerf.fields.NeRF`. It runs fused.
+Outcome = tuple[Results, list[Tensor]]  # and gradients
+Way = Callable[["Trial", list[Tensor]], Results]
 
-    Where the table has a hash grid, the field has a parameter ``features``, [e, f], as :class:`voronerf.HashGridField`.
 
-    Examples:
-        >>> from voronerf import NeRF
-        >>> from voronerf.router import LayeredField
-        >>> isinstance(NeRF(width=16, depth=2), LayeredField)
-        True
+class Trial:
+    """A copy of a module and a few samples of a call, in cells of their own whose parameters differ."""
+
+    def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
+        self.made_of, self.again, self.widest = (call, grouping), False, 1
+        device = grouping.device
+        picked = torch.arange(_TRIED, device=device) * call.layout.n // _TRIED
+        cells = (torch.arange(_TRIED, device=device) * 7 % 5 // 2).int()
+        self.entries = Grouping({"cells": cells}, _TRIED, _CELLS, device, grouping.backend, rows=picked)
+        generator = torch.Generator().manual_seed(0)
+        memo: dict[int, Any] = {id(p): _made_different(p, generator) for p in cell_parameters(call.module)}
+        module = clone_module(call.module, memo).to(dtype)
+        self._leaves: list[Tensor] = []
+
+        def leaf(value: Tensor) -> Tensor:
+            """An argument with a gradient of its own, where it takes one."""
+            own = value.detach().to(dtype if value.is_floating_point() else None)
+            if value.requires_grad and torch.is_grad_enabled():
+                self._leaves.append(own.requires_grad_())
+            return own
+
+        args, kwargs = map_tensors((call.args, call.kwargs), leaf)
+        self.call = replace(call, module=module, args=args, kwargs=kwargs)
+
+    def run(self, way: Way) -> Results:
+        """The results of a way, with rows that are fresh for it."""
+        with NoRandomness():
+            return way(self, self.call.arranged(self.entries))
+
+    def outcome(self, way: Way) -> Outcome:
+        """Results, and gradients of a weighted sum of them."""
+        results, generator, total = self.run(way), torch.Generator().manual_seed(7), []
+        for tensor in results.tensors:
+            if tensor.requires_grad and tensor.is_floating_point():
+                weights = torch.randn(tensor.shape, generator=generator).to(tensor)
+                total.append((tensor * weights).sum().float())
+        if not total or not torch.is_grad_enabled():
+            return results, []
+        torch.stack(total).sum().backward()  # not torch.autograd.grad, which some checkpoints refuse
+        leaves = [t for t in (*self.call.module.parameters(), *self._leaves) if t.requires_grad]
+        gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in leaves]
+        for leaf in leaves:
+            leaf.grad = None
+        return results, gradients
+
+    def agrees(self, way: Way, expected: Outcome) -> bool:
+        """Whether a way gives what the loop gives; where it does not, whether it does in float64.
+
+        A deep network of fast sines makes its own rounding as large as its results.
+        """
+        if _same(self.outcome(way), expected):
+            return True
+        try:
+            exact = Trial(*self.made_of, dtype=torch.float64)
+            exact.again = self.again
+            return _same(exact.outcome(way), exact.outcome(Trial.by_cells))
+        except Exception:
+            return False
+
+    def by_cells(self, given: list[Tensor]) -> Results:
+        """The loop."""
+        return run_cells(self.call, given, self.entries.occupied, again=self.again)
+
+    def grouped(self, given: list[Tensor]) -> Results:
+        """All cells at once."""
+        results, self.widest = run_grouped(self.call, given, self.entries, _TRIED)
+        return results
+
+    def is_groupable(self) -> bool:
+        """Whether the module runs for all cells at once on this batch, right or wrong."""
+        try:
+            with torch.no_grad():
+                self.run(Trial.grouped)
+        except Exception:
+            return False
+        return True
+
+    def fused(self, expected: Outcome) -> tuple[Program | None, str]:
+        """The network as one operation, or what stands in the way."""
+        try:
+            with NoRandomness():
+                rows = [rows[:ROWS] for rows in self.call.arranged(self.entries)]
+                program = Program(self.made_of[0].module, self.call, rows)
+            same = self.agrees(lambda t, rows: program.with_parameters_of(t.call.module).run(rows, t.entries), expected)
+        except Unfusable as error:
+            return None, str(error)
+        except Exception as error:
+            return None, f"the traced network fails for other samples ({type(error).__name__}: {error})"
+        return (program, "") if same else (None, "the traced network gives other results than its forward")
+
+    def check_rows(self) -> None:
+        """Raises TypeError where results for samples change when others are left out."""
+        bounds = [(cell, first, (first + last) // 2, last) for cell, first, last in self.entries.occupied]
+        halves = [half for cell, a, b, c in bounds for half in ((cell, a, b), (cell, b, c))]
+        whole = self.run(Trial.by_cells)
+        apart = self.run(lambda trial, given: run_cells(trial.call, given, halves, again=trial.again))
+        if not all(map(agree, apart.tensors, whole.tensors)):
+            name = type(self.call.module).__name__
+            raise TypeError(
+                f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when other "
+                "samples are left out: it mixes samples (attention or statistics over a batch)"
+            )
+
+
+def _same(found: Outcome, expected: Outcome) -> bool:
+    (a, ours), (b, theirs) = found, expected
+    alike = a.rows == b.rows and len(ours) == len(theirs)
+    return alike and all(map(agree, a.tensors, b.tensors)) and agree_gradients(ours, theirs)
+
+
+@torch.no_grad()
+def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Parameter:
+    """Entries for the cells of a trial, [3, ...], each some way off the router's own."""
+    with torch.inference_mode(False):
+        values = parameter.detach()[torch.arange(_CELLS, device=parameter.device) % parameter.shape[0]].clone()
+        if values.is_floating_point() and values.numel():
+            size = float(values.float().square().mean().sqrt()) or 0.1
+            noise = torch.randn(values.shape, generator=generator)
+            values += (0.2 * size * noise).to(values)
+        return nn.Parameter(values, requires_grad=parameter.requires_grad)
+
+
+def admitted(trial: Trial, fuse: bool) -> Choice:
+    """The fastest way that gives what the loop gives, or an error where that must be the fused one."""
+    for trial.again in (False, True):
+        try:
+            expected = trial.outcome(Trial.by_cells)
+            break
+        except Exception as error:  # perhaps its code runs again in the backward pass
+            why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
+    else:
+        return Choice("cell by cell", why)
+    if fuse:
+        program, why = trial.fused(expected)
+        if program is not None:
+            return Choice("fused", program=program)
+        trial.check_rows()
+        raise ValueError(
+            f"{_OP}: fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
+        )
+    choice = Choice("cell by cell", again=trial.again)
+    try:
+        if trial.agrees(Trial.grouped, expected):
+            piece = min(max(_PIECE * _TRIED // trial.widest, 1 << 10), 1 << 16)
+            return replace(choice, way="grouped", piece=piece, fusable=trial.fused(expected)[0] is not None)
+        choice.why = "its forward on the samples of all cells gives other results than on those of one cell"
+    except BackendUnavailable:
+        raise
+    except Ungroupable as error:
+        choice.why, choice.open = str(error), error.of_batch
+    except Exception as error:
+        choice.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
+    trial.check_rows()
+    return choice
+
+
+# Rays -----------------------------------------------------------------------------------------------------------------
+
+
+def flattened(call: Call) -> tuple[bool, ...]:
+    """For each tensor that a call with rays returns, whether the module itself makes [rays * samples, ...] of it.
+
+    A module is refused if samples of a ray meet in it, or if [n, 1, f] gives other results than [rays, samples, f].
     """
+    name, lead = type(call.module).__name__, call.layout.lead
+    for samples in (6, lead[-1]):  # a module may be made for a number of samples
+        few = (*[1] * (len(lead) - 2), min(lead[-2], 2), min(lead[-1], samples))
+        try:
+            whole, alone, other = _of_few(call, few)
+        except Exception:
+            continue
+        for a, b in zip(whole, other, strict=True):
+            if a.dim() > len(few) and a.shape[: len(few)] == few and not agree(b[..., 0, :], a[..., 0, :]):
+                raise TypeError(
+                    f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when "
+                    "others along its ray change: it mixes the samples of a ray"
+                )
+        if len(whole) != len(alone) or not all(agree(b.flatten(), a.flatten()) for a, b in zip(whole, alone)):
+            raise ValueError(
+                f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but {name} does not; "
+                "layout='flat' calls it with [n, f], for modules that squeeze or flatten their arguments"
+            )
+        return tuple(tuple(a.shape[: len(few)]) != few and a.shape[:1] == (math.prod(few),) for a in whole)
+    return ()
 
-    layers: MLP
 
-    def linears(self) -> list[nn.Linear]:
-        """The linear layers in the table's order."""
-        ...
+def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
+    """The tensors that the module's first cell returns for the first samples of the first rays.
 
-    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Turns the table's outputs [n, out] into what the field returns."""
-        ...
-
-
-def described_by_table(field: nn.Module) -> bool:
-    """Whether the table, the weights and ``activate`` of a field describe all that it computes.
-
-    They do not if a class has its own ``forward`` without its own ``linears`` and ``activate``, or if hooks or
-    parametrisations, such as weight normalisation, change inputs, outputs or weights of layers.
+    They are seen as rays, as the module would see them, and as rays with others behind the first sample of each.
     """
-    first = {}
-    for name in ("forward", "linears", "activate"):
-        first[name] = next((i for i, base in enumerate(type(field).__mro__) if name in vars(base)), 0)
-    if first["forward"] < max(first["linears"], first["activate"]) or "forward" in vars(field):
-        return False
-    return not any(
-        part._forward_hooks
-        or part._forward_pre_hooks
-        or part._backward_hooks
-        or part._backward_pre_hooks
-        or "parametrizations" in part._modules
-        for part in field.modules()
-    )
+    found, others = [], []
 
+    def first(tensor: Tensor, kind: str) -> Tensor:
+        found.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
+        others.append(found[-1].clone())
+        if kind != RAY and tensor.is_floating_point():
+            others[-1][(slice(None),) * (len(few) - 1) + (slice(1, None),)].mul_(0.7).add_(0.01)
+        return found[-1]
 
-def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The arguments for a field's own ``forward``: a direction for each sample, in the place of one for each ray."""
-    names = ("positions", "directions", "ray_index")
-    positions, directions, index = ((dict(zip(names, args)) | kwargs).get(name) for name in names)
-    if directions is None or index is None:
-        return args, kwargs
-    others = {name: value for name, value in kwargs.items() if name not in names}
-    return (positions, directions.index_select(0, index), None, *args[3:]), others
+    args, kwargs = call.changed(first)
+    small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
+    cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
+    with torch.no_grad(), NoRandomness(), in_place_of_parameters(call.module, cell):
+        return [tensors_of(small.run(rows)) for rows in (found, small.arranged(None), others)]

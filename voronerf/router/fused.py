@@ -1,362 +1,107 @@
-"""Networks of a fixed ``forward`` as one operation: a layer table, with the steps before and behind it.
+"""Networks as one operation: fields with a layer table, and any module whose ``forward`` is fixed.
 
-One call is traced, with a number of samples that no other size is a multiple of. Every function is put in its place on
-the way: before the first layer (encodings), among the layers (activations, and what moves columns), or behind them
-(activations of heads, dicts). Later calls run the layers as one operation, and do the steps before and behind again as
-they were, on rows in the original order. There, samples may meet parameters that all cells share: tables, planes.
+Such a module is traced once (:mod:`voronerf.router.trace`). Later calls run its layers as one operation, and do the
+steps before and behind them again as they were, on rows in the original order. There, samples may meet parameters that
+all cells share: tables, planes.
 
-Letters: n samples, k cells. A segment is a range of columns of a value from before the layers, or of a layer.
+Letters: n samples, k cells.
 """
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import itertools
-import math
-import threading
-import types
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
-from unittest import mock
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
-from voronerf.router.cells import cell_parameters, in_place_of_parameters, is_shared, owned_parameters
-from voronerf.router.grouped import METADATA, RANDOM, PerCell, for_all_cells, name_of, user_line, writes_in_place
-from voronerf.router.grouping import Grouping
-from voronerf.router.layout import Call, Results, map_tree, rebuild, tensors_of
+from voronerf.router.grouped import PerCell, for_all_cells
+from voronerf.router.grouping import Grouping, owned_parameters
+from voronerf.router.layout import Call, Results, map_tree, tensors_of
+from voronerf.router.trace import TABLE, Linear, Ref, Segment, Step, Trace, Unfusable
 
-ROWS = 37  # in a trace
-_PATCHES = threading.RLock()  # one thread at a time changes what torch calls for a custom function
-_BEFORE, _TABLE, _BEHIND = range(3)  # where a value comes from
-_ROW_CODE = 1 << 32  # more than there are columns
-_PLAIN = ("none", 1.0)
-_ACTIVATIONS: dict[str, set[Any]] = {
-    "relu": {F.relu, torch.relu, torch.relu_, torch.Tensor.relu, torch.Tensor.relu_, F.relu_},
-    "sigmoid": {torch.sigmoid, torch.Tensor.sigmoid, F.sigmoid, torch.sigmoid_, torch.Tensor.sigmoid_},
-    "sine": {torch.sin, torch.Tensor.sin, torch.sin_, torch.Tensor.sin_},
-    "softplus": {F.softplus},
-}
-_PRODUCTS = (torch.mul, torch.multiply, torch.Tensor.mul, torch.Tensor.__mul__, torch.Tensor.__rmul__)
-_MOVES = """
-    cat concat concatenate hstack dstack stack split chunk tensor_split unbind __getitem__ narrow select index_select
-    permute transpose swapaxes swapdims movedim moveaxis reshape view view_as reshape_as flatten unflatten unsqueeze
-    squeeze expand expand_as broadcast_to contiguous clone repeat tile flip roll
-"""
-_MOVERS = frozenset(
-    getattr(place, name) for place in (torch, torch.Tensor) for name in _MOVES.split() if hasattr(place, name)
-)
-"""What may move columns without changing them."""
+# Fields with a layer table --------------------------------------------------------------------------------------------
 
 
-class Unfusable(Exception):
-    """A module is not a network that a layer table describes; the message says where."""
+@runtime_checkable
+class LayeredField(Protocol):
+    """A field that describes its network by a layer table, like :class:`voronerf.fields.NeRF`. It runs fused.
 
+    Where the table has a hash grid, the field has a parameter ``features``, [e, f], as :class:`voronerf.HashGridField`.
 
-class _Ref(int):
-    """The number of a value, in the place of its tensor."""
-
-
-class _Rows(int):
-    """How many times a number is that of the samples, in its place."""
-
-
-@dataclass(eq=False)
-class _Step:
-    """One function of rows or of parameters.
-
-    Attributes:
-        function: Of PyTorch, or a custom ``autograd.Function``'s ``apply``.
-        given: Its args and kwargs, with what stands for tensors of rows, parameters, and their number.
-        values: Numbers of its results, in order.
-        inplace: Whether it writes to its first argument, which then goes on as the first of ``values``.
-        line: Where it stands in the module.
+    Examples:
+        >>> from voronerf import NeRF
+        >>> from voronerf.router import LayeredField
+        >>> isinstance(NeRF(width=16, depth=2), LayeredField)
+        True
     """
 
-    function: Any
-    given: Any
-    values: list[int]
-    inplace: bool
-    line: str
+    layers: MLP
 
-    def leaves(self) -> list[Any]:
-        """All entries of its arguments."""
-        found: list[Any] = []
+    def linears(self) -> list[nn.Linear]:
+        """The linear layers in the table's order."""
+        ...
 
-        def keep(_: str, leaf: Any, nested: bool) -> Any:
-            found.append(leaf)
-            return leaf
-
-        map_tree(self.given, keep)
-        return found
-
-    def refs(self) -> list[_Ref]:
-        """The values among its arguments."""
-        return [leaf for leaf in self.leaves() if isinstance(leaf, _Ref)]
-
-    def run(self, values: dict[int, Any], n: int) -> None:
-        """Does the step again, for n rows."""
-
-        def fill(_: str, leaf: Any, nested: bool) -> Any:
-            return values[leaf] if isinstance(leaf, _Ref) else leaf * n if isinstance(leaf, _Rows) else leaf
-
-        args, kwargs = map_tree(self.given, fill)
-        result = self.function(*args, **kwargs)
-        values.update(zip(self.values, [args[0]] if self.inplace else tensors_of(result), strict=True))
-
-    def activation(self) -> str | None:
-        """The name that a layer table has for its function, or None."""
-        args, kwargs = self.given
-        rest = (args[1:], {key: value for key, value in kwargs.items() if key != "inplace"})
-        name = next((name for name, functions in _ACTIVATIONS.items() if self.function in functions), None)
-        plain = rest in (((), {}), ((1, 20), {}), ((), {"beta": 1}))
-        return name if name != "softplus" or plain else None
+    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Turns the table's outputs [n, out] into what the field returns."""
+        ...
 
 
-class _Segment(NamedTuple):
-    """Columns ``start`` to ``stop`` of a value, or of layer ``layer`` after an activation of so many times its sums."""
+def described_by_table(field: nn.Module) -> bool:
+    """Whether the table, the weights and ``activate`` of a field describe all that it computes.
 
-    value: int
-    layer: int
-    activation: tuple[str, float]
-    start: int
-    stop: int
-
-
-@dataclass(eq=False)
-class _Linear:
-    """A linear layer of the trace: the values of its parameters, and where its inputs come from."""
-
-    weight: int
-    bias: int | None
-    inputs: tuple[_Segment, ...]
-    width: int
-
-
-class _Trace(TorchFunctionMode):
-    """Takes down the functions that a copy of the routed module calls with its first cell's parameters.
-
-    Attributes:
-        sizes: Of every value of rows, rows for each sample and the dimensions behind, 0 rows where their dimension is
-            not the first; None for one of parameters.
-        stages: Where every value comes from.
-        parameters: Values that are parameters, with their place among ``owned_parameters``.
-        shared: Values that are parameters of all cells in common, or made of such alone.
-        outputs: For each tensor of the result what stands for it, or the tensor where it depends on no sample.
+    They do not if a class has its own ``forward`` without its own ``linears`` and ``activate``, or if hooks or
+    parametrisations, such as weight normalisation, change inputs, outputs or weights of layers.
     """
-
-    def __init__(self, original: nn.Module, call: Call, given: list[Tensor]) -> None:
-        super().__init__()
-        module = call.module
-        self.sizes: list[tuple[int, ...] | None] = []
-        self.stages: list[int] = []
-        self.parameters: dict[int, int] = {}
-        self.shared: set[int] = set()
-        self.before: list[_Step] = []
-        self.behind: list[_Step] = []
-        self.weights: list[_Step] = []  # of parameters of cells alone
-        self.layers: list[_Linear] = []
-        single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for p in cell_parameters(module)}
-        owned = owned_parameters(module)
-        self._places = {id(single.get(id(parameter), parameter)): i for i, (_, _, parameter) in enumerate(owned)}
-        self._in_common = {i for i, (owner, name, _) in enumerate(owned) if is_shared(owner, name)}
-        self._buffers = {id(own): other for own, other in zip(module.buffers(), original.buffers(), strict=True)}
-        self._grad, self._running = torch.is_grad_enabled(), False
-        self._known: dict[int, tuple[Tensor, int]] = {}
-        self._codes: dict[int, Tensor] = {}  # like each value, with the number of its column in each entry
-        self._columns: list[tuple[int, int, tuple[str, float], int]] = []  # as in a segment
-        self._scaled: dict[int, tuple[int, float]] = {}
-        for tensor in given:
-            self._new(tensor)
-        with in_place_of_parameters(module, single), _custom_functions(self), self:
-            result = call.run(given)
-        self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
-        self.outputs = [self._ref(tensor) for tensor in tensors_of(result)]
-
-    def _new(self, tensor: Tensor, rows: bool = True) -> int:
-        """Numbers a value."""
-        self._known[id(tensor)] = (tensor, len(self.sizes))  # kept, so that no other tensor gets its id
-        if rows and not any(size and size % ROWS == 0 for size in tensor.shape):
-            raise Unfusable(
-                f"a tensor of shape {list(tensor.shape)} has no row for each of {ROWS} samples{user_line()}"
-            )
-        first = rows and tensor.shape[0] % ROWS == 0
-        self.sizes.append((tensor.shape[0] // ROWS if first else 0, *tensor.shape[1:]) if rows else None)
-        self.stages.append(_BEFORE)
-        return len(self.sizes) - 1
-
-    def _ref(self, value: Any) -> Any:
-        """What stands for an argument in a step."""
-        if isinstance(value, int) and not isinstance(value, bool) and value and value % ROWS == 0:
-            return _Rows(value // ROWS)
-        if not isinstance(value, Tensor):
-            return value
-        if id(value) in self._places and id(value) not in self._known:
-            number, place = self._new(value, rows=False), self._places[id(value)]
-            self.parameters[number] = place
-            self.shared |= {number} if place in self._in_common else set()
-        if id(value) in self._known:
-            return _Ref(self._known[id(value)][1])
-        if id(value) in self._buffers:
-            return self._buffers[id(value)]
-        if value.requires_grad or value.shape[:1] == (ROWS,):
-            raise Unfusable(f"a tensor comes from what is no PyTorch function{user_line()}")
-        return value
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return self.follow(func, args, kwargs or {})
-
-    def follow(self, func: Any, args: Any, kwargs: Any) -> Any:
-        """Calls a function and takes it down."""
-        if self._running or func in METADATA:
-            return func(*args, **kwargs)
-        given = map_tree((args, kwargs), lambda _, leaf, nested: self._ref(leaf))
-        step = _Step(func, given, [], writes_in_place(func) or bool(kwargs.get("inplace")), user_line())
-        operands = tensors_of((args, kwargs))
-        self._running = True  # what it calls itself is part of the step
-        try:
-            result = func(*args, **kwargs)
-        finally:
-            self._running = False
-        leaves = step.leaves()
-        if not any(isinstance(leaf, (_Ref, _Rows)) for leaf in leaves):
-            return result
-        idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
-        found = operands[:1] if step.inplace else tensors_of(result)
-        for refused, reason in (
-            (torch.is_grad_enabled() != self._grad, "the gradient mode changes"),
-            (func in RANDOM and not idle, "{} draws random numbers"),
-            (func is torch.autograd.grad, "gradients are taken"),
-            (not found and result is not None, "{} reads values"),
-        ):
-            if refused:
-                raise Unfusable(f"{reason.format(name_of(func))}{step.line}")
-        if not found or (not step.inplace and any(result is tensor for tensor in operands)):
-            return result
-        rows = any(isinstance(x, _Rows) or (isinstance(x, _Ref) and self.sizes[x] is not None) for x in leaves)
-        step.values = [self._new(tensor, rows) for tensor in found]
-        self._place(step, rows)
-        return result
-
-    def _place(self, step: _Step, rows: bool) -> None:
-        refs = step.refs()
-        stage = max((self.stages[ref] for ref in refs), default=_BEFORE)
-        parameters = {ref for ref in refs if self.sizes[ref] is None}
-        in_common = parameters <= self.shared
-        # A layer that all cells share, on what is no layer's, is part of an encoding.
-        if rows and step.function is F.linear and parameters and not (in_common and stage != _TABLE):
-            self._add_layer(step)
-        elif not in_common:
-            if rows:
-                raise Unfusable(f"parameters meet samples in {name_of(step.function)}{step.line}")
-            self.weights.append(step)
-        elif stage == _BEFORE:
-            self.before.append(step)
-            self.shared.update(() if rows else step.values)
-        elif parameters or not (self._activate(step, refs) or (stage == _TABLE and self._move(step, refs))):
-            self.stages[step.values[0] : step.values[-1] + 1] = [_BEHIND] * len(step.values)
-            self.behind.append(step)
-            factor = next((item for item in step.given[0] if type(item) in (int, float)), None)
-            if step.function in _PRODUCTS and factor is not None and stage == _TABLE:
-                self._scaled[step.values[0]] = (refs[0], factor)
-
-    def _add_layer(self, step: _Step) -> None:
-        args, kwargs = step.given
-        given = {"bias": None, **dict(zip(("input", "weight", "bias"), args)), **kwargs}
-        source, weight, bias = (given[name] for name in ("input", "weight", "bias"))
-        own = self.sizes[source] if isinstance(source, _Ref) else None
-        if own is None or not isinstance(weight, _Ref) or self.sizes[weight] is not None:
-            raise Unfusable(f"a layer has weights or inputs that are neither parameters nor samples{step.line}")
-        if self.stages[source] == _BEHIND:
-            earlier = next(s for s in self.behind if source in s.values)
-            name = f"{name_of(earlier.function)}{earlier.line}"
-            raise Unfusable(f"a layer reads the result of {name}, which is no activation or arrangement of a table")
-        if math.prod(own[:-1]) != 1:
-            raise Unfusable(f"a layer runs on other than one row for each sample{step.line}")
-        out = self.sizes[step.values[0]]
-        assert out is not None
-        self.layers.append(_Linear(weight, bias, self.segments(source), out[-1]))
-        self._name(step.values[0], -1, len(self.layers) - 1, _PLAIN, 0)
-
-    def _activate(self, step: _Step, refs: list[_Ref]) -> bool:
-        """Has the columns of one layer go through an activation; ``sin(factor * layer)`` is one."""
-        name = step.activation()
-        if name is None or len(refs) != 1:
-            return False
-        source, factor = self._scaled.get(refs[0], (refs[0], 1.0)) if name == "sine" else (refs[0], 1.0)
-        segments = self.segments(source) if self.stages[source] == _TABLE else ()
-        if len(segments) != 1 or segments[0].activation != _PLAIN or segments[0].layer < 0:
-            return False
-        self._name(step.values[0], -1, segments[0].layer, (name, factor), segments[0].start)
-        return True
-
-    def _move(self, step: _Step, refs: list[_Ref]) -> bool:
-        """Runs a function that may only move columns on the numbers of the columns, and reads where they went."""
-        if step.function not in _MOVERS or step.inplace:
-            return False
-        moved: dict[int, Any] = {ref: self._coded(ref) for ref in refs}
-        try:
-            step.run(moved, ROWS)
-        except Exception:
-            return False
-        for value in step.values:
-            m, *rest = self.sizes[value] or ()
-            codes = moved[value]
-            if codes.shape != (ROWS * m, *rest) or codes.dtype != torch.int64:
-                return False
-            by_row = codes.reshape(ROWS, -1)
-            if not torch.equal(by_row, by_row[:1] + torch.arange(ROWS)[:, None] * _ROW_CODE):
-                return False
-        for value in step.values:
-            self._codes[value], self.stages[value] = moved[value], _TABLE
-        return True
-
-    def _name(self, value: int, source: int, layer: int, activation: tuple[str, float], start: int) -> None:
-        """Numbers the columns of a value anew."""
-        m, *rest = self.sizes[value] or ()
-        width, first = m * math.prod(rest), len(self._columns)
-        self._columns += [(source, layer, activation, start + i) for i in range(width)]
-        codes = torch.arange(first, first + width) + torch.arange(ROWS)[:, None] * _ROW_CODE
-        self._codes[value] = codes.reshape(ROWS * m, *rest)
-        self.stages[value] = _TABLE if layer >= 0 else _BEFORE
-
-    def _coded(self, value: int) -> Tensor:
-        if value not in self._codes:
-            self._name(value, value, -1, _PLAIN, 0)
-        return self._codes[value]
-
-    def segments(self, value: int) -> tuple[_Segment, ...]:
-        """The columns of a value, in as few segments as possible."""
-        m = (self.sizes[value] or (1,))[0]
-        columns = [self._columns[code] for code in self._coded(value)[:m].flatten().tolist()]
-        found = []
-        for _, group in itertools.groupby(enumerate(columns), lambda pair: (pair[1][:3], pair[1][3] - pair[0])):
-            run = [column for _, column in group]
-            source, layer, activation, start = run[0]
-            found.append(_Segment(source, layer, activation, start, start + len(run)))
-        return tuple(found)
+    first = {}
+    for name in ("forward", "linears", "activate"):
+        first[name] = next((i for i, base in enumerate(type(field).__mro__) if name in vars(base)), 0)
+    if first["forward"] < max(first["linears"], first["activate"]) or "forward" in vars(field):
+        return False
+    return not any(
+        part._forward_hooks
+        or part._forward_pre_hooks
+        or part._backward_hooks
+        or part._backward_pre_hooks
+        or "parametrizations" in part._modules
+        for part in field.modules()
+    )
 
 
-@contextlib.contextmanager
-def _custom_functions(trace: _Trace) -> Iterator[None]:
-    """Shows a trace the custom functions of this thread, which no mode sees."""
-    here = threading.get_ident()
-    with _PATCHES:
-        own = torch.autograd.Function.apply.__func__  # type: ignore[attr-defined]
+def run_table(
+    field: LayeredField,
+    k: int,
+    backend: str,
+    positions: Tensor,
+    directions: Tensor | None,
+    ray_index: Tensor | None,
+    where: dict[str, Any],
+) -> Tensor:
+    """What the networks of a field give before its ``activate``: [n, out]; ``where`` tells ``routed_mlp`` the cells."""
+    linears = field.linears()
+    # A parameter that all cells share has no dimension of cells; the operation takes one for each.
+    weights = [w if w.dim() == 3 else w.expand(k, -1, -1) for w in [layer.weight for layer in linears]]
+    biases = [b if b is None or b.dim() == 2 else b.expand(k, -1) for b in [layer.bias for layer in linears]]
+    hashed = {} if field.layers.grid is None else {"features": field.features}  # type: ignore[attr-defined]
+    given = {"directions": directions, "direction_index": ray_index, "backend": backend, **hashed, **where}
+    return routed_mlp(positions, weights, biases, layers=field.layers, **given)[0]
 
-        def apply(cls: Any, *args: Any, **kwargs: Any) -> Any:
-            function = types.MethodType(own, cls)
-            return function(*args, **kwargs) if threading.get_ident() != here else trace.follow(function, args, kwargs)
 
-        with mock.patch.object(torch.autograd.Function, "apply", classmethod(apply)):
-            yield
+def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The arguments for a field's own ``forward``: a direction for each sample, in the place of one for each ray."""
+    names = ("positions", "directions", "ray_index")
+    positions, directions, index = ((dict(zip(names, args)) | kwargs).get(name) for name in names)
+    if directions is None or index is None:
+        return args, kwargs
+    others = {name: value for name, value in kwargs.items() if name not in names}
+    return (positions, directions.index_select(0, index), None, *args[3:]), others
+
+
+# Modules with a fixed forward -----------------------------------------------------------------------------------------
 
 
 class Program:
@@ -372,7 +117,7 @@ class Program:
     """
 
     def __init__(self, original: nn.Module, call: Call, given: list[Tensor]) -> None:
-        trace = _Trace(original, call, given)
+        trace = Trace(original, call, given)
         self._result, self._outputs = trace.result, trace.outputs
         self._before, self._weights = trace.before, trace.weights
         self._sizes, self._parameters, self._shared = trace.sizes, trace.parameters, trace.shared
@@ -380,18 +125,18 @@ class Program:
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(original)]
         made = {value for step in trace.weights for value in step.values}
         of_layers = {value for layer in trace.layers for value in (layer.weight, layer.bias) if value is not None}
-        self._used = of_layers.union(*[step.refs() for step in trace.weights]) - made
-        needed = [item for item in self._outputs if isinstance(item, _Ref)]
+        self._used = of_layers.union(*[step.refs for step in trace.weights]) - made
+        needed = [item for item in self._outputs if isinstance(item, Ref)]
         if not trace.layers:
             raise Unfusable("there is no linear layer")
         if any(trace.sizes[value] is None for value in needed):
             raise Unfusable("a result is made of parameters alone")
-        self._behind: list[_Step] = []
+        self._behind: list[Step] = []
         for step in reversed(trace.behind):
             if step.inplace or any(value in needed for value in step.values):
                 self._behind.insert(0, step)
-                needed += step.refs()
-        self._needed = {v: trace.segments(v) for v in dict.fromkeys(needed) if trace.stages[v] == _TABLE}
+                needed += step.refs
+        self._needed = {v: trace.segments(v) for v in dict.fromkeys(needed) if trace.stages[v] == TABLE}
         self._make_table(trace.layers)
 
     def with_parameters_of(self, module: nn.Module) -> Program:
@@ -400,11 +145,11 @@ class Program:
         copied._owned = [(owner, name) for owner, name, _ in owned_parameters(module)]
         return copied
 
-    def _make_table(self, layers: list[_Linear]) -> None:
+    def _make_table(self, layers: list[Linear]) -> None:
         uses = [s for segments in (*[li.inputs for li in layers], *self._needed.values()) for s in segments]
         self._pieces = [_cut([s for s in uses if s.layer == i]) for i in range(len(layers))]
-        self._blocks: list[tuple[_Segment, ...]] = []  # what layers read of the values from before
-        self._parts: list[tuple[_Linear, int, int, float]] = []
+        self._blocks: list[tuple[Segment, ...]] = []  # what layers read of the values from before
+        self._parts: list[tuple[Linear, int, int, float]] = []
         table: list[Layer] = []
         numbers: dict[tuple[int, int], int] = {}
         for index, linear in enumerate(layers):
@@ -436,7 +181,7 @@ class Program:
             raise Unfusable("nothing that is returned comes from a layer")
         self._table = MLP(tuple(table), tuple(outputs))
 
-    def _pieces_of(self, segment: _Segment) -> list[tuple[int, int]]:
+    def _pieces_of(self, segment: Segment) -> list[tuple[int, int]]:
         """The pieces of its layer that a segment is made of."""
         pieces = self._pieces[segment.layer] if segment.layer >= 0 else ()
         return [piece for piece in pieces if segment.start <= piece[0] < segment.stop]
@@ -475,18 +220,18 @@ class Program:
             values[value] = _joined(ranges).reshape(n * m, *sizes)
         for step in self._behind:
             step.run(values, n)
-        rows = [isinstance(item, _Ref) for item in self._outputs]
-        return Results(self._result, [values[x] if isinstance(x, _Ref) else x for x in self._outputs], rows)
+        rows = [isinstance(item, Ref) for item in self._outputs]
+        return Results(self._result, [values[x] if isinstance(x, Ref) else x for x in self._outputs], rows)
 
     def _stacked(self, values: dict[int, Any], k: int) -> tuple[list[Tensor], list[Tensor | None]]:
         """Weights [k, o, i] and biases [k, o] of the table, in its order."""
         known = {v: values[v].expand(k, *values[v].shape) if v in self._shared else values[v] for v in self._used}
         for step in self._weights:
-            args, kwargs = map_tree(step.given, lambda _, v, nested: PerCell(known[v]) if isinstance(v, _Ref) else v)
+            args, kwargs = map_tree(step.given, lambda _, v, nested: PerCell(known[v]) if isinstance(v, Ref) else v)
             results = tensors_of(for_all_cells(step.function, args, kwargs))
             known.update(zip(step.values, [r.stacked for r in results if isinstance(r, PerCell)], strict=True))
 
-        def part(value: int, linear: _Linear, start: int, stop: int, factor: float) -> Tensor:
+        def part(value: int, linear: Linear, start: int, stop: int, factor: float) -> Tensor:
             tensor: Tensor = known[value]
             tensor = tensor if stop - start == linear.width else tensor[:, start:stop]
             return tensor if factor == 1 else tensor * factor
@@ -495,7 +240,7 @@ class Program:
         return weights, [None if own[0].bias is None else part(own[0].bias, *own) for own in self._parts]
 
 
-def _cut(uses: list[_Segment]) -> dict[tuple[int, int], tuple[str, float]]:
+def _cut(uses: list[Segment]) -> dict[tuple[int, int], tuple[str, float]]:
     """The pieces that a layer falls into, so that every use is of whole pieces: activations by (start, stop)."""
     pieces = {}
     for start, stop in itertools.pairwise(sorted({edge for use in uses for edge in (use.start, use.stop)})):

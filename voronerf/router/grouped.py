@@ -15,14 +15,15 @@ import inspect
 import linecache
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.cells import cell_parameters, in_place_of_parameters
-from voronerf.router.grouping import Grouping
+from voronerf.router.cells import clone_module
+from voronerf.router.grouping import Grouping, cell_parameters, cells_of, in_place_of_parameters
 from voronerf.router.layout import Call, Results, map_tensors, split_rows, tensors_of
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
@@ -65,6 +66,18 @@ RANDOM = _find(
 """What draws random numbers."""
 CREATE = _find("zeros ones full empty rand randn randint", torch)
 """New tensors of given sizes; with n of them in front they are rows."""
+
+
+class NoRandomness(TorchFunctionMode):
+    """Random numbers are 0 and dropout does nothing, so that two calls can be compared."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func not in RANDOM:
+            return func(*args, **kwargs)
+        if "dropout" in getattr(func, "__name__", ""):
+            return args[0] if args else kwargs["input"]
+        return func(*args, **kwargs).zero_()
 
 
 def register(function: Any, rule: Rule) -> None:
@@ -349,3 +362,23 @@ def run_grouped(call: Call, given: list[Tensor], grouping: Grouping, piece: int)
             raise Ungroupable("a result is made of parameters alone")
         widest = max(widest, run.widest)
     return Results.joined(values, [part.n for part in parts], call.module), widest
+
+
+def run_cells(call: Call, given: list[Tensor], bounds: list[tuple[int, int, int]], *, again: bool = False) -> Results:
+    """A module's results for sorted rows, one call for each (cell, first row, row behind the last).
+
+    Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a copy of the
+    module, which keeps the cell's parameters.
+    """
+    module, counts = call.module, [last - first for _, first, last in bounds]
+    pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
+    values = []
+    for (cell, _, _), part in zip(bounds, split_rows(given, counts), strict=True):
+        own: dict[int, Any] = {key: piece[cell] for key, piece in pieces.items()}
+        if again:
+            kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
+            values.append(replace(call, module=clone_module(module, kept | own)).run(part))
+            continue
+        with in_place_of_parameters(module, own):
+            values.append(call.run(part))
+    return Results.joined(values, counts, module)

@@ -1,4 +1,4 @@
-"""Samples sorted by cell: the order, its inverse, and what running a module on the sorted rows needs to know.
+"""Samples and parameters by cell: sorted rows, stacked tensors, and what stands in for them while a module runs.
 
 n samples, k cells, e entries of a table. A sorted tensor may have m entries a sample: its first dimension is then
 n * m, sample after sample.
@@ -6,15 +6,21 @@ n * m, sample after sample.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from voronerf import ops
+from voronerf.backends import BackendUnavailable
+
+_LARGE = 1 << 22  # bytes
+SHARED = "_voronerf_shared"
+"""Where a part of a routed module keeps the names of its parameters that all cells share."""
 
 
 class Grouping:
@@ -194,3 +200,92 @@ class Assignments:
         """Remembers an assignment."""
         self._key, self._methods, self._grouping = key, {method}, grouping
         self._positions = positions.detach().clone()
+
+
+# Parameters -----------------------------------------------------------------------------------------------------------
+
+
+def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parameter]]:
+    """(owner, name, parameter) of every parameter of a module tree; one that is used twice comes twice."""
+    return [
+        (owner, name, parameter)
+        for owner in module.modules()
+        for name, parameter in list(owner._parameters.items())
+        if parameter is not None
+    ]
+
+
+def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
+    """The parameters that are stacked, [k, ...]; not those that all cells share."""
+    owned = [parameter for owner, name, parameter in owned_parameters(module) if not is_shared(owner, name)]
+    return list({id(parameter): parameter for parameter in owned}.values())
+
+
+def is_shared(owner: nn.Module, name: str) -> bool:
+    """Whether a parameter is one for all cells."""
+    return name in vars(owner).get(SHARED, ())
+
+
+@contextlib.contextmanager
+def in_place_of_parameters(module: nn.Module, values: Mapping[int, Any]) -> Iterator[None]:
+    """Lets a module find other tensors where its parameters are; ``values`` by the id of the parameter."""
+    owned = [one for one in owned_parameters(module) if id(one[2]) in values]
+    # Hooks such as that of torch.nn.utils.weight_norm leave tensors made of parameters behind.
+    attributes = [(part, dict(vars(part))) for part in module.modules() if part._forward_pre_hooks]
+    for owner, name, parameter in owned:
+        owner._parameters[name] = values[id(parameter)]
+    try:
+        yield
+    finally:
+        for owner, name, parameter in owned:
+            owner._parameters[name] = parameter
+        for owner, before in attributes:
+            for name, value in list(vars(owner).items()):
+                if isinstance(value, Tensor) and value is not before.get(name):
+                    vars(owner)[name] = before.get(name)
+
+
+@functools.cache
+def _on_huge_pages() -> Callable[[Tensor], None]:
+    try:
+        from voronerf.native.custom_op import on_huge_pages
+    except BackendUnavailable:
+        return lambda result: None
+    return on_huge_pages
+
+
+def empty_like(tensor: Tensor) -> Tensor:
+    """``torch.empty_like``, on huge pages where it is large: page faults cost more than what is written there."""
+    result = torch.empty_like(tensor)
+    _on_huge_pages()(result)
+    return result
+
+
+def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
+    """[k, ...] -> the tensor of each cell."""
+    large = stacked.nbytes >= _LARGE and stacked.requires_grad and torch.is_grad_enabled()
+    found: tuple[Tensor, ...] = _Cells.apply(stacked) if large else stacked.unbind(0)
+    return found
+
+
+class _Cells(torch.autograd.Function):
+    """The tensors of cells, whose gradients are put together in memory of :func:`empty_like`."""
+
+    @staticmethod
+    def forward(stacked: Tensor) -> tuple[Tensor, ...]:
+        return stacked.unbind(0)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Any) -> None:
+        ctx.save_for_backward(*inputs)
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> Tensor:
+        (stacked,) = ctx.saved_tensors
+        if torch.is_grad_enabled():  # these are differentiated again
+            return torch.stack([torch.zeros_like(stacked[0]) if own is None else own for own in gradients])
+        result = empty_like(stacked)
+        for own, gradient in zip(result.unbind(0), gradients, strict=True):
+            own.zero_() if gradient is None else own.copy_(gradient)
+        return result

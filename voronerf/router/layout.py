@@ -364,11 +364,10 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Te
     return positions
 
 
-def argument_names(function: Callable[..., Any], count: int) -> list[str]:
-    """Names of the first positional arguments of a function; their numbers where it does not name them."""
+def argument_names(function: Callable[..., Any]) -> list[str]:
+    """Names of the positional arguments of a function."""
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    names = [parameter.name for parameter in inspect.signature(function).parameters.values() if parameter.kind in kinds]
-    return [*names[:count], *map(str, range(len(names), count))]
+    return [parameter.name for parameter in inspect.signature(function).parameters.values() if parameter.kind in kinds]
 
 
 def accepted_names(functions: Iterable[Callable[..., Any]]) -> list[str] | None:

@@ -13,19 +13,13 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor, nn
 
-from voronerf import ops
 from voronerf.backends import BACKENDS
 from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.blending import Mixture
 from voronerf.router.cells import CellModules, check_module, fill_cell
-from voronerf.router.evaluate import (
-    Choices,
-    LayeredField,
-    described_by_table,
-    each_direction,
-    evaluate,
-)
+from voronerf.router.evaluate import Choices, evaluate
+from voronerf.router.fused import LayeredField, described_by_table, each_direction, run_table
 from voronerf.router.grouping import Assignments, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 
@@ -128,22 +122,22 @@ class VoronoiRouter(CellModules):
     ) -> None:
         module = getattr(module, "_orig_mod", module)  # of torch.compile, which would not see the parameters of cells
         check_module(module)
-        given = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
-        _check_options(module, coords, given, layout, assignment, temperature, backend, blend)
+        options = {"coords": coords, "assignment": assignment, "temperature": temperature, "layout": layout}
+        lists = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
+        _check_options(module, lists, **options, backend=backend, blend=blend)
         own = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
         super().__init__(module, own, share)
         self.assignment, self.temperature = assignment, temperature
         self.backend, self.blend, self.coords = backend, blend, coords
         self.per_ray = None if per_ray is None else tuple(per_ray)
-        self.shared = tuple(shared)
-        self.methods = tuple(methods)
+        self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
         self._own_coords = frozenset(
             name for name in ("forward", *methods) if "coords" in (accepted_names([getattr(module, name)]) or ())
         )
         self.fuse, self.layout = fuse, layout
         self._choices, self._assignments = Choices(), Assignments()
-        self._argument_names: dict[tuple[str, int], list[str]] = {}
+        self._argument_names = {name: argument_names(getattr(self.module, name)) for name in ("forward", *methods)}
         self._by_table = self._layered and described_by_table(self.module)
 
     @classmethod
@@ -160,15 +154,12 @@ class VoronoiRouter(CellModules):
         Raises:
             ValueError: Other than k modules, or modules that differ in parameters' names or shapes or in buffers.
         """
-        modules = list(modules)
+        modules, rule = list(modules), "VoronoiRouter.from_modules: modules must hold a module for each"
         if not modules:
-            raise ValueError("VoronoiRouter.from_modules: modules must hold a module for each cell, got none")
+            raise ValueError(f"{rule} cell, got none")
         router = cls(modules[0], diagram, **options)
         if len(modules) != router.num_cells:
-            raise ValueError(
-                f"VoronoiRouter.from_modules: modules must hold a module for each of {router.num_cells} cells, got "
-                f"{len(modules)}"
-            )
+            raise ValueError(f"{rule} of {router.num_cells} cells, got {len(modules)}")
         for index, module in enumerate(modules):
             fill_cell(router.module, index, module, f"VoronoiRouter.from_modules: modules[{index}]")
         return router
@@ -228,7 +219,7 @@ class VoronoiRouter(CellModules):
         return found
 
     def _coords_of_table(self, coords: Tensor | None, args: Any, kwargs: Any) -> Tensor | None:
-        """The positions that decide the cells; None for those of the samples themselves."""
+        """The positions that decide the cells; None for those of the samples."""
         rule = self.coords if coords is None else coords
         return None if rule is None or isinstance(rule, str) else find_positions(rule, args, kwargs)
 
@@ -240,21 +231,15 @@ class VoronoiRouter(CellModules):
         directions: Tensor | None = None,
         ray_index: Tensor | None = None,
     ) -> Any:
-        field, table, k = self.field, self.field.layers, self.num_cells
+        field, table = self.field, self.field.layers
         features = 6 if table.integrated else 3
         if positions.ndim != 2 or positions.shape[1] != features:
             raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
         if not table.uses_directions:
             directions = ray_index = None
-        linears = field.linears()
-        # A parameter that all cells share has no dimension of cells; the operation takes one for each.
-        weights = [w if w.dim() == 3 else w.expand(k, -1, -1) for w in [layer.weight for layer in linears]]
-        biases = [b if b is None or b.dim() == 2 else b.expand(k, -1) for b in [layer.bias for layer in linears]]
-        hashed = {} if table.grid is None else {"features": field.features}  # type: ignore[attr-defined]
 
-        def run(x: Tensor, d: Tensor | None, index: Tensor | None, cells: dict[str, Any]) -> Any:
-            given = {"directions": d, "direction_index": index, "backend": self.backend, **hashed, **cells}
-            outputs = ops.routed_mlp(x, weights, biases, layers=table, **given)[0]
+        def run(*samples: Any) -> Any:
+            outputs = run_table(field, self.num_cells, self.backend, *samples)
             return outputs if raw else field.activate(outputs)
 
         own = run(positions, directions, ray_index, self._where(positions, coords))
@@ -306,10 +291,8 @@ class VoronoiRouter(CellModules):
     @not_compiled
     def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """One call of a method of the module. ``torch.compile`` leaves it as it is and goes on behind it."""
-        names = self._argument_names.get((method, len(args)))
-        if names is None:
-            names = argument_names(getattr(self.module, method), len(args))
-            self._argument_names[method, len(args)] = names
+        known = self._argument_names[method]
+        names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
         rule = coords if coords is not None else self.coords
         if rule is None and self._layered:
             rule = "first3"
@@ -353,10 +336,7 @@ class VoronoiRouter(CellModules):
         return grouping
 
     def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
-        """What tells ``routed_mlp`` the cells: the diagram's tables, or the cells themselves.
-
-        They are given where they are drawn, and for many centres, which the diagram looks up faster than in turn.
-        """
+        """What tells ``routed_mlp`` the cells: themselves if drawn or of many centres, or the diagram's tables."""
         diagram = self.diagram
         if self.num_cells == 1:
             return {}
@@ -383,28 +363,23 @@ class VoronoiRouter(CellModules):
         return f"num_cells={self.num_cells}, depth={self.diagram.depth}, assignment={self.assignment!r}"
 
 
-def _check_options(
-    module: nn.Module,
-    coords: Any,
-    lists: dict[str, Any],
-    layout: str,
-    assignment: str,
-    temperature: float,
-    backend: str,
-    blend: float,
-) -> None:
+def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> None:
     """Raises ValueError or TypeError for an option that is wrong; ``lists`` are per_ray and the like."""
-    where = coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords)
-    for name, value, fits, rule in (
-        ("assignment", assignment, assignment in ("nearest", "stochastic"), "'nearest' or 'stochastic'"),
-        ("temperature", temperature, temperature > 0, "positive"),
-        ("blend", blend, 0 <= blend < float("inf"), "finite and at least 0"),
-        ("layout", layout, layout in ("rays", "flat"), "'rays' or 'flat'"),
-        ("backend", backend, backend in ("auto", *BACKENDS), f"auto, {', '.join(BACKENDS)}"),
-        ("coords", coords, where, "'first3', a slice or a function"),
-    ):
+    coords = options["coords"]
+    rules = {
+        "assignment": (options["assignment"] in ("nearest", "stochastic"), "'nearest' or 'stochastic'"),
+        "temperature": (options["temperature"] > 0, "positive"),
+        "blend": (0 <= options["blend"] < float("inf"), "finite and at least 0"),
+        "layout": (options["layout"] in ("rays", "flat"), "'rays' or 'flat'"),
+        "backend": (options["backend"] in ("auto", *BACKENDS), f"auto, {', '.join(BACKENDS)}"),
+        "coords": (
+            coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords),
+            "'first3', a slice or a function",
+        ),
+    }
+    for name, (fits, rule) in rules.items():
         if not fits:
-            raise ValueError(f"VoronoiRouter: {name} must be {rule}, got {value!r}")
+            raise ValueError(f"VoronoiRouter: {name} must be {rule}, got {options[name]!r}")
     for name, value in lists.items():
         if isinstance(value, (str, int)):
             raise TypeError(f"VoronoiRouter: {name} must be a list, got {value!r}")

@@ -17,8 +17,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops import grouped_linear
-from voronerf.router.cells import cells_of, empty_like
 from voronerf.router.grouped import GroupedRun, PerCell, register, writes_in_place
+from voronerf.router.grouping import cells_of, empty_like
 from voronerf.router.layout import map_tensors, tensors_of
 
 _ELEMENTWISE = """
