@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -29,6 +30,20 @@ def test_a_missing_torch_is_one_line(tmp_path) -> None:
         run = subprocess.run([sys.executable, "-c", without.format(program)], capture_output=True, text=True)
         assert run.returncode == 1 and run.stderr.endswith(text) and run.stderr.count("Traceback") == ("I" in text[:1])
         assert "During handling" not in run.stderr
+
+
+def test_threads_of_the_command_sleep_while_they_wait() -> None:
+    """A library leaves that to its program, and the command to its user."""
+    code = "import os, sys; sys.modules['torch'] = None; sys.argv[0] = {!r}\ntry: import voronerf\n"
+    code += "except BaseException: print(os.environ.get('OMP_WAIT_POLICY'))"
+    for program, given, found in (
+        ("/bin/voronerf", {}, "passive"),
+        ("/bin/voronerf", {"OMP_WAIT_POLICY": "active"}, "active"),
+        ("notebook", {}, "None"),
+    ):
+        env = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"} | given
+        run = subprocess.run([sys.executable, "-c", code.format(program)], env=env, capture_output=True, text=True)
+        assert run.stdout.strip() == found, run.stderr
 
 
 @pytest.mark.warp

@@ -2,7 +2,14 @@
 
 __version__ = "0.1.0"
 
+import os
 import sys
+
+# Whether this is the program and not a library of another.
+if _command := bool(sys.argv) and sys.argv[0].endswith(("/voronerf", "\\voronerf", "\\voronerf.exe")):
+    # OpenMP's threads spin for milliseconds by default while they wait for each other, on cores that others may need:
+    # beside ten busy processes a step of training takes twenty times as long. Read when torch loads its runtime.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 try:
     import torch as _torch  # noqa: F401
@@ -10,7 +17,7 @@ except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
     line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch"
-    if sys.argv and sys.argv[0].endswith(("/voronerf", "\\voronerf", "\\voronerf.exe")):  # the command
+    if _command:
         sys.exit(f"voronerf: error: {line}")
     raise ImportError(line) from None
 

@@ -5,6 +5,7 @@ import itertools
 import re
 from pathlib import Path
 
+import noisy_neighbour
 import pytest
 import torch
 from helpers import read_json, script
@@ -63,6 +64,17 @@ def test_step_profile_accounts_for_the_step(tmp_path):
     operators = {row["operator"]: row["ms"] for row in rows if "operator" in row}
     assert all(parts[part] > 0 for part in ("route", "composite", "optimiser", "other operators"))
     assert sum(operators.values()) == pytest.approx(sum(parts.values()) - parts["Python and dispatch"])
+
+
+def test_a_noisy_neighbour_is_compared_with_the_turn_before():
+    turns = [[(8.0, 7.0), (10.0, 6.0), (40.0, 9.0)], [(12.0, 7.0), (20.0, 6.0), (60.0, 9.0)]]
+    quiet, noisy = ([{"ms": ms, "cpu_ms": cpu, "others": 0.5} for ms, cpu in some] for some in turns)
+    found = {("sleep", 0): quiet, ("sleep", 1): noisy}
+    row = noisy_neighbour.row(found, "sleep", 1, cores=4, threads=4)
+    assert row == {
+        "step_ms": 20.0, "least_step_ms": 12.0, "cpu_ms": 7.0, "times_alone": 1.5, "fair": 1.25, "others": 0.5
+    }  # fmt: skip
+    assert noisy_neighbour.row(found, "sleep", 1, cores=4, threads=3)["fair"] == 1.0  # a core is left
 
 
 def test_centres_makes_only_the_rows_that_are_missing(tmp_path):
