@@ -6,11 +6,17 @@ import json
 import os
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import commands
 import numpy as np
 from PIL import Image
+
+from voronerf.rendering.cameras import orbit_cameras
+
+sys.path.append(str(Path(__file__).parents[1] / "data"))
+from scene_files import write_colmap, write_images, write_llff
 
 #: Options of a training of some steps.
 TINY = shlex.split(
@@ -45,6 +51,19 @@ def prepare_scenes(given: Path) -> None:
             (given / name / f"{file}.json").write_text(json.dumps({**lens, "frames": frames}))
     (given / "outside").mkdir()
     Image.fromarray(noise.integers(0, 255, (SIDE, SIDE, 3), dtype=np.uint8)).save(given / "outside" / "secret.png")
+
+
+def prepare_photographs(given: Path) -> None:
+    """The scenes, and images with a model of COLMAP's, binary and as text, or with LLFF's poses."""
+    prepare_scenes(given)
+    poses = orbit_cameras(9, radius=4, elevation=20, width=SIDE, height=SIDE, focal=20, centre=(1, 2, 3)).poses
+    points = np.random.default_rng(0).normal(size=(60, 3)) * 0.4 + (1, 2, 3)
+    for name in ("colmap", "colmap-text", "llff"):
+        write_images(given / name, [(SIDE, SIDE)] * 9)
+        if name == "llff":
+            write_llff(given / name, poses, (SIDE, SIDE), 20.0, (2.5, 5.5))
+        else:
+            write_colmap(given / name, poses, [(SIDE, SIDE)] * 9, points, binary=name == "colmap")
 
 
 def prepare_runs(given: Path) -> None:

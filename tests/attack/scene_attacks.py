@@ -14,26 +14,57 @@ from pathlib import Path
 from attempts import Failed
 from commands import judged
 from given import FIELDS, SIDE, TINY
-from hostile import damaged, json_text, mutated
+from hostile import VALUES, damaged, json_text, mutated
 from PIL import Image
 
 
 def stranger_scene(rng: random.Random, folder: Path, given: Path) -> str:
     """Two steps of training on a scene with other contents: refused in a line, or ends well."""
-    scene = Path(shutil.copytree(given / rng.choice(("blender", "capture")), folder / "scene"))
+    name = rng.choice(("blender", "capture", "colmap", "colmap-text", "llff"))
+    scene = Path(shutil.copytree(given / name, folder / "scene"))
     outside = Path(shutil.copytree(given / "outside", folder / "outside"))
-    change = rng.choice((contents, contents, contents, picture, picture, path, text))
+    transforms = name in ("blender", "capture")
+    change = rng.choice((contents, contents, picture, path, text) if transforms else (model, model, picture, link))
     change(rng, scene, outside)
     field = FIELDS[rng.choice(list(FIELDS))]
     out = folder / "run"
     verdict = judged("train", "--data", scene, "--out", out, *TINY, *field, "--steps", "2")
-    if change is path and verdict != "refused":
+    if change in (path, link) and verdict != "refused":
         raise Failed("an image outside of the scene was read")
     if sorted(file.name for file in outside.iterdir()) != ["secret.png"]:
         raise Failed("something was written outside")
     if verdict == "refused" and out.exists():
         raise Failed(f"{sorted(out.rglob('*'))} were written for a scene that was refused")
     return verdict
+
+
+def model(rng: random.Random, scene: Path, outside: Path) -> None:
+    """A file of COLMAP's model, or LLFF's poses, is damaged or has another number somewhere."""
+    file = rng.choice(sorted([*scene.glob("sparse/0/*"), *scene.glob("*.npy")]))
+    data = file.read_bytes()
+    if file.suffix == ".txt" and rng.random() < 0.7:
+        words = data.decode().split(" ")
+        words[rng.randrange(len(words))] = str(rng.choice(VALUES))
+        data = " ".join(words).encode(errors="replace")
+    elif rng.random() < 0.6:
+        number = rng.choice((1e308, -1.0, 0.0, float("nan"), 1e-300, 1e30, 4e9, 2.0**63))
+        other = rng.choice((struct.pack("<d", number), struct.pack("<q", rng.choice((-1, 0, 2**40, 2**62)))))
+        at = rng.randrange(max(1, len(data) - 8))
+        data = data[:at] + other + data[at + 8 :]
+    else:
+        data = damaged(rng, data)
+    file.write_bytes(data)
+
+
+def link(rng: random.Random, scene: Path, outside: Path) -> None:
+    """An image, all of them or the model's folder lead outside."""
+    there = scene / rng.choice(("images/01.jpg", "images", "sparse" if (scene / "sparse").is_dir() else "images"))
+    away = outside.with_name("away") if there.is_dir() else outside / "secret.png"
+    if there.is_dir():
+        there.rename(away)
+    else:
+        there.unlink()
+    there.symlink_to(away)
 
 
 def transforms(rng: random.Random, scene: Path) -> Path:

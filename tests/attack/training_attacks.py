@@ -32,7 +32,8 @@ VARIANTS = (
     [*FIELDS["nerf"], "--balance", "transport", "--assignment", "stochastic"],
     [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6", "--init", "random"],
 )
-SIGNALS = (*[signal.SIGKILL] * 6, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT)
+#: What ends a training; None is a full disk.
+SIGNALS = (*[signal.SIGKILL] * 6, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT, None)
 #: Interruptions of a chain.
 KILLS = 5
 
@@ -46,23 +47,18 @@ def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[st
     began = time.monotonic()
     _ends_well(_train(whole, options))
     length = time.monotonic() - began
-    kills, full = 0, 0
-    while kills < KILLS:
-        limit = rng.choice((None, None, None, rng.randrange(1, 200_000)))
-        pid = _train(part, options, limit)
-        if limit is None:
+    for _ in range(KILLS):
+        number = rng.choice(SIGNALS)
+        if number is None:  # a disk that is full after so many bytes of a file
+            pid = _train(part, options, rng.randrange(1, 200_000))
+        else:
+            pid = _train(part, options)
             time.sleep(rng.uniform(0, length))
-            number = rng.choice(SIGNALS)
             os.kill(pid, number)
-            kills += 1
-            _ends(pid, number)
-        else:  # a disk that is full after so many bytes of a file
-            full += 1
-            _ends(pid, None)
-            kills += 1
+        _ends(pid, number)
     _ends_well(_train(part, options))
     _same_runs(whole, part)
-    return Counter({RIGHT: kills})
+    return Counter({RIGHT: KILLS})
 
 
 def _train(out: Path, options: list[str], file_size: int | None = None) -> int:
