@@ -18,6 +18,7 @@ from helpers import python, read_json
 from PIL import Image
 
 from voronerf.cli import commands, main
+from voronerf.cli.main import COMMANDS
 from voronerf.data import builtin_scene
 from voronerf.rendering import CameraPath, orbit_cameras, write_camera_path
 from voronerf.training.checkpoint import load_checkpoint
@@ -245,6 +246,10 @@ def test_a_full_disk_is_one_line(monkeypatch, tmp_path, fails):
     succeeds(*command)
 
 
+def no_memory_to_import() -> int:
+    raise SystemError("error return without exception set")
+
+
 def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails):
     monkeypatch.chdir(tmp_path)
     train = f"train --data builtin --device cpu {TINY}"
@@ -258,6 +263,8 @@ def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails)
         fails(message, train, given)
     monkeypatch.setattr("voronerf.training.networks.SAMPLE_BYTES", 0)
     fails("not enough memory, 59604.6 GiB were asked for; try a smaller --width", train, "--rays 8000000000000")
+    monkeypatch.setitem(COMMANDS, "info", no_memory_to_import)
+    fails("not enough memory; try a smaller --width", "info")
     assert [path.name for path in tmp_path.iterdir()] in ([], ["runs"]) and not list(tmp_path.glob("runs/*"))
 
 

@@ -28,8 +28,12 @@ EXPECTED = (
     *(MemoryError, torch.OutOfMemoryError),
 )
 
-#: By which torch's plain RuntimeErrors tell that there is no memory left on a CPU, for tensors or for a thread.
-NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "can't start new thread")
+#: By which torch's plain RuntimeErrors tell that there is no memory left on a CPU, for tensors or for a thread, and a
+#: SystemError of Python that there is none for an import.
+NO_MEMORY = (
+    *("can't allocate memory", "not enough memory", "bad_alloc", "can't start new thread"),
+    "error return without exception set",
+)
 
 #: Said before a training that nothing was said about.
 WHAT_TO_TRY = """This trains the built-in scene for 480 s, into runs/. Ctrl-C stops it. Other things to try:
@@ -81,7 +85,7 @@ def main(args: list[str] | None = None) -> int:
             raise
         print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
         return 1
-    except RuntimeError as error:
+    except (RuntimeError, SystemError) as error:
         text = str(error)
         if os.environ.get("VORONERF_TRACEBACK") or not any(sign in text for sign in NO_MEMORY):
             raise
