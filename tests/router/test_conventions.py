@@ -41,6 +41,8 @@ from voronerf import VoronoiDiagram, VoronoiRouter
 CASES = [*LISTED, *LAYERS, *CALLS, *ARGUMENTS, *RULES]
 CASES += [case.fused() for case in CASES if case.fuses]
 every_case = pytest.mark.parametrize("case", CASES, ids=str)
+#: Without those that differ in one step of one module.
+every_module = pytest.mark.parametrize("case", [c for c in CASES if not c.name.startswith("step ")], ids=str)
 
 
 @pytest.fixture
@@ -64,19 +66,19 @@ def test_distinct_cells_equal_a_loop_over_masks(case: Case, dtype: torch.dtype, 
     router = routed(case, modules, centres)
     args, kwargs, inputs = prepared(case, dtype)
     expected = loop(case, modules, nearest(case, centres, args, kwargs), args, kwargs)
-    # A network is recognised after some calls: both ways of running it must be right.
-    first, _, found = (tensors(case.call(router, args, kwargs)) for _ in range(3))
+    # The first call chooses how those after it run.
+    close(tensors(case.call(router, args, kwargs)), expected, rtol=2e-3, atol=2e-4)
+    found = tensors(case.call(router, args, kwargs))
     # float32: sums in another order, and a sample near the kink of a ReLU may fall on either side.
     rtol, atol = (1e-9, 1e-10) if dtype == torch.float64 else (2e-3, 2e-4)
     slopes = gradients(modules, scalar(expected), inputs, create_graph=True)
     compared = [name for name in slopes if case.by_parameters or name.startswith("input")]
     curves = gradients(modules, scalar({name: slopes[name] for name in compared}), inputs)
-    for outputs in (first, found):
-        close(outputs, expected, rtol=rtol, atol=atol)
-        ours = gradients(router, scalar(outputs), inputs, create_graph=True)
-        close(ours, slopes, rtol=rtol, atol=10 * atol)
-        bent = gradients(router, scalar({name: ours[name] for name in compared}), inputs)
-        close(bent, curves, rtol=rtol, atol=100 * atol)
+    close(found, expected, rtol=rtol, atol=atol)
+    ours = gradients(router, scalar(found), inputs, create_graph=True)
+    close(ours, slopes, rtol=rtol, atol=10 * atol)
+    bent = gradients(router, scalar({name: ours[name] for name in compared}), inputs)
+    close(bent, curves, rtol=rtol, atol=100 * atol)
 
 
 @every_case
@@ -103,13 +105,13 @@ def test_identical_cells_give_the_fields_own_output(
         assert sorted(counter.rows[-len(counts) :]) == sorted(counts)
 
 
-@every_case
+@every_module
 def test_blended_cells_equal_a_weighted_sum_over_cells(case: Case) -> None:
     modules = [module.eval() for module in case.modules(torch.float64)]
     diagram = VoronoiDiagram(torch.rand(3, 3) * 2 - 1).refine({1: torch.rand(3, 3) * 2 - 1})[0]
     router = routed(case, modules, diagram, blend=0.3).eval()
     args, kwargs, _ = prepared(case, torch.float64)
-    for _ in range(3):
+    for _ in range(2):
         found = tensors(case.call(router, args, kwargs))
         close(found, blended(case, modules, router, args, kwargs), rtol=1e-5, atol=1e-5)
 
@@ -135,7 +137,7 @@ def test_few_samples_and_none(case: Case, centres: Tensor) -> None:
         assert all(not gradient.any() for gradient in gradients(router, scalar(none), inputs).values())
 
 
-@every_case
+@every_module
 def test_cells_come_out_as_they_went_in(case: Case, centres: Tensor) -> None:
     modules = case.modules()
     router = routed(case, modules, centres)
@@ -149,7 +151,7 @@ def test_cells_come_out_as_they_went_in(case: Case, centres: Tensor) -> None:
         close(tensors(case.call(cell, args, kwargs)), tensors(case.call(module, args, kwargs)), rtol=1e-5, atol=1e-6)
 
 
-@every_case
+@every_module
 def test_subdivision_and_state_change_nothing(case: Case, centres: Tensor) -> None:
     modules = case.modules()
     router = routed(case, modules, centres)

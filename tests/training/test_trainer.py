@@ -80,7 +80,7 @@ def test_training_learns(tmp_path, scene):
 
 
 @pytest.mark.parametrize("background", ["white", "random"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_collapse_to_white(tmp_path, scene, seed, background):
     """A NeRF that gives up paints every ray white; its opacity is then 0 and no gradient brings it back."""
     config = small(tmp_path, steps=100, seed=seed, rays=256, samples=24, width=32, cells=(), background=background)

@@ -21,19 +21,28 @@ from voronerf.training.trainer import Trainer
 HIERARCHICAL, PROPOSAL = {"sampling": "hierarchical"}, {"sampling": "proposal"}
 CONTRACTION, KILO, CONES = {"contraction": "sphere"}, {"field": "kilonerf"}, {"field": "mipnerf"}
 ROUNDS = {"proposal_rounds": 2, "proposal_anneal": 10.0, "distortion": 0.01}
-#: Settings, and the PSNR in dB that 200 steps reach, about 1 dB below the least of three seeds; white has 9.7.
+#: In an order in which every third has every kind of field and of sampling.
 VARIANTS = {
-    "nerf hierarchical": (HIERARCHICAL, 19.5),
-    "kilonerf": (KILO, 19.0),
-    "kilonerf proposal": (KILO | PROPOSAL, 19.0),
-    "kilonerf hierarchical": (KILO | HIERARCHICAL, 19.5),
-    "mipnerf": (CONES, 19.0),
-    "mipnerf hierarchical": (CONES | HIERARCHICAL, 19.0),
-    "nerf proposal": (PROPOSAL, 19.5),
-    "mipnerf split proposal": (CONES | PROPOSAL | {"split_proposal": True}, 19.0),
-    "nerf contraction": (CONTRACTION | HIERARCHICAL, 19.5),
-    "mipnerf contraction": (CONTRACTION | CONES, 19.0),
-    "mipnerf 360": (CONTRACTION | CONES | PROPOSAL | ROUNDS, 19.5),
+    "kilonerf": KILO,
+    "mipnerf": CONES,
+    "mipnerf contraction": CONTRACTION | CONES,
+    "nerf hierarchical": HIERARCHICAL,
+    "nerf proposal": PROPOSAL,
+    "nerf contraction": CONTRACTION | HIERARCHICAL,
+    "mipnerf split proposal": CONES | PROPOSAL | {"split_proposal": True},
+    "kilonerf hierarchical": KILO | HIERARCHICAL,
+    "kilonerf proposal": KILO | PROPOSAL,
+    "mipnerf hierarchical": CONES | HIERARCHICAL,
+    "mipnerf 360": CONTRACTION | CONES | PROPOSAL | ROUNDS,
+}
+#: The PSNR in dB that 200 steps reach, about 1 dB below the least of three seeds; white has 9.7.
+LEARNT = {
+    "nerf hierarchical": 19.5,
+    "kilonerf proposal": 19.0,
+    "mipnerf": 19.0,
+    "mipnerf split proposal": 19.0,
+    "nerf contraction": 19.5,
+    "mipnerf 360": 19.5,
 }
 CELLS = {
     "alone": {"cells": ()},
@@ -48,10 +57,12 @@ CELLS = {
 }
 
 
-@pytest.mark.parametrize("cells", CELLS)
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    ("variant", "cells"),
+    [(variant, cells) for i, variant in enumerate(VARIANTS) for j, cells in enumerate(CELLS) if i % 3 == j % 3],
+)
 def test_every_variant_with_every_kind_of_cells(tmp_path, scene, variant, cells):
-    trainer = Trainer(small(tmp_path, samples=10, **VARIANTS[variant][0], **CELLS[cells]), scene)
+    trainer = Trainer(small(tmp_path, samples=10, **VARIANTS[variant], **CELLS[cells]), scene)
     summary, config = trainer.run(), trainer.config
     assert summary["complete"] and summary["cells"] == config.final_cells
     assert summary["parameters"] == count_parameters(config)
@@ -71,14 +82,13 @@ def test_every_variant_with_every_kind_of_cells(tmp_path, scene, variant, cells)
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_resumes_bit_for_bit(tmp_path, scene, variant):
-    assert_resumes(tmp_path, scene, 9, assignment="stochastic", cells=(3, 2), **VARIANTS[variant][0])
+    assert_resumes(tmp_path, scene, 9, assignment="stochastic", cells=(3, 2), **VARIANTS[variant])
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_every_variant_learns(tmp_path, variant):
-    settings, floor = VARIANTS[variant]
+@pytest.mark.parametrize(("variant", "floor"), LEARNT.items())
+def test_variants_learn(tmp_path, variant, floor):
     size = {"steps": 200, "rays": 256, "samples": 16, "fine_samples": 16, "width": 32, "depth": 3}
-    config = small(tmp_path, **settings, **size, cells=(6,), evaluations=1, final_views=4)
+    config = small(tmp_path, **VARIANTS[variant], **size, cells=(6,), evaluations=1, final_views=4)
     assert Trainer(config, builtin_scene(25)).run()["psnr"] > floor
 
 
