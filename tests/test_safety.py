@@ -8,15 +8,20 @@ import torch
 from helpers import python, same, seeded
 
 import voronerf as v
+from voronerf.layers import MLP, Layer
 
 pytestmark = pytest.mark.native
 
+LAYERS = MLP((Layer(("positions",), 7, "sine"),), (0,))
 BAD = (torch.nan, torch.inf, -torch.inf)
 
 
+def halves(points):
+    return torch.tensor([0, len(points) // 2, len(points)], dtype=torch.int32)
+
+
 def network(points, weight):
-    offsets = torch.tensor([0, len(points) // 2, len(points)], dtype=torch.int32)
-    return v.grouped_linear(points, offsets, weight)
+    return v.grouped_linear(points, halves(points), weight)
 
 
 def calls(seed):
@@ -39,6 +44,7 @@ def calls(seed):
         lambda: tuple(v.centre_grid(centres).tables[1:3]),
         lambda: v.cell_sort(cells, 400),
         lambda: (network(points, weight),),
+        lambda: (v.grouped_mlp(points, halves(points), [weight], [None], layers=LAYERS),),
         gradient,
         lambda: (v.frequency_encode(points, 6),),
         lambda: tuple(v.composite(ray[0], rgb, ray[1], ray[2])),

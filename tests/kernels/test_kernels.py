@@ -40,12 +40,3 @@ def test_nearest_centre_with_ties_strides_and_non_finite_points(nearest_centre, 
     assert not points.is_contiguous()
     agree(nearest_centre, points, centres)
     agree(nearest_centre, points, centres, torch.randint(0, 3, (80,), device=device).float()[::2])
-
-
-def test_nearest_centre_passes_opcheck_and_compiles_whole(nearest_centre, device) -> None:
-    points, centres = torch.rand(9, 3, device=device), torch.rand(4, 3, device=device)
-    torch.library.opcheck(torch.ops.voronerf.nearest_centre_warp.default, (points, centres, None))
-    compiled = torch.compile(
-        lambda points: nearest_centre(points * 2, centres) + 1, fullgraph=True, backend="aot_eager"
-    )
-    assert torch.equal(compiled(points), nearest_centre(points * 2, centres) + 1)

@@ -7,7 +7,6 @@ import torch
 from composite_cases import PARTS, dense, evaluate, leaves_of, scene
 from helpers import on_any_number_of_threads
 from tolerances import assert_as_exact
-from torch import Tensor
 
 from voronerf.ops import composite
 
@@ -105,11 +104,6 @@ def test_half_storage(dtype: torch.dtype) -> None:
         torch.testing.assert_close(part.float(), want, rtol=torch.finfo(dtype).eps, atol=1e-6)
 
 
-def test_float64_is_left_to_the_reference() -> None:
-    cast, _ = leaves_of(dense(2, 3), torch.float64)
-    assert composite(**cast).colour.dtype == torch.float64
-
-
 def test_expanded_gradients() -> None:
     given, _ = leaves_of(dense(4, 9), torch.float32)
     leaf = torch.rand(4, 9, requires_grad=True)
@@ -143,21 +137,6 @@ def test_opcheck_of_some_gradients(form: str) -> None:
     slope = torch.rand_like(composite(**cast, backend="native").colour).requires_grad_()
     given = (slope, None, None, None, *cast.values(), [True, True, False, False, True])
     torch.library.opcheck(torch.ops.voronerf.composite_native_backward.default, given)
-
-
-def test_compiles_whole() -> None:
-    cast, leaves = leaves_of(dense(5, 7), torch.float32)
-
-    @torch.compile(fullgraph=True)
-    def loss(sigma: Tensor, rgb: Tensor) -> Tensor:
-        result = composite(**{**cast, "sigma": sigma, "rgb": rgb}, backend="native")
-        return result.colour.square().sum() + result.depth.sum()
-
-    compiled = torch.autograd.grad(loss(cast["sigma"], cast["rgb"]), leaves[:2])
-    result = composite(**cast, backend="native")
-    eager = torch.autograd.grad(result.colour.square().sum() + result.depth.sum(), leaves[:2])
-    for got, want in zip(compiled, eager):
-        torch.testing.assert_close(got, want)
 
 
 def test_offsets_that_do_not_rise() -> None:

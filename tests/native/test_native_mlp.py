@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-
 import pytest
 import torch
-from helpers import on_any_number_of_threads
+from helpers import on_any_number_of_threads, pairwise
 from torch import Tensor
 
 from voronerf.grids import HashGrid
@@ -197,8 +195,16 @@ def test_any_imbalance(counts: list[int]) -> None:
     assert_close(arguments(nerf(20, 2), counts, rays=9))
 
 
-@pytest.mark.parametrize("o", [1, 3, 4, 5, 16, 17, 33, 48, 63, 64, 65, 90, 130])
-@pytest.mark.parametrize("i", [1, 3, 4, 5, 63, 90])
+@pytest.mark.parametrize(
+    *pairwise(
+        {
+            "o": [1, 3, 4, 5, 16, 17, 33, 48, 63, 64, 65, 90, 130],
+            "i": [1, 3, 4, 5, 63, 90],
+            "isa": ["portable", "avx2", "avx512"],
+        }
+    ),
+    indirect=["isa"],
+)
 def test_linear_of_odd_sizes(i: int, o: int, isa: str) -> None:
     layers = MLP((Layer(("positions",), o),), (0,), None)
     assert_close(arguments(layers, [7, 0, 25], p=i))
@@ -253,23 +259,6 @@ def test_same_bits_for_any_number_of_threads(isa: str, dtype: torch.dtype, netwo
     layers = nerf(40, 2) if network == "nerf" else NETWORKS["hashed 32"]
     given = arguments(layers, [5000, 3, 0, 900], rays=50, own=network == "own tables")
     on_any_number_of_threads(lambda: evaluate(given, dtype, "native"))
-
-
-def test_several_python_threads_at_once() -> None:
-    given = [arguments(nerf(24, 2), [300 + 50 * i, 7], rays=11) for i in range(4)]
-    alone = [evaluate(one, torch.float32, "native") for one in given]
-    together: list[list[Tensor]] = [[] for _ in given]
-
-    def work(i: int) -> None:
-        for _ in range(3):
-            together[i] = evaluate(given[i], torch.float32, "native")
-
-    workers = [threading.Thread(target=work, args=(i,)) for i in range(len(given))]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    assert all(torch.equal(a, b) for one, other in zip(alone, together) for a, b in zip(one, other))
 
 
 @pytest.mark.parametrize("name", ["graph", "hashed 17"])
@@ -383,21 +372,6 @@ def test_opcheck() -> None:
     assert layer_table.Table.parse(table).with_widths(given["weights"]) == given["layers"]
 
 
-@pytest.mark.parametrize("layers", [nerf(8, 2), NETWORKS["hashed 17"]], ids=["nerf", "hashed"])
-def test_compiles_whole(layers: MLP) -> None:
-    given = cast(arguments(layers, [9, 0, 4], rays=3), torch.float32)
-
-    @torch.compile(fullgraph=True)
-    def loss(positions: Tensor, weights: list[Tensor]) -> Tensor:
-        return grouped_mlp(**{**given, "positions": positions, "weights": weights}, backend="native").square().sum()
-
-    leaves = [given["positions"], *given["weights"]]
-    compiled = torch.autograd.grad(loss(given["positions"], given["weights"]), leaves)
-    eager = torch.autograd.grad(grouped_mlp(**given, backend="native").square().sum(), leaves)
-    for got, want in zip(compiled, eager):
-        torch.testing.assert_close(got, want)
-
-
 def test_an_index_of_no_ray_is_refused() -> None:
     given = cast(arguments(nerf(6, 2), [5, 8], rays=4), torch.float32)
     for bad_index in (4, -1):
@@ -416,8 +390,3 @@ def test_a_plan_without_features_is_refused() -> None:
         linear.grouped_linear(torch.zeros(5, 0), offsets, weight)
     with pytest.raises(RuntimeError, match="grouped_mlp: every layer must have outputs, and inputs from sources"):
         native.grouped_mlp(torch.zeros(5, 0), offsets, [weight], [None], layers=chain(2, 0, out=2))
-
-
-def test_float64_is_left_to_the_reference() -> None:
-    given = cast(arguments(nerf(6, 2), [5, 8]), torch.float64)
-    assert grouped_mlp(**given).dtype == torch.float64

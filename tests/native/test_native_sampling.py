@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads
+from helpers import on_any_number_of_threads, pairwise
 from tolerances import assert_as_exact
 from torch import Tensor
 
@@ -66,9 +66,9 @@ def test_any_number_of_rows(isa: str, n: int) -> None:
         assert_close(run, inputs)
 
 
-@pytest.mark.parametrize("include_input", [True, False])
-@pytest.mark.parametrize("octaves", [1, 2, 3, 10, 16])
-@pytest.mark.parametrize("d", [1, 2, 3, 4, 5, 8, 9, 16, 17, 40])
+@pytest.mark.parametrize(
+    *pairwise({"include_input": [True, False], "octaves": [1, 2, 3, 10, 16], "d": [1, 2, 3, 4, 5, 8, 9, 16, 17, 40]})
+)
 def test_any_number_of_features(isa: str, d: int, octaves: int, include_input: bool) -> None:
     assert_close(
         lambda x, backend: frequency_encode(x, octaves, include_input=include_input, backend=backend), [points(35, d)]
@@ -141,12 +141,6 @@ def test_half_gradients(dtype: torch.dtype) -> None:
             torch.testing.assert_close(got.float(), right, rtol=0, atol=2 * torch.finfo(dtype).eps * scale)
 
 
-def test_float64_is_left_to_the_reference() -> None:
-    x = points(5)
-    assert frequency_encode(x, 2).dtype == integrated_encode(x, x.abs(), 2).dtype == torch.float64
-    assert resample(x.abs(), points(5, 4).cumsum(1), 2).dtype == torch.float64
-
-
 def test_non_contiguous_gradients() -> None:
     for run, inputs in all_encodings(20):
         leaves = [tensor.float().requires_grad_() for tensor in inputs]
@@ -156,32 +150,6 @@ def test_non_contiguous_gradients() -> None:
             for slope in (torch.ones(1, 1).expand_as(out), torch.ones_like(out))
         )
         assert all(torch.equal(a, b) for a, b in zip(expanded, same))
-
-
-def test_second_derivatives() -> None:
-    for run, inputs in all_encodings(7, 2):
-        results = {}
-        for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
-            leaves = [tensor.to(dtype).requires_grad_() for tensor in inputs]
-            firsts = torch.autograd.grad(run(*leaves, backend=backend).pow(3).sum(), leaves, create_graph=True)
-            results[backend] = torch.autograd.grad(sum(first.square().sum() for first in firsts), leaves)
-        for want, got in zip(results["reference"], results["native"]):
-            torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-5 * float(want.abs().max()))
-
-
-def test_compiles_whole() -> None:
-    weights, edges = torch.rand(5, 4), torch.rand(5, 5).cumsum(1)
-
-    def loss(x: Tensor, variances: Tensor) -> Tensor:
-        depths = resample(weights, edges, 3, backend="native")
-        plain = frequency_encode(x, 3, backend="native").square().sum()
-        return plain + (integrated_encode(x, variances, 2, backend="native") ** 3).sum() + depths.sum()
-
-    leaves = [torch.rand(9, 3, requires_grad=True), torch.rand(9, 3, requires_grad=True)]
-    compiled, eager = torch.compile(loss, fullgraph=True)(*leaves), loss(*leaves)
-    torch.testing.assert_close(compiled, eager)
-    for got, want in zip(torch.autograd.grad(compiled, leaves), torch.autograd.grad(eager, leaves)):
-        torch.testing.assert_close(got, want)
 
 
 @pytest.mark.parametrize(("r", "s", "count"), [(1, 1, 1), (7, 1, 5), (9, 33, 2), (40, 64, 65)])
@@ -194,15 +162,6 @@ def test_depths_of_the_reference(r: int, s: int, count: int, given: bool) -> Non
     wide = None if uniforms is None else uniforms.double()
     exact = resample(weights.double(), edges.double(), count, uniforms=wide, backend="reference")
     torch.testing.assert_close(found.double(), exact, rtol=1e-6, atol=0)
-
-
-def test_uniforms_at_and_beyond_the_ends() -> None:
-    weights, edges = torch.tensor([[0.0, 1.0, 0.0, 1.0, 0.0]]), torch.arange(6.0)[None]
-    uniforms = torch.tensor([[2.0, 1.0, 0.5, 0.0, -1.0]])
-    assert resample(weights, edges, 5, uniforms=uniforms, backend="native").tolist() == [[1, 1, 3, 4, 4]]
-    uniforms = torch.tensor([[0.75, float("nan"), 0.25]])
-    depths = resample(weights, edges, 3, uniforms=uniforms, backend="native")[0]
-    assert depths[:2].tolist() == [1.5, 3.5] and depths[2].isnan()
 
 
 def test_masses_whose_sum_overflows_float32() -> None:

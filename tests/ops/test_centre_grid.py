@@ -72,8 +72,8 @@ def points_around(centres):
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_finds_what_all_centres_give(backend, scene, dtype):
-    if backend == "reference" and scene in ("kilonerf", "lattice", "shell"):
-        pytest.skip("slow, and tested with fewer centres")
+    if backend == "reference" and (dtype == torch.float32 or scene in ("kilonerf", "lattice", "shell")):
+        pytest.skip("slow, and the same code for all centres and types")
     centres = SCENES[scene]().to(dtype)
     points = points_around(centres)
     lightest = centres.double().diff(dim=0).square().sum(1).mean().item() if len(centres) > 1 else 0.0
@@ -263,12 +263,17 @@ def test_compiled_graphs_refuse_grids_of_another_size():
 
 
 @native
+@pytest.mark.warp
 def test_ops_pass_opcheck_and_compile_whole():
     ops = torch.ops.voronerf
+    for backend in ("native", "warp"):  # which registers them
+        backends.resolve("nearest_centre_grid", backend=backend, device=torch.device("cpu"), dtype=torch.float32)
 
     points, centres, weights = torch.rand(50, 3), torch.rand(70, 3), torch.rand(70)
     grid = centre_grid(centres, weights=weights)
     torch.library.opcheck(ops.nearest_centre_grid.default, (points, centres, weights, *grid.tables))
+    tables = [grid.tables.frame, grid.tables.entries, grid.tables.lists, grid.tables.bits]
+    torch.library.opcheck(ops.nearest_centre_grid_warp.default, (points, centres, weights, *tables))
     torch.library.opcheck(ops.centre_grid.default, (centres.double(), weights.double()))
     compiled = torch.compile(
         lambda p: nearest_centre(p * 2, centres, weights=weights, grid=grid) + 1, fullgraph=True, backend="aot_eager"

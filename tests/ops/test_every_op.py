@@ -18,6 +18,9 @@ from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 NETWORK = MLP((Layer((POSITIONS,), 6, "sine"), Layer((0, DIRECTIONS), 4, "sigmoid")), (1, 0), 2, 1)
 GAUSSIANS = MLP(NETWORK.layers, NETWORK.outputs, 2, 1, "integrated")
 HASHED = HashGrid(levels=3, features=2, log2_entries=10, base=3, finest=40, interpolation="smoothstep")
+# The 16 features of whole vectors: what a forward pass keeps has no padding, which is never written.
+EIGHT = HashGrid(levels=8, features=2, log2_entries=10, base=3, finest=40)
+GRIDDED = MLP(NETWORK.layers, NETWORK.outputs, None, 1, "hash", EIGHT)
 # Diagram 0 has three centres, the second and third refined by diagrams 1 and 2, and that again by diagram 3.
 TREE = {
     "centres": torch.rand(10, 3, generator=torch.Generator().manual_seed(1)),
@@ -136,6 +139,14 @@ CASES = {
     "grouped_mlp, integrated": (
         lambda n: {**network(n, GAUSSIANS), "offsets": offsets_of([n - 5, 5])},
         {"layers": GAUSSIANS},
+    ),
+    "grouped_mlp, hashed": (
+        lambda n: {
+            **network(n, GRIDDED),
+            "features": torch.randn(EIGHT.table_shape),
+            "offsets": offsets_of([n - 5, 5]),
+        },
+        {"layers": GRIDDED},
     ),
     "routed_mlp": (lambda n: {**network(n), "centres": torch.rand(2, 3)}, {"layers": NETWORK}),
     "routed_mlp, nested": (lambda n: {**network(n, k=7), **TREE}, {"layers": NETWORK, "depth": 3}),

@@ -186,13 +186,6 @@ def test_gradients_that_nobody_asked_for_are_not_computed():
         assert wanted == [[True, False], [False, True]]
 
 
-def test_opcheck():
-    x, weight, _ = (tensor.requires_grad_() for tensor in layer([2, 0, 1, 3], 2, 3))
-    offsets, g, ops = offsets_of([2, 0, 1, 3]), torch.randn(6, 3, requires_grad=True), torch.ops.voronerf
-    torch.library.opcheck(ops.grouped_product, (x, offsets, weight))
-    torch.library.opcheck(ops.grouped_outer, (g, x, offsets))
-
-
 def test_autocast(device, backend):
     counts = COUNTS["odd"]
     x, weight, bias = (tensor.to(device).requires_grad_() for tensor in layer(counts, 7, 5))

@@ -315,18 +315,6 @@ def test_autocast(device, backend):
     assert all(leaf.grad.dtype == torch.float32 for leaf in leaves)
 
 
-def test_compiles(device, backend):
-    case = Case.make("nerf", COUNTS["odd"])
-    leaves = case.leaves(torch.float32, device)
-    run = lambda *leaves: case.run(grouped_mlp, list(leaves), backend=backend).square()  # noqa: E731
-    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
-    found, expected = ([y, *torch.autograd.grad(y.sum(), leaves)] for y in (compiled(*leaves), run(*leaves)))
-    for part, other in zip(found, expected):
-        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
-    with torch.no_grad():
-        torch.testing.assert_close(compiled(*leaves), run(*leaves))
-
-
 def test_inputs_without_features_are_refused(device, backend):
     positions, offsets, index = torch.rand(5, 3, device=device), offsets_of([2, 3], device), torch.zeros(5).int()
     table = MLP((Layer((POSITIONS, DIRECTIONS), 4, "relu"), Layer((0,), 2)), (1,), 2, 1)

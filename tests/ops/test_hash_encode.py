@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads
-from op_cases import FLOATS, need, refusals, refused
+from helpers import on_any_number_of_threads, pairwise
+from op_cases import FLOATS, HALVES, need, refusals, refused
 from tolerances import assert_as_exact
 
 from voronerf import HashGrid
@@ -103,11 +103,10 @@ def test_reads_the_tables_of_other_libraries(convention, sizes):
     torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-3)
 
 
-@grids
-@pytest.mark.parametrize("n", [0, 1, 17, 300])
-@pytest.mark.parametrize("dtype", FLOATS)
-def test_matches_the_reference(device, backend, grid, n, dtype):
+@pytest.mark.parametrize(*pairwise({"name": GRIDS, "n": [0, 1, 17, 300], "dtype": FLOATS}))
+def test_matches_the_reference(device, backend, name, n, dtype):
     need("hash_encode", backend, device, dtype)
+    grid = GRIDS[name]
     x, table = points(n, grid), features(grid, dtype)
     exact = reference(x.double(), table.double(), grid)
     found = hash_encode(x.to(device), table.to(device), grid, backend=backend)
@@ -218,10 +217,12 @@ def derivatives(encode, grid, x, table, cells, dtype):
     return [out, *first, *torch.autograd.grad(first, (arriving, *leaves), cotangents)]
 
 
+FEATURES = ["both", "one feature", "four features", "eight features"]
+KINDS = {"name": FEATURES, "dtype": [torch.float32, *HALVES], "isa": ["portable", "avx2", "avx512"]}
+
+
 @pytest.mark.native
-@pytest.mark.parametrize("several", [False, True])
-@pytest.mark.parametrize("name", ["both", "one feature", "four features", "eight features"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize(*pairwise({**KINDS, "several": [False, True]}), indirect=["isa"])
 def test_every_instruction_set(isa, poisoned, name, dtype, several):
     grid, n = GRIDS[name], 131
     x, cells = points(n, grid), torch.randint(3, (n,), dtype=torch.int32) if several else None

@@ -89,6 +89,15 @@ def test_weights_that_are_no_weights_count_as_zero(device, backend):
     torch.testing.assert_close(depths.cpu(), torch.tensor([[1.25, 1.75]]))
 
 
+def test_uniforms_at_and_beyond_the_ends(device, backend):
+    weights, edges = torch.tensor([[0.0, 1, 0, 1, 0]], device=device), torch.arange(6.0, device=device)[None]
+    uniforms = torch.tensor([[2.0, 1, 0.5, 0, -1]], device=device)
+    assert resample(weights, edges, 5, uniforms=uniforms, backend=backend).tolist() == [[1, 1, 3, 4, 4]]
+    uniforms = torch.tensor([[0.75, math.nan, 0.25]], device=device)
+    depths = resample(weights, edges, 3, uniforms=uniforms, backend=backend)[0]
+    assert depths[:2].tolist() == [1.5, 3.5] and depths[2].isnan()
+
+
 def test_no_rays(device, backend):
     weights, edges = (tensor.to(device) for tensor in rays(0, 5))
     assert resample(weights, edges, 7, backend=backend).shape == (0, 7)
