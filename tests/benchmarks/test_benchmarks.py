@@ -55,15 +55,6 @@ def test_metadata_says_what_was_measured_where():
     assert "available" in metadata["native"]
 
 
-@pytest.mark.parametrize("name", ["Makefile", "README.md", "CONTRIBUTING.md", "docs/performance.md"])
-def test_scripts_that_are_named_are_there(name):
-    for script in re.findall(r"benchmarks/\w+\.py", (BENCHMARKS.parent / name).read_text()):
-        assert (BENCHMARKS.parent / script).is_file(), f"{name} names {script}"
-
-
-# --- timing ---------------------------------------------------------------------------------------------------------
-
-
 def test_contenders_take_turns_and_slow_ones_are_capped():
     cost, turns = {"fast": 0.25, "middle": 0.5, "slow": 2.5, "slowest": 2.5}, []
 
@@ -123,9 +114,6 @@ def test_instruction_set_is_forced_and_put_back():
     assert before == native.describe()["instruction set"]
     with pytest.raises(ValueError, match="no sse9"), harness.instruction_set("sse9"):
         pass
-
-
-# --- the table ------------------------------------------------------------------------------------------------------
 
 
 def test_every_operation_has_rows_in_both_modes():
@@ -331,12 +319,11 @@ def test_bad_arguments_are_one_line(monkeypatch, arguments, message):
     assert text.startswith(f"throughput: error: {message}") and "\n" not in text
 
 
-def test_throughput_runs_as_a_script_and_table_reads_its_result(tmp_path):
+def test_throughput_runs_and_table_reads_its_result(tmp_path, capsys):
     path = tmp_path / "results" / "throughput.json"
-    script = str(BENCHMARKS / "throughput.py")
-    command = [sys.executable, script, "--quick", "--filter", "^resample", "--json", str(path), "--targets"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert "[1/1," in done.stderr and "not measured" in done.stdout
+    throughput.main(["--quick", "--filter", "^resample", "--json", str(path), "--targets"])
+    said = capsys.readouterr()
+    assert "[1/1," in said.err and "not measured" in said.out
     outcome = read_json(path)
     metadata = outcome["metadata"]
     assert metadata["benchmark"] == "throughput" and metadata["quick"] is True and metadata["device"] == "cpu"

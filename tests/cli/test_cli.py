@@ -282,33 +282,35 @@ def test_image_names_that_are_too_long_for_panels(tmp_path, monkeypatch, fails):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
-def test_signals_leave_a_usable_checkpoint(tmp_path):
-    last = tmp_path / "checkpoints" / "last.safetensors"
-    endless = TINY.replace("--steps 16", "--steps 100000 --checkpoint-every 0.2")
-    command = [sys.executable, "-m", "voronerf.cli.main", *words("train --data builtin --out", tmp_path, endless)]
-    steps = [0]
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+def test_signals_leave_a_usable_checkpoint(tmp_path, monkeypatch, capsys):
+    """SIGTERM in a process of its own, the others in this one."""
+    last, steps = tmp_path / "checkpoints" / "last.safetensors", [0]
 
-    def receive_signals():  # which nohup, and the background of a shell, have a process ignore
-        for number in signals:
-            signal.signal(number, signal.SIG_DFL)
-
-    for number in signals:
-        before = last.stat().st_mtime_ns if last.exists() else None
-        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        process = subprocess.Popen(command, **streams, preexec_fn=receive_signals)
-        deadline = time.monotonic() + 600
-        while not last.exists() or last.stat().st_mtime_ns == before:
-            assert time.monotonic() < deadline and process.poll() is None, process.stdout and process.stdout.read()
-            time.sleep(0.05)
-        process.send_signal(number)
-        output = process.communicate(timeout=600)[0].decode()
-        assert process.returncode == 130, output
-        assert "Traceback" not in output and "--resume" in output
+    def leaves_a_checkpoint(status, output):
+        assert status == 130 and "Traceback" not in output and "--resume" in output, output
         summary = read_json(tmp_path / "summary.json")
         assert not summary["complete"] and load_checkpoint(last).values["step"] == summary["steps"] > steps[-1]
         steps.append(summary["steps"])
-        command = [sys.executable, "-m", "voronerf.cli.main", *words("train --resume --out", tmp_path)]
+
+    endless = TINY.replace("--steps 16", "--steps 100000 --checkpoint-every 0.2")
+    command = [sys.executable, "-m", "voronerf.cli.main", *words("train --data builtin --out", tmp_path, endless)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    deadline = time.monotonic() + 600
+    while not last.exists():
+        assert time.monotonic() < deadline and process.poll() is None, process.stdout and process.stdout.read()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    output = process.communicate(timeout=600)[0].decode()
+    leaves_a_checkpoint(process.returncode, output)
+
+    train_step = Trainer.train_step
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
+        monkeypatch.setattr(Trainer, "train_step", lambda t, n=number: (signal.raise_signal(n), train_step(t))[1])
+        before = signal.signal(number, signal.SIG_DFL)  # nohup, and the background of a shell, ignore some
+        try:
+            leaves_a_checkpoint(main(words("train --resume --out", tmp_path)), "".join(capsys.readouterr()))
+        finally:
+            signal.signal(number, before)
     succeeds("eval", tmp_path, "--views 1 --panels 0")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 import sys
 from pathlib import Path
@@ -67,13 +68,14 @@ def test_options_on_a_page_exist(name: str) -> None:
             assert option in known, f"{name}: voronerf train has no {option}"
 
 
+@functools.cache
 def sources() -> set[str]:
     names = ("voronerf", "csrc", "kernels", "benchmarks", "tests", "docs", "examples", ".ci")
     files = [path for name in names for path in (ROOT / name).rglob("*.*")] + list(ROOT.glob("*.*"))
     return {f"/{path.relative_to(ROOT).as_posix()}" for path in files}
 
 
-@pytest.mark.parametrize("name", [*PAGES, "CONTRIBUTING.md", "CHANGELOG.md"])
+@pytest.mark.parametrize("name", [*PAGES, "CONTRIBUTING.md", "CHANGELOG.md", "Makefile"])
 def test_files_that_a_page_names_exist(name: str) -> None:
     files = sources()
     for path in re.findall(r"(?<![*>\w./-])[\w./-]+\.(?:py|cpp|cu|h|toml)\b(?!:)", (ROOT / name).read_text()):
