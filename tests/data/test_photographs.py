@@ -144,6 +144,17 @@ def test_masks_leave_pixels_out_of_training_and_scores(tmp_path):
         refuses(reason, load_scene, tmp_path, error=SceneError)
 
 
+def test_the_corners_that_a_fisheye_does_not_reach_are_left_out(tmp_path):
+    rig = orbit_cameras(9, radius=2, elevation=5, width=20, height=20, focal=6)
+    write_capture(tmp_path, rig, fl_x=6.0, k1=-0.1, is_fisheye=True)  # the angle t is at 6 (t - 0.1 t^3), at most 7.3
+    scene = load_scene(tmp_path)
+    y, x = torch.meshgrid(torch.arange(20) - 9.5, torch.arange(20) - 9.5, indexing="ij")
+    assert torch.equal(scene.train.masks[0], torch.hypot(x, y) < 7.3)
+    short = {"steps": 4, "cells": (), "width": 8, "rays": 32, "samples": 8, "evaluations": 1}
+    summary = Trainer(TrainConfig(out=tmp_path / "run", **short), scene).run()
+    assert 0 < summary["psnr"] < 100 and 0 < summary["ssim"] < 1
+
+
 def test_nerfstudio_files(tmp_path):
     """Its applied_transform leads from the original coordinates to those of the file; depth is not used."""
     write_capture(tmp_path, Cameras(POSES, torch.full((9, 4), 12.0), 12, 10))

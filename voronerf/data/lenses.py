@@ -5,6 +5,7 @@ Source: COLMAP, "Camera Models", and `src/colmap/sensor/models.h`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -64,16 +65,30 @@ def lens_inverts(cameras: Cameras) -> Tensor:
 
     A lens model that folds over inside the image has none there.
     """
-    if cameras.distortion is None:
-        return torch.ones(len(cameras), dtype=torch.bool)
     edge = torch.linspace(0, 1, 33, dtype=torch.float64)
-    sizes = torch.tensor([cameras.size(index) for index in range(len(cameras))], dtype=torch.float64)
-    x = torch.cat((edge, edge, torch.zeros(33), torch.ones(33)))[None] * sizes[:, :1]
-    y = torch.cat((torch.zeros(33), torch.ones(33), edge, edge))[None] * sizes[:, 1:]
-    fx, fy, cx, cy = cameras.intrinsics.double()[:, :, None].unbind(1)
-    coefficients = cameras.distortion.double()[:, None, :]
-    u, v = (x - cx) / fx, (y - cy) / fy
+    low, high = torch.zeros(33), torch.ones(33)
+    x, y = torch.cat((edge, edge, low, high)), torch.cat((low, high, edge, edge))
+    found = torch.ones(len(cameras), dtype=torch.bool)
+    for index in range(len(cameras)):
+        width, height = cameras.size(index)
+        found[index] = _has_ray(cameras, index, x * width, y * height).all()
+    return found
+
+
+def pixels_with_rays(cameras: Cameras, index: int) -> Tensor:
+    """The pixels of an image whose centre the lens model reaches, bool [h, w]; a fisheye may leave out the corners."""
+    width, height = cameras.size(index)
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    return _has_ray(cameras, index, x, y)
+
+
+def _has_ray(cameras: Cameras, index: int, x: Tensor, y: Tensor) -> Tensor:
+    if cameras.distortion is None:
+        return torch.ones_like(x, dtype=torch.bool)
+    fx, fy, cx, cy = cameras.intrinsics[index].double()
+    coefficients = cameras.distortion[index].double()
+    u, v = (x.double() - cx) / fx, (y.double() - cy) / fy
     a, b = undistort(u, v, coefficients, cameras.fisheye)
     again, and_again = distort(a, b, coefficients, cameras.fisheye)
-    error = torch.maximum((again - u).abs() * fx, (and_again - v).abs() * fy)
-    return (error < 1e-3).all(-1)
+    found = torch.maximum((again - u).abs() * fx, (and_again - v).abs() * fy) < 1e-3
+    return found & (torch.hypot(a, b) < math.pi) if cameras.fisheye else found

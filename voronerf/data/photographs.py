@@ -18,7 +18,7 @@ from torch import Tensor
 
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images, read_masks
-from voronerf.data.lenses import Lens, lens_inverts
+from voronerf.data.lenses import Lens, lens_inverts, pixels_with_rays
 from voronerf.data.scene import Scene, SceneError, Split
 from voronerf.data.transforms import distinct_names
 from voronerf.rendering.cameras import Cameras, focus_point
@@ -128,6 +128,7 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
     cameras = _cameras(frame.poses(poses), views, sizes, found.source)
     contraction = _contraction(kind, frame, cameras)
     cameras = cameras.downscaled(found.factor)
+    masks = _without_dark_corners(cameras, masks, found.source, views)
     near, far, box = frame.near, frame.far, None
     if kind == "object":
         box = carve_box(cameras[:count], images[:count, ..., 3], near, far)
@@ -311,11 +312,27 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
     fisheye = views[0].lens.fisheye
     distortion = bent if fisheye or bool(bent.any()) else None
     cameras = Cameras.of_images(poses.float(), torch.tensor(intrinsics), sizes, distortion, fisheye)
+    return cameras
+
+
+def _without_dark_corners(cameras: Cameras, masks: Tensor | None, source: Path, views: Sequence[View]) -> Tensor | None:
+    """The masks without the pixels that no ray of a fisheye reaches.
+
+    Raises:
+        SceneError: such pixels of another lens, whose model is then a wrong one.
+    """
     inverts = lens_inverts(cameras)
-    if not bool(inverts.all()):
+    if bool(inverts.all()):
+        return masks
+    if not cameras.fisheye:
         name = views[int(inverts.int().argmin())].path.name
         raise SceneError(f"{source}: the lens distortion of {name} cannot be inverted inside the image")
-    return cameras
+    if masks is None:
+        masks = torch.ones(len(cameras), cameras.height, cameras.width, dtype=torch.bool)
+    for index in (~inverts).nonzero()[:, 0].tolist():
+        width, height = cameras.size(index)
+        masks[index, :height, :width] &= pixels_with_rays(cameras, index)
+    return masks
 
 
 def _note(kind: str, frame: Frame, reading: Reading) -> str:
