@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -20,39 +19,25 @@ from voronerf.data import Scene
 from voronerf.data.record import write_scene
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.evaluation.lpips import Lpips, find_lpips
-from voronerf.evaluation.scores import evaluate, mean_scores
-from voronerf.files import json_text, write_text
+from voronerf.evaluation.scores import evaluate
+from voronerf.files import write_text
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import Checkpoint, CheckpointWriter, checkpoint_paths, last_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
-from voronerf.training.divergence import (
-    PATIENCE,
-    SETTLED,
-    GradientGuard,
-    all_finite,
-    one_colour_psnr,
-    why_scores_are_poor,
-)
-from voronerf.training.networks import (
-    check_memory,
-    computes_natively,
-    make_optimizer,
-    make_routers,
-    resolve_config,
-)
+from voronerf.training.divergence import PATIENCE, GradientGuard, all_finite
+from voronerf.training.networks import check_memory, computes_natively, make_optimizer, make_routers, resolve_config
 from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
+from voronerf.training.rates import learning_rate, sharpness, temperature
+from voronerf.training.records import record_scores, summarise
 from voronerf.training.renderers import make_renderer
 from voronerf.training.resume import resume_training, resumed_checkpoint, training_state
 from voronerf.training.run_directory import read_metrics
 from voronerf.training.splitting import median, save_samples, split_by_samples
 
-#: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
-#: which forgets in some thirty steps, would empty itself for good.
-WARMUP_STEPS = 100
 #: Steps between evaluations of random cells of the occupancy grid.
 OCCUPANCY_EVERY = 16
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
@@ -61,8 +46,6 @@ READ_EVERY = 50
 HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 #: Steps between tries to split the worst cell.
 SPLIT_EVERY = 5
-#: Entries of the last evaluation that summary.json repeats.
-FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views")
 
 
 class Trainer:
@@ -166,24 +149,8 @@ class Trainer:
         return len(self.stages) - 1
 
     def learning_rate(self) -> float:
-        """Exponential decay from ``lr`` to ``lr * lr_final``, after a linear rise over the warm-up, `WARMUP_STEPS` at
-        most; ``lr_split`` of it for each split that was made."""
-        config, done = self.config, self.fraction
-        assert config.lr is not None
-        rise = 1.0
-        if done < config.warmup and self.step < WARMUP_STEPS:
-            rise = 0.01 + 0.99 * max(done / config.warmup, self.step / WARMUP_STEPS)
-        rate = config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**self.level
-        return rate * self.rate_factor
-
-    def temperature(self) -> float:
-        """Of the stochastic assignment: exponential decay from ``temperature``, by ``temperature_final`` in all."""
-        return self.config.temperature * math.exp(math.log(self.config.temperature_final) * self.fraction)
-
-    def sharpness(self) -> float:
-        """Exponent of the proposal's weights (mip-NeRF 360, section 3): from 0 to 1 over the run, or 1."""
-        slope, done = self.config.proposal_anneal, self.fraction
-        return slope * done / ((slope - 1) * done + 1) if slope else 1.0
+        """Of the next step, see :func:`voronerf.training.rates.learning_rate`; half of it after a divergence."""
+        return learning_rate(self.config, self.fraction, self.step, self.level) * self.rate_factor
 
     def averaged(self) -> AbstractContextManager[None]:
         """A context in which the networks have their averaged weights, for pictures; not for training."""
@@ -215,7 +182,7 @@ class Trainer:
             for router in self.routers.values():
                 router.blend = self.config.blend
             self._evaluate(self.config.final_views, self.lpips)
-        return self._summarise()
+        return summarise(self)
 
     def advance(self, until: float = math.inf) -> None:
         """Trains until ``until`` training seconds or the end of the budget, whichever comes first.
@@ -304,8 +271,8 @@ class Trainer:
     def _train_step(self) -> Tensor:
         set_learning_rate(self.optimizer, self.learning_rate())
         for router in self.routers.values():
-            router.temperature = self.temperature()
-        self.renderer.sharpness = self.sharpness()
+            router.temperature = temperature(self.config, self.fraction)
+        self.renderer.sharpness = sharpness(self.config, self.fraction)
         if self.occupancy is not None and self.step % OCCUPANCY_EVERY == 0:
             self.router.eval()
             revisit_cells(self.occupancy, self.renderer.field, self.generator, backend=self.config.backend)
@@ -399,43 +366,7 @@ class Trainer:
         if self.stopped:
             return
         self.evaluated = self._due()
-        now = {
-            "step": self.step,
-            "seconds": round(self.seconds, 3),
-            "cells": self.router.num_cells,
-            "learning_rate": self.learning_rate(),
-            "views": len(scores),
-            **mean_scores(scores),
-        }
-        self.metrics = [m for m in self.metrics if m["step"] < self.step] + [now]
-        write_text(self.out / "metrics.jsonl", "".join(json_text(m) + "\n" for m in self.metrics))
-        self.say(
-            f"{self.seconds:7.1f} s  step {self.step:6d}  {self.router.num_cells:4d} cells  "
-            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
-        )
-        if self.one_colour is None:
-            self.one_colour = one_colour_psnr(self.scene)
-        settled = self.step >= SETTLED and self.fraction >= 0.5
-        poor = why_scores_are_poor(self.metrics, self.config, self.one_colour, settled=settled)
-        if poor is not None:
-            self.say(poor)
-
-    def _summarise(self) -> dict[str, Any]:
-        summary = {
-            **{key: self.metrics[-1].get(key) if self.metrics else None for key in FIGURES},
-            "complete": self.fraction >= 1 and not self.stopped,
-            "seconds": self.seconds,
-            "steps": self.step,
-            "rays_per_second": self.step * self.config.rays / max(self.seconds, 1e-9),
-            "parameters": sum(p.numel() for router in self.routers.values() for p in router.parameters()),
-            "cells": self.router.num_cells,
-            "splits_left": len(self.plan) - self.level,
-            "skipped_steps": int(self.guard.skipped),
-            "width": self.config.width,
-            "stages": [asdict(stage) for stage in self.stages],
-        }
-        write_text(self.out / "summary.json", json_text(summary, indent=2) + "\n")
-        return summary
+        record_scores(self, scores)
 
     def save(self, *, wait: bool = True) -> None:
         """Writes ``checkpoints/last.safetensors``; without ``wait`` it is begun, and :attr:`writer` ends it."""

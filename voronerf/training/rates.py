@@ -1,0 +1,32 @@
+"""What changes over a run: the learning rate, the temperature of the assignment, the sharpness of a proposal."""
+
+from __future__ import annotations
+
+import math
+
+from voronerf.training.config import TrainConfig
+
+#: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
+#: which forgets in some thirty steps, would empty itself for good.
+WARMUP_STEPS = 100
+
+
+def learning_rate(config: TrainConfig, done: float, step: int, splits: int) -> float:
+    """Exponential decay from ``lr`` to ``lr * lr_final`` over the fraction 0..1 that is done, after a linear rise over
+    the warm-up, `WARMUP_STEPS` at most; ``lr_split`` of it for each split that was made."""
+    assert config.lr is not None
+    rise = 1.0
+    if done < config.warmup and step < WARMUP_STEPS:
+        rise = 0.01 + 0.99 * max(done / config.warmup, step / WARMUP_STEPS)
+    return config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**splits
+
+
+def temperature(config: TrainConfig, done: float) -> float:
+    """Of the stochastic assignment: exponential decay from ``temperature``, by ``temperature_final`` in all."""
+    return config.temperature * math.exp(math.log(config.temperature_final) * done)
+
+
+def sharpness(config: TrainConfig, done: float) -> float:
+    """Exponent of the proposal's weights (mip-NeRF 360, section 3): from 0 to 1 over the run, or 1."""
+    slope = config.proposal_anneal
+    return slope * done / ((slope - 1) * done + 1) if slope else 1.0
