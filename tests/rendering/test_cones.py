@@ -10,6 +10,7 @@ from voronerf.rendering import Contraction, Perspective, Rays, orbit_cameras
 from voronerf.rendering.cones import frustum_gaussians, frustum_moments
 
 WIDE = torch.float64
+ORBIT = {"radius": 2.0, "elevation": 20.0, "width": 4, "height": 4, "focal": 4.0}
 
 
 def cone_points(edges, radius, count):
@@ -142,3 +143,17 @@ def test_contracted_cones_are_those_of_space_inside_of_the_sphere():
 def test_a_sphere_has_a_centre_and_a_radius(centre, radius):
     with pytest.raises(ValueError, match=r"centre must have shape \[3\] and radius be positive and finite, got "):
         Contraction(torch.zeros(centre), radius)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Contraction(torch.tensor([0.1, -0.2, 0.3]), 0.7),
+        Perspective(torch.tensor([0.5, 0.0, 1.0]), orbit_cameras(1, **ORBIT).poses[0, :3, :3].T, 0.8, (0.5, 0.4)),
+    ],
+)
+def test_contractions_can_be_undone(space):
+    points = torch.rand(50, 3, generator=seeded(1)) * 8 - torch.tensor([4.0, 4.0, -1.0])
+    if isinstance(space, Perspective):  # it does not map what lies before half its near plane
+        points = points @ space.axes + space.centre
+    torch.testing.assert_close(space.inverse(space.points(points)), points, rtol=1e-3, atol=1e-4)

@@ -199,7 +199,15 @@ def test_each_tab_has_its_own_view_and_a_closed_one_costs_nothing(viewer, scene,
     tab.until(lambda: len(viewer.clients) == 1)
     while viewer.render_next():
         pass
-    assert not viewer.render_next()
+
+
+def test_a_canvas_without_pixels_is_passed_over(scene, tab) -> None:
+    picture = tab.rest()
+    tab.size = (0, 0)
+    tab.look(scene.test.cameras, 1)
+    assert np.array_equal(tab.rest(), picture)
+    tab.click(float("nan"), -3.0)
+    tab.until(lambda: tab.viewer.tasks.empty())
 
 
 def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> None:

@@ -130,8 +130,7 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene, view: tuple[st
         say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
         if viewer is not None:
             say(f"{viewer.address} shows the run until Ctrl-C")
-            with contextlib.suppress(KeyboardInterrupt):
-                viewer.serve()
+            viewer.stay()
         return summary
 
 

@@ -50,6 +50,14 @@ class Contraction:
         offset, length = self._offset(points, centre)
         return centre + self.radius * offset * ((2 - 1 / length) / length)
 
+    def inverse(self, points: Tensor) -> Tensor:
+        """Where points [..., 3] of the contracted space come from; at most 1,000 R from the centre."""
+        centre = self.centre.to(points)
+        offset = (points - centre) / self.radius
+        length = offset.norm(dim=-1, keepdim=True)
+        far = 1 / ((2 - length).clamp_min(1e-3) * length.clamp_min(1))
+        return centre + self.radius * offset * torch.where(length > 1, far, 1)
+
     @property
     def cube(self) -> Tensor:
         """The corners [2, 3] of a box around all of space."""
@@ -115,6 +123,12 @@ class Perspective:
         local, depth = self._local(points)
         across = local[..., :2] / (depth * depth.new_tensor(self.slopes))
         return torch.cat((across, 1 - 2 * self.near / depth), dim=-1)
+
+    def inverse(self, points: Tensor) -> Tensor:
+        """Where points [..., 3] of the contracted space come from; at most 2,000 times the near plane's depth away."""
+        depth = 2 * self.near / (1 - points[..., 2:]).clamp_min(1e-3)
+        across = points[..., :2] * depth * depth.new_tensor(self.slopes)
+        return torch.cat((across, depth), dim=-1) @ self.axes.to(points) + self.centre.to(points)
 
     @property
     def cube(self) -> Tensor:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import io
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 import viser
 from PIL import Image
@@ -35,6 +38,7 @@ class Client:
     """A browser that has connected.
 
     Attributes:
+        camera: its camera, with so many pixels along the longer side.
         look: what it shows.
         longest: pixels along the longer side of its sharp picture.
         version: counts what changes its picture.
@@ -51,6 +55,9 @@ class Client:
         self.look, self.longest = Look(level=viewer.subject.diagram.depth), SHARP
         self.version, self.moved_at, self.drawn_at, self.cost = 0, 0.0, 0.0, 0.0
         self.wants_coarse = self.wants_sharp = True
+        start = viewer.server.initial_camera
+        self.camera: Callable[[int], Cameras] = partial(make_camera, np.eye(3), start.position, start.fov, 1.0)
+        self._look_around()
         self.picked: int | None = None
         self.wants_screenshot = False
         self.nodes: dict[str, list[Any]] = {"centres": [], "cameras": []}
@@ -60,18 +67,21 @@ class Client:
 
     # --- what it sees ----------------------------------------------------------------------------------------------
 
-    def camera(self, longest: int) -> Cameras:
-        """Its camera, with so many pixels along the longer side."""
-        seen = self.handle.camera
-        return make_camera(SO3(seen.wxyz).as_matrix(), seen.position, seen.fov, seen.aspect, longest)
-
     @property
     def shows_nodes(self) -> bool:
         """Whether something is drawn into the scene."""
         return any(self.nodes.values())
 
     async def _moved(self, _: object) -> None:
+        self._look_around()
         self.change()
+
+    def _look_around(self) -> None:
+        """Takes the browser's camera, unless its canvas has no pixels or its numbers are none."""
+        now = self.handle.camera
+        numbers = (*now.wxyz, *now.position, now.fov)
+        if min(now.image_width, now.image_height) > 0 and np.isfinite(numbers).all() and 0 < now.fov < math.pi:
+            self.camera = partial(make_camera, SO3(now.wxyz).as_matrix(), now.position, now.fov, now.aspect)
 
     def change(self, **look: Any) -> None:
         """Asks for new pictures, with other values of its `Look`."""
@@ -139,7 +149,7 @@ class Client:
             shot.on_click(lambda _: self._ask_screenshot())
 
     def _resize(self, longest: int) -> None:
-        self.longest = longest
+        self.longest = max(1, min(longest, LARGEST))
         self.change()
 
     def _ask_screenshot(self) -> None:
@@ -192,11 +202,12 @@ class Client:
     def _show_centres(self, show: bool) -> None:
         self._clear("centres")
         if show:
-            diagram = self.viewer.subject.diagram
+            diagram, contraction = self.viewer.subject.diagram, self.viewer.subject.renderer.contraction
+            centres = diagram.leaf_centres if contraction is None else contraction.inverse(diagram.leaf_centres)
             bounds = scene_bounds(self.viewer.subject.scene)
             cloud = self.handle.scene.add_point_cloud(
                 "/centres",
-                diagram.leaf_centres.cpu().numpy(),
+                centres.cpu().numpy(),
                 palette(diagram.num_cells).numpy(),
                 point_size=0.012 * float((bounds[1] - bounds[0]).norm()),
                 point_shape="circle",

@@ -53,11 +53,14 @@ class Keyframes:
         count = round(self.seconds.value * FPS)
         frames = smooth_path(keyframes, count, closed=self.closed.value)
         folder = self.folder / "camera_paths"
-        folder.mkdir(exist_ok=True)
         number = 1
         while (file := folder / f"path-{number}.json").exists():
             number += 1
-        write_camera_path(file, CameraPath(frames, FPS, keyframes, self.closed.value))
+        try:
+            write_camera_path(file, CameraPath(frames, FPS, keyframes, self.closed.value))
+        except OSError as error:
+            self.client.handle.add_notification("Path not saved", str(error), color="red")
+            return
         command = f"voronerf render {shlex.quote(str(self.folder))} --path {shlex.quote(str(file))}"
         self.client.handle.add_notification("Path saved", f"Render it with: {command}")
 

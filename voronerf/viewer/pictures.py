@@ -174,6 +174,7 @@ def cell_at(subject: Subject, camera: Cameras, look: Look, x: float, y: float) -
         x: position from the left, 0..1.
         y: position from the top, 0..1.
     """
-    left, top = (min(int(share * size), size - 1) for share, size in ((x, camera.width), (y, camera.height)))
+    sides = ((x, camera.width), (y, camera.height))
+    left, top = (min(int(max(0.0, min(share, 1.0)) * size), size - 1) for share, size in sides)
     image = render_look(subject, crop_camera(camera, left, top, 1, 1), replace(look, pane="cells"))
     return int(cells_of(subject, image.heaviest)) if float(image.opacity) > 0.5 else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 
 from voronerf.training.progress import Progress
@@ -33,6 +34,7 @@ class TrainingViewer(Viewer):
         self.trainer, self.diagram = trainer, trainer.router.diagram
         self.paused = False
         self.told_at = 0.0
+        self.now: Progress | None = None
         gui = self.server.gui
         self.line = gui.add_markdown("", order=-3)
         self.button = gui.add_button("Pause", order=-2)
@@ -46,6 +48,7 @@ class TrainingViewer(Viewer):
 
     def on_step(self, now: Progress) -> None:
         """Shows the state after a step; returns when training shall go on."""
+        self.now = now
         if not self.clients and not self.paused:
             return
         if self.trainer.router.diagram is not self.diagram:
@@ -53,16 +56,27 @@ class TrainingViewer(Viewer):
             for client in self.list_clients():
                 client.on_diagram()
         if time.perf_counter() - self.told_at > TELL:
-            self.tell(now)
+            self.tell()
         self.refresh()
         self.render_next()
         if self.paused:
-            self.tell(now)
+            self.tell()
             self.serve(lambda: not self.paused or self.trainer.stopped)
 
-    def tell(self, now: Progress) -> None:
+    def stay(self) -> None:
+        """Shows what came of the training, until Ctrl-C."""
+        self.button.visible = False
+        self.tell()
+        for client in self.list_clients():
+            client.change()
+        with contextlib.suppress(KeyboardInterrupt):
+            self.serve()
+
+    def tell(self) -> None:
         """Writes the lines about the training, and its curve."""
-        self.told_at = time.perf_counter()
+        self.told_at, now = time.perf_counter(), self.now
+        if now is None:
+            return
         self.line.content = (
             f"step {now.step:,}, {now.seconds:.0f} s, {now.fraction:.0%}  \n"
             f"{now.cells} cells, {now.rays_per_second / 1000:.1f} k rays/s  \n"

@@ -80,7 +80,8 @@ class Viewer:
     @property
     def address(self) -> str:
         """What to open in a browser."""
-        return f"http://{self.host}:{self.port}"
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
 
     def show_curve(self, points: Sequence[tuple[float, float]]) -> None:
         """Draws PSNR in dB over training seconds, from the second evaluation on.
@@ -113,6 +114,8 @@ class Viewer:
 
     def _enter(self, handle: viser.ClientHandle) -> None:
         self.clients[handle.client_id] = Client(handle, self)
+        if handle.client_id not in self.server.get_clients():  # it has left meanwhile
+            del self.clients[handle.client_id]
         self.wake.set()
 
     async def _leave(self, handle: viser.ClientHandle) -> None:
