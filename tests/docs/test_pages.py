@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import functools
 import re
 import sys
@@ -58,10 +59,12 @@ def test_every_option_of_every_command_is_on_the_page(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("name", [name for name in PAGES if "changelog" not in name])
 def test_options_on_a_page_exist(name: str) -> None:
+    from voronerf.cli.commands import train
     from voronerf.training.config import TrainConfig
 
     fields = dataclasses.fields(TrainConfig)
     known = {f"--{field.name.replace('_', '-')}" for field in fields}
+    known |= {f"--{parameter}" for parameter in inspect.signature(train).parameters}
     known |= {f"--no-{field.name.replace('_', '-')}" for field in fields if isinstance(field.default, bool)}
     for line in re.findall(r"voronerf train( [^`\n|]*)", (ROOT / name).read_text()):
         for option in re.findall(r"(?<!\w)--[a-z-]+", line):
