@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
+from composite_cases import dense, evaluate, leaves_of, scene
 from helpers import pairwise
-from op_cases import FLOATS, need, offsets_of, refusals, strided
+from op_cases import FLOATS, HALVES, need, offsets_of, refusals, strided
 from tolerances import assert_as_exact
 
 from voronerf.ops import Composite, composite
@@ -209,6 +210,33 @@ def test_gradients_of_the_backend(device, backend, form):
     plain = gradients(torch.float32, torch.device("cpu"), "reference")
     for found, same, right in zip(gradients(torch.float32, device, backend), plain, exact):
         assert_as_exact(found, same, right)
+
+
+@pytest.mark.parametrize("background", ["ray", "all", ""])
+def test_gradients_in_front_of_any_background(backend, background):
+    for given in (dense(4, 33, 3, background), scene([3, 0, 130, 1], 2, background, outside=(2, 5))):
+        exact, plain = (evaluate(given, dtype, "reference") for dtype in (torch.float64, torch.float32))
+        for found, same, right in zip(evaluate(given, torch.float32, backend), plain, exact):
+            assert_as_exact(found, same, right)
+
+
+@pytest.mark.parametrize("parts", [("colour",), ("opacity",), ("depth",), ("weights",), ("depth", "weights")])
+def test_gradients_of_some_outputs(backend, parts):
+    for given in (dense(4, 21), dense(4, 21, 2, "all"), scene([4, 0, 9])):
+        exact = evaluate(given, torch.float64, "reference", parts)
+        for found, right in zip(evaluate(given, torch.float32, backend, parts), exact):
+            torch.testing.assert_close(found.double(), right, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+def test_half_storage(backend, dtype):
+    cast, leaves = leaves_of(dense(3, 20), dtype)
+    result = composite(**cast, backend=backend)
+    gradients = torch.autograd.grad(sum(part.float().sum() for part in result), leaves)
+    assert all(tensor.dtype == dtype for tensor in (*result, *gradients))
+    wide = {name: None if tensor is None else tensor.float() for name, tensor in cast.items()}
+    for part, want in zip(result, composite(**wide, backend=backend)):
+        torch.testing.assert_close(part.float(), want, rtol=torch.finfo(dtype).eps, atol=1e-6)
 
 
 def test_errors():
