@@ -54,9 +54,8 @@ def flipped_bit(rng: random.Random, folder: Path, given: Path) -> str:
     older = load_checkpoint(checkpoint_paths(run)[1])
     # The header is a small part of the file, and the one with most structure.
     bit = rng.randrange(8 * min(len(data), 6000 if rng.random() < 0.5 else len(data)))
+    path.unlink()  # tensors that were read may be a map of the file
     path.write_bytes(flipped(data, bit) if rng.random() < 0.7 else damaged(rng, data))
-    if path.read_bytes() == data:
-        return RIGHT
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         found = last_checkpoint(run)
