@@ -112,10 +112,10 @@ def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 def check_message(op: str, call: dict[str, Any], name: str, error: Exception) -> None:
-    """The error names the op and an argument, in a line of some length."""
+    """The error names the op, or one that it is composed of, and an argument, in a line of some length."""
     text = str(error)
     arguments = inspect.signature(getattr(ops, op)).parameters
-    named = re.match(rf"{op}(_grid)?(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
+    named = re.match(rf"({'|'.join(backends.ops())})(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
     if not named or "\n" in text or len(text) > 500:
         raise Failed(f"{op}: the error for {name} is not clear: {type(error).__name__}: {text:.300}; {describe(call)}")
 

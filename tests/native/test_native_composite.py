@@ -125,5 +125,7 @@ def test_opcheck_of_some_gradients(form: str) -> None:
 def test_offsets_that_do_not_rise() -> None:
     given, _ = leaves_of(scene([5, 8]), torch.float32)
     for bad in ([0, 9, 5], [0, 5, 14], [-1, 5, 13]):
-        with pytest.raises(ValueError, match=r"^composite: ray_offsets must rise from 0 or more to at most .* 13, got"):
-            composite(**{**given, "ray_offsets": torch.tensor(bad, dtype=torch.int32)}, backend="native")
+        for backend in ("native", "reference"):
+            message = r"^composite: ray_offsets must rise from 0 or more to at most .* 13, got"
+            with pytest.raises(ValueError, match=message):
+                composite(**{**given, "ray_offsets": torch.tensor(bad, dtype=torch.int32)}, backend=backend)

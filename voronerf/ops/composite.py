@@ -60,7 +60,7 @@ def composite(
         and is not divided by the opacity.
 
     Raises:
-        ValueError: shapes, devices or an unknown backend.
+        ValueError: shapes, devices or an unknown backend; on the CPU also offsets that fall or exceed m.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 

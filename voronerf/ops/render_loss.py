@@ -55,7 +55,8 @@ def render_loss(
         RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
 
     Raises:
-        ValueError: shapes, devices, a density_scale that is not positive, an unknown backend.
+        ValueError: shapes, devices, a density_scale that is not positive, an unknown backend; on the CPU also offsets
+            that fall or exceed m.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 

@@ -36,6 +36,20 @@ class Composite(NamedTuple):
     weights: Tensor
 
 
+def check_ray_offsets(op: str, ray_offsets: Tensor, m: int) -> None:
+    """On the CPU, as the kernels do: ValueError unless the offsets rise from 0 or more to m or less."""
+    if ray_offsets.device.type != "cpu" or torch.compiler.is_compiling():
+        return
+    wrong = (ray_offsets < 0) | (ray_offsets > m)
+    wrong[1:] |= ray_offsets[1:] < ray_offsets[:-1]
+    if bool(wrong.any()):
+        ray = int(wrong.nonzero()[0])
+        raise ValueError(
+            f"{op}: ray_offsets must rise from 0 or more to at most the number of samples, {m}, got "
+            f"{int(ray_offsets[ray])} for ray {ray}"
+        )
+
+
 def composite(
     sigma: Tensor,
     rgb: Tensor,
@@ -56,6 +70,7 @@ def composite(
         opacity = weights.sum(dim=1)
         depth = (weights * depths).sum(dim=1)
     else:
+        check_ray_offsets("composite", ray_offsets, sigma.shape[0])
         rays = ray_offsets.shape[0] - 1
         row = torch.arange(sigma.shape[0], device=sigma.device)
         # One more than the ray of each sample: 0 and rays + 1 are for samples that belong to no ray.

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from voronerf.reference.composite import composite
+from voronerf.reference.composite import check_ray_offsets, composite
 
 
 class RenderLoss(NamedTuple):
@@ -49,6 +49,7 @@ def render_loss(
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
     colours, density = torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
+    check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
     seen = composite(density, colours, deltas, deltas, ray_offsets=ray_offsets, background=background)
     error = (seen.colour - target).square().sum(-1)
     rest = (seen.colour, seen.weights, density, error)
