@@ -201,6 +201,16 @@ def test_each_tab_has_its_own_view_and_a_closed_one_costs_nothing(viewer, scene,
         pass
 
 
+def test_a_camera_may_stand_anywhere(scene, tab) -> None:
+    near = tab.rest()
+    poses = scene.test.cameras.poses.clone()
+    poses[0, :3, 3] *= 3  # beyond where the scene ends for its own cameras
+    tab.look(replace(scene.test.cameras, poses=poses), 0)
+    far = tab.rest()
+    share = (far.min(-1) < 220).sum() / (near.min(-1) < 220).sum()
+    assert 0.06 < share < 0.2
+
+
 def test_a_canvas_without_pixels_is_passed_over(scene, tab) -> None:
     picture = tab.rest()
     tab.size = (0, 0)

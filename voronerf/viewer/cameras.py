@@ -73,10 +73,9 @@ def scene_bounds(scene: Scene) -> Tensor:
     return torch.stack((places.amin(0), places.amax(0)))
 
 
-def look_point(scene: Scene, index: int = 0) -> Tensor:
-    """What a training view looks at, as the point [3] to turn around: on its axis, beside the focus of all views."""
-    cameras = scene.train.cameras
-    focus = focus_point(cameras)
+def look_point(scene: Scene, cameras: Cameras, index: int) -> Tensor:
+    """What one of several cameras looks at, as the point [3] to turn around: on its axis, beside the scene's focus."""
+    focus = focus_point(scene.train.cameras)
     centre = scene_bounds(scene).mean(0) if focus is None else focus
     origin, forward = cameras.origins[index], cameras.forward[index]
     return origin + forward * ((centre - origin) @ forward).clamp_min(0.1)

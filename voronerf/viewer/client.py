@@ -254,7 +254,7 @@ class Client:
         def _(_: object) -> None:
             with self.handle.atomic():
                 self.handle.camera.position = pose[:3, 3]
-                self.handle.camera.look_at = look_point(scene, view).numpy()
+                self.handle.camera.look_at = look_point(scene, cameras, view).numpy()
                 self.handle.camera.up_direction = pose[:3, 1]
                 self.handle.camera.fov = fov
 

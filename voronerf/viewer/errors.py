@@ -95,7 +95,9 @@ class ViewErrors:
         inside &= (pixels[:, 0] < view.camera.width) & (pixels[:, 1] < view.camera.height)
         column, row = torch.where(inside[:, None], pixels, 0).long().unbind(-1)
         distance = (places - view.camera.origins[0]).norm(dim=-1)
-        seen = inside & (distance <= self._depth(view.image)[row, column] * (1 + BEHIND))
+        seen = distance <= self._depth(view.image)[row, column] * (1 + BEHIND)
+        seen |= (image.opacity.reshape(-1) < 0.5) & (view.image.opacity[row, column] < 0.5)
+        seen &= inside
         shape = image.opacity.shape
         picture = picture_of_error(view.error[row, column].reshape(*shape, 3), torch.zeros(()))
         picture[~seen.reshape(shape)] = torch.tensor(UNSEEN, dtype=torch.uint8)

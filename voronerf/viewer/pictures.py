@@ -104,9 +104,18 @@ def groups_of(diagram: VoronoiDiagram, level: int) -> Tensor:
     return starts.cumsum(0) - 1
 
 
+def space_from(scene: Scene, camera: Cameras) -> Scene:
+    """A scene for a camera that may be anywhere: its box, where it has one, is seen from outside and from inside."""
+    if scene.box is None:
+        return scene
+    diagonal = float((scene.box[1] - scene.box[0]).norm())
+    away = float((camera.origins[0] - scene.box.mean(0)).norm())
+    return replace(scene, near=0.01 * diagonal, far=away + diagonal)
+
+
 def render_bands(subject: Subject, camera: Cameras, look: Look, rows: int) -> Iterator[RenderedImage]:
     """Renders a camera in bands of `rows` rows from top to bottom, with what a look hides and crops."""
-    renderer, scene = subject.renderer, subject.scene
+    renderer, scene = subject.renderer, space_from(subject.scene, camera)
     if look.hidden:
         hidden = torch.zeros(subject.diagram.num_cells, dtype=torch.bool)
         hidden[list(look.hidden)] = True

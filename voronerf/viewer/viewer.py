@@ -69,9 +69,9 @@ class Viewer:
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
         self.host, self.port = host, self.server.get_port()
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
-        start, cameras = self.server.initial_camera, subject.scene.train.cameras
+        start, cameras = self.server.initial_camera, subject.scene.test.cameras
         start.position = cameras.origins[0].numpy()
-        start.look_at = look_point(subject.scene).numpy()
+        start.look_at = look_point(subject.scene, cameras, 0).numpy()
         start.fov = 2 * math.atan(cameras.size(0)[1] / 2 / float(cameras.intrinsics[0, 1]))
         self.curve: viser.GuiUplotHandle | None = None
         self.server.on_client_connect(self._enter)
