@@ -5,6 +5,7 @@ module for each sanitizer, which are told nothing of the scheduler (emulation.cp
 """
 
 import fcntl
+import functools
 import importlib.util
 import platform
 import shlex
@@ -16,8 +17,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent.parent
 HERE = Path(__file__).resolve().parent
 SANITIZERS = {"none": [], "address": ["-fsanitize=address"], "thread": ["-fsanitize=thread"]}
-PLAIN = {"emulation.cpp", "module.cpp", "index_maps.cpp", "chain_layout.cpp", "group_bindings.cpp", "plans.cpp"}
-"""Files with nothing to watch, as are those of csrc/bindings."""
+PYTHON = {"module.cpp", "index_maps.cpp", "chain_layout.cpp", "group_bindings.cpp", "plans.cpp"}
+"""Files for Python, which are compiled with the bindings of csrc/."""
+PLAIN = {"emulation.cpp", "python.cpp"}
+"""Files with nothing to watch."""
 SHARED = (
     "cell_sort_plan.cpp",
     "grouped_mlp_cuda_plan.cpp",
@@ -29,6 +32,7 @@ REPLACED = {"radix_sort.cu"}
 """What consists of the CUDA toolkit's headers: a file of the same name in this folder stands in."""
 
 
+@functools.cache
 def build(sanitizer="none"):
     """The module, built where it was not up to date."""
     out = ROOT / "build" / "cuda-emulation" / f"{platform.machine()}-{sys.implementation.cache_tag}"
@@ -43,11 +47,10 @@ def _build(out, sanitizer):
 
     module = out / sanitizer / f"voronerf_emulation{sysconfig.get_config_var('EXT_SUFFIX')}"
     kernels = [source for source in sorted((ROOT / "csrc").rglob("*.cu")) if source.name not in REPLACED]
-    sources = [*kernels, *sorted(HERE.glob("*.cu")), *sorted(HERE.glob("*.cpp"))]
+    sources = [*kernels, *sorted(HERE.glob("*.cu"))]
+    sources += [path for path in sorted(HERE.glob("*.cpp")) if path.name not in PYTHON]
     sources += [path for path in sorted((ROOT / "csrc").rglob("*.cpp")) if path.name in SHARED]
-    # Those of ops that have CUDA kernels.
-    bindings = [path for path in (ROOT / "csrc" / "bindings").glob("*.cpp") if "VN_CUDA(" in path.read_text()]
-    sources += sorted(bindings)
+    sources.append(_for_python(out / "bindings" / "python.cpp"))
     includes = [ROOT / "csrc", HERE, Path(pybind11.get_include()), Path(sysconfig.get_path("include"))]
     flags = ["-std=c++17", "-O1", "-g1", "-fPIC", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=hidden"]
     flags += ["-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-DVN_EMULATE", "-DVN_WITH_CUDA"]
@@ -63,7 +66,7 @@ def _build(out, sanitizer):
     ]
     objects = []
     for source in sources:
-        plain = source.name in PLAIN or source in bindings
+        plain = source.name in PLAIN
         objects.append(f"{'plain' if plain else sanitizer}/{source.parent.name}/{source.name}.o")
         lines += [f"build {objects[-1]}: cxx {source}", f"  flags = {shlex.join([] if plain else watched)}"]
     lines += [f"build {sanitizer}/{module.name}: link {' '.join(objects)}", ""]
@@ -73,6 +76,18 @@ def _build(out, sanitizer):
     if result.returncode != 0:
         raise RuntimeError(f"the emulated module does not compile:\n{result.stdout}{result.stderr}")
     return module
+
+
+def _for_python(path):
+    """One file with everything that is written for Python: the compiler's time goes into pybind11's headers."""
+    files = [file for file in sorted((ROOT / "csrc" / "bindings").glob("*.cpp")) if "VN_CUDA(" in file.read_text()]
+    own = "#define bind_these bind_these_{0}\n#define bound bound_{0}\n{1}#undef bind_these\n#undef bound\n"
+    files += [HERE / name for name in sorted(PYTHON)]
+    text = "".join(own.format(number, f'#include "{file}"\n') for number, file in enumerate(files))
+    if not path.exists() or path.read_text() != text:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return path
 
 
 def load(path):
