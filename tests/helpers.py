@@ -24,10 +24,10 @@ def refuses(message, call, *args, error=ValueError, **options):
     assert message in text and "\n" not in text, text
 
 
-def pairwise(values):
-    """Arguments of ``parametrize``: any two values of different parameters meet in a row, in few of all the products.
+def all_pairs(values):
+    """Arguments for ``parametrize``: few of all products, in which every two values of different parameters meet.
 
-    A key of several names, such as "i, o", has tuples as values.
+    A name of several parameters, such as "i, o", has tuples as values.
     """
     columns = [list(column) for column in values.values()]
     numbers = [range(len(column)) for column in columns]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads, pairwise
+from helpers import all_pairs, on_any_number_of_threads
 from torch import Tensor
 
 from voronerf.grids import HashGrid
@@ -196,7 +196,7 @@ def test_any_imbalance(counts: list[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    *pairwise(
+    *all_pairs(
         {
             "o": [1, 3, 4, 5, 16, 17, 33, 48, 63, 64, 65, 90, 130],
             "i": [1, 3, 4, 5, 63, 90],

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads, pairwise
+from helpers import all_pairs, on_any_number_of_threads
 from tolerances import assert_as_exact
 from torch import Tensor
 
@@ -67,7 +67,7 @@ def test_any_number_of_rows(isa: str, n: int) -> None:
 
 
 @pytest.mark.parametrize(
-    *pairwise({"include_input": [True, False], "octaves": [1, 2, 3, 10, 16], "d": [1, 2, 3, 4, 5, 8, 9, 16, 17, 40]})
+    *all_pairs({"include_input": [True, False], "octaves": [1, 2, 3, 10, 16], "d": [1, 2, 3, 4, 5, 8, 9, 16, 17, 40]})
 )
 def test_any_number_of_features(isa: str, d: int, octaves: int, include_input: bool) -> None:
     assert_close(

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from composite_cases import dense, evaluate, leaves_of, scene
-from helpers import pairwise
+from helpers import all_pairs
 from op_cases import FLOATS, HALVES, need, offsets_of, refusals, strided
 from tolerances import assert_as_exact
 
@@ -54,7 +54,7 @@ def pack(tensors, counts):
 SIZES = [(1, 1, 3), (5, 33, 3), (3, 64, 1), (2, 7, 5)]
 
 
-@pytest.mark.parametrize(*pairwise({"r, s, c": SIZES, "dtype": FLOATS, "form": ["dense", "packed"]}))
+@pytest.mark.parametrize(*all_pairs({"r, s, c": SIZES, "dtype": FLOATS, "form": ["dense", "packed"]}))
 def test_matches_a_slow_loop(device, backend, form, dtype, r, s, c):
     need("composite", backend, device, dtype)
     inputs = rays(r, s, c, dtype)

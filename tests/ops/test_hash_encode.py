@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads, pairwise
+from helpers import all_pairs, on_any_number_of_threads
 from op_cases import FLOATS, HALVES, need, refusals, refused
 from tolerances import assert_as_exact
 
@@ -103,7 +103,7 @@ def test_reads_the_tables_of_other_libraries(convention, sizes):
     torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize(*pairwise({"name": GRIDS, "n": [0, 1, 17, 300], "dtype": FLOATS}))
+@pytest.mark.parametrize(*all_pairs({"name": GRIDS, "n": [0, 1, 17, 300], "dtype": FLOATS}))
 def test_matches_the_reference(device, backend, name, n, dtype):
     need("hash_encode", backend, device, dtype)
     grid = GRIDS[name]
@@ -222,7 +222,7 @@ KINDS = {"name": FEATURES, "dtype": [torch.float32, *HALVES], "isa": ["portable"
 
 
 @pytest.mark.native
-@pytest.mark.parametrize(*pairwise({**KINDS, "several": [False, True]}), indirect=["isa"])
+@pytest.mark.parametrize(*all_pairs({**KINDS, "several": [False, True]}), indirect=["isa"])
 def test_every_instruction_set(isa, poisoned, name, dtype, several):
     grid, n = GRIDS[name], 131
     x, cells = points(n, grid), torch.randint(3, (n,), dtype=torch.int32) if several else None

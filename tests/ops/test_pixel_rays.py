@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import pairwise
+from helpers import all_pairs
 from op_cases import refusals, refused
 
 from voronerf.ops import pixel_rays
@@ -27,7 +27,7 @@ SIZES = {"b": [0, 1, 63, 300], "background": [None, "one", "per ray"], "channels
 LENSES = {"lens": [None, "bent", "fisheye"], "boxed": [False, True]}
 
 
-@pytest.mark.parametrize(*pairwise({**SIZES, **LENSES}))
+@pytest.mark.parametrize(*all_pairs({**SIZES, **LENSES}))
 def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, channels, b, background, lens, boxed):
     cameras, images = scene(channels, lens)
     index = torch.randint(0, images[..., 0].numel(), (b,))
