@@ -112,7 +112,7 @@ def _pycolmap() -> Run | None:
         return None
 
     def run(images: Path, database: Path, models: Path, model: str, shared: bool, in_order: bool) -> None:
-        pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
+        pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
         mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
         options = pycolmap.ImageReaderOptions(camera_model=model)
         try:
