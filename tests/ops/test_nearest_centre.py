@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import FLOATS, HALVES, need, refusals, strided
+from op_cases import FLOATS, HALVES, need, refusals
 
 from voronerf.backends import BackendUnavailable
 from voronerf.ops import nearest_centre
@@ -74,15 +74,6 @@ def test_dtypes(device, backend, dtype):
         assert torch.equal(cells.cpu(), slow(points, centres))
     mixed = nearest_centre(points.to(device), centres.double().to(device), backend=backend)
     assert torch.equal(mixed.cpu(), slow(points, centres))
-
-
-def test_layouts(device, backend):
-    points, centres, weights = torch.rand(101, 3), torch.rand(7, 3), torch.rand(7) / 10
-    expected = slow(points, centres, weights)
-    points, centres, weights = (strided(tensor.to(device)) for tensor in (points, centres, weights))
-    assert torch.equal(nearest_centre(points, centres, weights=weights, backend=backend).cpu(), expected)
-    columns = points.t().contiguous().t()
-    assert torch.equal(nearest_centre(columns, centres, weights=weights, backend=backend).cpu(), expected)
 
 
 def test_is_not_differentiable(device, backend):

@@ -8,7 +8,7 @@ import loops
 import pytest
 import torch
 from helpers import on_any_number_of_threads, same
-from op_cases import need, refusals, refused, strided
+from op_cases import need, refusals, refused
 from tolerances import assert_as_exact
 from torch import Tensor
 
@@ -187,20 +187,6 @@ def test_coordinates_beside_encoded_positions(device, backend):
         assert torch.equal(cells.cpu(), case.expected_cells)
     _, elsewhere = case.run([encoded, *leaves[1:]], coords=leaves[0] + 9, backend=backend)
     assert not torch.equal(elsewhere.cpu(), case.expected_cells)
-
-
-@pytest.mark.parametrize("name", ["raw", "integrated"])
-def test_layouts(device, backend, name):
-    case = Case.make(name, "tree")
-    leaves = [tensor.to(device) for tensor in case.leaves]
-    expected, _ = case.run(leaves, backend=backend)
-    case.options = {key: strided(value) if isinstance(value, Tensor) else value for key, value in case.options.items()}
-    given = [strided(tensor).requires_grad_() for tensor in leaves]
-    found, _ = case.run(given, backend=backend)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
-    found.sum().backward()
-    used = [leaf for leaf in given if leaf is not given[1] or case.table.uses_directions]
-    assert all(leaf.grad is not None for leaf in used)
 
 
 def test_power_diagram(device, backend):
