@@ -63,7 +63,6 @@ class Viewer:
         self.tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.wake = threading.Event()
         self.rate = 100_000.0  # pixels a second
-        self.warm = False
         self.errors = ViewErrors(subject.scene, self._render_view)
         with contextlib.redirect_stdout(io.StringIO()):  # viser draws a box around its address
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
@@ -130,7 +129,6 @@ class Viewer:
 
     def serve(self, until: Callable[[], bool] = lambda: False) -> None:
         """Renders what is asked for, until a function says so or Ctrl-C."""
-        self.warm_up()
         while not until():
             if not self.render_next():
                 # A picture may wait for its camera to rest; without one there is nothing to look at.
@@ -140,9 +138,6 @@ class Viewer:
 
     def warm_up(self) -> None:
         """Renders something small, since the first call of the operations loads much of torch."""
-        if self.warm:
-            return
-        self.warm = True
         cameras = self.subject.scene.train.cameras
         camera = Cameras(cameras.poses[:1], cameras.intrinsics[:1] * (SMALLEST / cameras.width), SMALLEST, SMALLEST)
         render_look(self.subject, camera, Look())
