@@ -100,7 +100,7 @@ class VoronerfModel(Model):
         contracted = seen_from_inside(cameras, box) if auto else self.config.contraction == "sphere"
         self.scene = scene_of(cameras, box, contracted=contracted)
         self.settings = resolve_config(self.config.train_config(contracted=contracted), self.scene)
-        self.bounds = None if contracted or self.scene.box is None else self.scene.box.to(device)
+        self.bounds = None if self.scene.box is None else self.scene.box.to(device)
         background = metadata.get("background")
         self.background = None if background is None else background.to(device)
         self.routers = make_routers(self.settings, device)
