@@ -341,19 +341,16 @@ def run_grouped(call: Call, given: list[Tensor], grouping: Grouping, piece: int)
     parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
     # Parameters are split once for all parts: their gradient is then put together once, where that of a slice would
     # fill a tensor of all cells for each part. Parts of one cell have the same piece.
-    sizes = {part.start: part.k for part in parts}
-    stacked = cell_parameters(call.module)
-    pieces = [p.split(list(sizes.values())) if len(sizes) > 1 else (p,) for p in stacked]
-    number, values, widest = {start: i for i, start in enumerate(sizes)}, [], 1
-    tables: dict[Any, Any] = {}
+    sizes, pieces = {part.start: part.k for part in parts}, []
+    for p in cell_parameters(call.module):
+        pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
+    values, widest, tables = [], 1, dict[Any, Any]()
     for part, rows in zip(parts, split_rows(given, [part.n for part in parts]), strict=True):
         run = GroupedRun(part, tables)
         for tensor in rows:
             run.mark(tensor)
-        stand_ins = {
-            id(p): PerCell(piece[number[part.start]], is_parameter=True, origin=(p, part.start))
-            for p, piece in zip(stacked, pieces, strict=True)
-        }
+        origin = part.start
+        stand_ins = {id(p): PerCell(own[origin], is_parameter=True, origin=(p, origin)) for p, own in pieces}
         with in_place_of_parameters(call.module, stand_ins), run:
             values.append(call.run(rows))
         if run.failed is not None:

@@ -229,9 +229,10 @@ def is_shared(owner: nn.Module, name: str) -> bool:
 @contextlib.contextmanager
 def in_place_of_parameters(module: nn.Module, values: Mapping[int, Any]) -> Iterator[None]:
     """Lets a module find other tensors where its parameters are; ``values`` by the id of the parameter."""
-    owned = [one for one in owned_parameters(module) if id(one[2]) in values]
+    parts = list(module.modules())
+    owned = [(part, name, p) for part in parts for name, p in part._parameters.items() if id(p) in values]
     # Hooks such as that of torch.nn.utils.weight_norm leave tensors made of parameters behind.
-    attributes = [(part, dict(vars(part))) for part in module.modules() if part._forward_pre_hooks]
+    attributes = [(part, dict(vars(part))) for part in parts if part._forward_pre_hooks]
     for owner, name, parameter in owned:
         owner._parameters[name] = values[id(parameter)]
     try:
