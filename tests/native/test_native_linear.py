@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import on_any_number_of_threads
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from voronerf.reference import grouped_linear as specification
 
@@ -122,6 +123,21 @@ def test_what_is_no_number_stays_in_its_row(dtype: torch.dtype) -> None:
     assert found[50].isnan().all() and not found[51].isfinite().all()
     rest = [row for row in range(ROWS) if row not in (50, 51)]
     assert torch.equal(found[rest], clean[rest])
+
+
+def test_calls_past_the_dispatcher_give_what_it_gives() -> None:
+    """A profiler, a mode or a transform is given the custom op; otherwise the compiled function is called at once."""
+    given = *inputs(63, 64, torch.float32), "sine"
+    direct = evaluate(native.grouped_linear, *given)
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        seen = evaluate(native.grouped_linear, *given)
+    assert all(map(torch.equal, direct, seen))
+    names = {event.key for event in profile.key_averages()}
+    assert {"voronerf::grouped_linear_native", "voronerf::grouped_linear_native_backward"} <= names
+    x, weight, bias, _ = given[:4]
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        fake = native.grouped_linear(mode.from_tensor(x), torch.tensor(OFFSETS, dtype=torch.int32), weight, bias)
+    assert type(fake) is not Tensor and fake.shape == (ROWS, 64)
 
 
 def test_large_results_ask_for_huge_pages() -> None:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from voronerf import ops
 from voronerf.backends import BackendUnavailable
 
-_LARGE = 1 << 22  # bytes
+_LARGE, _PAGE = 1 << 22, 1 << 21  # bytes
 SHARED = "_voronerf_shared"
 """Where a part of a routed module keeps the names of its parameters that all cells share."""
 
@@ -256,8 +256,11 @@ def _on_huge_pages() -> Callable[[Tensor], None]:
 
 
 def empty_like(tensor: Tensor) -> Tensor:
-    """``torch.empty_like``, on huge pages where it is large: page faults cost more than what is written there."""
-    result = torch.empty_like(tensor)
+    """``torch.empty_like``, from the start of a huge page where it is large: page faults cost more than the values."""
+    if tensor.nbytes < _LARGE or tensor.device.type != "cpu":
+        return torch.empty_like(tensor)
+    spare = tensor.new_empty(tensor.numel() + _PAGE // tensor.element_size())
+    result = spare[-spare.data_ptr() % _PAGE // tensor.element_size() :][: tensor.numel()].view(tensor.shape)
     _on_huge_pages()(result)
     return result
 
