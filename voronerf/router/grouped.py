@@ -34,7 +34,8 @@ Rule = Callable[..., Any]
 _RULES: dict[Any, Rule] = {}
 
 
-def _find(names: str, *places: Any) -> frozenset[Any]:
+def find(names: str, *places: Any) -> frozenset[Any]:
+    """The functions of these names in modules or classes, as far as they are there."""
     found = (getattr(place, name, None) for place in places for name in names.split())
     return frozenset(function for function in found if function is not None)
 
@@ -44,7 +45,7 @@ METADATA = frozenset(
     getattr(torch.Tensor, name).__get__
     for name in dir(torch.Tensor)
     if type(getattr(torch.Tensor, name)).__name__ in ("getset_descriptor", "property") and name not in _VALUES
-) | _find(
+) | find(
     """
     size dim ndimension numel nelement stride is_contiguous is_floating_point is_complex element_size get_device
     storage_offset is_signed is_same_size is_inference data_ptr __len__ __hash__ __repr__ __dir__ __reduce_ex__
@@ -54,7 +55,7 @@ METADATA = frozenset(
     torch.Tensor,
 )
 """What reads no value: shapes, dtypes, devices."""
-RANDOM = _find(
+RANDOM = find(
     """
     rand_like randn_like randint_like bernoulli normal_ uniform_ bernoulli_ exponential_ random_ cauchy_ log_normal_
     geometric_ dropout dropout_ alpha_dropout feature_alpha_dropout rrelu rand randn randint randperm normal multinomial
@@ -64,7 +65,7 @@ RANDOM = _find(
     torch.nn.functional,
 )
 """What draws random numbers."""
-CREATE = _find("zeros ones full empty rand randn randint", torch)
+CREATE = find("zeros ones full empty rand randn randint", torch)
 """New tensors of given sizes; with n of them in front they are rows."""
 
 
@@ -116,15 +117,11 @@ def register(function: Any, rule: Rule) -> None:
 
 
 class Ungroupable(Exception):
-    """A module cannot be run on the samples of all cells at once; the message says where.
-
-    Attributes:
-        of_batch: Whether it may be otherwise for other samples.
-    """
+    """A module cannot be run on the samples of all cells at once; the message says where."""
 
     def __init__(self, reason: str, of_batch: bool = False) -> None:
         super().__init__(reason)
-        self.of_batch = of_batch
+        self.of_batch = of_batch  # it may be otherwise for other samples
 
 
 class PerCell(torch.Tensor):

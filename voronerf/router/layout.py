@@ -113,18 +113,12 @@ class Layout:
 
     A module of layout "flat" sees [n, f] for every argument with rows. One of layout "rays" sees [n, 1, f] for
     [rays, samples, f] and [n, f] for what is per ray: n rays of one sample.
-
-    Attributes:
-        lead: Leading dimensions of a tensor with an entry for each sample.
-        per_ray: Names of the arguments with an entry for each ray, or None to tell by shapes.
-        shared: Names of the arguments that are the same for all samples.
-        flat: Whether the module sees [n, f].
     """
 
-    lead: tuple[int, ...]
-    per_ray: frozenset[str] | None
-    shared: frozenset[str]
-    flat: bool = False
+    lead: tuple[int, ...]  # leading dimensions of a tensor with an entry for each sample
+    per_ray: frozenset[str] | None  # names of the arguments with an entry for each ray; None to tell by shapes
+    shared: frozenset[str]  # names of the arguments that are the same for all samples
+    flat: bool = False  # the module sees [n, f]
 
     @property
     def n(self) -> int:
@@ -210,18 +204,17 @@ def _sizes(shape: Sequence[int], empty: str = "") -> str:
 
 @dataclasses.dataclass
 class Call:
-    """A method of a module with the arguments of one call, their layout, and their names, of positional ones first.
-
-    ``kinds`` says what each tensor has an entry for, once it has been looked at; it stays so for a part of the call.
-    """
+    """A method of a module with the arguments of one call, their layout, and their names."""
 
     module: nn.Module
     method: str
     layout: Layout
-    names: list[str]
+    names: list[str]  # of positional arguments first
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
-    kinds: dict[str, str] = dataclasses.field(default_factory=dict)
+    kinds: dict[str, str] = dataclasses.field(
+        default_factory=dict
+    )  # what each tensor has an entry for, once it is known
 
     @property
     def name(self) -> str:
@@ -282,17 +275,11 @@ def split_rows(rows: list[Tensor], sizes: list[int]) -> list[Sequence[Tensor]]:
 
 @dataclasses.dataclass
 class Results:
-    """What a method returned for rows.
+    """What a method returned for rows."""
 
-    Attributes:
-        value: Of any structure.
-        tensors: Its tensors, [n * m, ...] where they have rows.
-        rows: Which of them have rows.
-    """
-
-    value: Any
-    tensors: list[Tensor]
-    rows: list[bool]
+    value: Any  # of any structure
+    tensors: list[Tensor]  # its tensors, [n * m, ...] where they have rows
+    rows: list[bool]  # which of them have rows
 
     @staticmethod
     def joined(values: list[Any], counts: list[int], module: nn.Module) -> Results:

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops import grouped_linear
-from voronerf.router.grouped import GroupedRun, PerCell, register, writes_in_place
+from voronerf.router.grouped import GroupedRun, PerCell, find, register, writes_in_place
 from voronerf.router.grouping import cells_of, empty_like
 from voronerf.router.layout import map_tensors, tensors_of
 
@@ -43,11 +43,9 @@ def rule(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     return decorate
 
 
-def _spellings(names: str) -> list[Any]:
+def _spellings(names: str) -> frozenset[Any]:
     """The functions and methods of these names, in-place ones too."""
-    spelled = [spelling for name in names.split() for spelling in (name, f"{name}_")]
-    places = (torch, torch.Tensor)
-    return [getattr(place, name) for place in places for name in spelled if hasattr(place, name)]
+    return find(" ".join(f"{name} {name}_" for name in names.split()), torch, torch.Tensor)
 
 
 # Products -------------------------------------------------------------------------------------------------------------

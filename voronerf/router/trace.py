@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.grouped import METADATA, RANDOM, name_of, user_line, writes_in_place
+from voronerf.router.grouped import METADATA, RANDOM, find, name_of, user_line, writes_in_place
 from voronerf.router.grouping import cell_parameters, in_place_of_parameters, is_shared, owned_parameters
 from voronerf.router.layout import Call, map_tree, rebuild, tensors_of
 
@@ -33,20 +33,21 @@ _PATCHES = threading.RLock()  # one thread at a time changes what torch calls fo
 _BEFORE, TABLE, _BEHIND = range(3)  # where a value comes from
 _ROW_CODE = 1 << 32  # more than there are columns
 _PLAIN = ("none", 1.0)
-_ACTIVATIONS: dict[str, set[Any]] = {
-    "relu": {F.relu, torch.relu, torch.relu_, torch.Tensor.relu, torch.Tensor.relu_, F.relu_},
-    "sigmoid": {torch.sigmoid, torch.Tensor.sigmoid, F.sigmoid, torch.sigmoid_, torch.Tensor.sigmoid_},
-    "sine": {torch.sin, torch.Tensor.sin, torch.sin_, torch.Tensor.sin_},
-    "softplus": {F.softplus},
+_ACTIVATIONS = {
+    "relu": find("relu relu_", F, torch, torch.Tensor),
+    "sigmoid": find("sigmoid sigmoid_", F, torch, torch.Tensor),
+    "sine": find("sin sin_", torch, torch.Tensor),
+    "softplus": find("softplus", F),
 }
 _PRODUCTS = (torch.mul, torch.multiply, torch.Tensor.mul, torch.Tensor.__mul__, torch.Tensor.__rmul__)
-_MOVES = """
+_MOVERS = find(
+    """
     cat concat concatenate hstack dstack stack split chunk tensor_split unbind __getitem__ narrow select index_select
     permute transpose swapaxes swapdims movedim moveaxis reshape view view_as reshape_as flatten unflatten unsqueeze
     squeeze expand expand_as broadcast_to contiguous clone repeat tile flip roll
-"""
-_MOVERS = frozenset(
-    getattr(place, name) for place in (torch, torch.Tensor) for name in _MOVES.split() if hasattr(place, name)
+    """,
+    torch,
+    torch.Tensor,
 )
 """What may move columns without changing them."""
 
@@ -65,23 +66,14 @@ class Rows(int):
 
 @dataclass(eq=False)
 class Step:
-    """One function of rows or of parameters.
+    """One function of rows or of parameters."""
 
-    Attributes:
-        function: Of PyTorch, or a custom ``autograd.Function``'s ``apply``.
-        given: Its args and kwargs, with what stands for tensors of rows, parameters, and their number.
-        refs: The values among these.
-        values: Numbers of its results, in order.
-        inplace: Whether it writes to its first argument, which then goes on as the first of ``values``.
-        line: Where it stands in the module.
-    """
-
-    function: Any
-    given: Any
-    refs: list[Ref]
-    values: list[int]
-    inplace: bool
-    line: str
+    function: Any  # of PyTorch, or a custom ``autograd.Function``'s ``apply``
+    given: Any  # its args and kwargs, with what stands for tensors of rows, parameters, and their number
+    refs: list[Ref]  # the values among these
+    values: list[int]  # the numbers of its results, in order
+    inplace: bool  # it writes to its first argument, which then goes on as the first of ``values``
+    line: str  # where it stands in the module
 
     def run(self, values: dict[int, Any], n: int) -> None:
         """Does the step again, for n rows."""
@@ -123,24 +115,17 @@ class Linear:
 
 
 class Trace(TorchFunctionMode):
-    """Takes down the functions that a copy of the routed module calls with its first cell's parameters.
-
-    Attributes:
-        sizes: Of every value of rows, rows for each sample and the dimensions behind, 0 rows where their dimension is
-            not the first; None for one of parameters.
-        stages: Where every value comes from.
-        parameters: Values that are parameters, with their place among ``owned_parameters``.
-        shared: Values that are parameters of all cells in common, or made of such alone.
-        outputs: For each tensor of the result what stands for it, or the tensor where it depends on no sample.
-    """
+    """Takes down the functions that a copy of the routed module calls with its first cell's parameters."""
 
     def __init__(self, original: nn.Module, call: Call, given: list[Tensor]) -> None:
         super().__init__()
         module = call.module
+        # Of every value of rows, rows for each sample and the dimensions behind, 0 rows where theirs is not the first;
+        # None for one of parameters.
         self.sizes: list[tuple[int, ...] | None] = []
-        self.stages: list[int] = []
-        self.parameters: dict[int, int] = {}
-        self.shared: set[int] = set()
+        self.stages: list[int] = []  # where every value comes from
+        self.parameters: dict[int, int] = {}  # values that are parameters, with their place among ``owned_parameters``
+        self.shared: set[int] = set()  # values that are parameters of all cells in common, or made of such alone
         self.before: list[Step] = []
         self.behind: list[Step] = []
         self.weights: list[Step] = []  # of parameters of cells alone
@@ -160,7 +145,7 @@ class Trace(TorchFunctionMode):
         with in_place_of_parameters(module, single), _custom_functions(self), self:
             result = call.run(given)
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
-        self.outputs = [self._ref(tensor) for tensor in tensors_of(result)]
+        self.outputs = [self._ref(tensor) for tensor in tensors_of(result)]  # tensors where they depend on no sample
 
     def _new(self, tensor: Tensor, rows: bool = True) -> int:
         """Numbers a value."""
