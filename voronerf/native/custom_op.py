@@ -13,6 +13,7 @@ from torch.library import CustomOpDef
 
 from voronerf import native
 
+# torch has no public names for these questions; without an answer the custom op is called.
 _LISTENERS = [
     getattr(torch._C, name, lambda: True)
     for name in ("_len_torch_function_stack", "_len_torch_dispatch_stack", "_are_functorch_transforms_active")
@@ -60,7 +61,7 @@ def custom_op(
         schema = torch.library.infer_schema(run, mutates_args=())
         op = torch.library.custom_op(f"voronerf::{name}", run, mutates_args=(), device_types=devices, schema=schema)
         op.register_fake(fake or (lambda *arguments: next(steps(*arguments))))
-        return Op(op, run, devices, isinstance(results, type) and issubclass(results, Tensor))
+        return Op(op, run, devices, single=results is Tensor)
 
     return declare
 
