@@ -113,6 +113,7 @@ def test_tensors_that_are_not_dense(kind, make):
     refuses(message, ops.nearest_centre, make(), POINTS, error=TypeError)
 
 
+@pytest.mark.op("grouped_linear")
 def test_inference_tensors(backend):
     """They are taken unless autograd would have to keep them."""
     with torch.inference_mode():
