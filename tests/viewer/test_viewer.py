@@ -21,10 +21,11 @@ from voronerf import open_run
 from voronerf.cli import main
 from voronerf.data.record import read_scene
 from voronerf.evaluation.panels import palette
-from voronerf.rendering import read_camera_path
+from voronerf.rendering import orbit_cameras, read_camera_path
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.trainer import Trainer
 from voronerf.viewer import TrainingViewer, view_run
+from voronerf.viewer.cameras import scene_bounds
 
 
 @pytest.fixture
@@ -209,6 +210,12 @@ def test_a_camera_may_stand_anywhere(scene, tab) -> None:
     far = tab.rest()
     share = (far.min(-1) < 220).sum() / (near.min(-1) < 220).sum()
     assert 0.06 < share < 0.2
+
+
+def test_cameras_in_a_plane_have_space_around_them(scene) -> None:
+    cameras = orbit_cameras(4, radius=2.0, elevation=0.0, width=8, height=8, focal=9.0)
+    low, high = scene_bounds(replace(scene, box=None, train=replace(scene.train, cameras=cameras)))
+    assert bool((high - low > 1).all()) and bool((low < -2).any()) and bool((high > 2).any())
 
 
 def test_a_canvas_without_pixels_is_passed_over(scene, tab) -> None:

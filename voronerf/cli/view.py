@@ -78,9 +78,9 @@ def view(
         else:
             viewer.do(lambda: viewer.take_images(whole))
 
-    viewer.warm_up()
-    if scene is not None:
-        threading.Thread(target=read_images, daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(viewer):
+        viewer.warm_up()
+        if scene is not None:
+            threading.Thread(target=read_images, daemon=True).start()
         viewer.serve()
     return 0

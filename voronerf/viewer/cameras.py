@@ -65,12 +65,14 @@ def axial_depth(camera: Cameras, depth: Tensor) -> Tensor:
 
 
 def scene_bounds(scene: Scene) -> Tensor:
-    """The scene's box [2, 3], or without one a box around the cameras and what they look at."""
+    """The scene's box [2, 3], or without one a box around the cameras and what is before them."""
     if scene.box is not None:
         return scene.box.cpu()
     cameras = scene.train.cameras
     places = torch.cat((cameras.origins, cameras.origins + cameras.forward * cameras.origins.std().clamp_min(0.5)))
-    return torch.stack((places.amin(0), places.amax(0)))
+    low, high = places.amin(0), places.amax(0)
+    margin = (high - low).amax() / 2
+    return torch.stack((low - margin, high + margin))
 
 
 def look_point(scene: Scene, cameras: Cameras, index: int) -> Tensor:

@@ -31,7 +31,7 @@ class TrainingViewer(Viewer):
             trainer.out.name, trainer.out, trainer.scene, trainer.router, trainer.renderer, trainer.averaged
         )
         super().__init__(subject, host=host, port=port)
-        self.trainer, self.diagram = trainer, trainer.router.diagram
+        self.trainer, self.cells = trainer, trainer.router.num_cells
         self.paused = False
         self.told_at = 0.0
         self.now: Progress | None = None
@@ -51,8 +51,8 @@ class TrainingViewer(Viewer):
         self.now = now
         if not self.clients and not self.paused:
             return
-        if self.trainer.router.diagram is not self.diagram:
-            self.diagram = self.trainer.router.diagram
+        if now.cells != self.cells:  # after a split, or back at a checkpoint from before one
+            self.cells = now.cells
             for client in self.list_clients():
                 client.on_diagram()
         if time.perf_counter() - self.told_at > TELL:
