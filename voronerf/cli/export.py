@@ -46,7 +46,8 @@ def export(
         video: A turntable, or the video of --spiral or --path, .mp4.
         count: Points at the most.
         resolution: Cubes of the mesh along the longest side of the box; default 256, or what fits into the memory.
-        density: Density of the mesh's surface per scene unit; default that of which a cube lets half of the light pass.
+        density: Density of the mesh's surface per scene unit; default that of which a thirtieth of the
+            longest side of the box lets half of the light pass.
         box: What is exported, x y z of the lowest and of the highest corner; default the scene's box, or that around
             the sphere of a contraction.
         path: Camera path in nerfstudio's format, for the video.

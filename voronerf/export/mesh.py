@@ -24,6 +24,9 @@ from voronerf.training.config import ConfigError
 SUFFIXES = (".ply", ".glb", ".obj")
 #: Cubes along the longest side of the box, where there is memory for them.
 RESOLUTION = 256
+#: Share of the longest side of the box over which the density of the surface lets half of the light pass. Smaller ones
+#: leave out what a short training has made a faint fog, larger ones take fog around surfaces for a part of them.
+HALVING = 1 / 30
 #: Bytes of memory that a node takes at the most, in marching cubes.
 NODE = 40
 #: Volume of the smallest part that is kept, as a share of the largest.
@@ -47,7 +50,8 @@ def export_mesh(
         run: the run.
         path: the file.
         resolution: cubes along the longest side of the box; default 256, or what fits into the memory.
-        density: of the surface, per scene unit; default that of which a cube lets half of the light pass.
+        density: of the surface, per scene unit; default that of which a thirtieth of that side lets half of the light
+            pass.
         box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
 
     Raises:
@@ -79,7 +83,8 @@ def surface_mesh(run: Run, resolution: int | None, density: float | None, box: T
     closed = run.scene.box is not None and box is None
     box = box_of(run, box)
     nodes = Nodes.fill(box, _resolution(box, resolution))
-    level = math.log(2) / nodes.side if density is None else density
+    halving = HALVING * float((box[1] - box[0]).max())
+    level = math.log(2) / halving if density is None else density
     if not 0 < level < math.inf:
         raise ConfigError(f"--density must be positive and finite, got {density}")
     found = density_at(run, nodes)
@@ -91,7 +96,7 @@ def surface_mesh(run: Run, resolution: int | None, density: float | None, box: T
     solid = _largest_parts(~free, ndimage)
     if not solid.any() or not dense.any():
         raise ConfigError(f"--density must be lower: nothing in the box is as dense as {level:g}")
-    # Opacity of a cube of the level is 0.5; what was decided otherwise than by density gets the value of its side.
+    # The opacity of a cube of that side, 0.5 at the surface; what was decided otherwise than by density gets 0 or 1.
     opacity = (1 - torch.exp(found * (-math.log(2) / level))).numpy()
     opacity[solid & ~dense] = 1
     opacity[~solid & dense] = 0
@@ -106,7 +111,8 @@ def surface_mesh(run: Run, resolution: int | None, density: float | None, box: T
     mesh.remove_unreferenced_vertices()
     normals = torch.from_numpy(np.ascontiguousarray(mesh.vertex_normals, dtype=np.float32))
     points = torch.from_numpy(np.ascontiguousarray(mesh.vertices, dtype=np.float32))
-    colour, _ = ask(run, points, -normals, side=nodes.side)
+    # Just inside, where the field was trained; a vertex may lie in an empty cell of the occupancy grid.
+    colour, _ = ask(run, points - nodes.side / 2 * normals, -normals, side=nodes.side, everywhere=True)
     mesh.visual.vertex_colors = (colour.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     return mesh
 

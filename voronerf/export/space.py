@@ -43,7 +43,9 @@ def box_of(run: Run, box: Tensor | None = None) -> Tensor:
 
 
 @torch.no_grad()
-def ask(run: Run, points: Tensor, directions: Tensor, *, side: float) -> tuple[Tensor, Tensor]:
+def ask(
+    run: Run, points: Tensor, directions: Tensor, *, side: float, everywhere: bool = False
+) -> tuple[Tensor, Tensor]:
     """The colours [n, 3] and densities [n] that a run has at points [n, 3], seen along unit directions [n, 3].
 
     Where rays find nothing, since the occupancy grid is empty there, the density is 0 and the colour black.
@@ -53,11 +55,12 @@ def ask(run: Run, points: Tensor, directions: Tensor, *, side: float) -> tuple[T
         points: [n, 3].
         directions: [n, 3], or [1, 3] for all.
         side: of a cube around a point, for fields that are asked about Gaussians.
+        everywhere: ask the field where the grid is empty, too.
     """
     renderer = run.renderer
     colour, density = torch.zeros(len(points), 3), torch.zeros(len(points))
     rows = torch.arange(len(points))
-    if renderer.occupancy is not None:
+    if renderer.occupancy is not None and not everywhere:
         grid = renderer.occupancy
         rows = rows[grid.occupied.view(-1)[grid.cells(points.to(renderer.device)).long()].cpu()]
     for part in rows.split(CHUNK):
