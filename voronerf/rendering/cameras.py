@@ -173,7 +173,9 @@ class Cameras:
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on a device."""
         distortion = None if self.distortion is None else self.distortion.to(device)
-        return replace(self, poses=self.poses.to(device), intrinsics=self.intrinsics.to(device), distortion=distortion)
+        sizes = None if self.sizes is None else self.sizes.to(device)
+        poses, intrinsics = self.poses.to(device), self.intrinsics.to(device)
+        return replace(self, poses=poses, intrinsics=intrinsics, distortion=distortion, sizes=sizes)
 
     def downscaled(self, factor: int) -> Cameras:
         """Cameras of the images averaged over blocks of `factor` x `factor` pixels.
