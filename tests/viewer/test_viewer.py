@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import socket
+import sys
 import threading
 from dataclasses import replace
 
@@ -312,3 +313,12 @@ def test_a_run_is_shown_before_its_images_are_there(run, scene, monkeypatch) -> 
     assert tab.rest().std() > 20
     tab.close()
     viewer.close()
+
+
+def test_without_viser_it_is_one_line(run, monkeypatch, capsys) -> None:
+    for name in [name for name in sys.modules if name.startswith("voronerf.viewer")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(run.path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "the viewer needs viser: pip install 'voronerf[viewer]'" in line
