@@ -13,7 +13,7 @@ from helpers import refuses, seeded
 from voronerf import VoronoiDiagram
 from voronerf.data import builtin_scene
 from voronerf.export import cell_meshes, export_cells, export_mesh, export_points
-from voronerf.rendering import Contraction, Renderer
+from voronerf.rendering import Contraction, OccupancyGrid, Renderer
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
 
@@ -53,6 +53,15 @@ def test_a_mesh_is_the_outer_surface_alone(run, tmp_path, suffix):
     colours = mesh.visual.vertex_colors[:, :3]
     for colour, where in ((RED, mesh.vertices[:, 2] > 0.05), (BLUE, mesh.vertices[:, 2] < -0.05)):
         assert np.abs(np.median(colours[where], axis=0) - colour.numpy() * 255).max() < 2
+
+
+def test_vertices_in_empty_cells_of_an_occupancy_grid_have_colours(run, tmp_path):
+    grid = OccupancyGrid(BOX, 40, threshold=1.0)
+    grid.density = shell(grid.points(torch.arange(40**3)), None, None)[1].view(40, 40, 40)
+    grid.occupied = grid.density > 0
+    skipping = replace(run, renderer=Renderer({"field": shell}, samples=192, occupancy=grid))
+    mesh = export_mesh(skipping, tmp_path / "ball.ply", resolution=48)
+    assert mesh.is_watertight and mesh.visual.vertex_colors[:, :3].max(-1).min() > 200
 
 
 def test_a_mesh_of_an_unbounded_scene_is_what_the_cameras_see(run, tmp_path):
