@@ -118,9 +118,8 @@ class _Worker:
             tally.counts.update(one["counts"])
         done = len(found)
         if done < len(self.seeds):
-            long = f"took more than {self.part.seconds} s"
-            reason = long if status == signal.SIGALRM else f"ended by {_name(status)}"
-            failures.append((self.seeds[done], reason))
+            ended = f"ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+            failures.append((self.seeds[done], ended if status != -signal.SIGALRM else f"took {self.part.seconds} s"))
             tally.counts[FAILED] += 1
             done += 1
         elif peak > MEMORY:
@@ -170,25 +169,19 @@ def fork_command(run: Callable[[], int]) -> int:
     if pid:
         return pid
     try:
+        signal.alarm(120)  # it holds the pipe open that tells of the end of the attempt
         os._exit(run())
     except BaseException:
         os._exit(70)
 
 
 def _finish(pid: int) -> tuple[int, int]:
-    """The exit status of a process, or the signal that ended it, and the bytes of memory that it had at most."""
+    """The exit status of a process, below 0 for a signal, and the bytes of memory that it had at most."""
     _, status, usage = os.wait4(pid, 0)
-    return (os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)), usage.ru_maxrss * 1024
+    return os.waitstatus_to_exitcode(status), usage.ru_maxrss * 1024
 
 
 def _stop_children(folder: Path) -> None:
     """Ends what an attempt has left running."""
     with contextlib.suppress(OSError, ValueError):
         os.killpg(int((folder / "group").read_text()), signal.SIGKILL)
-
-
-def _name(status: int) -> str:
-    try:
-        return signal.Signals(status).name
-    except ValueError:
-        return f"status {status}"

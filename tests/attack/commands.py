@@ -5,11 +5,10 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
-import os
 import re
 from pathlib import Path
 
-from attempts import REFUSED, RIGHT, Failed, fork_command
+from attempts import REFUSED, RIGHT, Failed
 
 from voronerf.cli import main
 
@@ -49,9 +48,3 @@ def judged(*args: str | Path) -> str:
     if status != 1 or not lines or wrong or not lines[-1].startswith("voronerf: error: "):
         raise Failed(f"not one clear line with status {status}: {spoken}: {err!r:.400}")
     return REFUSED
-
-
-def train(out: Path, *options: str | Path) -> int:
-    """Trains in a process of its own; returns its exit status."""
-    pid = fork_command(lambda: run("train", "--out", out, *options)[0])
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])

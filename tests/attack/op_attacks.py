@@ -44,18 +44,22 @@ def valid_call(rng: random.Random, folder: Path, given: Path) -> str:
     op = rng.choice(list(op_calls.CALLS))
     call = op_calls.CALLS[op](rng, rng.choice(op_calls.SIZES))
     gradients = op in DIFFERENTIABLE and rng.random() < 0.3
-    found, expected = (results(op, call, backend, gradients) for backend in ("auto", "reference"))
+    found, slopes = results(op, call, "auto", gradients)
+    expected, others = results(op, call, "reference", gradients)
     if op == "draw_cell":
         drawn_rightly(call, found[0], expected[0])
         return RIGHT
     for part, other in zip(found, expected, strict=True):
         if not tolerances.agree(part, other):
             raise Failed(f"{op}: not what the reference gives: {difference(part, other)}; {describe(call)}")
+    if not tolerances.agree_gradients(slopes, others):
+        apart = ", ".join(difference(part, other) for part, other in zip(slopes, others, strict=True))
+        raise Failed(f"{op}: not the gradients of the reference: {apart}; {describe(call)}")
     return RIGHT
 
 
-def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> list[Tensor]:
-    """The tensors that an op returns or has written into, and the gradients of their sum."""
+def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tuple[list[Tensor], list[Tensor]]:
+    """The tensors that an op returns or has written into, and the gradients of their sum where they are asked for."""
     own = tree_map(
         lambda value: value.detach().clone() if isinstance(value, Tensor) and op in IN_PLACE else value, call
     )
@@ -71,13 +75,11 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> lis
         own = tree_map(leaf, own)
     returned = getattr(ops, op)(**own, backend=backend)
     found = [part for part in tree_leaves(own if op in IN_PLACE else returned) if isinstance(part, Tensor)]
-    if gradients:
-        smooth = [part for part in found if part.requires_grad and part.numel()]
-        if smooth:
-            total = sum(part.double().sum() for part in smooth)
-            asked = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
-            found = [part.detach() for part in found] + list(asked)
-    return found
+    smooth = [part for part in found if part.requires_grad and part.numel()]
+    if not smooth:
+        return found, []
+    total = sum(part.double().sum() for part in smooth)
+    return found, list(torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True))
 
 
 def drawn_rightly(call: dict[str, Any], found: Tensor, expected: Tensor) -> None:

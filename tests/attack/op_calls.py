@@ -116,19 +116,20 @@ def balance_centres(rng: random.Random, n: int) -> Call:
     return {**call, "neighbours": rng.randint(1, 9), "alpha": 0.05, "global_norm": rng.random() < 0.5}
 
 
-def cameras(c: int) -> Call:
+def cameras(rng: random.Random, c: int) -> Call:
     intrinsics = torch.cat([30 + 10 * torch.rand(c, 2), 4 * torch.rand(c, 2)], dim=1)
-    return {"poses": torch.eye(4).repeat(c, 1, 1), "intrinsics": intrinsics, "distortion": 0.01 * torch.randn(c, 4)}
+    lens = {"distortion": 0.01 * torch.randn(c, 8), "fisheye": rng.random() < 0.5}
+    return {"poses": torch.eye(4).repeat(c, 1, 1), "intrinsics": intrinsics, **lens}
 
 
 def camera_rays(rng: random.Random, n: int) -> Call:
     c = rng.randint(1, 4)
-    return {**cameras(c), "x": 8 * torch.rand(n), "y": 8 * torch.rand(n), "camera": index(n, c)}
+    return {**cameras(rng, c), "x": 8 * torch.rand(n), "y": 8 * torch.rand(n), "camera": index(n, c)}
 
 
 def pixel_rays(rng: random.Random, n: int) -> Call:
     c, h, w, channels = rng.randint(1, 4), rng.randint(1, 9), rng.randint(1, 9), rng.choice((3, 4))
-    call: Call = {**cameras(c), "images": torch.randint(256, (c, h, w, channels), dtype=torch.uint8)}
+    call: Call = {**cameras(rng, c), "images": torch.randint(256, (c, h, w, channels), dtype=torch.uint8)}
     call |= {"index": torch.randint(c * h * w, (n,)), "near": 0.1, "far": 5.0, "background": torch.rand(n, 3)}
     return {**call, "box": rng.choice((None, torch.tensor([[-1.0] * 3, [1.0] * 3])))}
 

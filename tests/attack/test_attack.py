@@ -1,14 +1,39 @@
 """The short form of `make attack`."""
 
+import os
+import signal
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from attempts import FAILED, REFUSED, RIGHT, Failed, Part, run_part
 from helpers import python
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="forks, and limits memory and files")
+
+
+def harmed(rng, folder, given):
+    """An attempt whose folder is named by its seed."""
+    seed = int(folder.name)
+    if seed == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if seed == 2:
+        time.sleep(60)
+    if seed == 3:
+        raise Failed("wrong")
+    return REFUSED if seed == 4 else RIGHT
+
+
+@linux
+def test_a_crash_is_a_failure_like_another():
+    tally = run_part(Part("part", harmed, 2, batch=4), range(6), jobs=2)
+    assert tally.counts == {RIGHT: 2, REFUSED: 1, FAILED: 3}
+    assert sorted(tally.failures) == [(1, "ended by SIGKILL"), (2, "took 2 s"), (3, "Failed: wrong")]
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="forks, and limits memory and files")
+@linux
 def test_a_short_attack_finds_nothing():
     table = python(Path(__file__).parent, "--short", "--jobs", 1).splitlines()[-7:]
     assert all(int(line.split()[1]) > 0 and int(line.split()[4]) == 0 for line in table), table
