@@ -279,8 +279,8 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     place = find_model(folder)
     if place is None:
         raise SceneError(f"{folder}: has no COLMAP model, cameras and images as .bin or .txt, in sparse/0 or sparse")
-    for file in place.iterdir():
-        stay_inside(file, folder, reading.allow_outside)
+    for part in place.iterdir():
+        stay_inside(part, folder, reading.allow_outside)
     model = read_model(place)
     longest = max(max(image.camera.width, image.camera.height) for image in model.images)
     chosen = choose_images(folder, reading.downscale, longest)
