@@ -67,7 +67,13 @@ def changed_settings(config: Mapping[str, Any]) -> Row:
     """The settings of a configuration, as in its JSON, that differ from their defaults."""
     usual = json.loads(
         TrainConfig(
-            field="nerf", occupancy=False, contraction="none", average=0.0, centres="balanced", rays=1024
+            field="nerf",
+            occupancy=False,
+            contraction="none",
+            average=0.0,
+            centres="balanced",
+            rays=1024,
+            downscale=1,
         ).to_json()
     )  # as in every training of the paper
     return {name: value for name, value in config.items() if name not in NOT_TOLD and value != usual.get(name)}

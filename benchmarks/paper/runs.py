@@ -50,6 +50,9 @@ LATER = {
     "field_options": [],
     "cell_tables": False,
     "average": 0.0,
+    "format": "auto",
+    "kind": "auto",
+    "normalise": True,
 }
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device", "blend"}

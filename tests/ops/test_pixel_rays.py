@@ -90,4 +90,6 @@ def test_refuses_what_makes_no_sense():
     refuses("background must have shape [b, 3] with b = 3, got [2, 3]", background=torch.rand(2, 3))
     refuses("distortion must have shape [c, 8] with c = 4, got [1, 8]", distortion=torch.zeros(1, 8))
     refuses("distortion must be given with fisheye, got None", fisheye=True)
+    with refused(TypeError, "pixel_rays: fisheye must be True or False, got int"):
+        pixel_rays(**good, near=0.0, far=1.0, fisheye=1)
     refuses("near and far must satisfy 0 <= near < far, got 1.0 and 1.0", near=1.0)

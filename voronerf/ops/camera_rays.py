@@ -7,7 +7,15 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
+from voronerf.checks import (
+    INDEX,
+    check_count,
+    check_dtype,
+    check_flag,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+)
 
 _OP = backends.declare(
     "camera_rays",
@@ -69,6 +77,7 @@ def camera_rays(
     if camera is not None:
         check_shape(_OP, "camera", camera, ("b",), sizes)
         check_dtype(_OP, "camera", camera, INDEX)
+    check_flag(_OP, "fisheye", fisheye)
     if distortion is not None:
         check_shape(_OP, "distortion", distortion, ("c", 8), sizes)
     elif fisheye:

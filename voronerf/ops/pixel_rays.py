@@ -10,6 +10,7 @@ from voronerf.backends import Implementation
 from voronerf.checks import (
     check_count,
     check_dtype,
+    check_flag,
     check_number,
     check_same_device,
     check_same_dtype,
@@ -84,6 +85,7 @@ def pixel_rays(
     check_dtype(_OP, "index", index, (torch.int64,))
     if box is not None:
         check_shape(_OP, "box", box, (2, 3))
+    check_flag(_OP, "fisheye", fisheye)
     if distortion is not None:
         check_shape(_OP, "distortion", distortion, ("c", 8), sizes)
     elif fisheye:

@@ -38,7 +38,8 @@ class Composite(NamedTuple):
 
 def check_ray_offsets(op: str, ray_offsets: Tensor, m: int) -> None:
     """On the CPU, as the kernels do: ValueError unless the offsets rise from 0 or more to m or less."""
-    if ray_offsets.device.type != "cpu" or torch.compiler.is_compiling():
+    traced = torch.compiler.is_compiling() or type(ray_offsets) is not Tensor  # which has no values
+    if traced or ray_offsets.device.type != "cpu":
         return
     wrong = (ray_offsets < 0) | (ray_offsets > m)
     wrong[1:] |= ray_offsets[1:] < ray_offsets[:-1]
