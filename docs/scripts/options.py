@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from voronerf.cli.main import COMMANDS
+from voronerf.cli.opening import Opening
 from voronerf.training.config import TrainConfig
 
 #: Headings above the settings of `voronerf train`, each before the setting that it names.
@@ -42,12 +43,18 @@ def train_tables() -> list[str]:
     unknown = set(SECTIONS) - {field.name for field in dataclasses.fields(TrainConfig)}
     if unknown:
         raise ValueError(f"options: SECTIONS must name settings of TrainConfig, got {', '.join(sorted(unknown))}")
-    texts, kinds, lines = field_docs(TrainConfig), get_type_hints(TrainConfig), []
-    for field in dataclasses.fields(TrainConfig):
+    lines = []
+    for field, line in zip(dataclasses.fields(TrainConfig), settings(TrainConfig), strict=True):
         if field.name in SECTIONS:
             lines += ["", f"### {SECTIONS[field.name]}", "", *HEADER]
-        lines.append(row(f"--{dashed(field.name)}", kinds[field.name], field.default, texts[field.name]))
+        lines.append(line)
     return [*lines, ""]
+
+
+def settings(kind: type) -> list[str]:
+    """A row for each field of a dataclass."""
+    texts, kinds = field_docs(kind), get_type_hints(kind)
+    return [row(f"--{dashed(f.name)}", kinds[f.name], f.default, texts[f.name]) for f in dataclasses.fields(kind)]
 
 
 def table(function: Callable[..., Any], arguments: str) -> list[str]:
@@ -56,6 +63,9 @@ def table(function: Callable[..., Any], arguments: str) -> list[str]:
     lines = []
     for name, parameter in inspect.signature(function).parameters.items():
         if kinds[name] is TrainConfig:
+            continue
+        if kinds[name] is Opening:
+            lines += settings(Opening)
             continue
         positional = parameter.kind is parameter.POSITIONAL_ONLY
         label = name.upper() if positional else f"--{dashed(name)}"

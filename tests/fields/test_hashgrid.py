@@ -31,6 +31,14 @@ def test_cells_share_the_grid_and_inherit_their_networks():
     assert router.module.features.grad is not None and router.module.features.grad.abs().sum() > 0
 
 
+def test_every_unit_that_reads_the_grid_learns_from_the_first_sample():
+    torch.manual_seed(0)
+    field = HashGridField(width=16, log2_entries=10, levels=4)
+    colour, density = field(*rays(1))
+    (colour.sum() + density.sum()).backward()
+    assert (field.trunk[0].bias.grad != 0).all()
+
+
 def test_cells_with_tables_of_their_own():
     router = VoronoiRouter(HashGridField(width=16, log2_entries=10, levels=4), torch.rand(3, 3))
     x, d = rays(50)

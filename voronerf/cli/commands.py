@@ -21,6 +21,7 @@ from rich.table import Table
 from voronerf import backends
 from voronerf.cli.board import Board
 from voronerf.cli.display import TrainingDisplay, printable
+from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.data import Scene, load_scene
 from voronerf.data.process import process as make_scene
 from voronerf.evaluation.panels import picture_of_colour, write_panels
@@ -28,7 +29,7 @@ from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.paths import CameraPath, read_camera_path, spiral_cameras
-from voronerf.run import Run, open_run
+from voronerf.run import Run
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device, why_no_occupancy
 from voronerf.training.progress import Progress
@@ -159,54 +160,25 @@ def _train(trainer: Trainer) -> dict[str, Any]:
 def evaluate_run(
     run: Path,
     /,
-    data: str | None = None,
-    downscale: int | None = None,
-    allow_outside: bool = False,
+    opening: Opening = AS_IN_TRAINING,
     views: int | None = None,
     panels: int = 4,
-    samples: int | None = None,
-    fine_samples: int | None = None,
-    occupancy: bool = False,
-    blend: float | None = None,
     lpips: Path | None = None,
-    device: str = "cpu",
-    backend: str = "auto",
 ) -> int:
     """Score a trained run on its test views and draw panels: truth, render, error, depth, cells.
 
     Args:
         run: The run directory.
-        data: Scene folder; default as in training, if that lies in the run directory, the working directory or
-            VORONERF_DATA, since a run may be another person's.
-        downscale: Factor on the images; default as in training.
-        allow_outside: Also read images that lie outside of the scene folder.
+        opening: How the run is opened.
         views: Number of test views, evenly spread; default all.
         panels: Number of views drawn.
-        samples: Samples per ray in the first pass; default as in training.
-        fine_samples: Samples per ray in the second pass; default as in training.
-        occupancy: Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses
-            its own grid.
-        blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
         lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
             of VORONERF_DATA or beside the scene, the installed lpips package.
-        device: Torch device.
-        backend: Backend of the operations.
     """
     if panels < 0:
         raise ConfigError(f"--panels must not be negative, got {panels}")
-    check_counts(views=views, samples=samples, fine_samples=fine_samples, downscale=downscale)
-    opened = open_run(
-        run,
-        data=data,
-        downscale=downscale,
-        allow_outside=allow_outside,
-        samples=samples,
-        fine_samples=fine_samples,
-        occupancy=occupancy,
-        blend=blend,
-        device=device,
-        backend=backend,
-    )
+    check_counts(views=views)
+    opened = opening.open(run)
     perceived, source = opened.find_lpips(lpips)
     if perceived is None:
         say(source)
@@ -233,15 +205,7 @@ def render(
     spiral: bool = False,
     frames: int = 60,
     fps: float | None = None,
-    data: str | None = None,
-    downscale: int | None = None,
-    allow_outside: bool = False,
-    samples: int | None = None,
-    fine_samples: int | None = None,
-    occupancy: bool = False,
-    blend: float | None = None,
-    device: str = "cpu",
-    backend: str = "auto",
+    opening: Opening = AS_IN_TRAINING,
 ) -> int:
     """Render a video of a trained run: a turntable, a spiral, or a camera path.
 
@@ -253,41 +217,19 @@ def render(
             was taken from one side, for which it is the default.
         frames: Frames of a turntable or a spiral.
         fps: Frames per second; default 24, or those of the path.
-        data: Scene folder; default as in training, if that lies in the run directory, the working directory or
-            VORONERF_DATA, since a run may be another person's.
-        downscale: Factor on the images, or on the frames of the path, which decides the video's size; default as in
-            training, and 1 for a path.
-        allow_outside: Also read images that lie outside of the scene folder.
-        samples: Samples per ray in the first pass; default as in training.
-        fine_samples: Samples per ray in the second pass; default as in training.
-        occupancy: Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses
-            its own grid.
-        blend: Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off.
-        device: Torch device.
-        backend: Backend of the operations.
+        opening: How the run is opened.
     """
-    check_counts(frames=frames, samples=samples, fine_samples=fine_samples, downscale=downscale)
+    check_counts(frames=frames)
     if fps is not None and not 0.01 <= fps <= 1000:
         raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
     given = given_path(path, spiral)
-    opened = open_run(
-        run,
-        data=data,
-        downscale=downscale,
-        allow_outside=allow_outside,
-        samples=samples,
-        fine_samples=fine_samples,
-        occupancy=occupancy,
-        blend=blend,
-        device=device,
-        backend=backend,
-    )
+    opened = opening.open(run)
     spiral = spiral or opened.scene.kind == "forward"
     name = path.stem if path is not None else "spiral" if spiral else "turntable"
     out = out or run / f"{name}.mp4"
     check_video(out)
     if given is not None:
-        given = replace(given, frames=given.frames.downscaled(downscale or 1))
+        given = replace(given, frames=given.frames.downscaled(opening.downscale or 1))
     write_flight(opened, out, given=given, spiral=spiral, frames=frames, fps=fps)
     return 0
 
@@ -359,13 +301,6 @@ def process(source: Path, out: Path, /, frames: int = 150, fisheye: bool = False
     check_counts(frames=frames)
     make_scene(source, out, frames=frames, fisheye=fisheye, say=say)
     return 0
-
-
-def check_counts(**counts: int | None) -> None:
-    """Raises ConfigError for an option below 1; None stands for its default."""
-    for name, value in counts.items():
-        if value is not None and value < 1:
-            raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
 
 
 def _figures(score: dict[str, Any]) -> list[str]:

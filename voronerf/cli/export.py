@@ -6,13 +6,13 @@ from pathlib import Path
 
 import torch
 
-from voronerf.cli.commands import check_counts, given_path, say, write_flight
+from voronerf.cli.commands import given_path, say, write_flight
+from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.evaluation.video import check_video
 from voronerf.export import cells as cell_files
 from voronerf.export import mesh as mesh_files
 from voronerf.export import points as point_files
 from voronerf.export.files import check_export
-from voronerf.run import open_run
 from voronerf.training.config import ConfigError
 
 
@@ -29,12 +29,7 @@ def export(
     box: tuple[float, float, float, float, float, float] | None = None,
     path: Path | None = None,
     spiral: bool = False,
-    data: str | None = None,
-    downscale: int | None = None,
-    allow_outside: bool = False,
-    occupancy: bool = False,
-    device: str = "cpu",
-    backend: str = "auto",
+    opening: Opening = AS_IN_TRAINING,
 ) -> int:
     """Write a trained run as points, a mesh, the cells of its diagram, or a video, for other programs.
 
@@ -52,16 +47,9 @@ def export(
             the sphere of a contraction.
         path: Camera path in nerfstudio's format, for the video.
         spiral: Go where the training cameras are, in the video; default for a forward-facing scene.
-        data: Scene folder; default as in training, if that lies in the run directory, the working directory or
-            VORONERF_DATA, since a run may be another person's.
-        downscale: Factor on the images; default as in training.
-        allow_outside: Also read images that lie outside of the scene folder.
-        occupancy: Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses
-            its own grid.
-        device: Torch device.
-        backend: Backend of the operations.
+        opening: How the run is opened.
     """
-    check_counts(count=count, downscale=downscale)
+    check_counts(count=count)
     outputs = {
         points: point_files.SUFFIXES,
         mesh: mesh_files.SUFFIXES,
@@ -75,15 +63,7 @@ def export(
     if video is not None:
         check_video(video)
     given = given_path(path, spiral)
-    opened = open_run(
-        run,
-        data=data,
-        downscale=downscale,
-        allow_outside=allow_outside,
-        occupancy=occupancy,
-        device=device,
-        backend=backend,
-    )
+    opened = opening.open(run)
     corners = None if box is None else torch.tensor(box).view(2, 3)
     if points is not None:
         cloud = point_files.export_points(opened, points, count=count, box=corners)

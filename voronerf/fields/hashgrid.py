@@ -13,6 +13,10 @@ from voronerf.fields.radiance import RadianceField, reset_layers
 from voronerf.grids import UNIT_CUBE, HashGrid
 from voronerf.layers import MLP, Layer
 
+#: Bias of the hidden layers at the start. The features are near zero then, so with a bias of zero every unit would be at
+#: the kink of its ReLU, and the first steps could switch off a whole layer for good: one seed in seven lost its colours.
+HIDDEN_BIAS = 0.3
+
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
@@ -124,6 +128,8 @@ class HashGridField(RadianceField):
         """Features near zero, as published; the layers as in :func:`voronerf.fields.radiance.reset_layers`."""
         nn.init.uniform_(self.features, -1e-4, 1e-4)
         reset_layers(self.linears(), [self.density, self.colour], self.density_scale)
+        for layer in (*self.linears()[:-3], self.view):
+            nn.init.constant_(layer.bias, HIDDEN_BIAS)
 
     def linears(self) -> list[nn.Linear]:
         """The linear layers in the order of ``layers``."""

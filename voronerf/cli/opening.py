@@ -1,0 +1,50 @@
+"""The options of every command that opens a trained run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from voronerf.data import Scene
+from voronerf.run import Run, open_run
+from voronerf.training.config import ConfigError
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How a run is opened; what is None is as in training."""
+
+    data: str | None = None
+    """Scene folder; default as in training, if that lies in the run directory, the working directory or VORONERF_DATA,
+    since a run may be another person's."""
+    downscale: int | None = None
+    """Factor on the images, and on the frames of a camera path; default as in training, and 1 for a path."""
+    allow_outside: bool = False
+    """Also read images that lie outside of the scene folder."""
+    samples: int | None = None
+    """Samples per ray in the first pass; default as in training."""
+    fine_samples: int | None = None
+    """Samples per ray in the second pass; default as in training."""
+    occupancy: bool = False
+    """Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses its own grid."""
+    blend: float | None = None
+    """Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off."""
+    device: str = "cpu"
+    """Torch device."""
+    backend: str = "auto"
+    """Backend of the operations."""
+
+    def open(self, run: Path, *, scene: Scene | None = None) -> Run:
+        """Opens the run; see :func:`voronerf.open_run`."""
+        check_counts(samples=self.samples, fine_samples=self.fine_samples, downscale=self.downscale)
+        return open_run(run, scene=scene, **vars(self))
+
+
+AS_IN_TRAINING = Opening()
+
+
+def check_counts(**counts: int | None) -> None:
+    """Raises ConfigError for an option below 1; None stands for its default."""
+    for name, value in counts.items():
+        if value is not None and value < 1:
+            raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
