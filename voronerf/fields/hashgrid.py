@@ -13,8 +13,8 @@ from voronerf.fields.radiance import RadianceField, reset_layers
 from voronerf.grids import UNIT_CUBE, HashGrid
 from voronerf.layers import MLP, Layer
 
-#: Bias of the hidden layers at the start. The features are near zero then, so with a bias of zero every unit would be at
-#: the kink of its ReLU, and the first steps could switch off a whole layer for good: one seed in seven lost its colours.
+#: Bias of the hidden layers at the start. The features are near zero then, so that with a bias of zero every unit would
+#: be at the kink of its ReLU, and the first steps could switch off a whole layer: one seed in seven lost its colours.
 HIDDEN_BIAS = 0.3
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
