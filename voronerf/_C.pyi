@@ -428,13 +428,25 @@ def nearest_centre_grid(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None,
 # const float64*, const float64*, const float64*, CentreGrid, int32*, int64, int64, Cpu
 
 # ObservedSamples, float32*, uint8*, int32*, float32*, Cpu
+@overload
 def observe_occupancy(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
+# ObservedSamples, float32*, uint8*, int32*, float32*, Cuda
+@overload
+def observe_occupancy(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cuda) -> None: ...
 
 # PixelRaysInputs, PixelRaysOutputs, Cpu
+@overload
 def pixel_rays(_0: PixelRaysInputs, _1: PixelRaysOutputs, _2: Cpu) -> bool: ...
+# PixelRaysInputs, PixelRaysOutputs, Cuda
+@overload
+def pixel_rays(_0: PixelRaysInputs, _1: PixelRaysOutputs, _2: Cuda) -> None: ...
 
 # RenderLossInputs, RenderLossOutputs, Cpu
+@overload
 def render_loss(_0: RenderLossInputs, _1: RenderLossOutputs, _2: Cpu) -> None: ...
+# RenderLossInputs, RenderLossOutputs, Cuda
+@overload
+def render_loss(_0: RenderLossInputs, _1: RenderLossOutputs, _2: Cuda) -> None: ...
 
 # const float32*, const float32*, const float32*, float32*, int64, int64, int64, Cpu
 @overload
@@ -444,7 +456,11 @@ def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor
 def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: int, _8: Cuda) -> None: ...
 
 # SparseAdam, const float32*, float32*, float32*, float32*, int64, Cpu
+@overload
 def sparse_adam(_0: SparseAdam, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: Cpu) -> None: ...
+# SparseAdam, const float32*, float32*, float32*, float32*, int64, Cuda
+@overload
+def sparse_adam(_0: SparseAdam, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: Cuda) -> None: ...
 
 # const float32*, float32*, int64, int64, Cpu
 @overload

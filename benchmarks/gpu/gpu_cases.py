@@ -103,6 +103,56 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             [torch.rand(180), torch.rand(180, 3), torch.rand(180).cumsum(0), torch.rand(180)],
         )
 
+    def agree(run: Callable[..., Any], tensors: list[Any], tolerance: float) -> None:
+        """Results of the native kernels there and of the reference here."""
+        found, expected = run("native", *(x.to(where, copy=True) for x in tensors)), run("reference", *tensors)
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one.cpu(), other, rtol=tolerance, atol=tolerance)
+
+    def loss() -> None:
+        offsets = torch.tensor([2, 2, 3, 73, 140, 178], dtype=torch.int32, device=where)
+
+        def run(x: list[Any], backend: str) -> Any:
+            given = {"background": x[2], "density_scale": 10.0, "backend": backend}
+            return voronerf.ops.render_loss(x[0], x[1].detach(), offsets, x[2].detach(), **given).loss
+
+        close(run, [3 * torch.randn(180, 4), torch.rand(180) / 10, torch.rand(5, 3)])
+
+    def pixels(fisheye: bool) -> None:
+        poses, lenses = torch.eye(4).repeat(3, 1, 1), torch.tensor([[15.0, 16.0, 8.2, 6.1]]).repeat(3, 1)
+        bent, images = torch.rand(3, 8) / 100, torch.randint(0, 256, (3, 12, 17, 4), dtype=torch.uint8)
+        box, colours, index = (
+            torch.tensor([[-1.0, -1, -3], [1, 1, -2]]),
+            torch.rand(300, 3),
+            torch.randint(0, 612, (300,)),
+        )
+
+        def run(
+            backend: str, poses: Any, lenses: Any, bent: Any, images: Any, box: Any, colours: Any, index: Any
+        ) -> Any:
+            rest: dict[str, Any] = {"box": box, "distortion": bent, "fisheye": fisheye, "background": colours}
+            return voronerf.ops.pixel_rays(poses, lenses, images, index, near=1.0, far=4.0, backend=backend, **rest)
+
+        agree(run, [poses, lenses, bent, images, box, colours, index], 2e-6)
+
+    def observe() -> None:
+        def run(backend: str, density: Any, occupied: Any, box: Any, *samples: Any) -> Any:
+            rule = {"decay": 0.9, "threshold": 0.8, "hidden": 1e-3}
+            voronerf.ops.observe_occupancy(density, occupied, box, *samples, **rule, backend=backend)
+            return density, occupied
+
+        density, box = torch.rand(4, 5, 6), torch.tensor([[0.0, 0, 0], [1, 1, 1]])
+        samples = [torch.rand(3000, 3), torch.rand(3000), torch.rand(3000), (torch.rand(3000) - 0.3).clamp(min=0)]
+        agree(run, [density, density >= 0.8, box, *samples], 1e-6)
+
+    def adam() -> None:
+        def run(backend: str, *tensors: Any) -> Any:
+            voronerf.ops.sparse_adam(*tensors, step=3, learning_rate=0.01, backend=backend)
+            return tensors
+
+        gradient = torch.randn(5000) * (torch.rand(5000) < 0.2)
+        agree(run, [torch.randn(5000), gradient, torch.randn(5000), torch.rand(5000)], 1e-6)
+
     def resample() -> None:
         weights, edges = torch.rand(6, 45), torch.rand(6, 46).cumsum(1)
         found = voronerf.resample(weights.to(where), edges.to(where), 70, backend="native")
@@ -204,6 +254,10 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             ),
         ),
         ("composite", composite),
+        ("render_loss", loss),
+        *((f"pixel_rays{' of a fisheye' * bent}", functools.partial(pixels, bent)) for bent in (False, True)),
+        ("observe_occupancy", observe),
+        ("sparse_adam", adam),
         ("resample", resample),
         *(
             (f"grouped_mlp {name} {precision}", functools.partial(network, layers, [70, 0, 1, 40], d, precision))

@@ -8,6 +8,7 @@ VN_STRUCT(ObservedSamples, positions, sigma, deltas, weights, box, x, y, z, m, d
 
 VN_BINDINGS(module) {
   module.cpu("observe_occupancy", VN_CPU(observe_occupancy_cpu));
+  module.cuda("observe_occupancy", VN_CUDA(observe_occupancy_cuda));
 }
 
 }  // namespace voronerf

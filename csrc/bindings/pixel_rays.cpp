@@ -10,6 +10,7 @@ VN_STRUCT(PixelRaysOutputs, origins, directions, near, far, colour);
 
 VN_BINDINGS(module) {
   module.cpu("pixel_rays", VN_CPU(pixel_rays_cpu));
+  module.cuda("pixel_rays", VN_CUDA(pixel_rays_cuda));
 }
 
 }  // namespace voronerf

@@ -9,6 +9,7 @@ VN_STRUCT(RenderLossOutputs, loss, colour, weights, density, error, gradient);
 
 VN_BINDINGS(module) {
   module.cpu("render_loss", VN_CPU(render_loss_cpu));
+  module.cuda("render_loss", VN_CUDA(render_loss_cuda));
 }
 
 }  // namespace voronerf

@@ -8,6 +8,7 @@ VN_STRUCT(SparseAdam, step_size, correction, decay, decay_sq, epsilon);
 
 VN_BINDINGS(module) {
   module.cpu("sparse_adam", VN_CPU(sparse_adam_cpu));
+  module.cuda("sparse_adam", VN_CUDA(sparse_adam_cuda));
 }
 
 }  // namespace voronerf

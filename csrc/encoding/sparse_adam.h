@@ -17,5 +17,7 @@ struct SparseAdam {
 // gradient: [n] -> parameter, mean, square: [n], updated in place where the gradient is not zero.
 void sparse_adam_cpu(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
                      int64_t n, Isa isa, int threads);
+void sparse_adam_cuda(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
+                      int64_t n, void* stream);
 
 }  // namespace voronerf

@@ -5,6 +5,7 @@
 // with the sum of what is behind.
 #include "common/cuda_wrappers.h"
 #include "rays/composite.h"
+#include "rays/ray_warp.h"
 
 namespace voronerf {
 
@@ -12,81 +13,22 @@ namespace {
 
 constexpr int kThreads = 128;
 constexpr int kWarps = kThreads / 32;
-constexpr int kChannels = 4;      // summed in one walk along the ray
-constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
+constexpr int kChannels = 4;  // summed in one walk along the ray
 
-// A NaN stays one.
-__device__ float finite_density(float sigma) {
-  return sigma > kOpaque ? kOpaque : sigma;
-}
-
-// A sum in two floats.
-struct Carry {
-  float high = 0.0f, low = 0.0f;
-
-  __device__ float plus(float x) const { return high + (low + x); }
-  __device__ void add(float x) {
-    const float sum = high + x, part = sum - high;
-    const float lost = (high - (sum - part)) + (x - part);
-    high = sum;
-    // What is infinite or no number has no digits to lose.
-    if (lost == lost && fabsf(lost) < INFINITY) low += lost;
-  }
-};
-
-__device__ float sum_of_lanes(float x) {
-  for (int step = 16; step > 0; step /= 2) x += __shfl_xor_sync(kAllLanes, x, step);
-  return x;
-}
-
-// Sum over this lane and those before it (after it, backwards).
-__device__ float running_sum(float x, int lane) {
-  for (int step = 1; step < 32; step *= 2) {
-    const float other = __shfl_up_sync(kAllLanes, x, step);
-    if (lane >= step) x += other;
-  }
-  return x;
-}
-
-__device__ float running_sum_back(float x, int lane) {
-  for (int step = 1; step < 32; step *= 2) {
-    const float other = __shfl_down_sync(kAllLanes, x, step);
-    if (lane + step < 32) x += other;
-  }
-  return x;
-}
-
-struct Range {
-  int64_t begin, end;
-};
-
-// Samples of a ray. Offsets that fall or exceed m cannot be refused without a host read: nothing outside is touched.
-__device__ Range samples_of(const CompositeInputs& in, int64_t ray) {
+__device__ RayRange samples_of(const CompositeInputs& in, int64_t ray) {
   if (in.offsets == nullptr) return {ray * in.s, (ray + 1) * in.s};
-  const int64_t first = in.offsets[ray], last = in.offsets[ray + 1];
-  const int64_t begin = first < 0 ? 0 : first > in.m ? in.m : first;
-  return {begin, last < begin ? begin : last > in.m ? in.m : last};
+  return ray_range(in.offsets, ray, in.m);
 }
 
 __device__ const float* background_of(const CompositeInputs& in, int64_t ray) {
   return in.background == nullptr || !in.background_per_ray ? in.background : in.background + ray * in.c;
 }
 
-// Optical depth in front of each lane's sample; the carry moves to the end of the chunk.
-__device__ float depth_in_front(float optical, int lane, Carry& carry) {
-  const float through = running_sum(optical, lane);
-  float before = __shfl_up_sync(kAllLanes, through, 1);
-  if (lane == 0) before = 0.0f;
-  const float front = carry.plus(before);
-  carry.add(__shfl_sync(kAllLanes, through, 31));
-  return front;
-}
-
 __global__ void __launch_bounds__(kThreads) composite_kernel(CompositeInputs in, CompositeOutputs out) {
   const int lane = threadIdx.x % 32;
   const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
   if (ray >= in.r) return;  // a whole warp
-  const Range range = samples_of(in, ray);
+  const RayRange range = samples_of(in, ray);
   const float* background = background_of(in, ray);
   float opacity = 0.0f, depth = 0.0f, left = 0.0f;
   int64_t channel = 0;
@@ -135,7 +77,7 @@ __global__ void __launch_bounds__(kThreads) composite_backward_kernel(CompositeI
   const int lane = threadIdx.x % 32;
   const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
   if (ray >= in.r) return;  // a whole warp
-  const Range range = samples_of(in, ray);
+  const RayRange range = samples_of(in, ray);
   const float* colour = g.colour == nullptr ? nullptr : g.colour + ray * in.c;
   const float of_depth = g.depth == nullptr ? 0.0f : g.depth[ray];
   const float of_opacity = g.opacity == nullptr ? 0.0f : g.opacity[ray];
@@ -170,11 +112,7 @@ __global__ void __launch_bounds__(kThreads) composite_backward_kernel(CompositeI
       for (int64_t k = 0; colour != nullptr && k < in.c; ++k) own = fmaf(colour[k], in.rgb[i * in.c + k], own);
     }
     const float share = active ? own * weight : 0.0f;
-    const float rest = running_sum_back(share, lane);
-    float after = __shfl_down_sync(kAllLanes, rest, 1);
-    if (lane == 31) after = 0.0f;
-    const float of_optical = own * (light * expf(-optical)) - behind.plus(after);
-    behind.add(__shfl_sync(kAllLanes, rest, 0));
+    const float of_optical = own * (light * expf(-optical)) - share_behind(share, lane, behind);
     if (!active) continue;
     g.sigma[i] = sigma <= kOpaque ? of_optical * delta : 0.0f;
     if (g.deltas != nullptr) g.deltas[i] = of_optical * density;

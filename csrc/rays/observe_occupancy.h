@@ -16,5 +16,7 @@ struct ObservedSamples {
 // density, occupied: [x,y,z]. cells, before: [m], working memory.
 void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* occupied, int32_t* cells, float* before,
                            int threads);
+void observe_occupancy_cuda(const ObservedSamples& in, float* density, uint8_t* occupied, int32_t* cells, float* before,
+                            void* stream);
 
 }  // namespace voronerf

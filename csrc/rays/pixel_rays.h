@@ -29,4 +29,7 @@ struct PixelRaysOutputs {
 // Returns false, with undefined results, if an index is not that of a pixel.
 bool pixel_rays_cpu(const PixelRaysInputs& in, const PixelRaysOutputs& out, int threads);
 
+// An index that is not that of a pixel cannot be refused without a host read, and is read outside of the images.
+void pixel_rays_cuda(const PixelRaysInputs& in, const PixelRaysOutputs& out, void* stream);
+
 }  // namespace voronerf

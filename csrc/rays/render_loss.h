@@ -31,4 +31,7 @@ struct RenderLossOutputs {
 // Throws std::invalid_argument for offsets that fall or exceed m.
 void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, Isa isa, int threads);
 
+// Offsets that fall or exceed m are not refused: samples outside are not touched.
+void render_loss_cuda(const RenderLossInputs& in, const RenderLossOutputs& out, void* stream);
+
 }  // namespace voronerf

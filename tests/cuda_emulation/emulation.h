@@ -15,6 +15,8 @@
 #include <type_traits>
 #include <vector>
 
+#include "emulation_atomics.h"
+
 #define __global__
 #define __device__
 #define __host__
@@ -277,16 +279,6 @@ inline unsigned __ballot_sync(unsigned mask, int predicate) {
     if (vn_emulation::from_lane<int>(slots, lane) != 0) votes |= 1u << lane;
   }
   return votes;
-}
-
-// Returns what was there before. Atomic for the sanitizers too, which know of threads alone.
-inline float atomicAdd(float* to, float value) {
-  float before, after;
-  __atomic_load(to, &before, __ATOMIC_RELAXED);
-  do {
-    after = before + value;
-  } while (!__atomic_compare_exchange(to, &before, &after, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
-  return before;
 }
 
 inline int __ffs(int x) {

@@ -121,6 +121,41 @@ def composited(module, inputs, r, c):
     return results, outgoing
 
 
+def step(module):
+    """What surrounds the networks in a step of training."""
+    gpu, offsets = module.Cuda(0, 0), integers(2, 2, 3, 73, 140, 177)
+    for background in (floats(3), floats(5, 3), None):
+        written(*rendered(module, offsets, background))
+    poses, lenses, bent, box = floats(3, 4, 4), floats(3, 4) + 9, floats(3, 8) / 99, np.array([[-1, -1, -1], [1, 1, 1]])
+    images, pixels = RANDOM.integers(0, 256, (3, 12, 17, 4), dtype=np.uint8), RANDOM.integers(0, 612, 300)
+    given = module.PixelRaysInputs(
+        *every((poses, lenses, bent)), True, *every((images, pixels, box.astype(np.float32), floats(3))), False,
+        3, 12, 17, 4, 300, 1.0, 4.0
+    )  # fmt: skip
+    results = [unwritten(300, 3), unwritten(300, 3), unwritten(300), unwritten(300), unwritten(300, 3)]
+    module.pixel_rays(given, module.PixelRaysOutputs(*every(results)), gpu)
+    written(*results)
+    density, occupied, before = floats(60), np.zeros(60, np.uint8), unwritten(700)
+    cells, corners = unwritten(700, dtype=np.int32), np.array([[0, 0, 0], [1, 1, 1]], np.float32)
+    samples = every((floats(700, 3), floats(700), floats(700), floats(700), corners))
+    seen = module.ObservedSamples(*samples, 3, 4, 5, 700, 0.9, 0.8, 0.01)
+    module.observe_occupancy(seen, *every((density, occupied, cells, before)), gpu)
+    assert (occupied == (density >= 0.8)).all()
+    rule, gradient = module.SparseAdam(0.01, 1.0, 0.9, 0.99, 1e-8), floats(700)
+    gradient[::3] = 0
+    module.sparse_adam(rule, *every((gradient, floats(700), floats(700), floats(700))), 700, gpu)
+
+
+def rendered(module, offsets, background):
+    """All that render_loss gives of 180 samples."""
+    r, per_ray = len(offsets) - 1, background is not None and background.ndim == 2
+    inputs = every((floats(180, 4), floats(180), offsets, floats(r, 3), background))
+    results = [unwritten(1), unwritten(r, 3), unwritten(180), unwritten(180), unwritten(r), unwritten(180, 4)]
+    given = module.RenderLossInputs(*inputs, per_ray, 10.0, r, 180)
+    module.render_loss(given, module.RenderLossOutputs(*every(results)), module.Cuda(0, 0))
+    return results
+
+
 def encode(module):
     x, gradient, gpu = floats(90, 3), floats(90, 27), module.Cuda(0, 0)
     for variances, include in ((None, True), (None, False), (floats(90, 3), False)):
@@ -252,6 +287,7 @@ def hostile(module):
         inputs = floats(m), floats(m, c), floats(m), floats(m), integers(*offsets), floats(c)
         inputs[0][::5], inputs[2][::7] = np.inf, np.nan
         composited(module, inputs, r, c)
+        rendered(module, integers(*offsets), None)
 
     encode_hashes(module, None, RANDOM.choice([least, -1, 0, 2, 3, most], 300).astype(np.int32))
 
@@ -272,7 +308,18 @@ def hostile(module):
 def main(path, kind="usual"):
     module = load(path)
     module.name_dtypes(DTYPES)
-    usual = (nearest_centre, locate_cell, draw_cell, cell_sort, composite, encode, hash_encode, resample, grouped_mlp)
+    usual = (
+        nearest_centre,
+        locate_cell,
+        draw_cell,
+        cell_sort,
+        composite,
+        step,
+        encode,
+        hash_encode,
+        resample,
+        grouped_mlp,
+    )
     for run in (hostile,) if kind == "hostile" else usual:
         run(module)
     print("clean")

@@ -12,11 +12,17 @@ from voronerf.training.trainer import Trainer
 STEPS = 16
 
 
-def losses(out, precision, *, on_device):
+SMALL = {
+    "nerf": {"depth": 2, "occupancy": False},
+    "hashgrid": {"field_options": ("levels=2", "log2_entries=10")},
+}
+
+
+def losses(out, field, precision, *, on_device):
     """Of the steps of a run that splits in the middle."""
     config = TrainConfig(
-        out=out, field="nerf", occupancy=False, steps=STEPS,
-        cells=(4,), split_at=(0.5,), width=16, depth=2, rays=32, samples=8, lr=0.005,
+        out=out, field=field, **SMALL[field], steps=STEPS,
+        cells=(4,), split_at=(0.5,), width=16, rays=32, samples=8, lr=0.005,
         warmup=0.0, reservoir=200, reservoir_batches=8, evaluations=1, precision=precision,
     )  # fmt: skip
     found = []
@@ -30,10 +36,13 @@ def losses(out, precision, *, on_device):
 
 
 @pytest.mark.native
-@pytest.mark.parametrize(("precision", "allowed"), [("fp32", 1e-3), ("bf16", 0.05), ("fp16", 0.02)])
-def test_steps_are_those_of_the_cpu(tmp_path, precision, allowed):
-    expected, _ = losses(tmp_path / "cpu", "fp32", on_device=False)
-    found, trainer = losses(tmp_path / "emulated", precision, on_device=True)
+@pytest.mark.parametrize(
+    ("field", "precision", "allowed"),
+    [("nerf", "fp32", 1e-3), ("nerf", "bf16", 0.05), ("nerf", "fp16", 0.02), ("hashgrid", "fp32", 1e-3)],
+)
+def test_steps_are_those_of_the_cpu(tmp_path, field, precision, allowed):
+    expected, _ = losses(tmp_path / "cpu", field, "fp32", on_device=False)
+    found, trainer = losses(tmp_path / "emulated", field, precision, on_device=True)
     assert trainer.router.num_cells == 4
     assert found == pytest.approx(expected, rel=allowed)
     assert found != expected

@@ -8,7 +8,7 @@ have these attributes, all of which are optional:
     training_defaults        options that differ in training from the defaults of the constructor
     learning_rate(**options) static method: Adam's rate at the start of a training; default ``LEARNING_RATE``
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
-    sparse_parameters        names of tables, as patterns, of which a step of training reads few entries. On a CPU their
+    sparse_parameters        names of tables, as patterns, of which a step of training reads few entries. Their
                              entries without a gradient stay as they are, see ``voronerf.ops.sparse_adam``
     scene_options(pixel, box, contracted)
                              static method: options from the width of a pixel at the middle of the scene and the

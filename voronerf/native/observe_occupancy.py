@@ -37,5 +37,6 @@ def observe_occupancy(
         threshold=threshold,
         hidden=hidden,
     )
+    machine = native.machine(density)
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
-    native.compiled.observe_occupancy(given, density, occupied.view(torch.uint8), cells, before, native.cpu())
+    native.compiled.observe_occupancy(given, density, occupied.view(torch.uint8), cells, before, machine)

@@ -28,7 +28,7 @@ def pixel_rays(
     return PixelRays(*_pixel_rays(poses, intrinsics, images, index, box, distortion, fisheye, background, near, far))
 
 
-@custom_op("pixel_rays_native", devices=("cpu",))
+@custom_op("pixel_rays_native")
 def _pixel_rays(
     poses: Tensor,
     intrinsics: Tensor,
@@ -66,6 +66,9 @@ def _pixel_rays(
         far=far,
     )
     results = compiled.PixelRaysOutputs(origins=origins, directions=directions, near=first, far=last, colour=colour)
-    if not compiled.pixel_rays(given, results, native.cpu()):
+    machine = native.machine(poses)
+    if isinstance(machine, compiled.Cuda):
+        compiled.pixel_rays(given, results, machine)
+    elif not compiled.pixel_rays(given, results, machine):
         low, high = (int(bound) for bound in index.aminmax())
         raise ValueError(f"pixel_rays: index must lie in 0 to {c * h * w - 1}, got values from {low} to {high}")

@@ -32,7 +32,7 @@ def render_loss(
     return RenderLoss(*parts)
 
 
-@custom_op("render_loss_native", devices=("cpu",))
+@custom_op("render_loss_native")
 def _render_loss(
     raw: Tensor,
     deltas: Tensor,
@@ -60,7 +60,7 @@ def _render_loss(
     results = compiled.RenderLossOutputs(
         loss=loss, colour=colour, weights=weights, density=density, error=error, gradient=gradient
     )
-    compiled.render_loss(given, results, native.cpu())
+    compiled.render_loss(given, results, native.machine(raw))
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

@@ -19,5 +19,6 @@ def sparse_adam(
     epsilon: float,
 ) -> None:
     """The formula of ``voronerf.ops.sparse_adam``; ``rate`` and ``correction`` are corrected for the moments' start."""
+    machine = native.machine(parameter)
     rule = native.compiled.SparseAdam(rate, correction, first, second, epsilon)
-    native.compiled.sparse_adam(rule, gradient, parameter.detach(), mean, square, parameter.numel(), native.cpu())
+    native.compiled.sparse_adam(rule, gradient, parameter.detach(), mean, square, parameter.numel(), machine)

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import Implementation
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import check_count, check_dtype, check_number, check_same_device, check_same_dtype, check_shape
 
-_OP = backends.declare("observe_occupancy", native=Implementation(("cpu",), (torch.float32,)))
+_OP = backends.declare("observe_occupancy", native=Implementation(EVERYWHERE, (torch.float32,)))
 
 
 def observe_occupancy(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import Implementation
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import (
     check_count,
     check_dtype,
@@ -19,7 +19,7 @@ from voronerf.checks import (
 )
 from voronerf.reference.pixel_rays import PixelRays
 
-_OP = backends.declare("pixel_rays", native=Implementation(("cpu",), (torch.float32,)))
+_OP = backends.declare("pixel_rays", native=Implementation(EVERYWHERE, (torch.float32,)))
 
 
 def pixel_rays(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import FLOATS, Implementation
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import (
     INDEX,
     check_count,
@@ -19,7 +19,7 @@ from voronerf.checks import (
 )
 from voronerf.reference.render_loss import RenderLoss
 
-_OP = backends.declare("render_loss", native=Implementation(("cpu",), FLOATS))
+_OP = backends.declare("render_loss", native=Implementation(EVERYWHERE, FLOATS))
 
 
 def render_loss(

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import Implementation
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import check_dtype, check_integer, check_number, check_same_device, check_tensor
 
-_OP = backends.declare("sparse_adam", native=Implementation(("cpu",), (torch.float32,)))
+_OP = backends.declare("sparse_adam", native=Implementation(EVERYWHERE, (torch.float32,)))
 
 
 @torch.no_grad()

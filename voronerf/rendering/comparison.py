@@ -94,10 +94,10 @@ def compare_marched(
     """`render_marched` and its loss in one pass from the outputs of the networks.
 
     None where that is not to be had: without a grid, for fields that do not declare what their outputs mean
-    (`activate_radiance`), and where `render_loss` is not native.
+    (`activate_radiance`), and for a backend that has no `render_loss`.
     """
     field, grid, backend = renderer.field, renderer.occupancy, renderer.backend
-    if grid is None or near.device.type != "cpu" or backend not in ("auto", "native"):
+    if grid is None or backend not in ("auto", "native"):
         return None
     if not isinstance(field, VoronoiRouter) or getattr(type(field.module), "activate", None) is not activate_radiance:
         return None

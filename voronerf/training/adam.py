@@ -43,7 +43,7 @@ class Adam(torch.optim.Adam):
         if not state:
             state["step"] = torch.tensor(0.0)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        state["step"] += 1
+        state["step"] = state["step"].cpu() + 1  # a fused optimiser loads it to the parameter's device
         sparse_adam(
             parameter,
             gradient,

@@ -262,12 +262,14 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) ->
     parent would set its step sizes for a thousand steps. The change is worth 0.7 dB after 800 steps of Lego at
     100 x 100.
 
-    On a CPU, entries of the field's tables that have no gradient stay as they are.
+    Entries of the field's tables that have no gradient stay as they are, except in a CUDA graph, whose steps are
+    torch's.
     """
     assert config.lr is not None
     dense, tables = parameter_groups(routers, config)
-    sparse = torch.device(config.device).type == "cpu"  # torch's fused step elsewhere
-    groups = [{"params": dense, "sparse": False}, *([{"params": tables, "sparse": sparse}] if tables else [])]
+    groups = [{"params": dense, "sparse": False}]
+    if tables:
+        groups.append({"params": tables, "sparse": not config.cuda_graph})
     options: dict[str, Any] = {"lr": config.lr}
     if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=dense[0].device), "capturable": True}

@@ -1,0 +1,66 @@
+// What samples teach an occupancy grid on CUDA, a thread a sample, in three launches: every cell finds one sample that
+// speaks for it, fades, and is raised by all of its samples. Densities are 0 or more, so that their bits have their
+// order and their signs are free: the sample that sets the sign of a cell first is the one that speaks for it. No two
+// threads store to the same place.
+#include "common/cuda_wrappers.h"
+#include "rays/observe_occupancy_math.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kThreads = 128;
+constexpr unsigned kSign = 0x80000000u;
+
+__device__ __forceinline__ int64_t this_sample() {
+  return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+}
+
+// before: the density of the cell that a sample speaks for, -1 for the others.
+__global__ void __launch_bounds__(kThreads)
+    claim_kernel(ObservedSamples in, unsigned* density, int32_t* __restrict__ cells, float* __restrict__ before) {
+  const int64_t i = this_sample();
+  if (i >= in.m) return;
+  const int64_t cell = observed_cell(in, i);
+  const unsigned bits = atomicOr(density + cell, kSign);
+  float kept;
+  memcpy(&kept, &bits, sizeof kept);
+  cells[i] = static_cast<int32_t>(cell);
+  before[i] = (bits & kSign) != 0 ? -1.0f : kept;
+}
+
+__global__ void __launch_bounds__(kThreads)
+    fade_kernel(ObservedSamples in, const int32_t* __restrict__ cells, const float* __restrict__ before,
+                float* __restrict__ density, uint8_t* __restrict__ occupied) {
+  const int64_t i = this_sample();
+  if (i >= in.m || before[i] < 0.0f) return;
+  const float faded = before[i] * in.decay;
+  density[cells[i]] = faded;
+  occupied[cells[i]] = faded >= in.threshold;
+}
+
+__global__ void __launch_bounds__(kThreads)
+    raise_kernel(ObservedSamples in, const int32_t* __restrict__ cells, int* density, uint8_t* __restrict__ occupied) {
+  const int64_t i = this_sample();
+  if (i >= in.m) return;
+  const float seen = observed_density(in, i);
+  int bits;
+  memcpy(&bits, &seen, sizeof bits);
+  const int old = atomicMax(density + cells[i], bits);
+  float kept;
+  memcpy(&kept, &old, sizeof kept);
+  if (seen >= in.threshold && !(kept >= in.threshold)) occupied[cells[i]] = 1;  // of the samples of a cell one at most
+}
+
+}  // namespace
+
+void observe_occupancy_cuda(const ObservedSamples& in, float* density, uint8_t* occupied, int32_t* cells, float* before,
+                            void* stream) {
+  if (in.m == 0) return;
+  const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(in.m, kThreads));
+  VN_LAUNCH(claim_kernel, blocks, kThreads, 0, stream, in, reinterpret_cast<unsigned*>(density), cells, before);
+  VN_LAUNCH(fade_kernel, blocks, kThreads, 0, stream, in, cells, before, density, occupied);
+  VN_LAUNCH(raise_kernel, blocks, kThreads, 0, stream, in, cells, reinterpret_cast<int*>(density), occupied);
+}
+
+}  // namespace voronerf

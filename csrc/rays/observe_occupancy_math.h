@@ -1,0 +1,34 @@
+// Arithmetic of observe_occupancy, one sample at a time, for the CPU and for CUDA.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "common/hd.h"
+#include "rays/observe_occupancy.h"
+
+namespace voronerf {
+
+// The cell of a sample; NaN is in the first of its axis.
+VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
+  const int64_t size[3] = {in.x, in.y, in.z};
+  int64_t cell = 0;
+  for (int axis = 0; axis < 3; ++axis) {
+    const float extent = in.box[3 + axis] - in.box[axis], last = static_cast<float>(size[axis] - 1);
+    const float place = (in.positions[3 * i + axis] - in.box[axis]) / extent * static_cast<float>(size[axis]);
+    const float inside = place > 0.0f ? (place < last ? place : last) : 0.0f;
+    cell = cell * size[axis] + static_cast<int64_t>(inside);
+  }
+  return cell;
+}
+
+// What a sample says of its cell: its density, or 0 if less than the share `hidden` of the light reaches it.
+VN_HD float observed_density(const ObservedSamples& in, int64_t i) {
+  const float density = in.sigma[i] == in.sigma[i] ? in.sigma[i] : INFINITY;
+  const float thickness = density * in.deltas[i];
+  // 1 - exp(-t) <= min(t, 1), which spares most samples the function.
+  if (in.weights[i] > in.hidden * (thickness < 1.0f ? thickness : 1.0f)) return density;
+  return in.weights[i] > in.hidden * -expm1f(-thickness) ? density : 0.0f;
+}
+
+}  // namespace voronerf

@@ -1,0 +1,83 @@
+// What the CUDA kernels share that give a ray to a warp: its samples, 32 at a time, and sums over them.
+#pragma once
+
+#include "common/cuda_wrappers.h"
+
+namespace voronerf {
+
+constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
+
+// A NaN stays one.
+__device__ inline float finite_density(float sigma) {
+  return sigma > kOpaque ? kOpaque : sigma;
+}
+
+// A sum in two floats.
+struct Carry {
+  float high = 0.0f, low = 0.0f;
+
+  __device__ float plus(float x) const { return high + (low + x); }
+  __device__ void add(float x) {
+    const float sum = high + x, part = sum - high;
+    const float lost = (high - (sum - part)) + (x - part);
+    high = sum;
+    // What is infinite or no number has no digits to lose.
+    if (lost == lost && fabsf(lost) < INFINITY) low += lost;
+  }
+};
+
+__device__ inline float sum_of_lanes(float x) {
+  for (int step = 16; step > 0; step /= 2) x += __shfl_xor_sync(kAllLanes, x, step);
+  return x;
+}
+
+// Sum over this lane and those before it (after it, backwards).
+__device__ inline float running_sum(float x, int lane) {
+  for (int step = 1; step < 32; step *= 2) {
+    const float other = __shfl_up_sync(kAllLanes, x, step);
+    if (lane >= step) x += other;
+  }
+  return x;
+}
+
+__device__ inline float running_sum_back(float x, int lane) {
+  for (int step = 1; step < 32; step *= 2) {
+    const float other = __shfl_down_sync(kAllLanes, x, step);
+    if (lane + step < 32) x += other;
+  }
+  return x;
+}
+
+// Optical depth in front of each lane's sample; the carry moves to the end of the chunk.
+__device__ inline float depth_in_front(float optical, int lane, Carry& carry) {
+  const float through = running_sum(optical, lane);
+  float before = __shfl_up_sync(kAllLanes, through, 1);
+  if (lane == 0) before = 0.0f;
+  const float front = carry.plus(before);
+  carry.add(__shfl_sync(kAllLanes, through, 31));
+  return front;
+}
+
+// Of a gradient to the optical depth of each lane's sample what those behind it take: the sum of their shares, which
+// are 0 where there is no sample. The carry moves to the front of the chunk.
+__device__ inline float share_behind(float share, int lane, Carry& carry) {
+  const float rest = running_sum_back(share, lane);
+  float after = __shfl_down_sync(kAllLanes, rest, 1);
+  if (lane == 31) after = 0.0f;
+  const float behind = carry.plus(after);
+  carry.add(__shfl_sync(kAllLanes, rest, 0));
+  return behind;
+}
+
+struct RayRange {
+  int64_t begin, end;
+};
+
+// Samples of a ray. Offsets that fall or exceed m cannot be refused without a host read: nothing outside is touched.
+__device__ inline RayRange ray_range(const int32_t* offsets, int64_t ray, int64_t m) {
+  const int64_t first = offsets[ray], last = offsets[ray + 1];
+  const int64_t begin = first < 0 ? 0 : first > m ? m : first;
+  return {begin, last < begin ? begin : last > m ? m : last};
+}
+
+}  // namespace voronerf
