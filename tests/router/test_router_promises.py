@@ -200,10 +200,18 @@ class Dimensions(nn.Module):
         return self.fc(torch.cat([x, d[:, None].expand(rays, samples, 3)], -1))
 
 
-def test_flat_is_for_modules_that_squeeze() -> None:
-    module, x, cam = Squeezes(), uniform((9, 7)), torch.randint(0, 4, (9, 7, 1))
+class Flattens(Squeezes):
+    """Returns a row for each sample whatever it is given."""
+
+    def forward(self, x: Tensor, cam: Tensor) -> Tensor:
+        return self.fc(torch.cat([x, self.table(cam[..., 0])], -1)).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("make", [Squeezes, Flattens])
+def test_flat_is_for_modules_that_squeeze_or_flatten(make: type[nn.Module]) -> None:
+    module, x, cam = make(), uniform((9, 7)), torch.randint(0, 4, (9, 7, 1))
     router = VoronoiRouter(module, centres(), coords="first3", layout="flat")
-    torch.testing.assert_close(router(x, cam), module(x, cam))
+    torch.testing.assert_close(router(x, cam), module(x, cam).reshape(9, 7, 3))
     with pytest.raises((ValueError, RuntimeError)) as error:
         VoronoiRouter(module, centres(), coords="first3")(x, cam)
     assert "layout='flat'" in str(error.value) + "".join(getattr(error.value, "__notes__", []))

@@ -9,7 +9,6 @@ module whose cells have parameters of their own, and results and gradients are c
 from __future__ import annotations
 
 import inspect
-import math
 import os
 import threading
 import warnings
@@ -46,7 +45,6 @@ class Choice:
 
     way: str  # "fused", "grouped" or "cell by cell"
     why: str = ""  # what stands in the way of a faster one
-    flat: tuple[bool, ...] = ()  # of the tensors of a result: the module itself makes them [rays * samples, ...]
     piece: int = 1 << 16  # rows that a grouped module runs on at once on a CPU
     again: bool = False  # the module's code runs again in the backward pass
     open: bool = False  # another batch may be carried out in a faster way
@@ -114,15 +112,14 @@ def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: C
     choice = _choose(call, grouping, choices, fuse)
     results, choice = _carry_out(call, grouping, choices, choice)
     order = grouping if choice.program is None or not call.layout.n else None
-    own = results.restored(call.layout, order, choice.flat)
+    own = results.restored(call.layout, order)
     if mixture is None:
         return own
     n, where, tensors = mixture.rows.shape[0], {"cells": mixture.cells}, tensors_of(own)
     entries = Grouping(where, n, grouping.k, grouping.device, grouping.backend, rows=mixture.rows)
     results, _ = _carry_out(call, entries, choices, choice)
     for i, tensor in enumerate(results.tensors):
-        if results.rows[i]:
-            tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(n, -1)))
+        tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(n, -1)))
     return rebuild(own, tensors)
 
 
@@ -166,12 +163,12 @@ def _choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Cho
         return Choice("cell by cell", f"for fewer than {_FEWEST} samples") if choice is None else choice
     call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is found out
     with torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else []):
-        rays = len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat
-        flat = choice.flat if choice is not None else flattened(call) if rays else ()
         trial = Trial(call, grouping)
         if choice is not None and not trial.is_groupable():
             return choice
-        found = replace(admitted(trial, fuse), flat=flat)
+        if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
+            check_rays(call)
+        found = admitted(trial, fuse)
     if len(choices.kinds) >= _KINDS:
         choices.kinds.clear()
     choices.kinds[kind] = found
@@ -274,7 +271,7 @@ class Trial:
         try:
             with NoRandomness():
                 rows = [rows[:ROWS] for rows in self.call.arranged(self.entries)]
-                program = Program(self.made_of[0].module, self.call, rows)
+                program = Program(replace(self.call, module=self.made_of[0].module), rows)
             same = self.agrees(lambda t, rows: program.with_parameters_of(t.call.module).run(rows, t.entries), expected)
         except Unfusable as error:
             return None, str(error)
@@ -298,7 +295,7 @@ class Trial:
 
 def _same(found: Outcome, expected: Outcome) -> bool:
     (a, ours), (b, theirs) = found, expected
-    alike = a.rows == b.rows and len(ours) == len(theirs)
+    alike = len(a.tensors) == len(b.tensors) and len(ours) == len(theirs)
     return alike and all(map(agree, a.tensors, b.tensors)) and agree_gradients(ours, theirs)
 
 
@@ -351,49 +348,33 @@ def admitted(trial: Trial, fuse: bool) -> Choice:
 # Rays -----------------------------------------------------------------------------------------------------------------
 
 
-def flattened(call: Call) -> tuple[bool, ...]:
-    """For each tensor that a call with rays returns, whether the module itself makes [rays * samples, ...] of it.
-
-    A module is refused if samples of a ray meet in it, or if [n, 1, f] gives other results than [rays, samples, f].
-    """
-    name, lead = type(call.module).__name__, call.layout.lead
+def check_rays(call: Call) -> None:
+    """Raises ValueError where [n, 1, f] gives other results than [rays, samples, f], for a few samples of one cell."""
+    lead = call.layout.lead
     for samples in (6, lead[-1]):  # a module may be made for a number of samples
-        few = (*[1] * (len(lead) - 2), min(lead[-2], 2), min(lead[-1], samples))
         try:
-            whole, alone, other = _of_few(call, few)
+            whole, alone = _of_few(call, (*[1] * (len(lead) - 2), min(lead[-2], 2), min(lead[-1], samples)))
         except Exception:
             continue
-        for a, b in zip(whole, other, strict=True):
-            if a.dim() > len(few) and a.shape[: len(few)] == few and not agree(b[..., 0, :], a[..., 0, :]):
-                raise TypeError(
-                    f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when "
-                    "others along its ray change: it mixes the samples of a ray"
-                )
         if len(whole) != len(alone) or not all(agree(b.flatten(), a.flatten()) for a, b in zip(whole, alone)):
             raise ValueError(
-                f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but {name} does not; "
-                "layout='flat' calls it with [n, f], for modules that squeeze or flatten their arguments"
+                f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but "
+                f"{type(call.module).__name__} does not: it mixes the samples of a ray, or squeezes or flattens its "
+                "arguments; for that, layout='flat' calls it with [n, f]"
             )
-        return tuple(tuple(a.shape[: len(few)]) != few and a.shape[:1] == (math.prod(few),) for a in whole)
-    return ()
+        return
 
 
 def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
-    """The tensors that the module's first cell returns for the first samples of the first rays.
-
-    They are seen as rays, as the module would see them, and as rays with others behind the first sample of each.
-    """
-    found, others = [], []
+    """What the first cell's module returns for a few samples, seen as rays and as the router shows them."""
+    found: list[Tensor] = []
 
     def first(tensor: Tensor, kind: str) -> Tensor:
         found.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
-        others.append(found[-1].clone())
-        if kind != RAY and tensor.is_floating_point():
-            others[-1][(slice(None),) * (len(few) - 1) + (slice(1, None),)].mul_(0.7).add_(0.01)
         return found[-1]
 
     args, kwargs = call.changed(first)
     small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
     cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
     with torch.no_grad(), NoRandomness(), in_place_of_parameters(call.module, cell):
-        return [tensors_of(small.run(rows)) for rows in (found, small.arranged(None), others)]
+        return [tensors_of(small.run(rows)) for rows in (found, small.arranged(None))]

@@ -22,7 +22,7 @@ from voronerf.ops import routed_mlp
 from voronerf.router.grouped import PerCell, for_all_cells
 from voronerf.router.grouping import Grouping, owned_parameters
 from voronerf.router.layout import Call, Results, map_tree, tensors_of
-from voronerf.router.trace import TABLE, Linear, Ref, Segment, Step, Trace, Unfusable
+from voronerf.router.trace import TABLE, Column, Linear, Ref, Step, Trace, Unfusable
 
 # Fields with a layer table --------------------------------------------------------------------------------------------
 
@@ -105,39 +105,35 @@ def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple
 
 
 class Program:
-    """The layer table of one call of a copy of the routed module, and the steps before and behind it.
+    """The layer table of one call of the routed module, and the steps before and behind it.
 
     Args:
-        original: The routed module.
-        call: Of the copy, which runs with the parameters of its first cell.
+        call: The call, which runs with the parameters of the first cell.
         given: The rows of the arguments, for ``ROWS`` samples.
 
     Raises:
         Unfusable: For a step that is no such network, or that cannot be done again for other samples.
     """
 
-    def __init__(self, original: nn.Module, call: Call, given: list[Tensor]) -> None:
-        trace = Trace(original, call, given)
+    def __init__(self, call: Call, given: list[Tensor]) -> None:
+        trace = Trace(call, given)
         self._result, self._outputs = trace.result, trace.outputs
         self._before, self._weights = trace.before, trace.weights
-        self._sizes, self._parameters, self._shared = trace.sizes, trace.parameters, trace.shared
+        self._parameters, self._shared = trace.parameters, trace.shared
         self._writes = any(step.inplace for step in trace.before)
-        self._owned = [(owner, name) for owner, name, _ in owned_parameters(original)]
-        made = {value for step in trace.weights for value in step.values}
-        of_layers = {value for layer in trace.layers for value in (layer.weight, layer.bias) if value is not None}
-        self._used = of_layers.union(*[step.refs for step in trace.weights]) - made
+        self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         needed = [item for item in self._outputs if isinstance(item, Ref)]
-        if not trace.layers:
-            raise Unfusable("there is no linear layer")
-        if any(trace.sizes[value] is None for value in needed):
-            raise Unfusable("a result is made of parameters alone")
+        if len(needed) < len(self._outputs) or trace.made.intersection(needed):
+            raise Unfusable("a result depends on no sample")
         self._behind: list[Step] = []
         for step in reversed(trace.behind):
             if step.inplace or any(value in needed for value in step.values):
                 self._behind.insert(0, step)
                 needed += step.refs
-        self._needed = {v: trace.segments(v) for v in dict.fromkeys(needed) if trace.stages[v] == TABLE}
-        self._make_table(trace.layers)
+        self._make_table(trace, [value for value in dict.fromkeys(needed) if trace.stages[value] == TABLE])
+        made = {value for step in trace.weights for value in step.values}
+        of_layers = {value for layer in self._layers for value in (layer.weight, layer.bias) if value is not None}
+        self._used = of_layers.union(*[step.refs for step in trace.weights]) - made
 
     def with_parameters_of(self, module: nn.Module) -> Program:
         """The same for a copy of the module, with parameters of its own."""
@@ -145,46 +141,45 @@ class Program:
         copied._owned = [(owner, name) for owner, name, _ in owned_parameters(module)]
         return copied
 
-    def _make_table(self, layers: list[Linear]) -> None:
-        uses = [s for segments in (*[li.inputs for li in layers], *self._needed.values()) for s in segments]
-        self._pieces = [_cut([s for s in uses if s.layer == i]) for i in range(len(layers))]
-        self._blocks: list[tuple[Segment, ...]] = []  # what layers read of the values from before
-        self._parts: list[tuple[Linear, int, int, float]] = []
-        table: list[Layer] = []
-        numbers: dict[tuple[int, int], int] = {}
-        for index, linear in enumerate(layers):
-            inputs: list[int | str] = []
-            for from_layers, group in itertools.groupby(linear.inputs, lambda segment: segment.layer >= 0):
-                segments = tuple(group)
-                if from_layers:
-                    inputs += [numbers[s.layer, start] for s in segments for start, _ in self._pieces_of(s)]
-                    continue
-                if segments not in self._blocks:
-                    self._blocks.append(segments)
-                if len(self._blocks) > 2:
-                    raise Unfusable("layers read more than two different inputs")
-                inputs.append((POSITIONS, DIRECTIONS)[self._blocks.index(segments)])
-            for (start, stop), (name, factor) in self._pieces[index].items():
-                numbers[index, start] = len(table)
-                table.append(Layer(tuple(inputs), stop - start, name))
-                self._parts.append((linear, start, stop, factor))
-        if not self._blocks:
-            raise Unfusable("no layer reads the samples")
-        self._raw: dict[tuple[int, int], int] = {}  # where each piece begins in the outputs
-        outputs: list[int] = []
-        for segment in [segment for segments in self._needed.values() for segment in segments]:
-            for start, _ in self._pieces_of(segment):
-                if (segment.layer, start) not in self._raw:
-                    self._raw[segment.layer, start] = sum(table[number].width for number in outputs)
-                    outputs.append(numbers[segment.layer, start])
+    def _make_table(self, trace: Trace, needed: list[int]) -> None:
+        """The table of the layers that some values depend on. Layers read others, and blocks of values, whole."""
+        columns = {value: trace.columns(value) for value in needed}
+        outputs = _sources(itertools.chain(*columns.values()), Linear)
         if not outputs:
             raise Unfusable("nothing that is returned comes from a layer")
-        self._table = MLP(tuple(table), tuple(outputs))
-
-    def _pieces_of(self, segment: Segment) -> list[tuple[int, int]]:
-        """The pieces of its layer that a segment is made of."""
-        pieces = self._pieces[segment.layer] if segment.layer >= 0 else ()
-        return [piece for piece in pieces if segment.start <= piece[0] < segment.stop]
+        used = set(outputs)
+        for layer in reversed(trace.layers):
+            used.update(_sources(layer.inputs, Linear) if layer in used else ())
+        self._layers = [layer for layer in trace.layers if layer in used]
+        reads = [_sources(layer.inputs, int) for layer in self._layers]
+        first = next((read for read in reads if read), [])
+        others = [value for value in dict.fromkeys(itertools.chain(*reads)) if value not in first]
+        if not first:
+            raise Unfusable("no layer reads the samples")
+        self._blocks = [first, others] if others else [first]
+        widths: dict[int | str, int] = {number: layer.width for number, layer in enumerate(self._layers)}
+        places: dict[Linear | int, tuple[int | str, int]] = {layer: (i, 0) for i, layer in enumerate(self._layers)}
+        for name, block in zip((POSITIONS, DIRECTIONS), self._blocks):
+            for value in block:
+                places[value] = name, widths.get(name, 0)
+                widths[name] = widths.get(name, 0) + trace.values[value].shape[1:].numel()
+        table = []
+        self._orders: list[tuple[Tensor, int] | None] = []  # where the columns of a weight go among those of its inputs
+        for layer in self._layers:
+            read = [(places[source][0], places[source][1] + i) for source, i in layer.inputs]
+            inputs = list(dict.fromkeys(name for name, _ in read))
+            starts = dict(zip(inputs, itertools.accumulate((widths[name] for name in inputs), initial=0)))
+            order, total = [starts[name] + i for name, i in read], sum(widths[name] for name in inputs)
+            self._orders.append(None if order == list(range(total)) else (torch.tensor(order), total))
+            table.append(Layer(tuple(inputs), layer.width, layer.activation))
+        self._table = MLP(tuple(table), tuple(self._layers.index(layer) for layer in outputs))
+        begins = dict(zip(outputs, itertools.accumulate((layer.width for layer in outputs), initial=0)))
+        self._shapes = {value: trace.values[value].shape[1:] for value in needed}
+        self._ranges = {}  # columns of the raw outputs, or of a value from before, that make a value
+        for value, own in columns.items():
+            found = [(-1, begins[s] + i) if isinstance(s, Linear) else (s, i) for s, i in own]
+            runs = [list(run) for _, run in itertools.groupby(enumerate(found), lambda x: (x[1][0], x[1][1] - x[0]))]
+            self._ranges[value] = [(run[0][1][0], run[0][1][1], run[-1][1][1] + 1) for run in runs]
 
     # Running ----------------------------------------------------------------------------------------------------------
 
@@ -197,10 +192,7 @@ class Program:
             values[value] = owner._parameters[name]
         for step in self._before:
             step.run(values, n)
-        blocks = [
-            _joined([(values[s.value].reshape(n, -1), s.start, s.stop) for s in block]).contiguous()
-            for block in self._blocks
-        ]
+        blocks = [_joined([values[value].reshape(n, -1) for value in block]).contiguous() for block in self._blocks]
         weights, biases = self._stacked(values, grouping.k)
         where = grouping.where if grouping.rows is None else {"cells": grouping.sorted_cells.int()}
         directions = blocks[1] if len(blocks) > 1 else None
@@ -209,19 +201,13 @@ class Program:
         )
         if where and grouping.rows is None:
             grouping.where = {"cells": cells}
-        for value, segments in self._needed.items():
-            ranges = []
-            for s in segments:
-                if s.layer < 0:
-                    ranges.append((values[s.value].reshape(n, -1), s.start, s.stop))
-                at = [(self._raw[s.layer, start], stop - start) for start, stop in self._pieces_of(s)]
-                ranges += [(raw, first, first + width) for first, width in at]
-            m, *sizes = self._sizes[value] or ()
-            values[value] = _joined(ranges).reshape(n * m, *sizes)
+        for value, ranges in self._ranges.items():
+            parts = [(raw if source < 0 else values[source].reshape(n, -1), a, b) for source, a, b in ranges]
+            joined = _joined([part if b - a == part.shape[1] else part[:, a:b] for part, a, b in parts])
+            values[value] = joined.reshape(n, *self._shapes[value])
         for step in self._behind:
             step.run(values, n)
-        rows = [isinstance(item, Ref) for item in self._outputs]
-        return Results(self._result, [values[x] if isinstance(x, Ref) else x for x in self._outputs], rows)
+        return Results(self._result, [values[value] for value in self._outputs])
 
     def _stacked(self, values: dict[int, Any], k: int) -> tuple[list[Tensor], list[Tensor | None]]:
         """Weights [k, o, i] and biases [k, o] of the table, in its order."""
@@ -230,34 +216,22 @@ class Program:
             args, kwargs = map_tree(step.given, lambda _, v, nested: PerCell(known[v]) if isinstance(v, Ref) else v)
             results = tensors_of(for_all_cells(step.function, args, kwargs))
             known.update(zip(step.values, [r.stacked for r in results if isinstance(r, PerCell)], strict=True))
-
-        def part(value: int, linear: Linear, start: int, stop: int, factor: float) -> Tensor:
-            tensor: Tensor = known[value]
-            tensor = tensor if stop - start == linear.width else tensor[:, start:stop]
-            return tensor if factor == 1 else tensor * factor
-
-        weights = [part(own[0].weight, *own) for own in self._parts]
-        return weights, [None if own[0].bias is None else part(own[0].bias, *own) for own in self._parts]
-
-
-def _cut(uses: list[Segment]) -> dict[tuple[int, int], tuple[str, float]]:
-    """The pieces that a layer falls into, so that every use is of whole pieces: activations by (start, stop)."""
-    pieces = {}
-    for start, stop in itertools.pairwise(sorted({edge for use in uses for edge in (use.start, use.stop)})):
-        found = {use.activation for use in uses if use.start < stop and start < use.stop}
-        if len(found) > 1:
-            raise Unfusable("a layer is used before and after its activation")
-        if found:
-            pieces[start, stop] = found.pop()
-    return pieces
+        weights: list[Tensor] = []
+        biases: list[Tensor | None] = []
+        for layer, order in zip(self._layers, self._orders, strict=True):
+            weight, bias = known[layer.weight], None if layer.bias is None else known[layer.bias]
+            if order is not None:
+                weight = weight.new_zeros(*weight.shape[:2], order[1]).index_add(2, order[0].to(weight.device), weight)
+            plain = layer.factor == 1
+            weights.append(weight if plain else weight * layer.factor)
+            biases.append(bias if plain or bias is None else bias * layer.factor)
+        return weights, biases
 
 
-def _joined(ranges: Iterable[tuple[Tensor, int, int]]) -> Tensor:
-    """Columns ``start`` to ``stop`` of each tensor, side by side."""
-    joined: list[tuple[Tensor, int, int]] = []
-    for source, start, stop in ranges:
-        if joined and joined[-1][0] is source and joined[-1][2] == start:
-            start = joined.pop()[1]
-        joined.append((source, start, stop))
-    parts = [tensor if b - a == tensor.shape[1] else tensor[:, a:b] for tensor, a, b in joined]
+def _sources(columns: Iterable[Column], kind: type[Any]) -> list[Any]:
+    """Layers, or values, that columns belong to, each once."""
+    return list(dict.fromkeys(source for source, _ in columns if isinstance(source, kind)))
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, 1)

@@ -355,7 +355,7 @@ def run_grouped(call: Call, given: list[Tensor], grouping: Grouping, piece: int)
         if any(isinstance(tensor, PerCell) for tensor in tensors_of(values[-1])):
             raise Ungroupable("a result is made of parameters alone")
         widest = max(widest, run.widest)
-    return Results.joined(values, [part.n for part in parts], call.module), widest
+    return Results.joined(values, [part.n for part in parts]), widest
 
 
 def run_cells(call: Call, given: list[Tensor], bounds: list[tuple[int, int, int]], *, again: bool = False) -> Results:
@@ -375,4 +375,4 @@ def run_cells(call: Call, given: list[Tensor], bounds: list[tuple[int, int, int]
             continue
         with in_place_of_parameters(module, own):
             values.append(call.run(part))
-    return Results.joined(values, counts, module)
+    return Results.joined(values, counts)

@@ -178,17 +178,15 @@ class Layout:
         ones = [1] * (0 if self.flat else len(self.lead) - (2 if kind == RAY else 1))
         return rows.reshape(rows.shape[0], *ones, *rows.shape[1:]) if ones else rows
 
-    def restore(self, rows: Tensor, flattened: bool) -> Tensor:
-        """Rows [n * m, ...] of a result in the original order, with the leading dimensions of the call.
-
-        They stay as they are where the module itself has ``flattened`` rays to [rays * samples, ...].
-        """
-        n, rest = self.n, rows.shape[1:]
-        if len(self.lead) == 1 or flattened or (n and rows.shape[0] != n):
-            return rows
+    def restore(self, rows: Tensor) -> Tensor:
+        """Rows of a result in the original order, with the leading dimensions of the call."""
         ones = 0 if self.flat else len(self.lead) - 1
-        dropped = next((i for i, size in enumerate(rest[:ones]) if size != 1), min(ones, len(rest)))
-        return rows.reshape(*self.lead, *rest[dropped:])
+        if rows.shape[1 : 1 + ones] != (1,) * ones:
+            raise ValueError(
+                f"{_OP}: results must keep the leading dimensions [{_sizes(self.lead)}, ...] of the arguments, but the "
+                "module flattens them; layout='flat' calls it with [n, f] for [rays, samples, f]"
+            )
+        return rows.reshape(*self.lead, *rows.shape[1 + ones :])
 
 
 def _named(name: str, names: Iterable[str]) -> bool:
@@ -278,44 +276,26 @@ class Results:
     """What a method returned for rows."""
 
     value: Any  # of any structure
-    tensors: list[Tensor]  # its tensors, [n * m, ...] where they have rows
-    rows: list[bool]  # which of them have rows
+    tensors: list[Tensor]  # its tensors, [n, ...]
 
     @staticmethod
-    def joined(values: list[Any], counts: list[int], module: nn.Module) -> Results:
-        """What a method returned for parts of the rows, as one; buffers of the module are constants."""
+    def joined(values: list[Any], counts: list[int]) -> Results:
+        """What a method returned for parts of the rows, as one."""
         parts = [tensors_of(value) for value in values]
         if any(len(part) != len(parts[0]) for part in parts):
             raise ValueError(f"{_OP}: module must return as many tensors for every cell, got different numbers")
-        buffers = {id(buffer) for buffer in module.buffers()}
-        joined = Results(values[0], [], [])
-        for pieces in zip(*parts, strict=True):
-            rows, first = id(pieces[0]) not in buffers, pieces[0]
-            m = first.shape[0] // counts[0] if first.dim() else 0
-            if rows and (m == 0 or any(p.dim() == 0 or p.shape[0] != m * n for p, n in zip(pieces, counts))):
+        for tensor, n in ((tensor, n) for part, n in zip(parts, counts, strict=True) for tensor in part):
+            if tensor.shape[:1] != (n,):
                 raise ValueError(
-                    f"{_OP}: results must have a row for each sample, got {list(first.shape)} for {counts[0]} samples"
+                    f"{_OP}: results must have a row for each sample, got {list(tensor.shape)} for {n} samples"
                 )
-            joined.tensors.append(torch.cat(pieces) if rows and len(pieces) > 1 else first)
-            joined.rows.append(rows)
-        return joined
+        joined = [torch.cat(pieces) if len(pieces) > 1 else pieces[0] for pieces in zip(*parts, strict=True)]
+        return Results(values[0], joined)
 
-    def restored(self, layout: Layout, grouping: Grouping | None, flat: Sequence[bool]) -> Any:
-        """The results in the caller's order, with the leading dimensions of the call.
-
-        ``grouping`` is None where they have that order; ``flat`` says which tensors the module itself flattens.
-        """
-        tensors = list(self.tensors)
-        for i, tensor in enumerate(tensors):
-            if not self.rows[i]:
-                continue
-            if grouping is not None:
-                m = tensor.shape[0] // grouping.n
-                tensor = grouping.unsort(tensor if m == 1 else tensor.unflatten(0, (grouping.n, m)))
-                tensor = tensor if layout.n else tensor[:0]
-                tensor = tensor if m == 1 else tensor.flatten(0, 1)
-            tensors[i] = layout.restore(tensor, i < len(flat) and flat[i])
-        return rebuild(self.value, tensors)
+    def restored(self, layout: Layout, grouping: Grouping | None) -> Any:
+        """The results with the leading dimensions of the call, from the order of a grouping, or None for the call's."""
+        tensors = self.tensors if grouping is None else [grouping.unsort(tensor) for tensor in self.tensors]
+        return rebuild(self.value, [layout.restore(tensor if layout.n else tensor[:0]) for tensor in tensors])
 
 
 def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:

@@ -2,26 +2,22 @@
 
 The number of samples is one that no other size is a multiple of. Every function is put in its place on the way: before
 the first layer (encodings), among the layers (activations, and what moves columns), or behind them (activations of
-heads, dicts).
-
-Letters: n samples. A segment is a range of columns of a value from before the layers, or of a layer.
+heads, dicts). A column is a feature of a value from before the layers, or of a layer.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
-import math
 import threading
 import types
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 from unittest import mock
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.grouped import METADATA, RANDOM, find, name_of, user_line, writes_in_place
@@ -31,8 +27,7 @@ from voronerf.router.layout import Call, map_tree, rebuild, tensors_of
 ROWS = 37  # in a trace
 _PATCHES = threading.RLock()  # one thread at a time changes what torch calls for a custom function
 _BEFORE, TABLE, _BEHIND = range(3)  # where a value comes from
-_ROW_CODE = 1 << 32  # more than there are columns
-_PLAIN = ("none", 1.0)
+_ROW_CODES = torch.arange(ROWS)[:, None] << 32  # apart by more than there are columns
 _ACTIVATIONS = {
     "relu": find("relu relu_", F, torch, torch.Tensor),
     "sigmoid": find("sigmoid sigmoid_", F, torch, torch.Tensor),
@@ -94,38 +89,32 @@ class Step:
         return name if name != "softplus" or plain else None
 
 
-class Segment(NamedTuple):
-    """Columns ``start`` to ``stop`` of a value, or of layer ``layer`` after an activation of so many times its sums."""
-
-    value: int
-    layer: int
-    activation: tuple[str, float]
-    start: int
-    stop: int
-
-
 @dataclass(eq=False)
 class Linear:
-    """A linear layer of the trace: the values of its parameters, and where its inputs come from."""
+    """A linear layer of the trace, and an activation of so many times its sums."""
 
-    weight: int
+    weight: int  # the values of its parameters
     bias: int | None
-    inputs: tuple[Segment, ...]
+    inputs: list[Column]
     width: int
+    activation: str = "none"
+    factor: float = 1.0
+
+
+Column = tuple[Linear | int, int]  # a layer or the number of a value, and which of its columns
 
 
 class Trace(TorchFunctionMode):
-    """Takes down the functions that a copy of the routed module calls with its first cell's parameters."""
+    """Takes down the functions that the routed module calls with its first cell's parameters."""
 
-    def __init__(self, original: nn.Module, call: Call, given: list[Tensor]) -> None:
+    def __init__(self, call: Call, given: list[Tensor]) -> None:
         super().__init__()
         module = call.module
-        # Of every value of rows, rows for each sample and the dimensions behind, 0 rows where theirs is not the first;
-        # None for one of parameters.
-        self.sizes: list[tuple[int, ...] | None] = []
+        self.values: list[Tensor] = []  # kept, so that no other tensor gets the id of one
         self.stages: list[int] = []  # where every value comes from
         self.parameters: dict[int, int] = {}  # values that are parameters, with their place among ``owned_parameters``
-        self.shared: set[int] = set()  # values that are parameters of all cells in common, or made of such alone
+        self.made: set[int] = set()  # values that are parameters, or made of them alone
+        self.shared: set[int] = set()  # those among them that all cells have in common
         self.before: list[Step] = []
         self.behind: list[Step] = []
         self.weights: list[Step] = []  # of parameters of cells alone
@@ -134,11 +123,11 @@ class Trace(TorchFunctionMode):
         owned = owned_parameters(module)
         self._places = {id(single.get(id(parameter), parameter)): i for i, (_, _, parameter) in enumerate(owned)}
         self._in_common = {i for i, (owner, name, _) in enumerate(owned) if is_shared(owner, name)}
-        self._buffers = {id(own): other for own, other in zip(module.buffers(), original.buffers(), strict=True)}
-        self._grad, self._running = torch.is_grad_enabled(), False
-        self._known: dict[int, tuple[Tensor, int]] = {}
+        self._running = False
+        self._numbers: dict[int, int] = {}  # of values, by the id of their tensor
         self._codes: dict[int, Tensor] = {}  # like each value, with the number of its column in each entry
-        self._columns: list[tuple[int, int, tuple[str, float], int]] = []  # as in a segment
+        self._columns: list[Column] = []
+        self._first: dict[Linear | int, int] = {}  # where the columns of a layer or value begin among these
         self._scaled: dict[int, tuple[int, float]] = {}
         for tensor in given:
             self._new(tensor)
@@ -149,15 +138,15 @@ class Trace(TorchFunctionMode):
 
     def _new(self, tensor: Tensor, rows: bool = True) -> int:
         """Numbers a value."""
-        self._known[id(tensor)] = (tensor, len(self.sizes))  # kept, so that no other tensor gets its id
         if rows and not any(size and size % ROWS == 0 for size in tensor.shape):
             raise Unfusable(
                 f"a tensor of shape {list(tensor.shape)} has no row for each of {ROWS} samples{user_line()}"
             )
-        first = rows and tensor.shape[0] % ROWS == 0
-        self.sizes.append((tensor.shape[0] // ROWS if first else 0, *tensor.shape[1:]) if rows else None)
+        number = self._numbers[id(tensor)] = len(self.values)
+        self.values.append(tensor)
         self.stages.append(_BEFORE)
-        return len(self.sizes) - 1
+        self.made |= set() if rows else {number}
+        return number
 
     def _ref(self, value: Any) -> Any:
         """What stands for an argument in a step."""
@@ -165,14 +154,12 @@ class Trace(TorchFunctionMode):
             return Rows(value // ROWS)
         if not isinstance(value, Tensor):
             return value
-        if id(value) in self._places and id(value) not in self._known:
+        if id(value) in self._places and id(value) not in self._numbers:
             number, place = self._new(value, rows=False), self._places[id(value)]
             self.parameters[number] = place
             self.shared |= {number} if place in self._in_common else set()
-        if id(value) in self._known:
-            return Ref(self._known[id(value)][1])
-        if id(value) in self._buffers:
-            return self._buffers[id(value)]
+        if id(value) in self._numbers:
+            return Ref(self._numbers[id(value)])
         if value.requires_grad or value.shape[:1] == (ROWS,):
             raise Unfusable(f"a tensor comes from what is no PyTorch function{user_line()}")
         return value
@@ -200,27 +187,21 @@ class Trace(TorchFunctionMode):
             self._running = False
         if not any(isinstance(leaf, (Ref, Rows)) for leaf in leaves):
             return result
-        idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
         found = operands[:1] if step.inplace else tensors_of(result)
-        for refused, reason in (
-            (torch.is_grad_enabled() != self._grad, "the gradient mode changes"),
-            (func in RANDOM and not idle, "{} draws random numbers"),
-            (func is torch.autograd.grad, "gradients are taken"),
-            (not found and result is not None, "{} reads values"),
-        ):
-            if refused:
-                raise Unfusable(f"{reason.format(name_of(func))}{step.line}")
+        idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
+        for refused, does in ((func in RANDOM and not idle, "draws random numbers"), (not found, "reads values")):
+            if refused and result is not None:
+                raise Unfusable(f"{name_of(func)} {does}{step.line}")
         if not found or (not step.inplace and any(result is tensor for tensor in operands)):
             return result
-        rows = any(isinstance(x, Rows) or (isinstance(x, Ref) and self.sizes[x] is not None) for x in leaves)
+        rows = any(isinstance(x, Rows) or (isinstance(x, Ref) and x not in self.made) for x in leaves)
         step.values = [self._new(tensor, rows) for tensor in found]
         self._place(step, rows)
         return result
 
     def _place(self, step: Step, rows: bool) -> None:
-        refs = step.refs
-        stage = max((self.stages[ref] for ref in refs), default=_BEFORE)
-        parameters = {ref for ref in refs if self.sizes[ref] is None}
+        stage = max((self.stages[ref] for ref in step.refs), default=_BEFORE)
+        parameters = self.made.intersection(step.refs)
         in_common = parameters <= self.shared
         # A layer that all cells share, on what is no layer's, is part of an encoding.
         if rows and step.function is F.linear and parameters and not (in_common and stage != TABLE):
@@ -232,88 +213,88 @@ class Trace(TorchFunctionMode):
         elif stage == _BEFORE:
             self.before.append(step)
             self.shared.update(() if rows else step.values)
-        elif parameters or not (self._activate(step, refs) or (stage == TABLE and self._move(step, refs))):
-            self.stages[step.values[0] : step.values[-1] + 1] = [_BEHIND] * len(step.values)
+        elif parameters or not (self._activate(step) or (stage == TABLE and self._move(step))):
+            for value in step.values:
+                self.stages[value] = _BEHIND
             self.behind.append(step)
             factor = next((item for item in step.given[0] if type(item) in (int, float)), None)
             if step.function in _PRODUCTS and factor is not None and stage == TABLE:
-                self._scaled[step.values[0]] = (refs[0], factor)
+                self._scaled[step.values[0]] = (step.refs[0], factor)
 
     def _add_layer(self, step: Step) -> None:
         args, kwargs = step.given
         given = {"bias": None, **dict(zip(("input", "weight", "bias"), args)), **kwargs}
         source, weight, bias = (given[name] for name in ("input", "weight", "bias"))
-        own = self.sizes[source] if isinstance(source, Ref) else None
-        if own is None or not isinstance(weight, Ref) or self.sizes[weight] is not None:
+        if source in self.made or not all(
+            isinstance(v, Ref) and v in self.made for v in (weight, bias) if v is not None
+        ):
             raise Unfusable(f"a layer has weights or inputs that are neither parameters nor samples{step.line}")
         if self.stages[source] == _BEHIND:
             earlier = next(s for s in self.behind if source in s.values)
             name = f"{name_of(earlier.function)}{earlier.line}"
             raise Unfusable(f"a layer reads the result of {name}, which is no activation or arrangement of a table")
-        if math.prod(own[:-1]) != 1:
+        if self.values[source].shape[0] != ROWS or self.values[source].shape[:-1].numel() != ROWS:
             raise Unfusable(f"a layer runs on other than one row for each sample{step.line}")
-        out = self.sizes[step.values[0]]
-        assert out is not None
-        self.layers.append(Linear(weight, bias, self.segments(source), out[-1]))
-        self._name(step.values[0], -1, len(self.layers) - 1, _PLAIN, 0)
+        value = step.values[0]
+        self.layers.append(Linear(weight, bias, self.columns(source), self.values[value].shape[-1]))
+        self._coded(value, self.layers[-1])
+        self.stages[value] = TABLE
 
-    def _activate(self, step: Step, refs: list[Ref]) -> bool:
+    def _activate(self, step: Step) -> bool:
         """Has the columns of one layer go through an activation; ``sin(factor * layer)`` is one."""
-        name = step.activation()
-        if name is None or len(refs) != 1:
+        name, factor = step.activation(), 1.0
+        if name is None or len(step.refs) != 1:
             return False
-        source, factor = self._scaled.get(refs[0], (refs[0], 1.0)) if name == "sine" else (refs[0], 1.0)
-        segments = self.segments(source) if self.stages[source] == TABLE else ()
-        if len(segments) != 1 or segments[0].activation != _PLAIN or segments[0].layer < 0:
+        source, value = int(step.refs[0]), step.values[0]
+        if name == "sine":
+            source, factor = self._scaled.get(source, (source, factor))
+        found = {column[0] for column in self.columns(source)} if self.stages[source] == TABLE else set()
+        layer = found.pop() if len(found) == 1 else None
+        if not isinstance(layer, Linear) or layer.activation != "none":
             return False
-        self._name(step.values[0], -1, segments[0].layer, (name, factor), segments[0].start)
+        self.layers.append(replace(layer, activation=name, factor=factor))
+        shift = self._number(self.layers[-1], layer.width) - self._first[layer]
+        self._codes[value], self.stages[value] = self._codes[source] + shift, TABLE
         return True
 
-    def _move(self, step: Step, refs: list[Ref]) -> bool:
+    def _move(self, step: Step) -> bool:
         """Runs a function that may only move columns on the numbers of the columns, and reads where they went."""
         if step.function not in _MOVERS or step.inplace:
             return False
-        moved: dict[int, Any] = {ref: self._coded(ref) for ref in refs}
         try:
+            moved: dict[int, Any] = {ref: self._coded(ref) for ref in step.refs}
             step.run(moved, ROWS)
         except Exception:
             return False
         for value in step.values:
-            m, *rest = self.sizes[value] or ()
             codes = moved[value]
-            if codes.shape != (ROWS * m, *rest) or codes.dtype != torch.int64:
+            if codes.shape != self.values[value].shape or len(codes) != ROWS or codes.dtype != torch.int64:
                 return False
-            by_row = codes.reshape(ROWS, -1)
-            if not torch.equal(by_row, by_row[:1] + torch.arange(ROWS)[:, None] * _ROW_CODE):
+            if not torch.equal(codes.reshape(ROWS, -1), codes[:1].reshape(1, -1) + _ROW_CODES):
                 return False
         for value in step.values:
             self._codes[value], self.stages[value] = moved[value], TABLE
         return True
 
-    def _name(self, value: int, source: int, layer: int, activation: tuple[str, float], start: int) -> None:
-        """Numbers the columns of a value anew."""
-        m, *rest = self.sizes[value] or ()
-        width, first = m * math.prod(rest), len(self._columns)
-        self._columns += [(source, layer, activation, start + i) for i in range(width)]
-        codes = torch.arange(first, first + width) + torch.arange(ROWS)[:, None] * _ROW_CODE
-        self._codes[value] = codes.reshape(ROWS * m, *rest)
-        self.stages[value] = TABLE if layer >= 0 else _BEFORE
+    def _number(self, source: Linear | int, width: int) -> int:
+        """Numbers the columns of a layer or of a value from before the layers, and gives the first number."""
+        first = self._first[source] = len(self._columns)
+        self._columns += [(source, i) for i in range(width)]
+        return first
 
-    def _coded(self, value: int) -> Tensor:
+    def _coded(self, value: int, layer: Linear | None = None) -> Tensor:
+        """The numbers of a value's columns, [ROWS, ...], each with that of its row."""
         if value not in self._codes:
-            self._name(value, value, -1, _PLAIN, 0)
+            shape = self.values[value].shape
+            assert shape[0] == ROWS
+            width = shape[1:].numel()
+            first = self._number(value if layer is None else layer, width)
+            self._codes[value] = (torch.arange(first, first + width) + _ROW_CODES).reshape(shape)
         return self._codes[value]
 
-    def segments(self, value: int) -> tuple[Segment, ...]:
-        """The columns of a value, in as few segments as possible."""
-        m = (self.sizes[value] or (1,))[0]
-        columns = [self._columns[code] for code in self._coded(value)[:m].flatten().tolist()]
-        found = []
-        for _, group in itertools.groupby(enumerate(columns), lambda pair: (pair[1][:3], pair[1][3] - pair[0])):
-            run = [column for _, column in group]
-            source, layer, activation, start = run[0]
-            found.append(Segment(source, layer, activation, start, start + len(run)))
-        return tuple(found)
+    def columns(self, value: int) -> list[Column]:
+        """What the columns of a value are."""
+        return [self._columns[code] for code in self._coded(value)[:1].flatten().tolist()]
 
 
 @contextlib.contextmanager
