@@ -1,4 +1,4 @@
-"""Scenes: loaders of Blender synthetic scenes and of photographs, and three scenes computed from formulas."""
+"""Scenes: loaders of Blender synthetic scenes and of photographs, and four scenes computed from formulas."""
 
 from __future__ import annotations
 
@@ -6,17 +6,28 @@ from dataclasses import replace
 from pathlib import Path
 
 from voronerf.data.blender import load_blender
-from voronerf.data.builtin import builtin_scene, rich_scene, translucent_scene
+from voronerf.data.builtin import builtin_scene, city_scene, rich_scene, translucent_scene
+from voronerf.data.builtin.city import city_of
 from voronerf.data.capture import load_capture
 from voronerf.data.colmap import find_model, load_colmap
 from voronerf.data.llff import FILE, load_llff
 from voronerf.data.photographs import Reading
 from voronerf.data.scene import KINDS, Scene, SceneError, Split
 
-__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "load_scene", "rich_scene", "translucent_scene"]
+__all__ = [
+    "Scene",
+    "SceneError",
+    "Split",
+    "builtin_scene",
+    "city_scene",
+    "load_scene",
+    "rich_scene",
+    "translucent_scene",
+]
 
 BUILTIN_SIZE = 100
 BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene, "builtin-translucent": translucent_scene}
+CITY = "builtin-city"  # of one block, or with their number: builtin-city:4x4
 #: In the order in which a folder is tried, with what shows each.
 FORMATS = {
     "blender": "transforms_train.json",
@@ -24,6 +35,11 @@ FORMATS = {
     "colmap": "a COLMAP model in sparse/0",
     "llff": FILE,
 }
+
+
+def is_builtin(source: str | Path | None) -> bool:
+    """Whether a source names a scene that is computed, and no folder."""
+    return source in BUILTIN or str(source).partition(":")[0] == CITY
 
 
 def load_scene(
@@ -38,9 +54,9 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", "builtin-rich" or "builtin-translucent", or a folder with `transforms_train.json` (Blender
-            synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, or LLFF's
-            `poses_bounds.npy`.
+        source: "builtin", "builtin-rich", "builtin-translucent", "builtin-city" of one block or "builtin-city:4x4" of
+            16, or a folder with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp,
+            nerfstudio), a COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
             and for photographs the least factor that leaves at most 512 pixels a side.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
@@ -65,13 +81,14 @@ def load_scene(
     for name, given, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
         if given != "auto" and given not in known:
             raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {given!r:.60}")
-    if str(source) in BUILTIN:
+    if is_builtin(source):
         if format != "auto" or kind not in ("auto", "object"):
             raise SceneError(f"{source}: format must be auto and kind auto or object, got {format} and {kind}")
         downscale = downscale or 1
         if downscale > BUILTIN_SIZE:
             raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
-        return BUILTIN[str(source)](BUILTIN_SIZE // downscale)
+        name, size = str(source), BUILTIN_SIZE // downscale
+        return BUILTIN[name](size) if name in BUILTIN else city_of(size, name.partition(":")[2] or "1x1")
     folder = Path(source)
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from voronerf.data import BUILTIN, Scene
+from voronerf.data import Scene, is_builtin
 from voronerf.evaluation.lpips import OFF
 from voronerf.evaluation.plots import plot_curves
 from voronerf.files import leads_outside, read_json, read_json_lines, remove_partial
@@ -51,7 +51,7 @@ def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None
     Raises:
         ConfigError: One lies in no folder of the user's choice.
     """
-    paths = {"data": None if data in BUILTIN else data, "lpips": None if str(lpips) == OFF else lpips}
+    paths = {"data": None if is_builtin(data) else data, "lpips": None if str(lpips) == OFF else lpips}
     for option, path in paths.items():
         if path is not None and is_outside(run, path):
             raise ConfigError(

@@ -175,7 +175,8 @@ def _image(cameras: Cameras, index: int, see: See, box: Array, fine: int) -> NDA
         directions = normalised(turned(local, pose[:3, :3].T))
         origin = pose[None, :3, 3]
         start = np.broadcast_to(origin - middle, directions.shape)
-        inside = slab(start, directions, (half[0] / 2, half[1] / 2, half[2] / 2))[2].nonzero()[0]
+        enter, leave, _ = slab(start, directions, (half[0] / 2, half[1] / 2, half[2] / 2))
+        inside = (leave > np.maximum(enter, 0)).nonzero()[0]  # the camera may be in the box
         rgba = np.zeros((u.size, 4), dtype=np.float32)
         rgba[inside] = see(origin, directions[inside])
         pixels = rgba.reshape(len(rows) // fine, fine, size, fine, 4).mean(axis=(1, 3))

@@ -1,0 +1,76 @@
+"""The built-in city: what grows, what stays, and that both ways to cast its rays see the same."""
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses
+
+from voronerf import backends
+from voronerf.data import SceneError, city_scene, load_scene
+from voronerf.data.builtin.city import block_caster, city_cameras
+from voronerf.data.builtin.city_solids import TALLEST, city
+from voronerf.data.builtin.solids import Sphere, first_hits, normalised
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return city_scene(20, blocks=2, train_views=2, test_views=1)
+
+
+def street_rays(blocks, count):
+    random = np.random.default_rng(0)
+    cameras = city_cameras(8, blocks, 2, 0)
+    origins = cameras.origins.numpy()[random.integers(len(cameras), size=count)]
+    targets = random.uniform((-1, -1, 0), (1, 1, 0.5), size=(count, 3)).astype(np.float32)
+    return origins, normalised(targets - origins)
+
+
+@pytest.mark.parametrize("way", ["numpy", pytest.param("warp", marks=pytest.mark.warp)])
+def test_rays_see_the_first_of_all_solids(way, monkeypatch):
+    if way == "numpy":
+        monkeypatch.setattr(backends, "missing", lambda backend, device: "left out")
+    groups = city(2)
+    origins, directions = street_rays(2, 1500)
+    depth, which = first_hits([solid for group in groups for solid in group], origins, directions)
+    found, number = block_caster(groups)(origins, directions)
+    same = np.isclose(found, depth, rtol=0, atol=1e-3)
+    assert same.mean() > 0.995 and (number == which)[same & np.isfinite(depth)].mean() > 0.995
+    assert np.isfinite(depth).mean() > 0.5 and len(np.unique(which)) > 60
+
+
+def test_a_larger_city_holds_the_smaller_one():
+    small, large = city(1)[1], city(3)[1]
+    assert [type(solid) for solid in small] == [type(solid) for solid in large]
+    away = np.array([s.centre for s in large]) - np.array([s.centre for s in small])
+    np.testing.assert_allclose(away, np.broadcast_to((-1, -1, 0), away.shape), atol=1e-6)
+    assert len({len(group) for group in city(3)[1:]}) > 1, "blocks differ"
+
+
+def test_views_are_from_streets_and_from_above(scene):
+    assert (len(scene.train), len(scene.test), scene.name) == (8, 4, "builtin-city-2x2")
+    heights = scene.train.cameras.origins[:, 2]
+    assert bool((heights[::2] < 0.2).all()) and bool((heights[1::2] > TALLEST).all())
+    alpha = scene.train.images[..., 3].float().mean((1, 2)) / 255
+    assert bool((alpha > 0.15).all()), "every view shows much of the city"
+    colours = scene.train.images[..., :3][scene.train.images[..., 3] == 255].float()
+    assert float(colours.std(0).mean()) > 25
+    assert scene.box[1, :2].tolist() == [1, 1] and float(scene.box[1, 2]) <= TALLEST + 0.1
+
+
+def test_no_camera_is_in_a_solid():
+    cameras = city_cameras(8, 3, 40, 1)
+    points = cameras.origins.numpy()
+    for solid in (solid for group in city(3) for solid in group):
+        low, high = solid.bounds()
+        assert isinstance(solid, Sphere) or not ((points > low) & (points < high)).all(-1).any()
+
+
+def test_names(scene):
+    one = load_scene("builtin-city", downscale=50)
+    assert one.name == "builtin-city-1x1" and one.train.images.shape == (40, 2, 2, 4)
+    again = city_scene(20, blocks=2, train_views=2, test_views=1)
+    assert torch.equal(again.test.images, scene.test.images)
+    for name in ("builtin-city:4", "builtin-city:0x0", "builtin-city:2x3", "builtin-city:99x99"):
+        refuses("builtin-city: blocks must be 1x1, 2x2, ... or 32x32, got", load_scene, name, error=SceneError)
+    refuses("city_scene: blocks must be 1 to 32, got 0", city_scene, blocks=0)
+    refuses("city_scene: size must be >= 1, got 0", city_scene, 0)

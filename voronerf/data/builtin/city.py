@@ -1,0 +1,139 @@
+"""The built-in city: blocks x blocks of streets, for scenes that grow while their detail stays as fine.
+
+Facades with windows, ledges and bricks, shops, trees, lamps and parked cars; some 90 solids on each block, which is one
+scene unit wide. Each block adds the same number of views from its streets and from above, on white. Rays are cast by
+`voronerf.ops.cast_solids` with Warp where it is installed, else by NumPy, block by block.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from voronerf import backends
+from voronerf.data.builtin.city_solids import city
+from voronerf.data.builtin.opaque import SUPERSAMPLES, Hits, bounds, render_views, see
+from voronerf.data.builtin.rich import caster
+from voronerf.data.builtin.solids import Array, Rows, Solid, first_hits, rotation, slab
+from voronerf.data.scene import Scene, SceneError
+from voronerf.rendering.cameras import Cameras, look_at
+
+TRAIN_VIEWS, TEST_VIEWS = 40, 8  # of a block; half of them from the street
+MOST = 32  # blocks a side
+NEAR = 0.02
+STREET_ANGLE, ABOVE_ANGLE = 1.2, 0.75  # fields of view, radians
+
+
+def city_scene(
+    size: int = 100, *, blocks: int = 1, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS
+) -> Scene:
+    """Computes the city.
+
+    Args:
+        size: of the square images, pixels.
+        blocks: on each side, 1 to 32.
+        train_views: of each block, the odd ones from its streets and the others from above.
+        test_views: likewise, apart from the training views.
+
+    Raises:
+        ValueError: a size or number of views below 1, or too many blocks.
+
+    Examples:
+        >>> from voronerf.data import city_scene
+        >>> scene = city_scene(4, blocks=2, train_views=2, test_views=1)
+        >>> scene.name, len(scene.train), len(scene.test)
+        ('builtin-city-2x2', 8, 4)
+    """
+    for name, value in (("size", size), ("train_views", train_views), ("test_views", test_views)):
+        if value < 1:
+            raise ValueError(f"city_scene: {name} must be >= 1, got {value}")
+    if not 1 <= blocks <= MOST:
+        raise ValueError(f"city_scene: blocks must be 1 to {MOST}, got {blocks}")
+    groups = city(blocks)
+    solids = [solid for group in groups for solid in group]
+    box, hits = bounds(solids), block_caster(groups)
+    look = functools.partial(see, solids=solids, hits=hits)
+    train, test = (
+        render_views(city_cameras(size, blocks, views, seed), name, look, box=box, supersamples=SUPERSAMPLES)
+        for seed, (name, views) in enumerate((("train", train_views), ("test", test_views)))
+    )
+    far = math.hypot(blocks, blocks) + 3
+    return Scene(f"builtin-city-{blocks}x{blocks}", train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
+
+
+def city_of(size: int, blocks: str) -> Scene:
+    """The city of blocks such as "4x4".
+
+    Raises:
+        SceneError: they are none of these.
+    """
+    found = re.fullmatch(r"([1-9]\d?)x\1", blocks)
+    if found is None or int(found[1]) > MOST:
+        raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, ... or {MOST}x{MOST}, got {blocks!r:.60}")
+    return city_scene(size, blocks=int(found[1]))
+
+
+def city_cameras(size: int, blocks: int, views: int, seed: int) -> Cameras:
+    """The cameras of each block in turn: from the middle of a street beside it, and from above its roofs."""
+    random = np.random.default_rng((seed, 2))
+    eyes, aims, angles = [], [], []
+    for row in range(blocks):
+        for column in range(blocks):
+            middle = np.array((column + 0.5 - blocks / 2, row + 0.5 - blocks / 2, 0))
+            for view in range(views):
+                eye, aim = (_in_the_street if view % 2 == 0 else _above)(random)
+                eyes.append(middle + eye)
+                aims.append(middle + aim)
+                angles.append(STREET_ANGLE if view % 2 == 0 else ABOVE_ANGLE)
+    up = torch.tensor((0.0, 0.0, 1.0))
+    poses = look_at(torch.from_numpy(np.stack(eyes)).float(), torch.from_numpy(np.stack(aims)).float(), up)
+    focal = 0.5 * size / (0.5 * torch.tensor(angles)).tan()
+    middles = torch.full_like(focal, size / 2)
+    return Cameras(poses, torch.stack((focal, focal, middles, middles), dim=1), size, size)
+
+
+def _in_the_street(random: np.random.Generator) -> tuple[Array, Array]:
+    """Eye and aim on a side of a block: near the middle of the street, along it or at the houses."""
+    along, off, height = random.uniform(-0.5, 0.5), random.uniform(0.47, 0.5), random.uniform(0.05, 0.16)
+    turn, climb = random.uniform(-0.1, 1.2), random.uniform(-0.12, 0.25)
+    eye = np.array((along, -off, height))
+    gaze = np.array((-np.sign(along) * np.cos(turn), np.sin(turn), climb))
+    side = rotation("z", 90.0 * int(random.integers(4)))
+    return side @ eye, side @ (eye + gaze)
+
+
+def _above(random: np.random.Generator) -> tuple[Array, Array]:
+    """Eye and aim of a view from above all roofs."""
+    aim = np.array((*random.uniform(-0.4, 0.4, size=2), 0.12))
+    azimuth, climb, distance = random.uniform(0, 2 * np.pi), random.uniform(0.5, 1.25), random.uniform(1.5, 2.3)
+    away = np.array((np.cos(climb) * np.cos(azimuth), np.cos(climb) * np.sin(azimuth), np.sin(climb)))
+    return aim + distance * away, aim
+
+
+def block_caster(groups: Sequence[Sequence[Solid]]) -> Hits:
+    """What finds the first solid on a ray, numbered through all groups."""
+    if not backends.missing("warp", torch.device("cpu")):
+        return caster([solid for group in groups for solid in group], "warp")
+    boxes = [bounds(group) for group in groups]
+    starts = np.cumsum([0, *(len(group) for group in groups)])
+
+    def hits(origins: Array, directions: Array) -> tuple[Array, Rows]:
+        origins, directions = np.broadcast_arrays(origins, directions)
+        depth, which = np.full(len(origins), np.inf, dtype=np.float32), np.zeros(len(origins), dtype=np.int64)
+        # Near blocks first, since they hide the others.
+        nearest = [float(np.linalg.norm(box.mean(axis=0) - origins[:1])) for box in boxes] if len(origins) else []
+        for group in np.argsort(nearest):
+            middle, half = boxes[group].mean(axis=0), (boxes[group][1] - boxes[group][0]) / 2
+            enter, leave, _ = slab(origins - middle, directions, tuple(half.tolist()))
+            rows = ((leave >= np.maximum(enter, 0)) & (enter < depth)).nonzero()[0]
+            found, number = first_hits(groups[group], origins[rows], directions[rows])
+            closer = found < depth[rows]
+            depth[rows[closer]], which[rows[closer]] = found[closer], starts[group] + number[closer]
+        return depth, which
+
+    return hits
