@@ -26,6 +26,7 @@ LAYERS = (
     {"data", "rendering", "fields"},
     {"evaluation"},
     {"training"},
+    {"distributed"},
     {"run"},
     {"export"},
     {"cli", "viewer"},

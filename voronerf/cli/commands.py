@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import os
 import shlex
@@ -22,8 +23,11 @@ from voronerf import backends
 from voronerf.cli.board import Board
 from voronerf.cli.display import TrainingDisplay, printable
 from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
+from voronerf.cli.ranks import train_on_ranks
 from voronerf.data import Scene, load_scene
 from voronerf.data.process import process as make_scene
+from voronerf.distributed.group import Group, own_rank, world_size
+from voronerf.distributed.trainer import RankTrainer
 from voronerf.evaluation.panels import picture_of_colour, write_panels
 from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
@@ -60,6 +64,9 @@ def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", p
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
         port: Port that --view listens at; 0 is any that is free.
     """
+    if world_size() > 1:
+        console.quiet = own_rank() > 0
+        return train_on_ranks(config, run_training, view=view)
     check_device(config.device)
     if view:
         import_viewer().check_address(host, port)
@@ -75,10 +82,13 @@ def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", p
     return 0 if summary["complete"] else 130
 
 
-def run_training(config: TrainConfig, scene: Scene, *, view: tuple[str, int] | None = None) -> dict[str, Any]:
+def run_training(
+    config: TrainConfig, scene: Scene, *, view: tuple[str, int] | None = None, group: Group | None = None
+) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
-    ``view`` is the address and the port where a viewer shows the training, and what came of it until Ctrl-C.
+    ``view`` is the address and the port where a viewer shows the training, and what came of it until Ctrl-C; ``group``
+    the ranks that train together.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the step in hand: the checkpoint and the summary are written,
     the pictures are not. A second one ends the process at once.
@@ -87,23 +97,26 @@ def run_training(config: TrainConfig, scene: Scene, *, view: tuple[str, int] | N
     longest = max(scene.test.names, key=lambda name: len(os.fsencode(name)))
     if config.panels and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
-    with held(config.out):
-        return _train_and_draw(config, config.out, scene, view)
+    with held(config.out) if group is None or group.rank == 0 else contextlib.nullcontext():
+        return _train_and_draw(config, config.out, scene, view, group)
 
 
-def _train_and_draw(config: TrainConfig, out: Path, scene: Scene, view: tuple[str, int] | None) -> dict[str, Any]:
+def _train_and_draw(
+    config: TrainConfig, out: Path, scene: Scene, view: tuple[str, int] | None, group: Group | None
+) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
         with TrainingDisplay(console, scene.name) as display:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
-            trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
+            make = Trainer if group is None else functools.partial(RankTrainer, group=group)
+            trainer = make(config, scene, on_step=display.on_step, on_event=display.on_event)
             if trainer.lpips is None:
                 display.on_event(trainer.lpips_source)
             if config.occupancy and trainer.occupancy is None:
                 obstacle = why_no_occupancy(trainer.config) or "a scene without a box"
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
             viewer = None
-            board = Board(out / "tensorboard", trainer) if config.tensorboard else None
+            board = Board(out / "tensorboard", trainer) if config.tensorboard and trainer.writes else None
             if view is not None:
                 viewer = import_viewer().TrainingViewer(trainer, host=view[0], port=view[1])
                 stack.callback(viewer.close)
@@ -126,8 +139,10 @@ def _train_and_draw(config: TrainConfig, out: Path, scene: Scene, view: tuple[st
             return summary
         if config.panels:
             with trainer.averaged():
-                write_panels(trainer.renderer, trainer.router.diagram, scene, out / "images", views=config.panels)
-        write_curve(out)
+                folder = out / "images" if trainer.writes else None
+                write_panels(trainer.renderer, trainer.diagram, scene, folder, views=config.panels)
+        if trainer.writes:
+            write_curve(out)
         say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
         if viewer is not None:
             say(f"{viewer.address} shows the run until Ctrl-C")

@@ -18,13 +18,14 @@ from rich.console import Console
 from voronerf.backends import BackendUnavailable
 from voronerf.cli import commands, compare, demo, export, info, view
 from voronerf.cli.display import one_line
+from voronerf.distributed.group import RankLost, may_tell
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
 from voronerf.training.run_directory import check_stored_paths, stored_config
 
 #: Errors that a user can cause; they are printed as one line. ValueError includes SceneError and CheckpointError.
 EXPECTED = (
-    *(ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError),
+    *(ConfigError, TrainingError, BackendUnavailable, RankLost, ValueError, OSError, ImportError),
     *(MemoryError, torch.OutOfMemoryError),
 )
 
@@ -83,7 +84,8 @@ def main(args: list[str] | None = None) -> int:
     except EXPECTED as error:
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
-        print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
+        if may_tell():
+            print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
         return 1
     except (RuntimeError, SystemError) as error:
         text = str(error)

@@ -327,6 +327,39 @@ class VoronoiDiagram(nn.Module):
         )
         return refined, parents
 
+    def part(self, cells: Tensor) -> "VoronoiDiagram":
+        """The diagram of some of the cells. A point that lies in one of them is located in it again.
+
+        Args:
+            cells: int64 [c], ascending numbers of cells, at least one; they become 0 to c - 1.
+
+        Raises:
+            ValueError: no cells, cells out of range, or cells that do not ascend.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiDiagram
+            >>> diagram = VoronoiDiagram(torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]))
+            >>> diagram.part(torch.tensor([0, 2])).locate(torch.tensor([[0.2, 0, 0], [1.9, 0, 0]]))
+            tensor([0, 1], dtype=torch.int32)
+        """
+        wanted = cells.tolist()
+        if not wanted or not 0 <= wanted[0] <= wanted[-1] < self.num_cells or wanted != sorted(set(wanted)):
+            raise ValueError(f"part: cells must be ascending numbers of 0..{self.num_cells - 1}, got {wanted}")
+        offsets, child, number = self.child_offsets.tolist(), self.child.tolist(), {c: i for i, c in enumerate(wanted)}
+        rows: list[list[int]] = [[] for _ in offsets[1:]]
+        for node in reversed(range(len(rows))):  # a refined centre comes before the diagram that refines it
+            for row in range(offsets[node], offsets[node + 1]):
+                if -child[row] - 1 in number if child[row] < 0 else rows[child[row]]:
+                    rows[node].append(row)
+        nodes = {node: i for i, node in enumerate(node for node, found in enumerate(rows) if found)}
+        kept = [row for found in rows for row in found]
+        links = [nodes[child[row]] if child[row] >= 0 else -1 - number[-child[row] - 1] for row in kept]
+        ends = torch.tensor([0, *(len(found) for found in rows if found)]).cumsum(0)
+        power, device = None if self.power is None else self.power[kept], self.centres.device
+        table = torch.tensor(links, dtype=torch.int32, device=device)
+        return VoronoiDiagram._from_tables(self.centres[kept], ends.to(device, torch.int32), table, power)
+
     def extra_repr(self) -> str:
         """What `print` shows."""
         kind = "Voronoi" if self.power is None else "power"

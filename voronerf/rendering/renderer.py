@@ -16,7 +16,7 @@ from voronerf.rendering.cameras import Cameras, Rays
 from voronerf.rendering.comparison import Comparison, compare_marched, compared
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
-from voronerf.rendering.marching import Marched, render_marched, render_until_opaque
+from voronerf.rendering.marching import Marched, Seen, render_marched, render_until_opaque
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.sampling import (
@@ -302,6 +302,27 @@ class Renderer:
         passes = self.render(rays, near, far, jitter=True, **given)
         return compared(self.loss(passes, target), passes[-1], target)
 
+    def look(self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None, heaviest: bool) -> Seen:
+        """What rays of a picture see, without randomness; without `heaviest` that part of the result means nothing."""
+        if self.occupancy is not None:
+            return render_until_opaque(
+                self.field,
+                rays,
+                near,
+                far,
+                self.occupancy,
+                samples=self.samples,
+                background=background,
+                spacing=self.spacing,
+                heaviest=heaviest,
+                backend=self.backend,
+            )
+        last = self.render(rays, near, far, background=background)[-1]
+        places = rays.origins
+        if heaviest:
+            places = last.positions[torch.arange(len(rays), device=places.device), last.weights.argmax(-1)]
+        return Seen(last.colour, last.opacity, last.depth, places)
+
     @torch.no_grad()
     def image(
         self,
@@ -341,27 +362,11 @@ class Renderer:
         places = rays.origins + far * rays.directions
         places = places if self.contraction is None else self.contraction.points(places)
         for rows in hit.nonzero()[:, 0].split(chunk):
-            ends = rays[rows], first[rows], last[rows]
-            if grid is not None:
-                seen = render_until_opaque(
-                    self.field,
-                    *ends,
-                    grid,
-                    samples=self.samples,
-                    background=background,
-                    spacing=self.spacing,
-                    heaviest=heaviest,
-                    backend=self.backend,
-                )
-                colour[rows], opacity[rows], depth[rows], places[rows] = seen
-                continue
-            part = self.render(*ends, background=background)[-1]
-            colour[rows] = part.colour.to(colour.dtype)
-            opacity[rows] = part.opacity.to(opacity.dtype)
-            depth[rows] = part.depth.to(depth.dtype)
+            seen = self.look(rays[rows], first[rows], last[rows], background, heaviest)
+            for whole, part in zip((colour, opacity, depth), seen):
+                whole[rows] = part.to(whole.dtype)
             if heaviest:
-                top = part.weights.argmax(-1)
-                places[rows] = part.positions[torch.arange(len(rows), device=rows.device), top]
+                places[rows] = seen.heaviest
         size = cameras.size(index)[::-1]
         return RenderedImage(
             colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3)

@@ -99,6 +99,9 @@ class CheckpointWriter:
             OSError: When the one before could not be written.
         """
         self.wait()
+        self._begin(checkpoint)
+
+    def _begin(self, checkpoint: Checkpoint) -> None:
         # The end of the process does not wait for it: a second Ctrl-C is to end it at once.
         self._thread = threading.Thread(target=self._write, args=(checkpoint,), daemon=True)
         self._thread.start()

@@ -47,7 +47,11 @@ class GradientGuard:
         if not scaled:
             dense = (p.grad for g in optimizer.param_groups if not g.get("sparse") for p in g["params"])
             parts += [gradient.sum() for gradient in dense if gradient is not None]  # a norm takes five times as long
-        self._found.copy_(torch.stack(parts).sum().abs().lt(LARGEST).logical_not_())  # true for NaN
+        self.judge(torch.stack(parts).sum(), optimizer, scaled=scaled)
+
+    def judge(self, total: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool = False) -> None:
+        """The same from the sum of the loss and of all gradients."""
+        self._found.copy_(total.abs().lt(LARGEST).logical_not_())  # true for NaN
         self.skipped.add_(self._found)
         self.in_a_row.add_(1).mul_(self._found)
         if not scaled:

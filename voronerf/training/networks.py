@@ -160,6 +160,21 @@ def count_parameters(config: TrainConfig, width: int | None = None) -> int:
     return total
 
 
+def check_backend(config: TrainConfig, device: torch.device) -> None:
+    """Looks up every op of a step: a backend that cannot train should say so before anything is written.
+
+    Raises:
+        BackendUnavailable: names the op.
+    """
+    marching = ("march_rays", "update_occupancy") if config.occupancy else ()
+    drawing = () if config.sampling == "stratified" else ("resample",)
+    assigning = ("draw_cell",) if config.assignment == "stochastic" else ()
+    ops = ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite")
+    for op in (*ops, *marching, *drawing, *assigning):
+        backends.resolve(op, backend=config.backend, device=device, dtype=torch.float32)
+    backends.resolve("cell_sort", backend=config.backend, device=device, dtype=torch.int32)
+
+
 def check_memory(config: TrainConfig) -> None:
     """Refuses what does not fit into the machine.
 

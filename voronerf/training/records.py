@@ -21,15 +21,16 @@ def record_scores(trainer: Trainer, scores: list[ViewScore]) -> None:
     now = {
         "step": trainer.step,
         "seconds": round(trainer.seconds, 3),
-        "cells": trainer.router.num_cells,
+        "cells": trainer.diagram.num_cells,
         "learning_rate": trainer.learning_rate(),
         "views": len(scores),
         **mean_scores(scores),
     }
     trainer.metrics = [m for m in trainer.metrics if m["step"] < trainer.step] + [now]
-    write_text(trainer.out / "metrics.jsonl", "".join(json_text(m) + "\n" for m in trainer.metrics))
+    if trainer.writes:
+        write_text(trainer.out / "metrics.jsonl", "".join(json_text(m) + "\n" for m in trainer.metrics))
     trainer.say(
-        f"{trainer.seconds:7.1f} s  step {trainer.step:6d}  {trainer.router.num_cells:4d} cells  "
+        f"{trainer.seconds:7.1f} s  step {trainer.step:6d}  {trainer.diagram.num_cells:4d} cells  "
         f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
     )
     if trainer.one_colour is None:
@@ -48,12 +49,13 @@ def summarise(trainer: Trainer) -> dict[str, Any]:
         "seconds": trainer.seconds,
         "steps": trainer.step,
         "rays_per_second": trainer.step * trainer.config.rays / max(trainer.seconds, 1e-9),
-        "parameters": sum(p.numel() for router in trainer.routers.values() for p in router.parameters()),
-        "cells": trainer.router.num_cells,
+        "parameters": trainer.parameter_count,
+        "cells": trainer.diagram.num_cells,
         "splits_left": len(trainer.plan) - trainer.level,
         "skipped_steps": int(trainer.guard.skipped),
         "width": trainer.config.width,
         "stages": [asdict(stage) for stage in trainer.stages],
     }
-    write_text(trainer.out / "summary.json", json_text(summary, indent=2) + "\n")
+    if trainer.writes:
+        write_text(trainer.out / "summary.json", json_text(summary, indent=2) + "\n")
     return summary

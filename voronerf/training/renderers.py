@@ -26,6 +26,7 @@ def make_renderer(
     fine_samples: int | None = None,
     occupancy: OccupancyGrid | None = None,
     backend: str | None = None,
+    kind: type[Renderer] = Renderer,
 ) -> Renderer:
     """The renderer that a configuration asks for.
 
@@ -37,12 +38,13 @@ def make_renderer(
         fine_samples: Samples per ray of the second pass; None for those of the configuration.
         occupancy: The grid of what is empty.
         backend: Of the operations; None for that of the configuration.
+        kind: The class to make.
 
     Raises:
         ConfigError: For a contraction that the scene does not allow.
     """
     device = next(routers["field"].parameters()).device
-    return Renderer(
+    return kind(
         {name: as_field(router) for name, router in routers.items()},
         samples=int(config.samples or 0) if samples is None else samples,
         fine_samples=0 if config.sampling == "stratified" else fine_samples or config.fine_samples,

@@ -17,18 +17,29 @@ from torch import Tensor
 from voronerf import backends
 from voronerf.data import Scene
 from voronerf.data.record import write_scene
+from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.reservoir import SampleReservoir
+from voronerf.diagram.subdivision import Split
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import evaluate
 from voronerf.files import write_text
+from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter
-from voronerf.training.average import averages_in_place, drop_averages, update_averages
+from voronerf.training.average import averages_in_place, update_averages
 from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import Checkpoint, CheckpointWriter, checkpoint_paths, last_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.divergence import PATIENCE, GradientGuard, all_finite
-from voronerf.training.networks import check_memory, computes_natively, make_optimizer, make_routers, resolve_config
+from voronerf.training.networks import (
+    check_backend,
+    check_memory,
+    computes_natively,
+    make_optimizer,
+    make_routers,
+    resolve_config,
+)
 from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.rates import learning_rate, sharpness, temperature
@@ -36,7 +47,7 @@ from voronerf.training.records import record_scores, summarise
 from voronerf.training.renderers import make_renderer
 from voronerf.training.resume import resume_training, resumed_checkpoint, training_state
 from voronerf.training.run_directory import read_metrics
-from voronerf.training.splitting import median, save_samples, split_by_samples
+from voronerf.training.splitting import split_by_samples, split_cells
 
 #: Steps between evaluations of random cells of the occupancy grid.
 OCCUPANCY_EVERY = 16
@@ -62,6 +73,10 @@ class Trainer:
         CheckpointError: With ``config.resume``, when there is no checkpoint or it is of another configuration.
     """
 
+    #: What renders, and whether this process writes the files of the run; the ranks of a joint training have their own.
+    renderer_type: type[Renderer] = Renderer
+    writes = True
+
     def __init__(
         self,
         config: TrainConfig,
@@ -84,14 +99,7 @@ class Trainer:
         self.on_event = on_event
         self.clock = clock or time.perf_counter
         self.device = torch.device(config.device)
-        # Look up every op of a step now: a backend that cannot train should say so before anything is written.
-        marching = ("march_rays", "update_occupancy") if config.occupancy else ()
-        drawing = () if config.sampling == "stratified" else ("resample",)
-        assigning = ("draw_cell",) if config.assignment == "stochastic" else ()
-        ops = ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite")
-        for op in (*ops, *marching, *drawing, *assigning):
-            backends.resolve(op, backend=config.backend, device=self.device, dtype=torch.float32)
-        backends.resolve("cell_sort", backend=config.backend, device=self.device, dtype=torch.int32)
+        check_backend(config, self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         # Random numbers are drawn on the device that uses them: the host need not wait, and a graph can draw them.
         self.draws = self.generator
@@ -108,7 +116,7 @@ class Trainer:
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=config.precision == "fp16")
         self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
         self.occupancy = make_grid(config, scene, self.device) if config.occupancy else None
-        self.renderer = make_renderer(config, scene, self.routers, occupancy=self.occupancy)
+        self.renderer = make_renderer(config, scene, self.routers, occupancy=self.occupancy, kind=self.renderer_type)
         self.guard = GradientGuard(self.device)
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
@@ -127,8 +135,18 @@ class Trainer:
 
     @property
     def router(self) -> VoronoiRouter:
-        """The router whose colours count; its diagram is that of the run."""
+        """The router whose colours count."""
         return self.routers["field"]
+
+    @property
+    def diagram(self) -> VoronoiDiagram:
+        """All cells of the run."""
+        return self.router.diagram
+
+    @property
+    def parameter_count(self) -> int:
+        """Parameters of all networks of all cells."""
+        return sum(p.numel() for router in self.routers.values() for p in router.parameters())
 
     # --- progress ------------------------------------------------------------------------------------------------
 
@@ -210,7 +228,7 @@ class Trainer:
                 speed = self.step * self.config.rays / max(self.seconds, 1e-9)
                 psnr = self.metrics[-1].get("psnr") if self.metrics else None
                 self.on_step(
-                    Progress(self.step, self.seconds, self.fraction, self.loss, speed, self.router.num_cells, psnr)
+                    Progress(self.step, self.seconds, self.fraction, self.loss, speed, self.diagram.num_cells, psnr)
                 )
             saving = self.seconds - self.saved_at >= self.config.checkpoint_every and not self.writer.busy
             if saving or self._due() > self.evaluated:
@@ -275,7 +293,7 @@ class Trainer:
         self.renderer.sharpness = sharpness(self.config, self.fraction)
         if self.occupancy is not None and self.step % OCCUPANCY_EVERY == 0:
             self.router.eval()
-            revisit_cells(self.occupancy, self.renderer.field, self.generator, backend=self.config.backend)
+            self._revisit(self.occupancy)
         self.renderer.train()
         loss, positions, importance = self._compute()
         if self.config.average:
@@ -283,6 +301,9 @@ class Trainer:
         if positions is not None and importance is not None:
             self.reservoir.add(positions, importance)
         return loss
+
+    def _revisit(self, grid: OccupancyGrid) -> None:
+        revisit_cells(grid, self.renderer.field, self.generator, backend=self.config.backend)
 
     def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Updates the parameters; returns the loss, and until the last split positions [n, 3] and importance [n]."""
@@ -316,42 +337,23 @@ class Trainer:
 
     def split(self) -> None:
         """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
-        config, level, planned = self.config, self.level, self.plan[self.level]
-        k = planned.children
-        if planned.most is not None:
-            k = min(k, planned.most - self.router.num_cells + 1)
-        points, importance = self.reservoir.samples()
-        if level == 0 and points.shape[0] < k:
-            self.save()
-            raise TrainingError(
-                f"{self.out}: more cells than samples: --cells asks for {k}, {points.shape[0]} samples were kept in "
-                f"{self.step} steps; in another --out, split later or keep more a batch (--reservoir, "
-                "--reservoir-batches)"
-            )
         with backends.torch_on_one_thread() if self.any_threads else nullcontext():
-            split = split_by_samples(config, planned, self.router.diagram, k, points, importance, self.generator)
-        balances = [] if split is None else list(split.balances.values())
-        if planned.most is not None and not balances:
-            return  # the reservoir goes on collecting samples
-        save_samples(self.out / "samples" / f"level-{level + 1}.npz", points, importance)
-        for name, router in self.routers.items():
-            if split is not None and balances and (name != "proposal" or config.split_proposal):
-                router.subdivide(
-                    split.diagram, split.parents, optimizer=self.optimizer, inherit=config.init == "inherit"
-                )
-        if config.init == "random":  # the averages are of other networks
-            drop_averages(self.optimizer)
-        before = median([balance.imbalance_before for balance in balances])
-        after = median([balance.imbalance_after for balance in balances])
-        self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
-        self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
+            if not split_cells(self):
+                return  # the reservoir goes on collecting samples
+        self.reservoir = SampleReservoir(self.config.reservoir, self.config.reservoir_batches, device=self.device)
         self._compute = self._make_step()  # a graph would update the parameters from before the split
-        when = f"at {self.seconds:.0f} s, step {self.step}"
-        if balances:
-            self.say(f"{self.router.num_cells} cells {when}, std(W / max W) {before:.3f} -> {after:.4f}")
-        else:
-            need = max(k, config.min_cell_samples)
-            self.say(f"no cell split {when}: none holds {need} of the {points.shape[0]} samples kept")
+
+    def find_split(self, k: int, points: Tensor, importance: Tensor) -> Split | None:
+        """The next split of every cell, or of the worst, into k; None if there are fewer samples than that."""
+        planned = self.plan[self.level]
+        return split_by_samples(self.config, planned, self.diagram, k, points, importance, self.generator)
+
+    def divide(self, split: Split) -> None:
+        """Gives the networks the cells of a split."""
+        inherit = self.config.init == "inherit"
+        for name, router in self.routers.items():
+            if name != "proposal" or self.config.split_proposal:
+                router.subdivide(split.diagram, split.parents, optimizer=self.optimizer, inherit=inherit)
 
     # --- evaluation and files --------------------------------------------------------------------------------------
 
@@ -370,7 +372,7 @@ class Trainer:
 
     def save(self, *, wait: bool = True) -> None:
         """Writes ``checkpoints/last.safetensors``; without ``wait`` it is begun, and :attr:`writer` ends it."""
-        if not self.described:  # not earlier: a run whose first step fails leaves nothing
+        if self.writes and not self.described:  # not earlier: a run whose first step fails leaves nothing
             write_text(self.out / "config.json", self.config.to_json())
             write_scene(self.out / "scene.json", self.scene)
             self.described = True

@@ -1,0 +1,58 @@
+"""Two ranks in processes of this machine, with one thread each; torch is imported once for all of them."""
+
+import contextlib
+import io
+import multiprocessing
+import os
+import socket
+import sys
+import traceback
+from pathlib import Path
+
+import torch
+
+#: Seconds until ranks that hang are ended.
+LIMIT = 100
+
+
+def _rank(rank, size, port, folder, restarts, function, args):
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(size), "MASTER_ADDR": "127.0.0.1"}
+    os.environ |= {"MASTER_PORT": str(port), "TORCHELASTIC_RESTART_COUNT": str(restarts)}
+    torch.set_num_threads(1)
+    said, code = io.StringIO(), 1
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        try:
+            code = function(*args) or 0
+        except BaseException:
+            traceback.print_exc()
+    (folder / f"rank-{rank}.txt").write_text(said.getvalue())
+    os._exit(code)
+
+
+def on_ranks(function, *args, folder, size=2, each=None, restarts=0):
+    """Calls a function on every rank, with arguments of its own where ``each`` has them.
+
+    Returns what the ranks returned, which is their exit status, and what they printed.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["voronerf.cli", "voronerf.distributed.trainer"])
+    folder = Path(folder)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    given = each or [args] * size
+    ranks = [
+        context.Process(target=_rank, args=(rank, size, port, folder, restarts, function, given[rank]))
+        for rank in range(size)
+    ]
+    for rank in ranks:
+        rank.start()
+    for rank in ranks:
+        rank.join(LIMIT)
+        if rank.is_alive():
+            rank.kill()
+            rank.join()
+    said = [folder / f"rank-{rank}.txt" for rank in range(size)]
+    texts = [path.read_text() if path.is_file() else "" for path in said]
+    print(*texts, sep="\n", file=sys.stderr)  # where a test fails
+    return [rank.exitcode for rank in ranks], texts

@@ -1,0 +1,94 @@
+"""Partial sums of rays put together, against one composite of all samples; which voxels cells reach."""
+
+import pytest
+import torch
+from helpers import refuses, seeded
+
+from voronerf import OccupancyGrid, VoronoiDiagram, composite
+from voronerf.distributed.sharing import Sharing, assign_cells, voxels_of_ranks
+from voronerf.distributed.sums import along_rays, compose, own_samples, sum_runs
+
+
+@pytest.mark.parametrize("ranks", [1, 3])
+def test_partial_sums_are_one_composite(ranks):
+    """Colours and gradients in float64, whatever rank has which sample, with opaque and empty ones."""
+    generator, rays, samples = seeded(), 40, 9
+    density = torch.rand(rays, samples, generator=generator, dtype=torch.float64) * 3
+    density[0, 2], density[1], density[2, 4] = 1e9, 0, torch.inf
+    colour = torch.rand(rays, samples, 3, generator=generator, dtype=torch.float64)
+    depths = torch.rand(rays, samples, generator=generator, dtype=torch.float64).sort(-1)[0]
+    deltas = torch.full_like(depths, 0.1)
+    owner = torch.randint(ranks, (rays, samples), generator=generator)
+    weights = torch.rand(rays, 3, generator=generator, dtype=torch.float64)
+
+    whole = density.clone().requires_grad_(), colour.clone().requires_grad_()
+    expected = composite(whole[0], whole[1], depths, deltas)
+    (expected.colour * weights).sum().backward()
+
+    parts = density.clone().requires_grad_(), colour.clone().requires_grad_()
+    index = torch.arange(rays, dtype=torch.int32).repeat_interleave(samples)
+    found = []
+    for rank in range(ranks):
+        own = (owner == rank).reshape(-1)
+        given = torch.zeros(rays * samples, 3), index, depths.reshape(-1), deltas.reshape(-1)
+        mine = own_samples(*given, owner.reshape(-1), own, hidden=False)
+        found.append(sum_runs(mine, parts[1].reshape(-1, 3)[own], parts[0].reshape(-1)[own], "auto"))
+    ray, start = torch.cat([runs.ray for runs in found]), torch.cat([runs.start for runs in found])
+    order = along_rays(ray, start)
+    sums = (torch.cat([getattr(runs, name) for runs in found])[order] for name in ("colour", "optical"))
+    seen = compose(*sums, ray[order], rays)
+    (seen.colour * weights).sum().backward()
+
+    assert torch.allclose(seen.colour, expected.colour, rtol=1e-12, atol=1e-14)
+    assert torch.allclose(1 - seen.through, expected.opacity, rtol=1e-12, atol=1e-14)
+    finite = density.isfinite()
+    assert torch.allclose(parts[0].grad[finite], whole[0].grad[finite], rtol=1e-10, atol=1e-13)
+    assert torch.allclose(parts[1].grad, whole[1].grad, rtol=1e-10, atol=1e-13)
+
+
+def test_a_gap_that_another_rank_may_fill_ends_a_run():
+    depths, deltas = torch.tensor([0.1, 0.19, 0.5, 0.9]), torch.full((4,), 0.1)
+    given = torch.zeros(4, 3), torch.zeros(4, dtype=torch.int32), depths, deltas
+    cells, own = torch.tensor([0, 1, 2, 2]), torch.ones(4, dtype=torch.bool)
+    assert own_samples(*given, cells, own, hidden=True).run_offsets.tolist() == [0, 2, 4]
+    assert own_samples(*given, cells, own, hidden=False).run_offsets.tolist() == [0, 4]
+    assert own_samples(*given, cells, ~own, hidden=False).run_offsets.tolist() == [0]
+
+
+@pytest.mark.parametrize("power", [False, True])
+def test_voxels_that_cells_reach(power):
+    """All voxels with a point of a rank's cells are among its own, and few others, in a nested diagram."""
+    generator = seeded()
+    centres = torch.rand(6, 3, generator=generator)
+    weights = torch.rand(6, generator=generator) * 0.1 if power else None
+    diagram, _ = VoronoiDiagram(centres, weights=weights).refine({2: torch.rand(4, 3, generator=generator)})
+    sharing = Sharing(diagram, assign_cells(diagram.leaf_centres, torch.ones(9), 3))
+    grid = OccupancyGrid(torch.tensor([[0.0, 0, 0], [1.0, 1, 1]]), (8, 6, 10), threshold=1.0)
+    points = torch.rand(200_000, 3, generator=generator)
+    inside = torch.zeros(3, 480, dtype=torch.bool)
+    inside[sharing.owner[diagram.locate(points)], grid.cells(points)] = True
+    reached = voxels_of_ranks(sharing, grid, 3)
+    assert not (inside & ~reached).any()
+    assert reached.sum() < 1.3 * inside.sum()
+
+
+@pytest.mark.parametrize(("cells", "ranks"), [(16, 4), (7, 3), (5, 5)])
+def test_cells_are_shared_evenly(cells, ranks):
+    generator = seeded()
+    weights = torch.rand(cells, generator=generator) + 0.5
+    owner = assign_cells(torch.rand(cells, 3, generator=generator), weights, ranks)
+    loads = torch.bincount(owner, weights=weights, minlength=ranks)
+    assert (loads > 0).all() and loads.max() - loads.min() <= 2 * weights.max()
+
+
+def test_a_part_of_a_diagram_locates_its_own_points():
+    generator = seeded()
+    coarse = VoronoiDiagram(torch.rand(5, 3, generator=generator))
+    diagram, _ = coarse.refine({i: torch.rand(3, 3, generator=generator) for i in (0, 3)})
+    cells = torch.tensor([1, 3, 6, 8])
+    part, points = diagram.part(cells), torch.rand(2000, 3, generator=generator)
+    found = diagram.locate(points)
+    for new, old in enumerate(cells.tolist()):
+        assert (part.locate(points[found == old]) == new).all()
+    for wrong in ([], [3, 1], [9]):
+        refuses("ascending numbers of 0..8", diagram.part, torch.tensor(wrong, dtype=torch.int64))

@@ -1,0 +1,272 @@
+"""Renders and learns rays that pass through the cells of several ranks. Only partial sums of rays travel.
+
+Before the first split all ranks have the same network, and each evaluates its slice of the rays. Afterwards each
+evaluates its own cells on all rays, and sends a partial sum for each run to the rank in whose slice the ray is. That
+rank makes the colour and the loss, and sends the gradients of the sums back. Each way takes 24 bytes a run.
+
+r rays, m own samples, q runs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.distributed.group import Group
+from voronerf.distributed.sharing import Sharing, voxels_of_ranks
+from voronerf.distributed.sums import Samples, along_rays, compose, own_samples, sum_runs
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.marching import Seen
+from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid, density_of
+from voronerf.rendering.renderer import RenderedImage, Renderer
+from voronerf.rendering.sampling import stratified_depths
+
+#: Rays of a picture at a time: no ray ends at the first surface, since other ranks do not know it in time.
+PICTURE_CHUNK = 16_384
+
+
+class Learnt(NamedTuple):
+    """What a step finds, beside the gradients that it leaves.
+
+    Attributes:
+        loss: [], the part of this rank's slice of the rays; the parts of all ranks add up to the loss.
+        positions: [m, 3] of own samples.
+        density: [m].
+        deltas: [m].
+        weights: [m], their contributions to their rays.
+        importance: [m], the weights times the errors of the rays.
+    """
+
+    loss: Tensor
+    positions: Tensor
+    density: Tensor
+    deltas: Tensor
+    weights: Tensor
+    importance: Tensor
+
+
+class RankRenderer(Renderer):
+    """A renderer in one pass over points, for all ranks at once: each of them calls the same methods.
+
+    Attributes:
+        group: The ranks.
+        sharing: Which of them owns which cells; None while all have the same network.
+    """
+
+    group: Group
+    sharing: Sharing | None = None
+    _reached: Tensor  # bool [v], the voxels of the grid that own cells reach
+    _several: Tensor  # bool [v], those that cells of two or more ranks reach
+
+    def join(self, group: Group) -> None:
+        """Renders with the ranks of a group."""
+        self.group = group
+
+    def own_cells(self, sharing: Sharing) -> None:
+        """Renders only the cells of this rank from now on; the grid forgets what they do not reach."""
+        self.sharing = sharing
+        self.limit_grid()
+
+    def limit_grid(self) -> None:
+        """Empties the voxels of the grid that own cells do not reach; they have no samples then."""
+        grid = self.occupancy
+        if grid is None or self.sharing is None:
+            return
+        reached = voxels_of_ranks(self.sharing, grid, self.group.size)
+        self._reached, self._several = reached[self.group.rank], reached.sum(0) > 1
+        grid.density.view(-1)[~self._reached] = 0
+        grid.occupied.view(-1)[~self._reached] = False
+
+    # --- samples ---------------------------------------------------------------------------------------------------
+
+    def _slices(self, rays: int) -> list[int]:
+        """The rays of each rank: from the first number to before the next."""
+        return [rays * rank // self.group.size for rank in range(self.group.size + 1)]
+
+    def _owns(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """The cell of each position, and whether this rank evaluates it."""
+        if self.sharing is None:
+            cells = torch.zeros(len(positions), dtype=torch.int32, device=positions.device)
+            return cells, torch.ones_like(cells, dtype=torch.bool)
+        cells = self.sharing.diagram.locate(positions, backend=self.backend)
+        return cells, self.sharing.owner[cells] == self.group.rank
+
+    def samples_of(
+        self, rays: Rays, near: Tensor, far: Tensor, *, jitter: bool = False, generator: torch.Generator | None = None
+    ) -> Samples:
+        """The samples that this rank evaluates: those that one process would, with the same random numbers."""
+        first, last = 0, len(rays)
+        if self.sharing is None:
+            first, last = self._slices(len(rays))[self.group.rank :][:2]
+        grid, kept = self.occupancy, slice(first, last)
+        if grid is None:
+            depths, deltas, _ = stratified_depths(
+                near, far, self.samples, jitter=jitter, spacing=self.spacing, generator=generator
+            )
+            depths, deltas = depths[kept], deltas[kept]
+            positions = torch.addcmul(rays.origins[kept, None, :], depths[:, :, None], rays.directions[kept, None, :])
+            positions = positions if self.contraction is None else self.contraction.points(positions)
+            index = torch.arange(first, last, device=near.device, dtype=torch.int32).repeat_interleave(self.samples)
+            found = positions.reshape(-1, 3), index, depths.reshape(-1), deltas.reshape(-1)
+        else:
+            uniforms = None
+            if jitter:
+                drawn_on = near.device if generator is None else generator.device
+                shape = len(rays), self.samples
+                uniforms = torch.rand(shape, device=drawn_on, dtype=near.dtype, generator=generator).to(near.device)[
+                    kept
+                ]
+            march = grid.march(
+                rays[kept],
+                near[kept],
+                far[kept],
+                self.samples,
+                uniforms=uniforms,
+                spacing=self.spacing,
+                backend=self.backend,
+            )
+            found = march.positions, march.ray_index + first, march.depths, march.deltas
+        hidden = self.sharing is not None and grid is not None
+        return own_samples(*found, *self._owns(found[0]), hidden=hidden)
+
+    # --- a step ----------------------------------------------------------------------------------------------------
+
+    def learn(
+        self,
+        rays: Rays,
+        near: Tensor,
+        far: Tensor,
+        target: Tensor,
+        *,
+        background: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Learnt:
+        """Renders rays, the same on all ranks, and leaves the gradients of the mean squared error of their colours.
+
+        Gradients of parameters that several ranks have are sums over the samples of this one.
+
+        Args:
+            rays: r rays.
+            near: [r].
+            far: [r].
+            target: [r, 3].
+            background: [3] or [r, 3]; None is black.
+            generator: Of the samples, in the same state on all ranks.
+        """
+        samples = self.samples_of(rays, near, far, jitter=True, generator=generator)
+        colour, density = self.field(samples.positions, rays.directions, samples.ray_index)
+        runs = sum_runs(samples, colour.to(near.dtype), density.to(near.dtype), self.backend)
+        sums = torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1).detach()
+        bounds = self._slices(len(rays))
+        first, last = bounds[self.group.rank :][:2]
+        counts: list[int] = []
+        if self.sharing is not None:
+            ends = torch.tensor(bounds, device=near.device)
+            counts = torch.searchsorted(runs.ray, ends).diff().tolist()
+            sums, came = self.group.send("sums", sums, counts)
+        order = along_rays(sums[:, 5].long(), sums[:, 4])
+        part, optical = sums[order, :3].requires_grad_(), sums[order, 3].requires_grad_()
+        ray = sums[order, 5].long() - first
+        with torch.enable_grad():
+            whole = compose(part, optical, ray, last - first)
+            seen = whole.colour
+            if background is not None:
+                behind = background if background.dim() == 1 else background[first:last]
+                seen = seen + whole.through[:, None] * behind
+            error = (seen - target[first:last]).square().sum(-1)
+            loss = error.sum() / (3 * len(rays))
+        gradients = torch.autograd.grad(loss, (part, optical))
+        answers = torch.empty_like(sums)
+        answers[order] = torch.cat(
+            (gradients[0], gradients[1][:, None], whole.front.detach()[:, None], error.detach()[ray, None]), 1
+        )
+        if self.sharing is not None:
+            answers, _ = self.group.send("gradients", answers, came, counts)
+        torch.autograd.backward((runs.colour, runs.optical), (answers[:, :3], answers[:, 3]))
+        run = torch.repeat_interleave(samples.run_offsets.diff())
+        weights = runs.weights * answers[run, 4]
+        importance = weights * answers[run, 5]
+        return Learnt(loss.detach(), samples.positions, density.detach(), samples.deltas, weights, importance)
+
+    # --- the grid --------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def observe(self, grid: OccupancyGrid, found: Learnt, *, decay: float, backend: str) -> None:
+        """Teaches the grid what the samples of all ranks found in the voxels that own cells reach.
+
+        Samples in voxels of several ranks travel, as voxel and density, 8 bytes each.
+        """
+        density = found.density.float().nan_to_num(nan=float("inf"), posinf=float("inf"))
+        visible = found.weights > HIDDEN * -torch.expm1(-density * found.deltas)
+        density = torch.where(visible, density, 0)
+        positions, cells = found.positions, grid.cells(found.positions)
+        if self.sharing is None:
+            common = torch.ones_like(cells, dtype=torch.bool)
+        else:
+            common = self._several[cells]
+        told = torch.stack((cells[common].view(torch.float32), density[common]), 1)
+        told = self.group.share("occupancy", told)
+        cells = told[:, 0].contiguous().view(torch.int32)
+        if self.sharing is not None:
+            ours = self._reached[cells]
+            cells, told = cells[ours], told[ours]
+        positions = torch.cat((positions[~common], grid.points(cells.long())))
+        density = torch.cat((density[~common], told[:, 1]))
+        ones = torch.ones_like(density)  # what counts has been decided
+        grid.observe(positions, density, ones, ones, decay=decay, backend=backend)
+
+    def revisited(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        """The field of all ranks, for the grid: each evaluates the positions that it owns."""
+        _, own = self._owns(positions)
+        if self.sharing is None:
+            own[:] = False
+            bounds = self._slices(len(positions))
+            own[bounds[self.group.rank] : bounds[self.group.rank + 1]] = True
+        density = torch.zeros_like(positions[:, 0])
+        density[own] = density_of(self.field, positions[own])
+        return torch.zeros_like(positions), self.group.largest(density)
+
+    def forget_others(self, grid: OccupancyGrid) -> None:
+        """Empties the voxels that own cells do not reach, after an update of all."""
+        if self.sharing is not None:
+            grid.density.view(-1)[~self._reached] = 0
+            grid.occupied.view(-1)[~self._reached] = False
+
+    # --- pictures --------------------------------------------------------------------------------------------------
+
+    def look(self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None, heaviest: bool) -> Seen:
+        """As that of a renderer; every rank gets the same."""
+        samples = self.samples_of(rays, near, far)
+        colour, density = self.field(samples.positions, rays.directions, samples.ray_index)
+        runs = sum_runs(samples, colour.to(near.dtype), density.to(near.dtype), self.backend)
+        columns = [runs.colour, *(x[:, None] for x in (runs.optical, runs.start, runs.ray, runs.depth))]
+        if heaviest:
+            run = torch.repeat_interleave(samples.run_offsets.diff())
+            top = torch.zeros_like(runs.optical).scatter_reduce(0, run, runs.weights, "amax")
+            at = torch.where(runs.weights == top[run], samples.depths, float("inf"))
+            columns += [top[:, None], torch.full_like(top, float("inf")).scatter_reduce(0, run, at, "amin")[:, None]]
+        sums = self.group.share("pictures", torch.cat([column.to(near.dtype) for column in columns], 1))
+        sums = sums[along_rays(sums[:, 5].long(), sums[:, 4])]
+        ray = sums[:, 5].long()
+        whole = compose(sums[:, :3], sums[:, 3], ray, len(rays))
+        seen, opacity = whole.colour, 1 - whole.through
+        if background is not None:
+            seen = seen + whole.through[:, None] * background.to(seen)
+        depth = torch.zeros_like(near).index_add(0, ray, whole.front * sums[:, 6])
+        depth = torch.where(opacity > 0, depth / torch.where(opacity > 0, opacity, 1), far)
+        places = rays.origins
+        if heaviest:
+            weight = whole.front * sums[:, 7]
+            top = torch.zeros_like(near).scatter_reduce(0, ray, weight, "amax")
+            chosen = (weight == top[ray]) & (weight > 0)
+            at = far.clone()
+            at[ray[chosen]] = sums[chosen, 8]
+            places = rays.origins + at[:, None] * rays.directions
+            places = places if self.contraction is None else self.contraction.points(places)
+        return Seen(seen, opacity, depth, places)
+
+    def image(self, *args: Any, chunk: int | None = None, **given: Any) -> RenderedImage:
+        """As that of a renderer; every rank gets the same."""
+        return super().image(*args, chunk=PICTURE_CHUNK if chunk is None else chunk, **given)

@@ -1,0 +1,134 @@
+"""Partial sums: what a rank knows of a ray that passes through its cells, and how those of all ranks become a colour.
+
+r rays, m samples of all rays (packed), q runs. A run is a piece of a ray on which no other rank has a sample between
+two of its own. With the optical depth tau of the runs before, a ray has the colour ``sum exp(-tau) * colour of run``
+(NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.ops.composite import composite
+
+#: Stands for infinite density, as in `composite`.
+_OPAQUE = 1e30
+
+
+class Samples(NamedTuple):
+    """Samples of this rank, ray after ray, near to far.
+
+    Attributes:
+        positions: [m, 3].
+        ray_index: int32 [m].
+        depths: [m].
+        deltas: [m], the lengths of their strata.
+        run_offsets: int32 [q + 1], where each run begins.
+    """
+
+    positions: Tensor
+    ray_index: Tensor
+    depths: Tensor
+    deltas: Tensor
+    run_offsets: Tensor
+
+
+class Runs(NamedTuple):
+    """The partial sums of runs. The first two have gradients.
+
+    Attributes:
+        colour: [q, 3], as if nothing were in front.
+        optical: [q], the optical depth.
+        depth: [q], the sum of weight times depth.
+        ray: int64 [q].
+        start: [q], the depth of the first sample.
+        weights: [m], contributions of the samples, as if nothing were in front of their run.
+    """
+
+    colour: Tensor
+    optical: Tensor
+    depth: Tensor
+    ray: Tensor
+    start: Tensor
+    weights: Tensor
+
+
+def own_samples(
+    positions: Tensor, ray_index: Tensor, depths: Tensor, deltas: Tensor, cells: Tensor, own: Tensor, *, hidden: bool
+) -> Samples:
+    """Keeps the samples in own cells, and finds their runs.
+
+    Args:
+        positions: [n, 3], all samples that this rank knows, in the order of :class:`Samples`, as the next three.
+        ray_index: int32 [n].
+        depths: [n].
+        deltas: [n].
+        cells: int32 [n], the cell of each.
+        own: bool [n], whether it is one of this rank.
+        hidden: Whether other ranks may have samples that are not among these. A cell is convex, so that none lies
+            between two samples in one cell; nor does one between two neighbouring strata.
+    """
+    kept = own.nonzero()[:, 0]
+    ray, at, length, cell = ray_index[kept], depths[kept], deltas[kept], cells[kept]
+    begins = (kept.diff() != 1) | (ray.diff() != 0)
+    if hidden:
+        near = at.diff() < torch.minimum(length[1:], length[:-1])  # less than the stratum between would be long
+        begins |= (cell.diff() != 0) & ~near
+    first = 1 + begins.nonzero()[:, 0]
+    ends = torch.tensor([len(kept)], device=kept.device)
+    offsets = torch.cat((ends.new_zeros(min(len(kept), 1)), first, ends)).to(torch.int32)
+    return Samples(positions[kept], ray, at, length, offsets)
+
+
+def sum_runs(samples: Samples, colour: Tensor, density: Tensor, backend: str) -> Runs:
+    """The partial sums of the runs of samples with these colours [m, 3] and densities [m]."""
+    offsets = samples.run_offsets
+    first = offsets[:-1].long()
+    run = torch.repeat_interleave(offsets.diff())
+    found = composite(density, colour, samples.depths, samples.deltas, ray_offsets=offsets, backend=backend)
+    optical = torch.zeros_like(samples.depths[first]).index_add(0, run, density.clamp(max=_OPAQUE) * samples.deltas)
+    ray, start = samples.ray_index[first].long(), samples.depths[first]
+    return Runs(found.colour, optical, found.depth.detach(), ray, start, found.weights.detach())
+
+
+class Composed(NamedTuple):
+    """Rays made of runs.
+
+    Attributes:
+        colour: [r, 3], without a background.
+        through: [r], the light that passes all of them.
+        front: [q], the light that arrives at each run.
+    """
+
+    colour: Tensor
+    through: Tensor
+    front: Tensor
+
+
+def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed:
+    """Puts runs together, differentiable in both.
+
+    Args:
+        colour: [q, 3].
+        optical: [q].
+        ray: int64 [q], ascending; the runs of a ray from near to far.
+        rays: r.
+    """
+    counts = torch.bincount(ray, minlength=rays)
+    slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
+    most = int(counts.max()) if len(ray) else 1
+    place = ray * most + slot
+    table = optical.new_zeros(rays * most).index_put((place,), optical).reshape(rays, most)
+    # The sum is shifted: less its last term it would be inf - inf for an opaque run.
+    front = torch.exp(-torch.nn.functional.pad(table[:, :-1], (1, 0)).cumsum(1)).reshape(-1)[place]
+    whole = colour.new_zeros(rays, 3).index_add(0, ray, front[:, None] * colour)
+    return Composed(whole, torch.exp(-table.sum(1)), front)
+
+
+def along_rays(ray: Tensor, start: Tensor) -> Tensor:
+    """The order of runs by their rays, and from near to far."""
+    order = start.argsort(stable=True)
+    return order[ray[order].argsort(stable=True)]
