@@ -17,6 +17,7 @@ from voronerf.reference.composite import composite
 from voronerf.reference.frequency_encode import frequency_encode
 from voronerf.reference.hash_encode import interpolate
 from voronerf.reference.integrated_encode import integrated_encode
+from voronerf.reference.render_loss import render_loss
 from voronerf.reference.spherical_harmonics import spherical_harmonics
 
 
@@ -136,6 +137,29 @@ def composite_backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tu
             if want and tensor is not None and cotangent is not None
         ]
         return (*second_derivatives(outputs, pairs, leaves, graph), None)
+
+
+def render_loss_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    """Of the forward op of render_loss, the last of whose results is the gradient of the loss."""
+    *tensors, ctx.density_scale = inputs
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(*output[1:])
+    ctx.save_for_backward(*tensors, output[-1])
+
+
+def render_loss_backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
+    """Scales the gradient; where that is differentiated again, it comes from the reference formula."""
+    *tensors, gradient = ctx.saved_tensors
+    if of_loss is None:
+        found = None
+    elif torch.is_grad_enabled():
+        raw, deltas, ray_offsets, target, background = tensors
+        given = {"background": background, "density_scale": ctx.density_scale}
+        loss = render_loss(raw, deltas, ray_offsets, target, **given).loss
+        (found,) = torch.autograd.grad(loss, raw, of_loss, create_graph=True)
+    else:
+        found = of_loss * gradient
+    return found, None, None, None, None, None
 
 
 def encode_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

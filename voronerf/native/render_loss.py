@@ -1,20 +1,17 @@
 """``render_loss`` of the compiled module. r rays, m samples of all rays (packed).
 
-The gradient of the loss is computed with it, so the backward pass only scales it. Where the gradient is differentiated
-again, it comes from the reference formula.
+The gradient of the loss is computed with it, so the backward pass only scales it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
-import torch
 from torch import Tensor
 
 from voronerf import native
+from voronerf.derivatives import render_loss_backward, render_loss_setup
 from voronerf.native.custom_op import custom_op
-from voronerf.reference import render_loss as reference
 from voronerf.reference.render_loss import RenderLoss
 
 
@@ -63,25 +60,4 @@ def _render_loss(
     compiled.render_loss(given, results, native.machine(raw))
 
 
-def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    *tensors, ctx.density_scale = inputs
-    ctx.set_materialize_grads(False)
-    ctx.mark_non_differentiable(*output[1:])
-    ctx.save_for_backward(*tensors, output[-1])
-
-
-def _backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
-    *tensors, gradient = ctx.saved_tensors
-    if of_loss is None:
-        found = None
-    elif torch.is_grad_enabled():
-        raw, deltas, ray_offsets, target, background = tensors
-        given = {"background": background, "density_scale": ctx.density_scale}
-        loss = reference.render_loss(raw, deltas, ray_offsets, target, **given).loss
-        (found,) = torch.autograd.grad(loss, raw, of_loss, create_graph=True)
-    else:
-        found = of_loss * gradient
-    return found, None, None, None, None, None
-
-
-_render_loss.register_autograd(_backward, setup_context=_setup)
+_render_loss.register_autograd(render_loss_backward, setup_context=render_loss_setup)

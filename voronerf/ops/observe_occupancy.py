@@ -9,7 +9,11 @@ from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import check_count, check_dtype, check_number, check_same_device, check_same_dtype, check_shape
 
-_OP = backends.declare("observe_occupancy", native=Implementation(EVERYWHERE, (torch.float32,)))
+_OP = backends.declare(
+    "observe_occupancy",
+    native=Implementation(EVERYWHERE, (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 def observe_occupancy(
@@ -43,7 +47,7 @@ def observe_occupancy(
         decay: 0 to 1.
         threshold: density from which a cell counts as occupied.
         hidden: share of the light, 0 to 1.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Raises:
         ValueError: shapes, devices, a grid that is not contiguous, a decay out of range, an unknown backend.

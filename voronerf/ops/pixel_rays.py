@@ -19,7 +19,11 @@ from voronerf.checks import (
 )
 from voronerf.reference.pixel_rays import PixelRays
 
-_OP = backends.declare("pixel_rays", native=Implementation(EVERYWHERE, (torch.float32,)))
+_OP = backends.declare(
+    "pixel_rays",
+    native=Implementation(EVERYWHERE, (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 def pixel_rays(
@@ -53,7 +57,7 @@ def pixel_rays(
         fisheye: the lenses are fisheyes.
         background: float32 [3] or [b, 3], the colour behind images with an alpha channel; None leaves their
             colours as they are.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         PixelRays(origins, directions, near, far, colour). A ray that misses the box has far == near.

@@ -19,7 +19,11 @@ from voronerf.checks import (
 )
 from voronerf.reference.render_loss import RenderLoss
 
-_OP = backends.declare("render_loss", native=Implementation(EVERYWHERE, FLOATS))
+_OP = backends.declare(
+    "render_loss",
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+)
 
 
 def render_loss(
@@ -46,7 +50,7 @@ def render_loss(
         target: [r, 3], the colours to learn.
         background: [3] or [r, 3], added with weight 1 - opacity, or None.
         density_scale: factor on the density, > 0.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     ``deltas``, ``target`` and ``background`` are float32, or float64 where ``raw`` is; so are the results. The loss is
     differentiable in ``raw``, any number of times. Nothing else has gradients.

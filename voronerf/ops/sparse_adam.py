@@ -9,7 +9,11 @@ from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import check_dtype, check_integer, check_number, check_same_device, check_tensor
 
-_OP = backends.declare("sparse_adam", native=Implementation(EVERYWHERE, (torch.float32,)))
+_OP = backends.declare(
+    "sparse_adam",
+    native=Implementation(EVERYWHERE, (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
 
 
 @torch.no_grad()
@@ -47,7 +51,7 @@ def sparse_adam(
         learning_rate: the rate.
         betas: decay of the two moments, in [0, 1).
         epsilon: > 0, added outside of the root.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Raises:
         ValueError: shapes, devices, a tensor that is not contiguous, numbers out of range, an unknown backend.

@@ -1,0 +1,110 @@
+"""What rendered samples teach an occupancy grid as Warp kernels, in place. x, y, z cells along each axis, m samples."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from voronerf.kernels._launch import array, launch
+
+wp.set_module_options({"enable_backward": False})
+
+_INFINITY = wp.constant(float("inf"))
+
+
+@wp.func
+def _place(x: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) -> wp.int32:
+    place = (x - low) / (high - low) * wp.float32(size)
+    inside = wp.float32(0.0)
+    if place > 0.0:  # NaN is not
+        inside = wp.min(place, wp.float32(size - 1))
+    return wp.int32(inside)
+
+
+@wp.kernel
+def _find_kernel(
+    positions: wp.array2d(dtype=wp.float32),
+    box: wp.array2d(dtype=wp.float32),
+    x: wp.int32,
+    y: wp.int32,
+    z: wp.int32,
+    density: wp.array(dtype=wp.float32),
+    cells: wp.array(dtype=wp.int32),
+    before: wp.array(dtype=wp.float32),
+) -> None:
+    i = wp.tid()
+    cell = _place(positions[i, 0], box[0, 0], box[1, 0], x)
+    cell = cell * y + _place(positions[i, 1], box[0, 1], box[1, 1], y)
+    cell = cell * z + _place(positions[i, 2], box[0, 2], box[1, 2], z)
+    cells[i] = cell
+    before[i] = density[cell]
+
+
+@wp.kernel
+def _fade_kernel(
+    cells: wp.array(dtype=wp.int32),
+    before: wp.array(dtype=wp.float32),
+    decay: wp.float32,
+    density: wp.array(dtype=wp.float32),
+) -> None:
+    i = wp.tid()
+    # From the old density: all samples of a cell write the same.
+    density[cells[i]] = before[i] * decay
+
+
+@wp.kernel
+def _raise_kernel(
+    cells: wp.array(dtype=wp.int32),
+    sigma: wp.array(dtype=wp.float32),
+    deltas: wp.array(dtype=wp.float32),
+    weights: wp.array(dtype=wp.float32),
+    hidden: wp.float32,
+    density: wp.array(dtype=wp.float32),
+) -> None:
+    i = wp.tid()
+    found = sigma[i]
+    if wp.isnan(found):
+        found = _INFINITY
+    thickness = found * deltas[i]
+    # 1 - exp(-t), by its series where the subtraction would cost digits.
+    absorbed = 1.0 - wp.exp(-thickness)
+    if thickness < 0.01:
+        absorbed = thickness * (1.0 - 0.5 * thickness * (1.0 - thickness / 3.0))
+    if weights[i] > hidden * absorbed:
+        wp.atomic_max(density, cells[i], found)
+
+
+@wp.kernel
+def _compare_kernel(
+    cells: wp.array(dtype=wp.int32),
+    density: wp.array(dtype=wp.float32),
+    threshold: wp.float32,
+    occupied: wp.array(dtype=wp.uint8),
+) -> None:
+    i = wp.tid()
+    occupied[cells[i]] = wp.where(density[cells[i]] >= threshold, wp.uint8(1), wp.uint8(0))
+
+
+def observe_occupancy(
+    density: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    positions: Tensor,
+    sigma: Tensor,
+    deltas: Tensor,
+    weights: Tensor,
+    decay: float,
+    threshold: float,
+    hidden: float,
+) -> None:
+    """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
+    m = positions.shape[0]
+    cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
+    flat, rows, faded = (array(tensor, density) for tensor in (density.view(-1), cells, before))
+    samples = [array(tensor, density) for tensor in (sigma, deltas, weights)]
+    places = [array(positions, density), array(box, density), *density.shape]
+    launch(_find_kernel, m, [*places, flat, rows, faded], density)
+    launch(_fade_kernel, m, [rows, faded, decay, flat], density)
+    launch(_raise_kernel, m, [rows, *samples, hidden, flat], density)
+    launch(_compare_kernel, m, [rows, flat, threshold, array(occupied.view(-1), density)], density)
