@@ -60,10 +60,12 @@ gpu-check:
 emulate-cuda: $(VENV)/.built
 	@for seed in 1 2 3; do OMP_NUM_THREADS=1 $(BIN)/pytest -q tests/ops -k native-cpu --emulate-cuda $$seed || exit 1; done
 
-# The C++ of the CPU kernels under AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer, with random inputs.
-sanitize:
+# The C++ of the CPU kernels under AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer, with random inputs,
+# and random calls of the operations with the extension under AddressSanitizer.
+sanitize: $(VENV)/.built
 	@tests/cpp/sanitize.sh
 	@tests/cpp/sanitize_ops.sh
+	@tests/cpp/sanitize_calls.sh
 
 # Random calls of the operations, kills, damaged checkpoints and strangers' files, for about an hour. ATTACK_ARGS names
 # parts, seeds and counts: tests/attack --help.
