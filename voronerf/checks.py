@@ -1,8 +1,9 @@
 """Validators shared by every public operation.
 
 Each raises at once with a message of one form, "operation: argument must <rule>, got <what came>": ValueError for
-shapes and values, TypeError for dtypes and kinds. Only shapes, dtypes and devices are checked. No element of a tensor
-is read, so that an operation can be traced by ``torch.compile`` and captured in a CUDA graph.
+shapes and values, TypeError for dtypes and kinds. Only shapes, dtypes and devices are checked, and by ``check_range``
+indices on the CPU. No other element of a tensor is read, so that an operation can be traced by ``torch.compile`` and
+captured in a CUDA graph.
 
 Dimension letters in a rule ("n", "k+1") bind at their first use. Passing the same ``sizes`` dictionary to several
 checks makes a letter mean the same number in all of them.
@@ -129,6 +130,18 @@ def check_count(op: str, name: str, count: int) -> None:
     """Raises ValueError when a batch has more rows than an int32 index can number."""
     if count > MAX_COUNT:
         raise ValueError(f"{op}: {name} must have fewer than 2**31 rows, got {count}: split the batch")
+
+
+def check_range(op: str, name: str, index: Tensor, count: int) -> None:
+    """Raises ValueError for an index on the CPU that is not 0 to ``count - 1``.
+
+    Elsewhere the values are not read, since that would wait for the device, nor while ``torch.compile`` traces.
+    """
+    if index.device.type != "cpu" or index.numel() == 0 or torch.compiler.is_compiling():
+        return
+    low, high = (int(bound) for bound in index.aminmax())
+    if low < 0 or high >= count:
+        raise ValueError(f"{op}: {name} must lie in 0 to {count - 1}, got values from {low} to {high}")
 
 
 def check_integer(op: str, name: str, value: int, minimum: int, maximum: int = MAX_COUNT) -> None:

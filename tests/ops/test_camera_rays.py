@@ -52,6 +52,8 @@ def test_refuses_what_makes_no_sense():
     refuses("poses must have shape [c, 4, 4], got [2, 3, 4]", poses=some.poses[:, :3])
     refuses("y must have shape [b] with b = 5, got [4]", y=x[1:])
     refuses("camera must have dtype int32, got int64", camera=torch.zeros(5, dtype=torch.int64))
+    wrong = torch.tensor([0, 1, 2, 0, 0], dtype=torch.int32)
+    refuses("camera must lie in 0 to 1, got values from 0 to 2", camera=wrong)
     refuses("distortion must have shape [c, 8] with c = 2, got [1, 8]", distortion=torch.zeros(1, 8))
     refuses("distortion must be given with fisheye, got None", fisheye=True)
     refuses("poses must have dtype float32, got float64", poses=some.poses.double())

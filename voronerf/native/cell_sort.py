@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf import native
+from voronerf.checks import check_range
 from voronerf.native.custom_op import custom_op
 
 WAYS = native.compiled.CellSortWay
@@ -45,5 +46,4 @@ def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = 
         return
     workspace = cells.new_empty(compiled.cell_sort_workspace(n, k))
     if not compiled.cell_sort(cells, order, offsets, workspace, n, k, machine):
-        low, high = (int(bound) for bound in cells.aminmax())
-        raise ValueError(f"{caller}: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
+        check_range(caller, "cells", cells, k)

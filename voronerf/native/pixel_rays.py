@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from torch import Tensor
 
 from voronerf import native
+from voronerf.checks import check_range
 from voronerf.native.custom_op import custom_op
 from voronerf.reference.pixel_rays import PixelRays
 
@@ -70,5 +71,4 @@ def _pixel_rays(
     if isinstance(machine, compiled.Cuda):
         compiled.pixel_rays(given, results, machine)
     elif not compiled.pixel_rays(given, results, machine):
-        low, high = (int(bound) for bound in index.aminmax())
-        raise ValueError(f"pixel_rays: index must lie in 0 to {c * h * w - 1}, got values from {low} to {high}")
+        check_range("pixel_rays", "index", index, c * h * w)

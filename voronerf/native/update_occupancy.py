@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf import native
+from voronerf.checks import check_range
 from voronerf.native.custom_op import custom_op
 
 
@@ -28,5 +29,4 @@ def _update(
     n, q = density.numel(), cells.shape[0]
     results = remembered, occupied.view(torch.uint8)
     if not native.compiled.update_occupancy(density, cells, values, *results, n, q, decay, threshold, native.cpu()):
-        low, high = (int(bound) for bound in cells.aminmax())
-        raise ValueError(f"update_occupancy: cells must lie in 0 to {n - 1}, got values from {low} to {high}")
+        check_range("update_occupancy", "cells", cells, n)

@@ -12,6 +12,7 @@ from voronerf.checks import (
     check_count,
     check_dtype,
     check_flag,
+    check_range,
     check_same_device,
     check_same_dtype,
     check_shape,
@@ -43,7 +44,8 @@ def camera_rays(
         intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
         x: float32 [b], to the right, in pixels; the centre of the first column is at 0.5.
         y: float32 [b], downwards.
-        camera: int32 [b], the camera of each position, 0 to c - 1, not checked; None for the first camera.
+        camera: int32 [b], the camera of each position, 0 to c - 1; None for the first camera. Others are an error on
+            the CPU, and undefined on CUDA, where they are not checked.
         distortion: float32 [c, 8], (k1, k2, p1, p2, k3, k4, k5, k6) of OpenCV's rational model, or None for none.
         fisheye: the lenses are fisheyes, and distortion is (k1, k2, p1, p2, k3, k4, s1, s2) of COLMAP's
             THIN_PRISM_FISHEYE, whose k1 to k4 are those of OpenCV's fisheye model.
@@ -53,7 +55,7 @@ def camera_rays(
         (origins float32 [b, 3], directions float32 [b, 3] of unit length).
 
     Raises:
-        ValueError: shapes, devices or an unknown backend.
+        ValueError: shapes, devices or an unknown backend; on the CPU also cameras out of range.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 
@@ -77,6 +79,7 @@ def camera_rays(
     if camera is not None:
         check_shape(_OP, "camera", camera, ("b",), sizes)
         check_dtype(_OP, "camera", camera, INDEX)
+        check_range(_OP, "camera", camera, sizes["c"])
     check_flag(_OP, "fisheye", fisheye)
     if distortion is not None:
         check_shape(_OP, "distortion", distortion, ("c", 8), sizes)

@@ -7,6 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
+from voronerf.checks import check_range
 from voronerf.grids import GridLevel, HashGrid
 
 _PRIMES = (1, 2654435761, 805459861)
@@ -14,10 +15,8 @@ _PRIMES = (1, 2654435761, 805459861)
 
 def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, *, cells: Tensor | None = None) -> Tensor:
     """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
-    if cells is not None and cells.device.type == "cpu" and cells.numel() and not torch.compiler.is_compiling():
-        first, last = (int(bound) for bound in cells.aminmax())
-        if first < 0 or last >= len(table):
-            raise ValueError(f"hash_encode: cells must lie in 0 to {len(table) - 1}, got values from {first} to {last}")
+    if cells is not None:
+        check_range("hash_encode", "cells", cells, len(table))
     return interpolate(positions, table, grid, cells)
 
 

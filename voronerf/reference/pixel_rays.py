@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from voronerf.checks import check_range
 from voronerf.reference.camera_rays import camera_rays
 
 
@@ -53,10 +54,7 @@ def pixel_rays(
 ) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
     c, h, w, channels = images.shape
-    if index.device.type == "cpu" and index.shape[0] > 0 and not torch.compiler.is_compiling():
-        low, high = (int(bound) for bound in index.aminmax())
-        if low < 0 or high >= c * h * w:
-            raise ValueError(f"pixel_rays: index must lie in 0 to {c * h * w - 1}, got values from {low} to {high}")
+    check_range("pixel_rays", "index", index, c * h * w)
     pixel = index % (h * w)
     x, y = ((place + 0.5).to(poses.dtype) for place in (pixel % w, pixel // w))
     camera = (index // (h * w)).to(torch.int32)

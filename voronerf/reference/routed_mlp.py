@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf.checks import check_range
 from voronerf.layers import MLP
 from voronerf.reference.cell_sort import cell_sort
 from voronerf.reference.grouped_mlp import check_direction_index, grouped_mlp
@@ -73,10 +74,7 @@ def routed_mlp(
             cells = operations.nearest_centre(coords, centres, weights=centre_weights)
         else:
             cells = operations.locate_cell(coords, centres, child_offsets, child, depth=depth, weights=centre_weights)
-    if cells.device.type == "cpu" and n > 0 and not torch.compiler.is_compiling():
-        low, high = (int(bound) for bound in cells.aminmax())
-        if low < 0 or high >= k:
-            raise ValueError(f"routed_mlp: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
+    check_range("routed_mlp", "cells", cells, k)
     order, offsets = operations.cell_sort(cells, k)
     if direction_index is not None:
         direction_index = direction_index[order]

@@ -5,18 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from voronerf.checks import check_range
+
 
 @torch.no_grad()
 def update_occupancy(
     density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
 ) -> tuple[Tensor, Tensor]:
     """The larger of the density found and the decayed old one; see ``voronerf.ops.update_occupancy``."""
-    if cells.device.type == "cpu" and cells.shape[0] > 0 and not torch.compiler.is_compiling():
-        low, high = (int(bound) for bound in cells.aminmax())
-        if low < 0 or high >= density.numel():
-            raise ValueError(
-                f"update_occupancy: cells must lie in 0 to {density.numel() - 1}, got values from {low} to {high}"
-            )
+    check_range("update_occupancy", "cells", cells, density.numel())
     flat = density.reshape(-1)
     row = cells.long()
     # A cell decays once, however often it occurs.
