@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from convention_harness import EXAMPLES
 
-SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem != "nerf_pytorch_style")
+ELSEWHERE = ("nerf_pytorch_style", "sharded_nerf")  # which have tests of their own
+SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem not in ELSEWHERE)
 
 
 def run(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:

@@ -10,10 +10,9 @@ from __future__ import annotations
 import contextlib
 import copy
 import fnmatch
-import warnings
 import weakref
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +22,7 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.router.grouping import SHARED, cell_parameters, owned_parameters
 from voronerf.router.layout import tensors_of
+from voronerf.router.optimizers import check_optimizer, drop_state, is_stale, move_state
 
 _OP = "VoronoiRouter"
 
@@ -148,6 +148,19 @@ def _draw_parameters(template: nn.Module, k: int, generator: torch.Generator | N
 # Cells ----------------------------------------------------------------------------------------------------------------
 
 
+class Finer(NamedTuple):
+    """What a router becomes: a diagram, int64 parents of its cells, and how they get what their parents have.
+
+    ``take`` gives the entries of this process's new cells, the slice ``own``; ``shards`` says which rank has which.
+    """
+
+    diagram: VoronoiDiagram
+    parents: Tensor
+    take: Callable[[Tensor], Tensor]
+    own: slice = slice(None)
+    shards: Any = None
+
+
 class CellModules(nn.Module):
     """k modules, one for each cell of a diagram, as one module with stacked parameters."""
 
@@ -176,7 +189,9 @@ class CellModules(nn.Module):
         Raises:
             IndexError: If there is no such cell.
         """
-        index = self._check_index("cell", index)
+        return self._plain(self._check_index("cell", index))
+
+    def _plain(self, index: int) -> nn.Module:
         own = {id(p): nn.Parameter(p.detach()[index].clone(), p.requires_grad) for p in cell_parameters(self.module)}
         plain: nn.Module = clone_module(self.module, own)
         for part in plain.modules():
@@ -247,27 +262,34 @@ class CellModules(nn.Module):
             (8, torch.Size([8, 1, 3]))
         """
         split = {"backend": self.backend, "generator": self.generator, **split}
-        diagram, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
+        check_optimizer(optimizer, self.module, "subdivide")
+        finer = self._finer(diagram, parents, points, weights, split)
         # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
-        new = torch.bincount(parents, minlength=self.num_cells)[parents] > 1
-        fresh = None if inherit else _draw_parameters(self.cell(0), diagram.num_cells, self.generator)
-        _check_optimizer(optimizer, self.module, "subdivide")
-        before = self.num_cells
-        stacked = {id(parameter) for parameter in cell_parameters(self.module)}
-        for name, parameter in self.module.named_parameters():
-            if id(parameter) in stacked:
-                with torch.inference_mode(False):
-                    values = parameter.detach()[parents.to(parameter.device)]
-                    if fresh is not None:
-                        values[new.to(values.device)] = fresh[name][new].to(values)
-                    _replace_values(parameter, values)
-        self.diagram = copy.deepcopy(diagram).to(self.diagram.centres.device)
+        new = torch.bincount(finer.parents, minlength=self.num_cells)[finer.parents] > 1
+        fresh = None if inherit else _draw_parameters(self._plain(0), len(new), self.generator)
+        self._become(finer, optimizer, new[finer.own], fresh)
+        if optimizer is None:
+            self._watch_optimizers("router.subdivide(..., optimizer=optimizer)")
+        return finer.parents
+
+    def _finer(self, diagram: Any, parents: Any, points: Any, weights: Any, split: dict[str, Any]) -> Finer:
+        diagram, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
+        return Finer(diagram, parents, lambda stacked: stacked[parents.to(stacked.device)])
+
+    def _become(self, finer: Finer, optimizer: Any, new: Tensor, fresh: dict[str, Tensor] | None = None) -> None:
+        """Replaces the cells; those of ``new``, bool [own cells], get the values of ``fresh``, [all new cells, ...]."""
+        names, before = {id(p): name for name, p in self.module.named_parameters()}, 0
+        for parameter in cell_parameters(self.module):
+            before = len(parameter)
+            with torch.inference_mode(False):
+                values = finer.take(parameter.detach())
+                if fresh is not None:
+                    values[new.to(values.device)] = fresh[names[id(parameter)]][finer.own][new].to(values)
+                _replace_values(parameter, values)
+        self.diagram = copy.deepcopy(finer.diagram).to(self.diagram.centres.device)
         self._forget_assignments()
         if optimizer is not None:
-            _move_state(optimizer, self.module, parents, before, None if inherit else new)
-        else:
-            self._watch_optimizers("router.subdivide(..., optimizer=optimizer)")
-        return parents
+            move_state(optimizer, self.module, finer.take, before, None if fresh is None else new)
 
     def _watch_optimizers(self, line: str) -> None:
         """Raises at the next step of an optimiser that holds state of other cells, and says which ``line`` to write."""
@@ -277,7 +299,7 @@ class CellModules(nn.Module):
 
         def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
             held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched]
-            if any(watched[id(parameter)]() is parameter and _is_stale(optimizer, parameter) for parameter in held):
+            if any(watched[id(parameter)]() is parameter and is_stale(optimizer, parameter) for parameter in held):
                 raise ValueError(
                     f"{_OP}: optimizer ({type(optimizer).__name__}) holds the state of other cells than the router "
                     f"has; write {line}, or make the optimizer afterwards"
@@ -312,10 +334,10 @@ class CellModules(nn.Module):
         Raises:
             ValueError: If the optimiser holds none of the router's parameters.
         """
-        _check_optimizer(optimizer, self.module, "load_state_dict")
+        check_optimizer(optimizer, self.module, "load_state_dict")
         result = super().load_state_dict(state_dict, strict, assign)
         if optimizer is not None:
-            _drop_state(optimizer)
+            drop_state(optimizer)
         return result
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
@@ -338,62 +360,3 @@ class CellModules(nn.Module):
         copied = memo[id(self)] = type(self).__new__(type(self))
         copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
         return copied
-
-
-# Optimisers -----------------------------------------------------------------------------------------------------------
-
-
-def _check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, method: str) -> None:
-    """Raises ValueError for an optimiser that holds none of a module's parameters."""
-    ours, groups = set(map(id, module.parameters())), [] if optimizer is None else optimizer.param_groups
-    if groups and ours and ours.isdisjoint(id(parameter) for group in groups for parameter in group["params"]):
-        raise ValueError(f"{_OP}.{method}: optimizer must hold the router's parameters, got one of others")
-
-
-def _move_state(
-    optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
-) -> None:
-    """Gives every cell the state that an optimiser has for its parent among k cells, or zero to those of ``fresh``.
-
-    The parameters have their new shapes already. A state that is not of cells begins anew.
-    """
-    lost = False
-    for parameter in cell_parameters(module):
-        state = optimizer.state.get(parameter, {})
-        for key, value in state.items():
-            if isinstance(value, Tensor) and value.shape == (k, *parameter.shape[1:]):
-                state[key] = value[parents.to(value.device)]
-                if fresh is not None:
-                    state[key][fresh.to(value.device)] = 0
-            else:
-                lost |= isinstance(value, list) or (isinstance(value, Tensor) and value.dim() > 0)
-    if lost:
-        _begin_anew(optimizer)
-        warnings.warn(
-            f"{_OP}.subdivide: the state of {type(optimizer).__name__} cannot be inherited by cells and begins anew",
-            stacklevel=4,
-        )
-
-
-def _drop_state(optimizer: torch.optim.Optimizer) -> None:
-    """Lets an optimiser begin anew where its state has the shapes of other cells than the parameters have."""
-    for group in optimizer.param_groups:
-        for parameter in group["params"]:
-            if _is_stale(optimizer, parameter):
-                optimizer.state.pop(parameter)
-                if isinstance(optimizer, torch.optim.Adagrad):  # which makes its state when it is made
-                    total = torch.full_like(parameter, group["initial_accumulator_value"])
-                    optimizer.state[parameter].update(step=torch.tensor(0.0), sum=total)
-    if isinstance(optimizer, torch.optim.LBFGS):
-        _begin_anew(optimizer)
-
-
-def _begin_anew(optimizer: torch.optim.Optimizer) -> None:
-    optimizer.state.clear()
-    if isinstance(optimizer, torch.optim.LBFGS):
-        optimizer._numel_cache = None  # the number of entries of all parameters together
-
-
-def _is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
-    state = optimizer.state.get(parameter, {})
-    return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())

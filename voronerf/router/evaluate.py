@@ -62,6 +62,7 @@ class Choices:
     def forget(self) -> None:
         """Begins anew, after a change of dtype, device or parameters' names."""
         self.kinds: dict[Any, Choice] = {}
+        self.checked: set[Any] = set()  # kinds of calls with rays over ranks
         self._said: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
@@ -86,7 +87,7 @@ class Choices:
         return Choices, ()
 
 
-def _kind(call: Call, device: torch.device, fuse: bool) -> Any:
+def kind_of(call: Call, device: torch.device, fuse: bool) -> Any:
     """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
 
     Numbers count by what they are only where they would go into a fused network.
@@ -109,21 +110,20 @@ def _kind(call: Call, device: torch.device, fuse: bool) -> Any:
 
 def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, *, fuse: bool) -> Any:
     """What a method returns for the samples of all cells (or two placeholders), some mixed with those of others."""
-    choice = _choose(call, grouping, choices, fuse)
-    results, choice = _carry_out(call, grouping, choices, choice)
+    choice = choose(call, grouping, choices, fuse)
+    results, choice = carry_out(call, grouping, choices, choice)
     order = grouping if choice.program is None or not call.layout.n else None
     own = results.restored(call.layout, order)
     if mixture is None:
         return own
-    n, where, tensors = mixture.rows.shape[0], {"cells": mixture.cells}, tensors_of(own)
-    entries = Grouping(where, n, grouping.k, grouping.device, grouping.backend, rows=mixture.rows)
-    results, _ = _carry_out(call, entries, choices, choice)
+    entries, tensors = grouping.of_entries(mixture.rows, mixture.cells), tensors_of(own)
+    results, _ = carry_out(call, entries, choices, choice)
     for i, tensor in enumerate(results.tensors):
-        tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(n, -1)))
+        tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(entries.n, -1)))
     return rebuild(own, tensors)
 
 
-def _carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice) -> tuple[Results, Choice]:
+def carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice) -> tuple[Results, Choice]:
     """Results sorted by cell; of a fused network in the original order, but for entries and placeholders."""
     if choice.program is not None:
         choices.note(call, choice)
@@ -154,8 +154,9 @@ def _carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice)
     return results, choice
 
 
-def _choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
-    layout, kind = call.layout, _kind(call, grouping.device, fuse)
+def choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
+    """How to carry out a call of this kind, found out if it is the first."""
+    layout, kind = call.layout, kind_of(call, grouping.device, fuse)
     choice = choices.kinds.get(kind)
     if choice is not None and not choice.open:
         return choice

@@ -17,11 +17,12 @@ from voronerf.backends import BACKENDS
 from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.blending import Mixture
-from voronerf.router.cells import CellModules, check_module, fill_cell
-from voronerf.router.evaluate import Choices, evaluate
+from voronerf.router.cells import check_module, fill_cell
+from voronerf.router.evaluate import Choices
 from voronerf.router.fused import LayeredField, described_by_table, each_direction, run_table
 from voronerf.router.grouping import Assignments, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
+from voronerf.router.shard import ShardedCells, evaluate_over_ranks
 
 Assignment = Literal["nearest", "stochastic"]
 
@@ -30,7 +31,7 @@ _MANY = 256
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
 
-class VoronoiRouter(CellModules):
+class VoronoiRouter(ShardedCells):
     """k copies of a module, one for each cell of a Voronoi diagram; the copy of its cell evaluates each sample.
 
     ``router(...)`` takes the arguments of the module's ``forward`` and returns what it returns, in the same order and
@@ -127,15 +128,14 @@ class VoronoiRouter(CellModules):
         _check_options(module, lists, **options, backend=backend, blend=blend)
         own = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
         super().__init__(module, own, share)
-        self.assignment, self.temperature = assignment, temperature
-        self.backend, self.blend, self.coords = backend, blend, coords
+        self.assignment, self.temperature, self.blend = assignment, temperature, blend
+        self.backend, self.coords, self.fuse, self.layout = backend, coords, fuse, layout
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
         self._own_coords = frozenset(
             name for name in ("forward", *methods) if "coords" in (accepted_names([getattr(module, name)]) or ())
         )
-        self.fuse, self.layout = fuse, layout
         self._choices, self._assignments = Choices(), Assignments()
         self._argument_names = {name: argument_names(getattr(self.module, name)) for name in ("forward", *methods)}
         self._by_table = self._layered and described_by_table(self.module)
@@ -237,13 +237,15 @@ class VoronoiRouter(CellModules):
             raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
         if not table.uses_directions:
             directions = ray_index = None
+        mixture = None if raw else self._mixture(positions[:, :3] if coords is None else coords)
+        if self._shards is not None:
+            return self._run_over_ranks(raw, mixture, self._where(positions, coords), positions, directions, ray_index)
 
         def run(*samples: Any) -> Any:
             outputs = run_table(field, self.num_cells, self.backend, *samples)
             return outputs if raw else field.activate(outputs)
 
         own = run(positions, directions, ray_index, self._where(positions, coords))
-        mixture = None if raw else self._mixture(positions[:, :3] if coords is None else coords)
         if mixture is None:
             return own
         if ray_index is not None:
@@ -263,9 +265,8 @@ class VoronoiRouter(CellModules):
             >>> router.explain()
             'forward: not called yet'
         """
-        if self._by_table:
-            return "forward: fused, by the layer table of the field"
-        return self._choices.explain(("forward", *self.methods))
+        ways = self._choices.explain(("forward", *self.methods))
+        return ("forward: fused, by the layer table of the field" if self._by_table else ways) + self._explain_shards()
 
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
@@ -310,7 +311,7 @@ class VoronoiRouter(CellModules):
         call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
         with self._choices.lock:  # what stands in for the module's parameters does so for one call at a time
             mixture, grouping = self._mixture(positions), self._group(method, positions)
-            return evaluate(call, grouping, mixture, self._choices, fuse=self.fuse)
+            return evaluate_over_ranks(self._shards, call, grouping, mixture, self._choices, self.fuse)
 
     def _mixture(self, positions: Tensor) -> Mixture | None:
         """The other cells that samples near borders are evaluated in too."""
@@ -340,7 +341,8 @@ class VoronoiRouter(CellModules):
         diagram = self.diagram
         if self.num_cells == 1:
             return {}
-        if (self.assignment == "stochastic" and self.training) or (diagram.depth == 1 and self.num_cells > _MANY):
+        drawn = self.assignment == "stochastic" and self.training
+        if drawn or self._shards is not None or (diagram.depth == 1 and self.num_cells > _MANY):
             return {"cells": self.assign((positions[:, :3] if coords is None else coords).detach())}
         tables = {"centres": diagram.centres, "centre_weights": diagram.power, "coords": coords}
         if diagram.depth == 1:

@@ -1,0 +1,71 @@
+"""The state that optimisers keep for the parameters of cells, when cells are split, moved or loaded."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.router.grouping import cell_parameters
+
+_OP = "VoronoiRouter"
+
+
+def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, method: str) -> None:
+    """Raises ValueError for an optimiser that holds none of a module's parameters."""
+    ours, groups = set(map(id, module.parameters())), [] if optimizer is None else optimizer.param_groups
+    if groups and ours and ours.isdisjoint(id(parameter) for group in groups for parameter in group["params"]):
+        raise ValueError(f"{_OP}.{method}: optimizer must hold the router's parameters, got one of others")
+
+
+def move_state(
+    optimizer: torch.optim.Optimizer, module: nn.Module, take: Callable[[Tensor], Tensor], k: int, fresh: Tensor | None
+) -> None:
+    """Gives every cell the state that an optimiser has for its parent among k cells, or zero to those of ``fresh``.
+
+    The parameters have their new shapes already. A state that is not of cells begins anew.
+    """
+    lost = False
+    for parameter in cell_parameters(module):
+        state = optimizer.state.get(parameter, {})
+        for key, value in state.items():
+            if isinstance(value, Tensor) and value.shape == (k, *parameter.shape[1:]):
+                state[key] = take(value)
+                if fresh is not None:
+                    state[key][fresh.to(value.device)] = 0
+            else:
+                lost |= isinstance(value, list) or (isinstance(value, Tensor) and value.dim() > 0)
+    if lost:
+        _begin_anew(optimizer)
+        warnings.warn(
+            f"{_OP}.subdivide: the state of {type(optimizer).__name__} cannot be inherited by cells and begins anew",
+            stacklevel=5,
+        )
+
+
+def drop_state(optimizer: torch.optim.Optimizer) -> None:
+    """Lets an optimiser begin anew where its state has the shapes of other cells than the parameters have."""
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            if is_stale(optimizer, parameter):
+                optimizer.state.pop(parameter)
+                if isinstance(optimizer, torch.optim.Adagrad):  # which makes its state when it is made
+                    total = torch.full_like(parameter, group["initial_accumulator_value"])
+                    optimizer.state[parameter].update(step=torch.tensor(0.0), sum=total)
+    if isinstance(optimizer, torch.optim.LBFGS):
+        _begin_anew(optimizer)
+
+
+def _begin_anew(optimizer: torch.optim.Optimizer) -> None:
+    optimizer.state.clear()
+    if isinstance(optimizer, torch.optim.LBFGS):
+        optimizer._numel_cache = None  # the number of entries of all parameters together
+
+
+def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
+    """Whether an optimiser has a state of another shape than a parameter."""
+    state = optimizer.state.get(parameter, {})
+    return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())
