@@ -56,11 +56,42 @@ def _sample(
 
 
 @wp.func
-def _cell(
-    origin: wp.float32, direction: wp.float32, at: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32
-) -> wp.int32:
+def _point(origin: wp.vec3, direction: wp.vec3, at: wp.float32, space: wp.array2d(dtype=wp.float32)) -> wp.vec3:
+    # In the space of the grid: `space` has a row for the centre and the radius of a sphere, five for a perspective.
+    x = origin[0] + at * direction[0]
+    y = origin[1] + at * direction[1]
+    z = origin[2] + at * direction[2]
+    if space.shape[0] == 1:
+        radius = space[0, 3]
+        x = (x - space[0, 0]) / radius
+        y = (y - space[0, 1]) / radius
+        z = (z - space[0, 2]) / radius
+        length = wp.sqrt(x * x + y * y + z * z)
+        if length < 1.0:
+            length = wp.float32(1.0)
+        factor = (2.0 - 1.0 / length) / length
+        x = space[0, 0] + radius * x * factor
+        y = space[0, 1] + radius * y * factor
+        z = space[0, 2] + radius * z * factor
+    if space.shape[0] == 5:
+        x -= space[0, 0]
+        y -= space[0, 1]
+        z -= space[0, 2]
+        right = x * space[1, 0] + y * space[1, 1] + z * space[1, 2]
+        up = x * space[2, 0] + y * space[2, 1] + z * space[2, 2]
+        depth = x * space[3, 0] + y * space[3, 1] + z * space[3, 2]
+        if depth < space[4, 0] / 2.0:
+            depth = space[4, 0] / 2.0
+        x = right / (depth * space[4, 1])
+        y = up / (depth * space[4, 2])
+        z = 1.0 - 2.0 * space[4, 0] / depth
+    return wp.vec3(x, y, z)
+
+
+@wp.func
+def _cell(point: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) -> wp.int32:
     scale = wp.float32(size) / (high - low)
-    place = (origin + at * direction - low) * scale
+    place = (point - low) * scale
     cell = wp.int32(-1)
     if place >= 0.0 and place <= wp.float32(size):
         cell = wp.min(wp.int32(place), size - 1)
@@ -79,6 +110,7 @@ def _march_kernel(
     jittered: wp.bool,
     start: wp.array(dtype=wp.int32),
     started: wp.bool,
+    space: wp.array2d(dtype=wp.float32),
     samples: wp.int32,
     disparity: wp.bool,
     most: wp.int32,
@@ -92,6 +124,8 @@ def _march_kernel(
     stop: wp.array(dtype=wp.int32),
 ) -> None:
     ray = wp.tid()
+    origin = wp.vec3(origins[ray, 0], origins[ray, 1], origins[ray, 2])
+    direction = wp.vec3(directions[ray, 0], directions[ray, 1], directions[ray, 2])
     begin = near[ray]
     end = far[ray]
     stratum = wp.int32(0)
@@ -111,9 +145,10 @@ def _march_kernel(
         if jittered:
             inside = uniforms[ray, stratum]
         at = _sample(begin, end, stratum, inside, samples, disparity, first, last)
-        x = _cell(origins[ray, 0], directions[ray, 0], at, box[0, 0], box[1, 0], occupied.shape[0])
-        y = _cell(origins[ray, 1], directions[ray, 1], at, box[0, 1], box[1, 1], occupied.shape[1])
-        z = _cell(origins[ray, 2], directions[ray, 2], at, box[0, 2], box[1, 2], occupied.shape[2])
+        point = _point(origin, direction, at, space)
+        x = _cell(point[0], box[0, 0], box[1, 0], occupied.shape[0])
+        y = _cell(point[1], box[0, 1], box[1, 1], occupied.shape[1])
+        z = _cell(point[2], box[0, 2], box[1, 2], occupied.shape[2])
         taken = wp.bool(False)
         if x >= 0 and y >= 0 and z >= 0:
             taken = occupied[x, y, z] != wp.uint8(0)
@@ -126,7 +161,7 @@ def _march_kernel(
                 depths[row + found] = at
                 deltas[row + found] = last - first
                 for axis in range(3):
-                    positions[row + found, axis] = origins[ray, axis] + at * directions[ray, axis]
+                    positions[row + found, axis] = point[axis]
         if going:
             stratum += 1
             if taken:
@@ -154,10 +189,11 @@ def march_rays(
     start: Tensor | None = None,
     most: int | None = None,
     capacity: int | None = None,
+    contraction: Tensor | None = None,
 ) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
     rest = (samples, disparity, samples if most is None else most)
-    tensors = (origins, directions, near, far, occupied, box, uniforms, start)
+    tensors = (origins, directions, near, far, occupied, box, uniforms, start, contraction)
     offsets = _count(*tensors, *rest, MAX_COUNT if capacity is None else capacity)
     rows = int(offsets[-1]) if capacity is None else capacity
     return March(offsets, *_fill(*tensors, offsets, *rest, rows))
@@ -173,6 +209,7 @@ def _count(
     box: Tensor,
     uniforms: Tensor | None,
     start: Tensor | None,
+    contraction: Tensor | None,
     samples: int,
     disparity: bool,
     most: int,
@@ -180,7 +217,9 @@ def _count(
 ) -> Tensor:
     offsets = near.new_zeros(near.shape[0] + 1, dtype=torch.int32)
     counts = offsets[1:]
-    inputs = _inputs(origins, directions, near, far, occupied, box, uniforms, start, samples, disparity, most)
+    inputs = _inputs(
+        origins, directions, near, far, occupied, box, uniforms, start, contraction, samples, disparity, most
+    )
     none, no_index = array(near[:0], near), array(offsets[:0], near)
     results = [array(counts, near), no_index, none, none, array(origins[:0], near), no_index]
     launch(_march_kernel, near.shape[0], [*inputs, True, no_index, *results], near)
@@ -198,6 +237,7 @@ def _fill(
     box: Tensor,
     uniforms: Tensor | None,
     start: Tensor | None,
+    contraction: Tensor | None,
     offsets: Tensor,
     samples: int,
     disparity: bool,
@@ -207,7 +247,9 @@ def _fill(
     ray_index = near.new_zeros(rows, dtype=torch.int32)
     depths, deltas, positions = near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3)
     stop = near.new_empty(near.shape[0], dtype=torch.int32)
-    inputs = _inputs(origins, directions, near, far, occupied, box, uniforms, start, samples, disparity, most)
+    inputs = _inputs(
+        origins, directions, near, far, occupied, box, uniforms, start, contraction, samples, disparity, most
+    )
     results = [
         array(offsets[:0], near),
         *(array(tensor, near) for tensor in (ray_index, depths, deltas, positions, stop)),
@@ -225,6 +267,7 @@ def _inputs(
     box: Tensor,
     uniforms: Tensor | None,
     start: Tensor | None,
+    contraction: Tensor | None,
     samples: int,
     disparity: bool,
     most: int,
@@ -233,7 +276,9 @@ def _inputs(
     places = near.new_empty(0, 0) if uniforms is None else uniforms
     views = [array(tensor, near) for tensor in (origins, directions, near, far, occupied, box, places)]
     first = [array(start, near, torch.int32), start is not None]
-    return [*views, uniforms is not None, *first, samples, disparity, most]
+    # [0, 0] for the world's own, [1, 4] or [5, 3].
+    space = near.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1])
+    return [*views, uniforms is not None, *first, array(space, near), samples, disparity, most]
 
 
 @_count.register_fake
@@ -246,6 +291,7 @@ def _(
     box: Tensor,
     uniforms: Tensor | None,
     start: Tensor | None,
+    contraction: Tensor | None,
     samples: int,
     disparity: bool,
     most: int,
@@ -264,6 +310,7 @@ def _(
     box: Tensor,
     uniforms: Tensor | None,
     start: Tensor | None,
+    contraction: Tensor | None,
     offsets: Tensor,
     samples: int,
     disparity: bool,

@@ -81,5 +81,5 @@ def test_what_cannot_be_opened(trained, scene, tmp_path) -> None:
     with pytest.raises(ConfigError, match="--blend must be a distance of 0 or more, got -1"):
         open_run(folder, scene=scene, blend=-1)
     refuses("--device must be cpu or cuda, got 'meta'", open_run, folder, scene=scene, device="meta", error=ConfigError)
-    with pytest.raises(ConfigError, match="--occupancy needs a scene with a box around everything"):
+    with pytest.raises(ConfigError, match="--occupancy needs a scene with a box or --contraction"):
         open_run(folder, scene=replace(scene, box=None), occupancy=True)

@@ -149,6 +149,11 @@ class MarchInputs(NamedTuple):
     z: int  # int64
     disparity: bool
     most: int  # int64
+    space: MarchSpace
+
+class MarchSpace(NamedTuple):
+    sphere: Tensor | None  # const float32*
+    perspective: Tensor | None  # const float32*
 
 MlpCaller: tuple[str, ...]  # grouped_mlp grouped_linear routed_mlp
 

@@ -191,7 +191,7 @@ def open_run(
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     state = checkpoint.group("occupancy")
     if state:
-        renderer.occupancy = OccupancyGrid.from_state(state, device=renderer.device)
+        renderer.occupancy = OccupancyGrid.from_state(state, contraction=renderer.contraction, device=renderer.device)
     elif occupancy:
         renderer.occupancy = make_picture_grid(config, scene, renderer.field, backend=backend)
     return Run(path, config, scene, routers, renderer)

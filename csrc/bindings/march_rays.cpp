@@ -4,7 +4,9 @@
 
 namespace voronerf {
 
-VN_STRUCT(MarchInputs, origins, directions, near, far, occupied, box, uniforms, start, r, s, x, y, z, disparity, most);
+VN_STRUCT(MarchSpace, sphere, perspective);
+VN_STRUCT(MarchInputs, origins, directions, near, far, occupied, box, uniforms, start, r, s, x, y, z, disparity, most,
+          space);
 
 VN_BINDINGS(module) {
   module.cpu("march_rays_count", VN_CPU(march_rays_count_cpu));

@@ -11,6 +11,12 @@
 
 namespace voronerf {
 
+// The space of the grid: a contracted one, or with neither that of the rays.
+struct MarchSpace {
+  const float* sphere;       // [4], centre and radius
+  const float* perspective;  // [5,3], centre, right, up, ahead and (near, a, b)
+};
+
 struct MarchInputs {
   const float *origins, *directions;  // [r,3]
   const float *near, *far;            // [r]
@@ -22,6 +28,7 @@ struct MarchInputs {
   int64_t x, y, z;
   bool disparity;
   int64_t most;  // samples of a ray
+  MarchSpace space;
 };
 
 // Strata of a word of the mask.

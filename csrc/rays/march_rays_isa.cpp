@@ -36,12 +36,41 @@ VN_INLINE float sample_at(const Ray& ray, int64_t i, float inside, float first, 
   return above > last ? last : above;
 }
 
+enum class Space { kWorld, kSphere, kPerspective };
+
+// The point at a distance along a ray, in the space of the grid.
+template <Space S>
+VN_INLINE void point_at(const MarchInputs& in, const float* origin, const float* direction, float at, float* point) {
+  for (int axis = 0; axis < 3; ++axis) point[axis] = origin[axis] + at * direction[axis];
+  if (S == Space::kSphere) {
+    const float *centre = in.space.sphere, radius = in.space.sphere[3];
+    for (int axis = 0; axis < 3; ++axis) point[axis] = (point[axis] - centre[axis]) / radius;
+    const float whole = __builtin_sqrtf(point[0] * point[0] + point[1] * point[1] + point[2] * point[2]);
+    const float length = whole < 1.0f ? 1.0f : whole;
+    const float factor = (2.0f - 1.0f / length) / length;
+    for (int axis = 0; axis < 3; ++axis) point[axis] = centre[axis] + radius * point[axis] * factor;
+  } else if (S == Space::kPerspective) {
+    const float *centre = in.space.perspective, *slopes = in.space.perspective + 12;
+    const float x = point[0] - centre[0], y = point[1] - centre[1], z = point[2] - centre[2];
+    float local[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const float* along = in.space.perspective + 3 * (axis + 1);
+      local[axis] = x * along[0] + y * along[1] + z * along[2];
+    }
+    const float nearest = slopes[0] / 2.0f;
+    const float depth = local[2] < nearest ? nearest : local[2];
+    point[0] = local[0] / (depth * slopes[1]);
+    point[1] = local[1] / (depth * slopes[2]);
+    point[2] = 1.0f - 2.0f * slopes[0] / depth;
+  }
+}
+
 VN_INLINE Ray ray_of(const MarchInputs& in, int64_t i) {
   return {in.near[i], in.far[i], static_cast<float>(in.s)};
 }
 
 // Cells of 32 strata from `first`, -1 outside the box.
-template <bool Jittered, bool Disparity>
+template <Space S, bool Jittered, bool Disparity>
 VN_INLINE void cells_of(const MarchInputs& in, const Ray& ray, const float* origin, const float* direction,
                         const float* scale, const float* uniforms, int64_t first, int32_t* cells) {
   float edges[kMarchWord + 1];
@@ -50,10 +79,12 @@ VN_INLINE void cells_of(const MarchInputs& in, const Ray& ray, const float* orig
   const int32_t count[3] = {static_cast<int32_t>(in.x), static_cast<int32_t>(in.y), static_cast<int32_t>(in.z)};
   for (int64_t j = 0; j < kMarchWord; ++j) {
     const float at = sample_at<Disparity>(ray, first + j, Jittered ? uniforms[j] : 0.5f, edges[j], edges[j + 1]);
+    float point[3];
+    point_at<S>(in, origin, direction, at, point);
     int32_t cell = 0;
     int inside = 1;
     for (int axis = 0; axis < 3; ++axis) {
-      const float place = (origin[axis] + at * direction[axis] - in.box[axis]) * scale[axis];
+      const float place = (point[axis] - in.box[axis]) * scale[axis];
       const int here = (place >= 0.0f) & (place <= size[axis]);
       const int32_t whole = static_cast<int32_t>(here ? place : 0.0f);
       cell = cell * count[axis] + (whole < count[axis] ? whole : count[axis] - 1);
@@ -67,7 +98,7 @@ VN_INLINE int bits_of(uint32_t word) {
   return __builtin_popcount(word);
 }
 
-template <bool Jittered, bool Disparity>
+template <Space S, bool Jittered, bool Disparity>
 VN_INLINE void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
   const int64_t size[3] = {in.x, in.y, in.z};
@@ -90,7 +121,8 @@ VN_INLINE void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int
         for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = 0.0f;
         __builtin_memcpy(uniforms, in.uniforms + i * in.s + first, sizeof(float) * there);
       }
-      cells_of<Jittered, Disparity>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first, cells);
+      cells_of<S, Jittered, Disparity>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first,
+                                       cells);
       uint32_t word = 0;
       for (int64_t j = 0; j < kMarchWord; ++j) {
         // Without a branch, which nothing could predict.
@@ -108,7 +140,7 @@ VN_INLINE void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int
   }
 }
 
-template <bool Disparity>
+template <Space S, bool Disparity>
 VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
                     float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
@@ -131,9 +163,7 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
         ray_index[row] = static_cast<int32_t>(i);
         depths[row] = sample_at<Disparity>(ray, stratum, inside, first, last);
         deltas[row] = last - first;
-        for (int axis = 0; axis < 3; ++axis) {
-          positions[3 * row + axis] = in.origins[3 * i + axis] + depths[row] * in.directions[3 * i + axis];
-        }
+        point_at<S>(in, in.origins + 3 * i, in.directions + 3 * i, depths[row], positions + 3 * row);
         ++row;
         if (++got == in.most) next = stratum + 1;
       }
@@ -142,24 +172,47 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
   }
 }
 
+template <Space S>
+VN_INLINE void count_in(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
+  if (in.disparity) {
+    in.uniforms == nullptr ? count<S, false, true>(in, mask, counts, begin, end)
+                           : count<S, true, true>(in, mask, counts, begin, end);
+  } else {
+    in.uniforms == nullptr ? count<S, false, false>(in, mask, counts, begin, end)
+                           : count<S, true, false>(in, mask, counts, begin, end);
+  }
+}
+
+template <Space S>
+VN_INLINE void fill_in(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
+                       float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
+  if (in.disparity) {
+    fill<S, true>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
+  } else {
+    fill<S, false>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
+  }
+}
+
 }  // namespace
 
 void march_count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
-  if (in.disparity) {
-    in.uniforms == nullptr ? count<false, true>(in, mask, counts, begin, end)
-                           : count<true, true>(in, mask, counts, begin, end);
+  if (in.space.sphere != nullptr) {
+    count_in<Space::kSphere>(in, mask, counts, begin, end);
+  } else if (in.space.perspective != nullptr) {
+    count_in<Space::kPerspective>(in, mask, counts, begin, end);
   } else {
-    in.uniforms == nullptr ? count<false, false>(in, mask, counts, begin, end)
-                           : count<true, false>(in, mask, counts, begin, end);
+    count_in<Space::kWorld>(in, mask, counts, begin, end);
   }
 }
 
 void march_fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index, float* depths,
                 float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
-  if (in.disparity) {
-    fill<true>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
+  if (in.space.sphere != nullptr) {
+    fill_in<Space::kSphere>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
+  } else if (in.space.perspective != nullptr) {
+    fill_in<Space::kPerspective>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
   } else {
-    fill<false>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
+    fill_in<Space::kWorld>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
   }
 }
 

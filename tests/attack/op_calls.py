@@ -153,6 +153,7 @@ def march_rays(rng: random.Random, n: int) -> Call:
         call["uniforms"] = torch.rand(n, samples, dtype=dtype)
     if rng.random() < 0.3:
         call |= {"start": index(n, samples), "most": rng.randint(1, 9), "capacity": rng.randint(1, 200)}
+    call["contraction"] = rng.choice((None, torch.rand(4, dtype=dtype) + 0.1, torch.rand(5, 3, dtype=dtype) + 0.1))
     return call
 
 

@@ -9,7 +9,12 @@ from op_cases import need, refusals
 from torch import Tensor
 
 from voronerf.ops import march_rays
+from voronerf.rendering import Contraction, Perspective
 from voronerf.rendering.sampling import stratified_depths
+
+SPHERE = Contraction(torch.tensor([0.1, -0.2, 0.3]), radius=0.7)
+AXES = torch.linalg.qr(torch.tensor([[1.0, 0.2, 0.1], [-0.3, 1.0, 0.2], [0.1, -0.2, 1.0]])).Q
+AHEAD = Perspective(torch.tensor([0.1, -0.2, -1.5]), AXES * AXES.diagonal().sign(), 0.4, (0.6, 0.5))
 
 pytestmark = pytest.mark.op("march_rays")
 
@@ -55,6 +60,23 @@ def test_a_full_grid_gives_stratified_samples(device, backend):
         torch.testing.assert_close(found.positions, places)
 
 
+@pytest.mark.parametrize("space", [SPHERE, AHEAD])
+def test_samples_of_a_contracted_grid_are_those_in_its_occupied_cells(device, backend, space):
+    given = case(40) | {"box": space.cube, "far": torch.full((40,), 6.0)}
+    options = {"spacing": "disparity", "contraction": space.numbers}
+    found = march(given, 50, device, backend, **options)
+    depths, deltas, _ = stratified_depths(given["near"], given["far"], 50, jitter=False, spacing="disparity")
+    world = given["origins"][:, None] + depths[..., None] * given["directions"][:, None]
+    place = (space.points(world) - space.cube[0]) / (space.cube[1] - space.cube[0])
+    sizes = torch.tensor(given["occupied"].shape)
+    cell = (place * sizes).long().clamp(min=0).minimum(sizes - 1).unbind(-1)
+    kept = given["occupied"][cell] & ((place >= 0) & (place <= 1)).all(-1)
+    assert 0 < len(found.depths) == int(kept.sum()) < 40 * 50
+    torch.testing.assert_close(found.depths, depths[kept])
+    torch.testing.assert_close(found.deltas, deltas[kept])
+    torch.testing.assert_close(found.positions, space.points(world[kept]))
+
+
 def test_samples_are_those_in_occupied_cells(device, backend):
     given = case(40)
     found = march(given, 50, device, backend)
@@ -71,12 +93,13 @@ def test_samples_are_those_in_occupied_cells(device, backend):
 
 
 @pytest.mark.parametrize(("r", "samples"), [(0, 4), (1, 1), (65, 31), (130, 32), (63, 65)])
-@pytest.mark.parametrize("spacing", ["linear", "disparity"])
-def test_equals_the_reference_to_the_last_bit(device, backend, spacing, r, samples):
+@pytest.mark.parametrize(
+    "rest", [{}, {"spacing": "disparity", "contraction": SPHERE.numbers}, {"contraction": AHEAD.numbers}]
+)
+def test_equals_the_reference_to_the_last_bit(device, backend, rest, r, samples):
     need("march_rays", backend, device, torch.float32)
     for shape in ((1, 1, 1), (16, 3, 33)):
         given = case(r, shape)
-        rest = {"spacing": spacing}
         for more in (
             {},
             {"uniforms": torch.rand(r, samples)},
@@ -144,4 +167,6 @@ def test_refuses_what_makes_no_sense():
     refuses("start must have dtype int32, got int64", start=torch.zeros(4, dtype=torch.int64))
     refuses("most must be at least 1, got 0", most=0)
     refuses("capacity must be at least 1, got 0", capacity=0)
+    refuses("contraction must have shape [4], got [3]", contraction=torch.zeros(3))
+    refuses("contraction must have shape [5, 3], got [2, 3]", contraction=torch.zeros(2, 3))
     refuses("spacing must be one of linear, disparity, got 'log'", spacing="log")

@@ -6,7 +6,10 @@ from helpers import refuses, render_image, seeded
 
 from voronerf import HashGridField, NeRF, VoronoiRouter
 from voronerf.rendering import (
+    Cameras,
+    Contraction,
     OccupancyGrid,
+    Perspective,
     Rays,
     Renderer,
     intersect_box,
@@ -141,6 +144,49 @@ def test_images_are_the_same_with_a_fraction_of_the_samples():
     bare = render_image(Ball(), cameras(), 0, occupancy=grid, heaviest=False, **options)
     assert torch.equal(bare.colour, quick.colour) and not torch.equal(bare.heaviest, quick.heaviest)
     refuses("chunk must be >= 1, got 0", render_image, Ball(), cameras(), 0, occupancy=grid, chunk=0, **options)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Contraction(torch.zeros(3), 1.0),
+        Perspective(torch.tensor([0.0, 0.0, 3.0]), torch.diag(torch.tensor([1.0, 1.0, -1.0])), 1.0, (0.7, 0.7)),
+    ],
+)
+def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
+    """A ball before a far wall that is as thin as fog: the grid learns both, and pictures lose nothing."""
+    asked, random = [0], seeded(0)
+
+    def scene(positions, directions, ray_index):
+        asked[0] += len(positions)
+        world = space.inverse(positions)
+        return (positions + 2) / 4, 60.0 * (world.norm(dim=-1) < 0.5) + 0.4 * (world[:, 2] < -20)
+
+    poses = torch.eye(4)[None].clone()
+    poses[0, 2, 3] = 3.0
+    camera = Cameras(poses, torch.tensor([[24.0, 24.0, 12.0, 12.0]]), 24, 24)
+    grid = OccupancyGrid(space.cube, 16, threshold=1.0, contraction=space)
+    rays, options = camera.image_rays(0), {"samples": 96, "spacing": "disparity"}
+    ends = torch.full((len(rays),), 1.0), torch.full((len(rays),), 60.0)
+    for _ in range(40):
+        seen = render_marched(scene, rays, *ends, grid, jitter=True, generator=random, **options)
+        grid.observe(seen.positions, seen.density, seen.deltas, seen.weights, decay=0.8)
+        cells = torch.randint(16**3, (256,), generator=random)
+        grid.update(scene, cells, decay=1.0, generator=random)
+    pictures, counts = [], []
+    for occupancy in (None, grid):
+        asked[0] = 0
+        renderer = Renderer({"field": scene}, contraction=space, occupancy=occupancy, **options)
+        pictures.append(renderer.image(camera, 0, near=1.0, far=60.0))
+        counts.append(asked[0])
+    assert counts[1] * 3 < counts[0]
+    plain, quick = pictures
+    torch.testing.assert_close(quick.colour, plain.colour, atol=2e-2, rtol=0)
+    assert bool((plain.opacity > 0.95).all())  # by the ball or the wall
+    torch.testing.assert_close(quick.heaviest[12, 12], plain.heaviest[12, 12], atol=1e-5, rtol=0)
+    same = OccupancyGrid.from_state(grid.state_dict(), contraction=space)
+    again = Renderer({"field": scene}, contraction=space, occupancy=same, **options)
+    assert torch.equal(again.image(camera, 0, near=1.0, far=60.0).colour, quick.colour)
 
 
 def test_a_translucent_field_is_walked_to_its_end():

@@ -294,7 +294,12 @@ def test_refusals():
         (proposal, {"fine_samples": 3, "rounds": 0}, "rounds must be >= 1, and 1 without a proposal, got 0"),
         (coarse, {"fine_samples": 3, "rounds": 2}, "rounds must be >= 1, and 1 without a proposal, got 2"),
         (one, {"distortion": -1}, "distortion must be >= 0 and finite, got -1"),
-        (one, {"distortion": 0.1, "occupancy": grid}, "without contraction and distortion"),
+        (one, {"distortion": 0.1, "occupancy": grid}, "without distortion"),
+        (
+            one,
+            {"contraction": Contraction(torch.zeros(3), 1.0), "occupancy": grid},
+            "a grid in the space of contraction",
+        ),
         (one, {"fine_samples": 3, "occupancy": grid}, "occupancy must come with a single pass over points"),
     ):
         refuses(message, Renderer, fields, **{"samples": 3, **options})

@@ -146,9 +146,11 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
     assert same(tensors(config.out), tensors(tmp_path / "whole"))
 
 
-def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch):
+@pytest.mark.parametrize("contraction", ["none", "sphere"])
+def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction):
     monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
-    found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8)
+    settings = {"contraction": contraction, "precision": "fp32" if contraction == "none" else "bf16"}
+    found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8, **settings)
     assert len(found["occupancy.density"].unique()) > 1
 
 

@@ -133,12 +133,15 @@ def test_widths_count_all_networks(scene):
 
 
 def test_empty_space_is_skipped_wherever_that_works(scene):
-    for settings in (HIERARCHICAL, CONES, CONTRACTION, {"distortion": 0.01}, {"cuda_graph": True, "device": "cuda"}):
+    for settings in (HIERARCHICAL, CONES, {"distortion": 0.01}, {"cuda_graph": True, "device": "cuda"}):
         assert not resolve_config(TrainConfig(**settings), scene).occupancy
-    for settings in ({}, KILO, {"field": "nerf"}):
+    assert not resolve_config(TrainConfig(**CONTRACTION), scene).occupancy  # but where it is asked for
+    grid = {"occupancy_resolution": 8}
+    for settings in ({}, KILO, {"field": "nerf"}, CONTRACTION | grid, CONTRACTION | KILO | grid):
         assert resolve_config(TrainConfig(**settings), scene).occupancy
         assert not resolve_config(TrainConfig(occupancy=False, **settings), scene).occupancy
-        assert not resolve_config(TrainConfig(**settings), replace(scene, box=None)).occupancy
+        resolved = resolve_config(TrainConfig(**settings), replace(scene, box=None))
+        assert resolved.occupancy == ("contraction" in settings)
 
 
 def test_a_hash_grid_in_a_scene_without_bounds_is_contracted(scene):

@@ -8,6 +8,7 @@ import importlib
 import os
 import shlex
 import signal
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType, ModuleType
@@ -113,7 +114,9 @@ def _train_and_draw(
             if trainer.lpips is None:
                 display.on_event(trainer.lpips_source)
             if config.occupancy and trainer.occupancy is None:
-                obstacle = why_no_occupancy(trainer.config) or "a scene without a box"
+                bare = trainer.config.contraction == "none"
+                other = "a scene without a box" if bare else "a contraction, unless by --occupancy-resolution 64"
+                obstacle = why_no_occupancy(trainer.config) or other
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
             viewer = None
             board = Board(out / "tensorboard", trainer) if config.tensorboard and trainer.writes else None
@@ -256,6 +259,11 @@ def given_path(path: Path | None, spiral: bool) -> CameraPath | None:
     return None if path is None else read_camera_path(path)
 
 
+def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
+    """The parts of a work, with a bar of its progress on a terminal."""
+    return track(parts, description=name, console=console, disable=not console.is_terminal)
+
+
 def write_flight(
     run: Run, out: Path, *, given: CameraPath | None, spiral: bool, frames: int = 60, fps: float | None = None
 ) -> None:
@@ -267,7 +275,7 @@ def write_flight(
         cameras = spiral_cameras(scene.train.cameras, frames, near=scene.near, far=scene.far)
     else:
         cameras = turntable_cameras(scene.train.cameras, frames)
-    numbers = track(range(len(cameras)), description="rendering", console=console, disable=not console.is_terminal)
+    numbers = tracked(range(len(cameras)), "rendering")
     pictures = (picture_of_colour(run.render(cameras, number, heaviest=False).colour) for number in numbers)
     write_video(out, pictures, fps or 24)
     say(f"wrote {out}")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from voronerf.cli.commands import given_path, say, write_flight
+from voronerf.cli.commands import given_path, say, tracked, write_flight
 from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.evaluation.video import check_video
 from voronerf.export import cells as cell_files
@@ -69,7 +69,9 @@ def export(
         cloud = point_files.export_points(opened, points, count=count, box=corners)
         say(f"wrote {points}: {len(cloud.vertices):,} points")
     if mesh is not None:
-        surface = mesh_files.export_mesh(opened, mesh, resolution=resolution, density=density, box=corners)
+        surface = mesh_files.export_mesh(
+            opened, mesh, resolution=resolution, density=density, box=corners, track=tracked
+        )
         closed = "watertight" if surface.is_watertight else "open"
         say(f"wrote {mesh}: {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {closed}")
     if cells is not None:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from voronerf.checks import available_memory
 from voronerf.export.files import check_export, write_geometry
-from voronerf.export.space import Nodes, ask, box_of, density_at, hidden_and_seen, training_views
+from voronerf.export.space import Nodes, Track, ask, box_of, density_at, hidden_and_seen, in_silence, training_views
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
 
@@ -40,6 +40,7 @@ def export_mesh(
     resolution: int | None = None,
     density: float | None = None,
     box: Tensor | None = None,
+    track: Track = in_silence,
 ) -> Any:
     """Writes the surface of a run as .ply, .glb or .obj, and returns it as a ``trimesh.Trimesh``.
 
@@ -53,6 +54,8 @@ def export_mesh(
         density: of the surface, per scene unit; default that of which a thirtieth of that side lets half of the light
             pass.
         box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
+        track: shows progress: it is given the parts of each of the three long works, a sequence, and the work's name,
+            and yields the parts.
 
     Raises:
         ConfigError: a resolution that does not fit into the memory, a density that is none, no box, or a run that has
@@ -69,12 +72,14 @@ def export_mesh(
     """
     path = Path(path)
     check_export(path, SUFFIXES)
-    mesh = surface_mesh(run, resolution, density, box)
+    mesh = surface_mesh(run, resolution, density, box, track)
     write_geometry(path, mesh)
     return mesh
 
 
-def surface_mesh(run: Run, resolution: int | None, density: float | None, box: Tensor | None) -> Any:
+def surface_mesh(
+    run: Run, resolution: int | None, density: float | None, box: Tensor | None, track: Track = in_silence
+) -> Any:
     """The mesh that :func:`export_mesh` writes."""
     import trimesh
     from scipy import ndimage
@@ -87,9 +92,9 @@ def surface_mesh(run: Run, resolution: int | None, density: float | None, box: T
     level = math.log(2) / halving if density is None else density
     if not 0 < level < math.inf:
         raise ConfigError(f"--density must be positive and finite, got {density}")
-    found = density_at(run, nodes)
+    found = density_at(run, nodes, track)
     dense = (found > level).numpy()
-    hidden, seen = _views_of(run, nodes)
+    hidden, seen = _views_of(run, nodes, track)
     # Free is what is empty, not hidden, and connected to what a camera sees to be free.
     labels, _ = ndimage.label(~dense & ~hidden)
     free = np.isin(labels, np.unique(labels[seen & (labels > 0)]))
@@ -128,10 +133,10 @@ def _resolution(box: Tensor, wanted: int | None) -> int:
     return wanted
 
 
-def _views_of(run: Run, nodes: Nodes) -> tuple[Any, Any]:
-    views = list(training_views(run))
+def _views_of(run: Run, nodes: Nodes, track: Track) -> tuple[Any, Any]:
+    views = list(training_views(run, track=track))
     hidden, seen = np.empty(nodes.shape, dtype=bool), np.empty(nodes.shape, dtype=bool)
-    for first, last in nodes.slabs():
+    for first, last in track(nodes.slabs(), "what the views see"):
         parts = hidden_and_seen(nodes.slab(first, last), views, nodes.side)
         hidden[first:last], seen[first:last] = (part.view(last - first, *nodes.shape[1:]).numpy() for part in parts)
     return hidden, seen

@@ -5,8 +5,9 @@ n points, c cameras. Positions and densities are in scene units.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,8 @@ from voronerf.rendering.contraction import Contraction
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
 
+#: What shows progress: it is given the parts of a work and its name, and yields the parts, as `rich.progress.track`.
+Track = Callable[[Sequence[Any], str], Iterable[Any]]
 #: Points that a field is asked for at a time.
 CHUNK = 1 << 17
 #: Views that are rendered to find out what cameras see, and the pixels along their longer side.
@@ -62,7 +65,9 @@ def ask(
     rows = torch.arange(len(points))
     if renderer.occupancy is not None and not everywhere:
         grid = renderer.occupancy
-        rows = rows[grid.occupied.view(-1)[grid.cells(points.to(renderer.device)).long()].cpu()]
+        places = points.to(renderer.device)
+        places = places if renderer.contraction is None else renderer.contraction.points(places)
+        rows = rows[grid.occupied.view(-1)[grid.cells(places).long()].cpu()]
     for part in rows.split(CHUNK):
         positions = points[part].to(renderer.device)
         along = (directions if len(directions) == 1 else directions[part]).to(renderer.device)
@@ -112,18 +117,22 @@ class Nodes:
         """Positions [n, 3] of indices [n, 3], which need not be whole."""
         return self.origin + self.side * indices
 
-    def slabs(self) -> Iterator[tuple[int, int]]:
+    def slabs(self) -> list[tuple[int, int]]:
         """Ranges of first indices with about `CHUNK` nodes each."""
         step = max(CHUNK // (self.shape[1] * self.shape[2]), 1)
-        for first in range(0, self.shape[0], step):
-            yield first, min(first + step, self.shape[0])
+        return [(first, min(first + step, self.shape[0])) for first in range(0, self.shape[0], step)]
 
 
-def density_at(run: Run, nodes: Nodes) -> Tensor:
+def in_silence(parts: Sequence[Any], name: str) -> Iterable[Any]:
+    """The `Track` that shows nothing."""
+    return parts
+
+
+def density_at(run: Run, nodes: Nodes, track: Track = in_silence) -> Tensor:
     """The densities of a run at nodes, float32 of their shape; seen from above, as densities depend on no direction."""
     density = torch.empty(nodes.shape)
     down = torch.tensor([[0.0, 0.0, -1.0]])
-    for first, last in nodes.slabs():
+    for first, last in track(nodes.slabs(), "density"):
         _, found = ask(run, nodes.slab(first, last), down, side=nodes.side)
         density[first:last] = found.view(last - first, *nodes.shape[1:])
     return density.nan_to_num(0, 0, 0)
@@ -146,11 +155,12 @@ class View:
     surface: Tensor
 
 
-def training_views(run: Run, count: int = VIEWS, side: int = VIEW_SIDE) -> Iterator[View]:
+def training_views(run: Run, count: int = VIEWS, side: int = VIEW_SIDE, track: Track = in_silence) -> Iterator[View]:
     """Renders evenly spread training views, at their size over the whole number that leaves `side` pixels or more."""
     cameras = run.scene.train.cameras
     cameras = cameras.downscaled(max(max(cameras.width, cameras.height) // side, 1))
-    for number in torch.linspace(0, len(cameras) - 1, min(count, len(cameras))).round().long().tolist():
+    numbers = torch.linspace(0, len(cameras) - 1, min(count, len(cameras))).round().long().tolist()
+    for number in track(numbers, "views"):
         image = run.render(cameras, number)
         camera, surface = cameras[[number]], image.heaviest.cpu()
         distance = (surface - camera.origins[0].cpu()).norm(dim=-1)

@@ -31,10 +31,11 @@ def march_rays(
     start: Tensor | None = None,
     most: int | None = None,
     capacity: int | None = None,
+    contraction: Tensor | None = None,
 ) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
     rest = (samples, disparity, samples if most is None else most)
-    tensors = (origins, directions, near, far, occupied, box, uniforms, start)
+    tensors = (origins, directions, near, far, occupied, box, uniforms, start, contraction)
     mask, offsets = _count(*tensors, *rest, MAX_COUNT if capacity is None else capacity)
     rows = int(offsets[-1]) if capacity is None else capacity
     return March(offsets, *_fill(*tensors, mask, offsets, *rest, rows))
@@ -50,6 +51,7 @@ def _count(
     box: Tensor,
     uniforms: Tensor | None,
     start: Tensor | None,
+    contraction: Tensor | None,
     samples: int,
     disparity: bool,
     most: int,
@@ -59,7 +61,9 @@ def _count(
     mask = near.new_empty(r, -(-samples // 32), dtype=torch.int32)
     offsets = near.new_empty(r + 1, dtype=torch.int32)
     yield mask, offsets
-    given = _inputs(origins, directions, near, far, occupied, box, uniforms, start, samples, disparity, most)
+    given = _inputs(
+        origins, directions, near, far, occupied, box, uniforms, start, contraction, samples, disparity, most
+    )
     native.compiled.march_rays_count(given, mask, offsets, capacity, native.cpu())
 
 
@@ -73,6 +77,7 @@ def _fill(
     box: Tensor,
     uniforms: Tensor | None,
     start: Tensor | None,
+    contraction: Tensor | None,
     mask: Tensor,
     offsets: Tensor,
     samples: int,
@@ -84,7 +89,9 @@ def _fill(
     depths, deltas, positions = near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3)
     results = ray_index, depths, deltas, positions, stop
     yield results
-    given = _inputs(origins, directions, near, far, occupied, box, uniforms, start, samples, disparity, most)
+    given = _inputs(
+        origins, directions, near, far, occupied, box, uniforms, start, contraction, samples, disparity, most
+    )
     native.compiled.march_rays_fill(given, mask, offsets, rows, *results, native.cpu())
 
 
@@ -97,11 +104,13 @@ def _inputs(
     box: Tensor,
     uniforms: Tensor | None,
     start: Tensor | None,
+    contraction: Tensor | None,
     samples: int,
     disparity: bool,
     most: int,
 ) -> native.compiled.MarchInputs:
     x, y, z = occupied.shape
+    contracted = 0 if contraction is None else contraction.dim()
     return native.compiled.MarchInputs(
         origins=origins,
         directions=directions,
@@ -118,4 +127,7 @@ def _inputs(
         z=z,
         disparity=disparity,
         most=most,
+        space=native.compiled.MarchSpace(
+            sphere=contraction if contracted == 1 else None, perspective=contraction if contracted == 2 else None
+        ),
     )

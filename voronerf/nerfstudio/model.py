@@ -295,7 +295,9 @@ class VoronerfModel(Model):
         self.splits = state["splits"]
         self.reservoir.load_state_dict(state["reservoir"])
         if state["occupancy"] is not None:
-            self.renderer.occupancy = OccupancyGrid.from_state(state["occupancy"], device=self.kwargs["device"])
+            self.renderer.occupancy = OccupancyGrid.from_state(
+                state["occupancy"], contraction=self.renderer.contraction, device=self.kwargs["device"]
+            )
 
 
 def _over(colour: Tensor, opacity: Tensor, background: Tensor | None) -> Tensor:

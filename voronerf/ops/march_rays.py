@@ -41,6 +41,7 @@ def march_rays(
     start: Tensor | None = None,
     most: int | None = None,
     capacity: int | None = None,
+    contraction: Tensor | None = None,
     backend: str = "auto",
 ) -> March:
     """Stratified samples of rays without those in empty cells of a grid, packed for ``composite``.
@@ -48,6 +49,10 @@ def march_rays(
     Each ray is cut into ``samples`` strata between its near and its far end, with one sample in each, as in
     ``rendering.stratified_depths``. A sample is kept if its cell of the grid is occupied. Space outside the box is
     empty. If every cell is occupied, the result is the stratified one.
+
+    With a ``contraction``, rays and their samples are still those of the world, and the grid, its box and the positions
+    are of the contracted space (Barron et al. 2022, "Mip-NeRF 360", equation 10; or Mildenhall et al. 2020, "NeRF",
+    appendix C).
 
     Rays can be walked piece by piece, to stop at opaque surfaces: ``most`` samples at a time, with the ``stop`` of one
     call as the ``start`` of the next.
@@ -69,6 +74,8 @@ def march_rays(
         start: int32 [r], the first stratum to consider, >= 0; None for 0.
         most: largest number of samples of a ray, at least 1; None for all.
         capacity: rows of the result, at least 1; None for the number of samples.
+        contraction: [4], centre and radius of a sphere; [5, 3], centre, right, up, ahead and (near, a, b) of normalised
+            device coordinates; or None. See ``voronerf.rendering.Contraction`` and ``Perspective``.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
@@ -103,12 +110,23 @@ def march_rays(
     check_integer(_OP, "samples", samples, 1)
     check_dtype(_OP, "origins", origins, (torch.float32, torch.float64))
     check_dtype(_OP, "occupied", occupied, (torch.bool,))
+    if contraction is not None:
+        check_shape(_OP, "contraction", contraction, (4,) if contraction.dim() == 1 else (5, 3))
     if uniforms is not None:
         check_shape(_OP, "uniforms", uniforms, ("r", "s"), {**sizes, "s": samples})
     if start is not None:
         check_shape(_OP, "start", start, ("r",), sizes)
         check_dtype(_OP, "start", start, INDEX)
-    check_same_dtype(_OP, origins=origins, directions=directions, near=near, far=far, box=box, uniforms=uniforms)
+    check_same_dtype(
+        _OP,
+        origins=origins,
+        directions=directions,
+        near=near,
+        far=far,
+        box=box,
+        uniforms=uniforms,
+        contraction=contraction,
+    )
     check_same_device(
         _OP,
         origins=origins,
@@ -119,6 +137,7 @@ def march_rays(
         box=box,
         uniforms=uniforms,
         start=start,
+        contraction=contraction,
     )
     check_choice(_OP, "spacing", spacing, _SPACINGS)
     for name, value in (("most", most), ("capacity", capacity)):
@@ -142,5 +161,6 @@ def march_rays(
             start=start,
             most=most,
             capacity=capacity,
+            contraction=None if contraction is None else contraction.detach(),
         )
     )

@@ -20,7 +20,7 @@ class March(NamedTuple):
         ray_index: int32 [m], the ray of each sample.
         depths: [m], distance along the ray, rising along each ray.
         deltas: [m], length of the stratum of each sample.
-        positions: [m, 3], where the samples are.
+        positions: [m, 3], where the samples are, in the space of the grid.
         stop: int32 [r], the stratum at which each ray continues: s if the whole ray was walked.
 
     Examples:
@@ -57,6 +57,7 @@ def march_rays(
     start: Tensor | None = None,
     most: int | None = None,
     capacity: int | None = None,
+    contraction: Tensor | None = None,
 ) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
     r, device = len(near), near.device
@@ -71,9 +72,9 @@ def march_rays(
 
     taken = far[:, None] > near[:, None]
     cell = torch.zeros_like(at, dtype=torch.int64)
-    for axis, size in enumerate(occupied.shape):
+    points = [origins[:, axis, None] + at * directions[:, axis, None] for axis in range(3)]
+    for axis, (size, place) in enumerate(zip(occupied.shape, contracted(points, contraction))):
         scale = box.new_full((), size) / (box[1, axis] - box[0, axis])
-        place = origins[:, axis, None] + at * directions[:, axis, None]
         place = (place - box[0, axis]) * scale
         taken = taken & (place >= 0) & (place <= size)
         # NaN has been left out; it may become any integer.
@@ -100,13 +101,32 @@ def march_rays(
     positions = depths.new_zeros(rows, 3)
     if r > 0:
         used = torch.arange(rows, device=device) < offsets[-1]
-        positions = torch.where(used[:, None], origins[ray_index] + depths[:, None] * directions[ray_index], 0)
+        points = [origins[ray_index, axis] + depths * directions[ray_index, axis] for axis in range(3)]
+        positions = torch.where(used[:, None], torch.stack(contracted(points, contraction), dim=-1), 0)
     last = torch.where(taken_now, stratum[:-1], -1).amax(dim=1)
     waiting = torch.where(taken & ~taken_now, stratum[:-1], samples).amin(dim=1)
     # A ray that has got all it may goes on behind its last sample, one that was cut with the sample it did not get.
     full = (got == wanted) & (wanted == (samples if most is None else most))
     stop = torch.where(got < wanted, waiting, torch.where(full, last + 1, samples))
     return March(offsets.to(torch.int32), ray_index, depths, deltas, positions, stop.to(torch.int32))
+
+
+def contracted(points: list[Tensor], contraction: Tensor | None) -> list[Tensor]:
+    """Three coordinates of points, mapped as ``voronerf.rendering.Contraction`` or ``Perspective`` does it."""
+    if contraction is None:
+        return points
+    if contraction.dim() == 1:
+        centre, radius = contraction[:3], contraction[3]
+        x, y, z = ((points[axis] - centre[axis]) / radius for axis in range(3))
+        # The root in float64 rounds as one in float32 should, which that of torch does not.
+        length = (x * x + y * y + z * z).double().sqrt().to(x.dtype).clamp_min(1)
+        factor = (2 - length.reciprocal()) / length
+        return [centre[axis] + radius * offset * factor for axis, offset in enumerate((x, y, z))]
+    centre, (near, across, down) = contraction[0], contraction[4].unbind()
+    x, y, z = (points[axis] - centre[axis] for axis in range(3))
+    right, up, ahead = (x * axis[0] + y * axis[1] + z * axis[2] for axis in contraction[1:4])
+    depth = torch.maximum(ahead, near / 2)
+    return [right / (depth * across), up / (depth * down), 1 - 2 * near / depth]
 
 
 def _depth(near: Tensor, far: Tensor, fraction: Tensor, disparity: bool) -> Tensor:

@@ -58,6 +58,17 @@ class Contraction:
         far = 1 / ((2 - length).clamp_min(1e-3) * length.clamp_min(1))
         return centre + self.radius * offset * torch.where(length > 1, far, 1)
 
+    def stretch(self, points: Tensor) -> Tensor:
+        """World length of a unit of contracted length, [...], along rays from the centre at contracted points [..., 3];
+        at most 1,000,000."""
+        length = (points - self.centre.to(points)).norm(dim=-1) / self.radius
+        return (2 - length).clamp(1e-3, 1).square().reciprocal()
+
+    @property
+    def numbers(self) -> Tensor:
+        """[4], what `voronerf.ops.march_rays` takes: centre and radius."""
+        return torch.cat((self.centre, self.centre.new_tensor([self.radius])))
+
     @property
     def cube(self) -> Tensor:
         """The corners [2, 3] of a box around all of space."""
@@ -129,6 +140,16 @@ class Perspective:
         depth = 2 * self.near / (1 - points[..., 2:]).clamp_min(1e-3)
         across = points[..., :2] * depth * depth.new_tensor(self.slopes)
         return torch.cat((across, depth), dim=-1) @ self.axes.to(points) + self.centre.to(points)
+
+    def stretch(self, points: Tensor) -> Tensor:
+        """World depth of a unit of contracted depth, [...], at contracted points [..., 3]; at most 2,000,000 near."""
+        return 2 * self.near / (1 - points[..., 2]).clamp_min(1e-3).square()
+
+    @property
+    def numbers(self) -> Tensor:
+        """[5, 3], what `voronerf.ops.march_rays` takes: centre, axes, and near with the slopes."""
+        last = self.centre.new_tensor([[self.near, *self.slopes]])
+        return torch.cat((self.centre[None], self.axes.to(self.centre), last))
 
     @property
     def cube(self) -> Tensor:

@@ -89,7 +89,8 @@ def render_marched(
         rays: r rays.
         near: [r], start of the integral.
         far: [r], end.
-        grid: which space is empty; all space outside its box is.
+        grid: which space is empty; all space outside its box is. With a contraction the field's positions are of the
+            contracted space.
         samples: s, strata of a ray.
         background: [3] or [r, 3]; None is black.
         jitter: random samples in the strata, the same ones as in `render_rays`, else their middles.
@@ -228,6 +229,7 @@ def render_until_opaque(
     if background is not None:
         colour += (1 - opacity)[:, None] * background.to(colour)
     place = rays.origins + at[:, None] * rays.directions
+    place = place if grid.contraction is None else grid.contraction.points(place)
     return Seen(colour, opacity, _normalised(depth, opacity, far), place)
 
 

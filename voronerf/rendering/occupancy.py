@@ -1,6 +1,8 @@
 """An occupancy grid: which cells of the box of a scene are empty, so that rays can skip them.
 
-x, y, z cells of the grid along each axis, q cells to update, r rays, s strata of a ray. Densities are per world unit.
+x, y, z cells of the grid along each axis, q cells to update, r rays, s strata of a ray. Densities are per world unit;
+with a contraction, those that a grid remembers are per unit of contracted space, so that a far cell counts as dense as
+a near one that takes as much light.
 Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (cells keep the largest recent density,
 which decays). Learning it from the samples of a batch, and emptying what is hidden, are additions of this project.
 """
@@ -18,6 +20,7 @@ from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.update_occupancy import update_occupancy
 from voronerf.reference.observe_occupancy import cells_of
 from voronerf.rendering.cameras import Rays
+from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
 
 CHUNK = 1 << 17  # points that a field evaluates at a time
@@ -34,6 +37,7 @@ class OccupancyGrid:
         density: float32 [x, y, z], the remembered density of each cell.
         occupied: bool [x, y, z], density >= threshold.
         threshold: per world unit.
+        contraction: of the space that the box is in, or None.
 
     Examples:
         >>> import torch
@@ -55,6 +59,7 @@ class OccupancyGrid:
         *,
         threshold: float,
         remembered: float = 2.0,
+        contraction: Contraction | Perspective | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         """Makes a grid that is occupied everywhere.
@@ -65,6 +70,7 @@ class OccupancyGrid:
             threshold: density from which a cell is occupied, per world unit, > 0 and finite.
             remembered: density of a new cell, in thresholds, >= 1. The larger it is, the more often a cell has to be
                 found empty before it counts as empty.
+            contraction: of the space that the box and the positions are in. Rays stay those of the world.
             device: of the grid; default that of the box.
 
         Raises:
@@ -81,6 +87,8 @@ class OccupancyGrid:
             raise ValueError(f"OccupancyGrid: remembered must be at least 1 and finite, got {remembered}")
         self.box = box.detach().to(device=device, dtype=torch.float32).clone()
         self.threshold = float(threshold)
+        self.contraction = contraction
+        self._numbers = None if contraction is None else contraction.numbers.to(self.box)
         self.density = torch.full(shape, remembered * self.threshold, device=self.box.device)
         self.occupied = torch.ones(shape, dtype=torch.bool, device=self.box.device)
 
@@ -137,7 +145,8 @@ class OccupancyGrid:
         found = []
         for part in cells.split(CHUNK):
             uniforms = torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device)
-            found.append(density_of(field, self.points(part, uniforms)))
+            points = self.points(part, uniforms)
+            found.append(density_of(field, points) * self._stretch(points))
         values = torch.cat(found) if found else self.density.new_empty(0)
         # What int32 does not hold must stay out of range, not wrap into it.
         cells = cells.clamp(-1, MAX_COUNT).to(torch.int32)
@@ -175,19 +184,23 @@ class OccupancyGrid:
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
+        stretch = self._stretch(positions)
         observe_occupancy(
             self.density,
             self.occupied,
             self.box,
             positions,
-            density.float(),
-            deltas,
+            density.float() * stretch,
+            deltas / stretch,
             weights.float(),
             decay=decay,
             threshold=self.threshold,
             hidden=HIDDEN,
             backend=backend,
         )
+
+    def _stretch(self, points: Tensor) -> Tensor | float:
+        return 1.0 if self.contraction is None else self.contraction.stretch(points)
 
     def cells(self, points: Tensor) -> Tensor:
         """Flat numbers int32 [n] of the cells that points [n, 3] lie in; outside the box the nearest at its border."""
@@ -219,6 +232,7 @@ class OccupancyGrid:
             spacing=spacing,
             start=start,
             most=most,
+            contraction=self._numbers,
             backend=backend,
         )
 
@@ -232,8 +246,13 @@ class OccupancyGrid:
         }
 
     @staticmethod
-    def from_state(state: Mapping[str, Tensor], *, device: torch.device | str = "cpu") -> OccupancyGrid:
-        """A grid from its `state_dict`.
+    def from_state(
+        state: Mapping[str, Tensor],
+        *,
+        contraction: Contraction | Perspective | None = None,
+        device: torch.device | str = "cpu",
+    ) -> OccupancyGrid:
+        """A grid from its `state_dict`, and its contraction, which is not part of it.
 
         Raises:
             ValueError: an entry is missing or has a wrong shape.
@@ -249,7 +268,8 @@ class OccupancyGrid:
                 "OccupancyGrid: state must hold density and occupied of one shape [x, y, z], got "
                 f"{list(density.shape)} and {list(occupied.shape)}"
             )
-        grid = OccupancyGrid(state["box"], density.shape, threshold=float(state["threshold"]), device=device)
+        threshold = float(state["threshold"])
+        grid = OccupancyGrid(state["box"], density.shape, threshold=threshold, contraction=contraction, device=device)
         grid.density.copy_(density)
         grid.occupied.copy_(occupied)
         return grid

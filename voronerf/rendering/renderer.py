@@ -93,7 +93,7 @@ class Renderer:
 
     Raises:
         ValueError: fields of other names, a second field without fine samples, several rounds without a proposal, a
-            negative distortion, or occupancy with several passes, cones, a contraction or distortion.
+            negative distortion, or occupancy with several passes, cones, distortion or without the contraction.
 
     Examples:
         >>> import torch
@@ -130,10 +130,10 @@ class Renderer:
             raise ValueError(f"Renderer: rounds must be >= 1, and 1 without a proposal, got {rounds}")
         if not 0 <= distortion < float("inf"):
             raise ValueError(f"Renderer: distortion must be >= 0 and finite, got {distortion}")
-        if occupancy is not None and (fine_samples or cones or contraction is not None or distortion):
-            raise ValueError(
-                "Renderer: occupancy must come with a single pass over points, without contraction and distortion"
-            )
+        if occupancy is not None and (fine_samples or cones or distortion):
+            raise ValueError("Renderer: occupancy must come with a single pass over points, without distortion")
+        if occupancy is not None and (occupancy.contraction is None) != (contraction is None):
+            raise ValueError("Renderer: occupancy must be a grid in the space of contraction, got one in another")
         self.fields = dict(fields)
         self.samples, self.fine_samples, self.cones = samples, fine_samples, cones
         self.contraction, self.spacing, self.backend = contraction, spacing, backend

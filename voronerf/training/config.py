@@ -154,9 +154,9 @@ class TrainConfig:
     fields without a grid, else ndc where the cameras face forward and the sphere elsewhere."""
     occupancy: bool = True
     """Skip samples in empty space, in training and in pictures, wherever that works: for points in a single pass, in a
-    scene with a box, without contraction, --distortion and --cuda-graph."""
-    occupancy_resolution: int = 64
-    """Cells of the occupancy grid along each axis."""
+    scene with a box or with a contraction, without --distortion and --cuda-graph."""
+    occupancy_resolution: int | None = None
+    """Cells of the occupancy grid along each axis; default 64, and no grid with a contraction."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Products of the networks while training: float32, bfloat16, or float16 with a scaled loss. Sums, parameters and
     moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""

@@ -82,11 +82,11 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
         "reservoir_batches",
         "evaluations",
         "keep_checkpoints",
-        "occupancy_resolution",
     ):
         need(getattr(config, name) >= 1, name, "be at least 1")
     need(config.downscale is None or config.downscale >= 1, "downscale", "be at least 1")
-    need(config.occupancy_resolution <= 512, "occupancy_resolution", "be at most 512")
+    cells = config.occupancy_resolution
+    need(cells is None or 1 <= cells <= 512, "occupancy_resolution", "be at least 1 and at most 512")
     need(config.samples is None or config.samples >= 1, "samples", "be at least 1")
     need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
     need(config.width is None or config.width >= 2, "width", "be at least 2")
@@ -132,7 +132,6 @@ def why_no_occupancy(config: TrainConfig) -> str | None:
     obstacles = {
         f"--field {config.field}, which takes cones": config.field_type.cones,
         f"--sampling {config.sampling}": config.sampling != "stratified",
-        f"--contraction {config.contraction}": config.contraction in ("sphere", "ndc"),
         "--distortion": config.distortion > 0,
         "--cuda-graph": config.cuda_graph,
     }

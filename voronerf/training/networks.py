@@ -26,6 +26,8 @@ from voronerf.training.renderers import make_contraction
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
+#: Cells of the occupancy grid along each axis.
+OCCUPANCY_RESOLUTION = 64
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
 
@@ -101,10 +103,14 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
         else:
             forward = isinstance(scene.contraction, Perspective)
             config = replace(config, contraction="ndc" if forward else "sphere")
-    if config.occupancy and (scene.box is None or why_no_occupancy(config) is not None):
+    boxed = scene.box is not None and config.contraction == "none"
+    asked = config.contraction != "none" and config.occupancy_resolution is not None
+    if config.occupancy and (not (boxed or asked) or why_no_occupancy(config) is not None):
         config = replace(config, occupancy=False)
+    if config.occupancy and config.occupancy_resolution is None:
+        config = replace(config, occupancy_resolution=OCCUPANCY_RESOLUTION)
     if config.samples is None:
-        config = replace(config, samples=samples_for(scene) if config.occupancy else 64)
+        config = replace(config, samples=samples_for(scene) if config.occupancy and boxed else 64)
     if config.position_octaves is None and "position_octaves" in kind.options:
         config = replace(config, position_octaves=kind.octaves(octaves_for(scene, config.contraction)))
     if kind.scene_options is not None:

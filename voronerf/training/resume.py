@@ -126,7 +126,8 @@ def resume_training(trainer: Trainer, checkpoint: Checkpoint) -> None:
         trainer.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
         trainer.reservoir.load_state_dict(checkpoint.group("reservoir"))
         if trainer.occupancy is not None:
-            trainer.occupancy = OccupancyGrid.from_state(checkpoint.group("occupancy"), device=trainer.device)
+            state, contraction = checkpoint.group("occupancy"), trainer.renderer.contraction
+            trainer.occupancy = OccupancyGrid.from_state(state, contraction=contraction, device=trainer.device)
             trainer.renderer.occupancy = trainer.occupancy
         generators = checkpoint.group("generator")
         trainer.generator.set_state(generators["state"])
