@@ -1,15 +1,15 @@
-"""Two ranks in processes of this machine, with one thread each; torch is imported once for all of them."""
+"""Ranks in processes of this machine, with one thread each; torch is imported once for all of them."""
 
 import contextlib
 import io
 import multiprocessing
 import os
-import socket
 import sys
 import traceback
 from pathlib import Path
 
 import torch
+from torch.distributed import TCPStore
 
 #: Seconds until ranks that hang are ended.
 LIMIT = 100
@@ -17,7 +17,8 @@ LIMIT = 100
 
 def _rank(rank, size, port, folder, restarts, function, args):
     os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(size), "MASTER_ADDR": "127.0.0.1"}
-    os.environ |= {"MASTER_PORT": str(port), "TORCHELASTIC_RESTART_COUNT": str(restarts)}
+    os.environ |= {"MASTER_PORT": str(port), "TORCHELASTIC_USE_AGENT_STORE": "True"}
+    os.environ |= {"TORCHELASTIC_RESTART_COUNT": str(restarts)}
     torch.set_num_threads(1)
     said, code = io.StringIO(), 1
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
@@ -29,24 +30,25 @@ def _rank(rank, size, port, folder, restarts, function, args):
     os._exit(code)
 
 
-def on_ranks(function, *args, folder, size=2, each=None, restarts=0):
+def on_ranks(function, *args, folder, size=2, each=None, restarts=0, watch=None):
     """Calls a function on every rank, with arguments of its own where ``each`` has them.
 
-    Returns what the ranks returned, which is their exit status, and what they printed.
+    ``watch`` is called with the processes while they run. Returns the exit status of each rank, and
+    what it printed.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["voronerf.cli", "voronerf.distributed.trainer"])
     folder = Path(folder)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # as torchrun keeps it
     given = each or [args] * size
     ranks = [
-        context.Process(target=_rank, args=(rank, size, port, folder, restarts, function, given[rank]))
+        context.Process(target=_rank, args=(rank, size, store.port, folder, restarts, function, given[rank]))
         for rank in range(size)
     ]
     for rank in ranks:
         rank.start()
+    if watch is not None:
+        watch(ranks)
     for rank in ranks:
         rank.join(LIMIT)
         if rank.is_alive():

@@ -84,7 +84,7 @@ def main(args: list[str] | None = None) -> int:
     except EXPECTED as error:
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
-        if may_tell():
+        if may_tell(error):
             print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
         return 1
     except (RuntimeError, SystemError) as error:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import signal
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import timedelta
@@ -75,8 +78,8 @@ class Group:
         try:
             yield
         except RuntimeError as error:  # DistError and what gloo throws
-            reason = " ".join(str(error).split())[:200]
-            raise RankLost(f"another rank has ended or does not answer for {PATIENCE} s ({reason})") from None
+            reason = re.sub(r"^\[\S+\] *", "", str(error)).splitlines()[0].split(". ")[0]
+            raise RankLost(f"another rank has ended, or has not answered for {PATIENCE} s ({reason})") from None
 
     def check_equal(self, what: dict[str, str]) -> None:
         """Compares texts of all ranks, each rank naming them alike.
@@ -169,10 +172,16 @@ def joined(device: torch.device) -> Iterator[Group]:
     _current = None
 
 
-def may_tell() -> bool:
-    """Whether this process is to say what is wrong: of many ranks that meet an error, the first."""
+def may_tell(error: Exception) -> bool:
+    """Whether this process is to say what is wrong: of many ranks that meet an error, the first.
+
+    One that only knows that another has ended leaves that one a second to say why.
+    """
     if _current is None:
         return own_rank() == 0
+    if isinstance(error, RankLost):
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # of torchrun, which ends the ranks that are left
+        time.sleep(1)
     try:
         return bool(_current.store.add(_TOLD, 1) == 1)
     except RuntimeError:  # the process that kept the store is gone

@@ -1,0 +1,96 @@
+"""What goes wrong on one rank ends all of them, with one line from one of them; runs go on from their checkpoint."""
+
+import json
+import os
+import signal
+from unittest import mock
+
+import pytest
+from ranks import on_ranks
+
+from voronerf.cli import main
+from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
+from voronerf.training.trainer import Trainer
+
+ARGUMENTS = """
+train --data builtin --downscale 8 --field nerf --no-occupancy --samples 8 --width 8 --depth 2 --rays 32 --cells 4
+--split-at-steps 6 --steps 12 --reservoir-batches 5 --evaluations 1 --final-views 1 --panels 0
+"""
+
+
+def command(out, *more):
+    return [*ARGUMENTS.split(), "--out", str(out), *more]
+
+
+def dies(args, step):
+    """Ends rank 1 by SIGKILL in a step."""
+    real = Trainer.train_step
+
+    def train_step(self):
+        if self.step == step and os.environ["RANK"] == "1":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(self)
+
+    with mock.patch.object(Trainer, "train_step", train_step):
+        return main(args)
+
+
+def has_no_room(args):
+    """Rank 0 cannot write its checkpoint."""
+    full = OSError(28, "No space left on device")
+    with mock.patch("voronerf.training.checkpoint.save_checkpoint", side_effect=full):
+        return main(args)
+
+
+def complaints(texts):
+    return [line for text in texts for line in text.splitlines() if line.startswith("voronerf: error:")]
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        (["--cells", "1", "--rays", "16"], "--cells must be at least 2 on every level"),
+        (["--sampling", "proposal"], "--sampling must be stratified with several ranks, got 'proposal'"),
+    ],
+)
+def test_settings_that_ranks_cannot_use(tmp_path, changes, line):
+    given = command(tmp_path / "run", *changes)
+    codes, texts = on_ranks(main, given, folder=tmp_path)
+    assert codes == [1, 1] and len(complaints(texts)) == 1 and line in complaints(texts)[0]
+    assert not (tmp_path / "run").exists()
+
+
+def test_ranks_that_differ(tmp_path):
+    each = [(command(tmp_path / "run"),), (command(tmp_path / "run", "--seed", "1"),)]
+    codes, texts = on_ranks(main, folder=tmp_path, each=each)
+    assert codes == [1, 1]
+    assert complaints(texts) == ["voronerf: error: --seed must be the same on all ranks, got 0 on 0 and 1 on 1"]
+    assert not (tmp_path / "run").exists()
+
+
+def test_more_ranks_than_cells(tmp_path):
+    codes, texts = on_ranks(main, command(tmp_path / "run"), folder=tmp_path, size=5)
+    assert codes == [1] * 5
+    expected = "voronerf: error: --cells must be at least the 5 ranks on the first level with several ranks, got (4,)"
+    assert complaints(texts) == [expected]
+
+
+def test_a_full_disk(tmp_path):
+    codes, texts = on_ranks(has_no_room, command(tmp_path / "run"), folder=tmp_path)
+    assert codes == [1, 1]
+    assert len(complaints(texts)) == 1 and "No space left on device" in complaints(texts)[0]
+
+
+def test_a_rank_that_is_killed(tmp_path):
+    """The other says so; started again as by torchrun, the run ends bit for bit as one that nothing happened to."""
+    whole, out = command(tmp_path / "whole"), command(tmp_path / "run", "--checkpoint-every", "1e-6")
+    assert on_ranks(main, whole, folder=tmp_path)[0] == [0, 0]
+    codes, texts = on_ranks(dies, out, 9, folder=tmp_path)
+    assert codes == [1, -signal.SIGKILL] and len(complaints(texts)) == 1
+    assert "another rank has ended" in complaints(texts)[0]
+    assert 0 < load_checkpoint(checkpoint_path(tmp_path / "run")).values["step"] <= 9
+    assert on_ranks(main, out, folder=tmp_path, restarts=1)[0] == [0, 0]
+    first, second = (load_checkpoint(checkpoint_path(tmp_path / run)).tensors for run in ("whole", "run"))
+    assert first.keys() == second.keys() and all(first[name].equal(second[name]) for name in first)
+    metrics = [json.loads((tmp_path / run / "summary.json").read_text())["psnr"] for run in ("whole", "run")]
+    assert metrics[0] == metrics[1]
