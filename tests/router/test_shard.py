@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -212,6 +213,29 @@ def shared_parameters(group: Any) -> None:
 def blended(group: Any) -> None:
     for module in (plain, Views, nerf):
         compared(group, module, [40, 0, 33], train=False, blend=0.2)
+
+
+@case
+def bytes_sent(group: Any) -> None:
+    """How many samples each cell gets; positions and directions there, outputs back, their gradients there."""
+    size, rank = dist.get_world_size(group), dist.get_rank(group)
+    torch.manual_seed(4)
+    router = VoronoiRouter(nerf(), VoronoiDiagram(CENTRES))
+    router.shard(group)
+    batches = [torch.rand(n, 3) for n in COUNTS[:size]]
+    own = torch.tensor(router.own_cells)
+    here = [int(torch.isin(router.diagram.locate(batch), own).sum()) for batch in batches]
+    away, asked = COUNTS[rank] - here[rank], sum(here) - here[rank]
+    sent, exchange = [], dist.all_to_all_single
+
+    def counted(output: Tensor, given: Tensor, came: list[int], there: list[int], **options: Any) -> Any:
+        sent.append((sum(there) - there[rank]) * given.element_size())
+        return exchange(output, given, came, there, **options)
+
+    with mock.patch.object(dist, "all_to_all_single", counted):
+        colour, density = router(batches[rank], nn.functional.normalize(batches[rank], dim=1))
+        (colour.sum() + density.sum()).backward()
+    assert sent == [8 * (5 - len(own) + 2 * (size - 1)), 24 * away, 16 * asked, 16 * away]
 
 
 # Cells ----------------------------------------------------------------------------------------------------------------
