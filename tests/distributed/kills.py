@@ -17,7 +17,7 @@ from voronerf.cli import main
 from voronerf.training.checkpoint import checkpoint_path, checkpoint_paths, load_checkpoint
 
 #: Seconds of an undisturbed run in which the kills fall.
-LONGEST = 6.0
+LONGEST = 15.0
 
 
 def kills(count, seed):

@@ -2,11 +2,12 @@
 
 import functools
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
 import torch
-from helpers import same
+from helpers import refuses, same
 from ranks import on_ranks
 
 from voronerf import open_run
@@ -21,6 +22,7 @@ CONFIGS = {
     "nerf": {"field": "nerf", "samples": 24, "depth": 2, "cells": (3, 3), "min_cell_samples": 4},
     "dense": {"field": "nerf", "samples": 24, "depth": 2, "cells": (4,), "occupancy": False},
     "hashgrid": {"cells": (4,)},
+    "contracted": {"cells": (4,), "contraction": "sphere", "occupancy_resolution": 32},
 }
 
 
@@ -88,8 +90,8 @@ def test_two_ranks_are_one_process(runs, name):
             assert (two[key] - expected).norm() <= 1e-5 * expected.norm(), key
     first, second = (open_run(runs / f"{count}-{name}", scene=scene()) for count in ("one", "two"))
     assert torch.allclose(first.render(0).colour, second.render(0).colour, atol=1e-4)
-    files = [sorted(str(p.relative_to(run)) for p in run.rglob("*.*")) for run in (first.path, second.path)]
-    assert files[0] == files[1]
+    files = [{str(p.relative_to(run.path)) for p in run.path.rglob("*.*")} for run in (first, second)]
+    assert all(name.startswith("checkpoints/cells-") for name in files[0] ^ files[1])
     scores = [json.loads((run.path / "summary.json").read_text()) for run in (first, second)]
     # Pictures of one process end rays at opaque surfaces.
     assert scores[0]["psnr"] == pytest.approx(scores[1]["psnr"], abs=0.02)
@@ -113,13 +115,12 @@ def test_resumed_on_other_numbers_of_ranks(runs, tmp_path):
     half = settings(tmp_path / "half", "nerf")
     codes, _ = on_ranks(train, tmp_path, {"half": half}, 11, folder=tmp_path)
     assert codes == [0, 0] and load_checkpoint(checkpoint_path(half.out)).values["step"] == 12
-    checkpoint = checkpoint_path(half.out).read_bytes()
+    files = sorted(path.name.split("-")[0] for path in (half.out / "checkpoints").iterdir())
+    assert files == ["cells", "cells", "last.safetensors"]
     expected = tensors(runs / "two-nerf")
     for ranks in (2, 3, 1):
         config = replace(half, out=tmp_path / f"to-{ranks}", resume=True)
-        path = checkpoint_path(config.out)
-        path.parent.mkdir(parents=True)
-        path.write_bytes(checkpoint)
+        shutil.copytree(half.out, config.out)
         if ranks == 1:
             Trainer(config, scene()).run()
         else:
@@ -130,3 +131,6 @@ def test_resumed_on_other_numbers_of_ranks(runs, tmp_path):
         for key, value in expected.items():
             if value.is_floating_point() and not key.startswith("sharing"):
                 assert (found[key] - value).norm() <= 1e-5 * value.norm(), (ranks, key)
+    shard = next(path for path in half.out.rglob("cells-*"))
+    shard.rename(shard.with_name("elsewhere"))
+    refuses(f"{shard}: there is no checkpoint", load_checkpoint, checkpoint_path(half.out))

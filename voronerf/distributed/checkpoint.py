@@ -1,7 +1,9 @@
-"""Checkpoints of a training over ranks: rank 0 writes what all of them have, as one process would."""
+"""Checkpoints of a training over ranks: each writes its cells, and rank 0 what all have in common."""
 
 from __future__ import annotations
 
+import secrets
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,7 +13,14 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.distributed.group import RankLost
 from voronerf.distributed.sharing import assign_cells
 from voronerf.router.grouping import cell_parameters
-from voronerf.training.checkpoint import Checkpoint, CheckpointError, CheckpointWriter
+from voronerf.training.checkpoint import (
+    VOXELS,
+    Checkpoint,
+    CheckpointError,
+    CheckpointWriter,
+    save_checkpoint,
+    shard_path,
+)
 
 if TYPE_CHECKING:
     from voronerf.distributed.trainer import RankTrainer
@@ -49,14 +58,24 @@ def names_of_cells(trainer: RankTrainer) -> list[str]:
 
 
 class RankWriter(CheckpointWriter):
-    """Writes the checkpoints of all ranks into one file; every rank calls the same methods."""
+    """Writes a file for the cells of each rank, and when all are there the checkpoint that names them.
 
-    #: Whether a checkpoint is being written differs between ranks; a new one waits for it.
+    Every rank calls the same methods. A checkpoint counts from the moment that rank 0 has written it.
+    """
+
+    #: Whether something is being written differs between ranks; a new checkpoint waits for the one before.
     busy = False
 
     def __init__(self, trainer: RankTrainer) -> None:
         super().__init__(trainer.out, trainer.config.keep_checkpoints)
         self.trainer = trainer
+        self._shard: Path | None = None
+        self._index: Checkpoint | None = None
+
+    @property
+    def ready(self) -> bool:
+        """Whether this rank has written its cells, for a checkpoint that is not there yet."""
+        return self._index is not None and not super().busy and self._error is None
 
     def write(self, checkpoint: Checkpoint) -> None:
         """Begins to write a checkpoint of all ranks.
@@ -69,14 +88,24 @@ class RankWriter(CheckpointWriter):
             RankLost: When that is so on another rank.
         """
         self.wait()
-        trainer = self.trainer
-        if trainer.sharing is not None:
-            names = [*names_of_cells(trainer), *(["occupancy.density"] if trainer.occupancy is not None else [])]
-            parts = trainer.group.at_first({name: checkpoint.tensors[name] for name in names})
-            if trainer.writes:
-                checkpoint = self._whole(checkpoint, parts, trainer)
-        if trainer.writes:
-            self._begin(checkpoint)
+        trainer, group = self.trainer, self.trainer.group
+        if trainer.sharing is None:
+            self._index = checkpoint
+            return
+        token = group.from_first(f"{trainer.step}-{secrets.token_hex(4)}")
+        names = [shard_path(self.run, token, rank).name for rank in range(group.size)]
+        cells = trainer.sharing.cells(group.rank).tolist()
+        own = [*names_of_cells(trainer), *([VOXELS] if trainer.occupancy is not None else [])]
+        self._index = self._without_cells(checkpoint, own, names)
+        self._shard = shard_path(self.run, token, group.rank)
+        self._begin(Checkpoint({name: checkpoint.tensors[name] for name in own}, {"cells": cells}))
+
+    def commit(self) -> None:
+        """Begins to write the checkpoint itself, when all ranks are :attr:`ready`."""
+        super().wait()
+        index, self._index, self._shard = self._index, None, None
+        if index is not None and self.trainer.writes:
+            self._begin(index)
 
     def wait(self) -> None:
         """Returns when the checkpoint is written on all ranks.
@@ -85,6 +114,12 @@ class RankWriter(CheckpointWriter):
             OSError: When it could not be.
             RankLost: When it could not be on another rank.
         """
+        self._join()
+        if self._index is not None:
+            self.commit()
+            self._join()
+
+    def _join(self) -> None:
         failure: OSError | None = None
         try:
             super().wait()
@@ -94,23 +129,19 @@ class RankWriter(CheckpointWriter):
         if self.trainer.group.largest(failed) > 0:
             raise failure or RankLost("another rank could not write the checkpoint")
 
-    def _whole(self, own: Checkpoint, parts: list[dict[str, Tensor]], trainer: RankTrainer) -> Checkpoint:
-        """The checkpoint of one process that had all cells."""
-        assert trainer.sharing is not None
-        sharing, tensors = trainer.sharing, dict(own.tensors)
-        for name in parts[0]:
-            if name == "occupancy.density":
-                tensors[name] = torch.stack([part[name] for part in parts]).amax(0)
-                continue
-            whole = parts[0][name].new_empty(sharing.diagram.num_cells, *parts[0][name].shape[1:])
-            for rank, part in enumerate(parts):
-                whole[sharing.cells(rank).cpu()] = part[name]
-            tensors[name] = whole
-        if trainer.occupancy is not None:
-            tensors["occupancy.occupied"] = tensors["occupancy.density"] >= trainer.occupancy.threshold
-        names = [name for name in tensors if name.startswith("router.diagram.")]
-        tensors = {name: tensor for name, tensor in tensors.items() if name not in names}
+    def _save(self, checkpoint: Checkpoint) -> None:
+        if self._shard is None:
+            super()._save(checkpoint)
+        else:
+            save_checkpoint(self._shard, checkpoint)
+
+    def _without_cells(self, state: Checkpoint, own: list[str], shards: list[str]) -> Checkpoint:
+        """What all ranks have, with the diagram of all cells."""
+        sharing = self.trainer.sharing
+        assert sharing is not None
+        diagram = "router.diagram."
+        tensors = {n: t for n, t in state.tensors.items() if n not in own and not n.startswith(diagram)}
         for name, tensor in sharing.diagram.state_dict().items():
-            tensors[f"router.diagram.{name}"] = tensor.detach().to("cpu", copy=True)
-        tensors["sharing.owner"], tensors["sharing.weights"] = sharing.owner.cpu(), trainer.weights
-        return Checkpoint(tensors, own.values)
+            tensors[diagram + name] = tensor.detach().to("cpu", copy=True)
+        tensors["sharing.owner"], tensors["sharing.weights"] = sharing.owner.cpu(), self.trainer.weights
+        return Checkpoint(tensors, {**state.values, "shards": shards})

@@ -129,7 +129,7 @@ class RankRenderer(Renderer):
             )
             found = march.positions, march.ray_index + first, march.depths, march.deltas
         hidden = self.sharing is not None and grid is not None
-        return own_samples(*found, *self._owns(found[0]), hidden=hidden)
+        return own_samples(*found, *self._owns(found[0]), hidden=hidden, bent=self.contraction is not None)
 
     # --- a step ----------------------------------------------------------------------------------------------------
 
@@ -202,6 +202,10 @@ class RankRenderer(Renderer):
         visible = found.weights > HIDDEN * -torch.expm1(-density * found.deltas)
         density = torch.where(visible, density, 0)
         positions, cells = found.positions, grid.cells(found.positions)
+        if grid.contraction is not None:  # the grid will stretch them as at the middle of their voxel
+            middle = grid.contraction.stretch(grid.points(cells.long()))
+            density = density * grid.contraction.stretch(positions) / middle
+            positions = grid.points(cells.long())
         if self.sharing is None:
             common = torch.ones_like(cells, dtype=torch.bool)
         else:

@@ -57,7 +57,15 @@ class Runs(NamedTuple):
 
 
 def own_samples(
-    positions: Tensor, ray_index: Tensor, depths: Tensor, deltas: Tensor, cells: Tensor, own: Tensor, *, hidden: bool
+    positions: Tensor,
+    ray_index: Tensor,
+    depths: Tensor,
+    deltas: Tensor,
+    cells: Tensor,
+    own: Tensor,
+    *,
+    hidden: bool,
+    bent: bool = False,
 ) -> Samples:
     """Keeps the samples in own cells, and finds their runs.
 
@@ -68,15 +76,16 @@ def own_samples(
         deltas: [n].
         cells: int32 [n], the cell of each.
         own: bool [n], whether it is one of this rank.
-        hidden: Whether other ranks may have samples that are not among these. A cell is convex, so that none lies
-            between two samples in one cell; nor does one between two neighbouring strata.
+        hidden: Whether other ranks may have samples that are not among these. None lies between two neighbouring
+            strata, nor, since a cell is convex, between two samples in one cell.
+        bent: Whether rays are bent by a contraction, and may leave a cell and come back.
     """
     kept = own.nonzero()[:, 0]
     ray, at, length, cell = ray_index[kept], depths[kept], deltas[kept], cells[kept]
     begins = (kept.diff() != 1) | (ray.diff() != 0)
     if hidden:
         near = at.diff() < torch.minimum(length[1:], length[:-1])  # less than the stratum between would be long
-        begins |= (cell.diff() != 0) & ~near
+        begins |= ~near if bent else (cell.diff() != 0) & ~near
     first = 1 + begins.nonzero()[:, 0]
     ends = torch.tensor([len(kept)], device=kept.device)
     offsets = torch.cat((ends.new_zeros(min(len(kept), 1)), first, ends)).to(torch.int32)

@@ -74,6 +74,7 @@ class RankTrainer(Trainer):
 
     renderer_type = RankRenderer
     renderer: RankRenderer
+    writer: RankWriter
 
     def __init__(
         self,
@@ -167,13 +168,14 @@ class RankTrainer(Trainer):
         shared = self._shared()
         ids = {id(parameter) for parameter in shared}
         dense = [p for g in self.optimizer.param_groups if not g.get("sparse") for p in g["params"]]
-        own = sum((p.grad.sum() for p in dense if id(p) not in ids), loss)
+        own = torch.stack([loss, *(p.grad.sum() for p in dense if id(p) not in ids)]).sum()
         passed = (self._measured - self._told) * (self.group.rank == 0)
         self._told = self._measured
-        news = torch.stack((loss, own, loss.new_tensor(passed), loss.new_tensor(float(self._asked))))
+        agreed = own.new_tensor((passed, float(self._asked), float(self.writer.ready)))
+        news = torch.cat((torch.stack((loss, own)), agreed))
         gradients = [p.grad for p in shared if p.grad is not None]
         flat = self.group.total(torch.cat([news, *(gradient.reshape(-1) for gradient in gradients)]))
-        rest = flat[4:]
+        rest = flat[5:]
         for parameter in shared:
             part, rest = rest[: parameter.numel()], rest[parameter.numel() :]
             parameter.grad = part.view_as(parameter)
@@ -181,6 +183,8 @@ class RankTrainer(Trainer):
         self.guard.judge(total, self.optimizer)
         self._agreed += float(flat[2])
         self.stopped |= bool(flat[3] > 0)
+        if flat[4] == self.group.size:
+            self.writer.commit()
         return flat[0]
 
     def _check_moments(self) -> bool:

@@ -3,6 +3,9 @@
 The tensors are those of the routers with their diagrams, of the optimiser, of the sample reservoir and of the random
 generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file, beside a checksum for
 each tensor and one for the JSON.
+
+A training on several processes writes a file for the cells of each, and then the checkpoint, whose JSON names these
+files as ``shards``. Whoever loads it gets the tensors of all cells.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import json
 import threading
 import warnings
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +29,8 @@ from voronerf.files import parse_json, rename, write_bytes
 FORMAT = "voronerf-checkpoint-2"
 #: The name of the checksum of the JSON, beside those of the tensors.
 _VALUES = "values"
+#: The tensor of a shard that has an entry for each voxel, not for each cell: 0 where others know better.
+VOXELS = "occupancy.density"
 
 
 class CheckpointError(ValueError):
@@ -72,6 +78,26 @@ def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
         else:
             path.unlink()
     rename(written, last)
+    _remove_shards(run)
+
+
+def shard_path(run: Path, token: str, rank: int) -> Path:
+    """Where one of several processes keeps its cells; the token is that of one checkpoint."""
+    return checkpoint_path(run).with_name(f"cells-{token}-{rank}.safetensors")
+
+
+def _remove_shards(run: Path) -> None:
+    """Removes the shards that no checkpoint of a run names; none while it has a file that cannot be read."""
+    named: set[str] = set()
+    for path in checkpoint_paths(run):
+        try:
+            with safe_open(path, framework="pt") as file:
+                named |= set(parse_json(file.metadata()[_VALUES]).get("shards", ()))
+        except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OSError):
+            return
+    for path in checkpoint_path(run).parent.glob("cells-*.safetensors"):
+        if path.name not in named:
+            path.unlink(missing_ok=True)
 
 
 class CheckpointWriter:
@@ -121,9 +147,12 @@ class CheckpointWriter:
 
     def _write(self, checkpoint: Checkpoint) -> None:
         try:
-            keep_checkpoint(self.run, checkpoint, self.keep)
+            self._save(checkpoint)
         except OSError as error:
             self._error = error
+
+    def _save(self, checkpoint: Checkpoint) -> None:
+        keep_checkpoint(self.run, checkpoint, self.keep)
 
 
 def last_checkpoint(run: Path) -> Checkpoint:
@@ -180,11 +209,37 @@ def load_checkpoint(path: Path) -> Checkpoint:
             if sums.get(name) != found.get(name):
                 what = "has another checksum" if name in found else "is missing"
                 raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
-        return Checkpoint(tensors, parse_json(metadata["values"]), str(path))
+        values = parse_json(metadata["values"])
+        return Checkpoint(_join_shards(path, tensors, values.pop("shards", ())), values, str(path))
     except CheckpointError:
         raise
     except (SafetensorError, ValueError, KeyError, AttributeError, OSError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint: {error}") from None
+
+
+def _join_shards(path: Path, tensors: dict[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    """The tensors of a checkpoint and of its shards.
+
+    Raises:
+        CheckpointError: When one is missing or damaged, or they are not each cell once.
+    """
+    if not names:
+        return tensors
+    if any(Path(name).name != name for name in names):
+        raise CheckpointError(f"{path}: shards must be names of files beside it, got {', '.join(names):.200}")
+    shards = [load_checkpoint(path.with_name(name)) for name in names]
+    cells = torch.cat([torch.tensor(shard.values["cells"], dtype=torch.int64) for shard in shards])
+    order = cells.argsort()
+    rows = [{name: t for name, t in shard.tensors.items() if name != VOXELS} for shard in shards]
+    fits = all(part.keys() == rows[0].keys() for part in rows) and torch.equal(cells[order], torch.arange(len(cells)))
+    counts = zip(rows, shards, strict=True)
+    if not fits or any(len(t) != len(shard.values["cells"]) for part, shard in counts for t in part.values()):
+        raise CheckpointError(f"{path}: shards must have all tensors of each cell once, {', '.join(names)} have not")
+    joined = {name: torch.cat([part[name] for part in rows])[order] for name in rows[0]}
+    if VOXELS in shards[0].tensors:
+        joined[VOXELS] = torch.stack([shard.tensors[VOXELS] for shard in shards]).amax(0)
+        joined["occupancy.occupied"] = joined[VOXELS] >= float(tensors["occupancy.threshold"])
+    return {**tensors, **joined}
 
 
 def _checksum(tensor: Tensor) -> int:
