@@ -50,6 +50,13 @@ def leads_outside(path: Path, folder: Path) -> bool:
     return any(not Path(of(path)).is_relative_to(of(folder)) for of in (os.path.abspath, os.path.realpath))
 
 
+def cache_folder() -> Path:
+    """Where files are kept that can be made again: VORONERF_CACHE, or `voronerf` in the user's folder of caches."""
+    return Path(
+        os.environ.get("VORONERF_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "voronerf"
+    ).expanduser()
+
+
 def remove_partial(folder: Path) -> None:
     """Removes what processes that died left of files that they wrote below a folder."""
     for partial in folder.rglob(".*.partial"):

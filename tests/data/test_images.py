@@ -69,11 +69,11 @@ def test_one_image_with_alpha_gives_all_alpha(tmp_path):
     paths = [tmp_path / "a.png", tmp_path / "b.png"]
     Image.new("RGB", (3, 2), (1, 2, 3)).save(paths[0])
     Image.new("RGBA", (3, 2), (4, 5, 6, 7)).save(paths[1])
-    images, sizes = read_images(paths, 1)
+    images, sizes, _ = read_images(paths, 1)
     assert sizes.tolist() == [[3, 2], [3, 2]]
     assert images[:, 0, 0].tolist() == [[1, 2, 3, 255], [4, 5, 6, 7]]
     Image.new("RGB", (2, 3), (7, 8, 9)).save(paths[0])
-    images, sizes = read_images(paths, 1)
+    images, sizes, _ = read_images(paths, 1)
     assert images.shape == (2, 3, 3, 4) and sizes.tolist() == [[2, 3], [3, 2]]
     assert (images[0, :, :2] == torch.tensor([7, 8, 9, 255])).all() and not images[0, :, 2:].any()
 
@@ -111,5 +111,5 @@ def test_what_does_not_fit_into_memory_is_not_decoded(tmp_path, monkeypatch):
     message = (
         "0.png: 4 images of 100 x 50 need 0.00 GiB with --downscale 1, more than 75% of the 0.00 GiB that are free"
     )
-    refuses(message, read_images, paths, 1, error=SceneError)
+    refuses(message, read_images, paths, 1, keep="memory", error=SceneError)
     assert read_images(paths, 2)[0].shape == (4, 25, 50, 3)

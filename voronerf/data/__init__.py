@@ -50,6 +50,7 @@ def load_scene(
     format: str = "auto",
     kind: str = "auto",
     normalise: bool = True,
+    images: str = "auto",
 ) -> Scene:
     """Loads a scene.
 
@@ -66,6 +67,8 @@ def load_scene(
             "unbounded"; "auto" tells it by transparent pixels and by the cameras.
         normalise: move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera
             at distance 1; else the coordinates of the files are kept.
+        images: of a folder: keep them in "memory"; on "disk", decoded once into a file of the cache (VORONERF_CACHE, or
+            `voronerf` in the user's caches) that is mapped into memory; or "auto": on disk if they do not fit.
 
     Raises:
         SceneError: the data cannot be used; one line that names the file and what is wrong with it.
@@ -81,6 +84,8 @@ def load_scene(
     for name, given, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
         if given != "auto" and given not in known:
             raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {given!r:.60}")
+    if images not in ("auto", "memory", "disk"):
+        raise SceneError(f"{source}: images must be auto, memory or disk, got {images!r:.60}")
     if is_builtin(source):
         if format != "auto" or kind not in ("auto", "object"):
             raise SceneError(f"{source}: format must be auto and kind auto or object, got {format} and {kind}")
@@ -88,7 +93,13 @@ def load_scene(
         if downscale > BUILTIN_SIZE:
             raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
         name, size = str(source), BUILTIN_SIZE // downscale
-        return BUILTIN[name](size) if name in BUILTIN else city_of(size, name.partition(":")[2] or "1x1")
+        if name not in BUILTIN:
+            return city_of(size, name.partition(":")[2] or "1x1", images)
+        if images == "disk":
+            raise SceneError(
+                f"{source}: images must be auto or memory for a built-in scene other than a city, got disk"
+            )
+        return BUILTIN[name](size)
     folder = Path(source)
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")
@@ -106,7 +117,7 @@ def load_scene(
     if format != "auto" and format not in held:
         raise SceneError(f"{folder}: format must be {' or '.join(held)}, which it has, got {format}")
     chosen = held[0] if format == "auto" else format
-    reading = Reading(downscale, allow_outside, kind, normalise)
+    reading = Reading(downscale, allow_outside, kind, normalise, images)
     others = tuple(f"--format {name} would read {FORMATS[name]}" for name in held if name != chosen)
     scene = LOADERS[chosen](folder, reading)
     return replace(scene, notes=(*scene.notes, *others))

@@ -68,10 +68,10 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
     downscale = reading.downscale or 1
     paths = [frame.path for frame in (*train_frames, *test_frames)]
-    images, sizes = read_images(paths, downscale)
+    images, sizes, on_disk = read_images(paths, downscale, keep=reading.images, name=folder.resolve().name)
     count = len(train_frames)
-    train = _split(entries, train_file, train_frames, images[:count], sizes[:count], downscale)
-    test = _split(test_entries, test_file, test_frames, images[count:], sizes[count:], downscale)
+    train = _split(entries, train_file, train_frames, images[:count], sizes[:count], downscale, on_disk)
+    test = _split(test_entries, test_file, test_frames, images[count:], sizes[count:], downscale, on_disk)
     box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
     return Scene(
         folder.resolve().name,
@@ -93,6 +93,7 @@ def _split(
     images: torch.Tensor,
     sizes: torch.Tensor,
     downscale: int,
+    on_disk: bool,
 ) -> Split:
     intrinsics = []
     for width, height in sizes.tolist():
@@ -102,4 +103,4 @@ def _split(
         intrinsics.append((focal, focal, width / 2, height / 2))
     poses = torch.stack([frame.pose for frame in frames]).float()
     cameras = Cameras.of_images(poses, torch.tensor(intrinsics), sizes).downscaled(downscale)
-    return Split(cameras, images, tuple(distinct_names([frame.path for frame in frames], path.parent)))
+    return Split(cameras, images, tuple(distinct_names([frame.path for frame in frames], path.parent)), on_disk=on_disk)

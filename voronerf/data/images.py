@@ -18,6 +18,7 @@ from torch import Tensor
 
 from voronerf.checks import available_memory
 from voronerf.data.scene import SceneError
+from voronerf.data.store import stored
 
 #: Decided by the content of a file. Pillow would read others too, some of them by starting another program.
 FORMATS = ("PNG", "JPEG")
@@ -28,8 +29,6 @@ PNG_DEPTH = 24  # offset of the bits a channel
 SHARE = 0.75
 #: Bytes for each pixel while a view is rendered and scored, most of them for SSIM.
 VIEW = 550
-#: Bytes for the number of each pixel that is trained, where that is not all of them.
-NUMBER = 8
 #: Images are decoded by up to four threads while those in hand take at most this many bytes.
 THREADS, IN_HAND = 4, 2**26
 #: Pixels that are converted and averaged at a time.
@@ -117,50 +116,91 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
         return pixels
 
 
-def read_images(paths: Sequence[Path], factor: int) -> tuple[Tensor, Tensor]:
+class Decoded(NamedTuple):
+    """What `read_images` gives.
+
+    Attributes:
+        images: uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel, with the smaller ones in the
+            upper left corner and zeros around them.
+        sizes: int64 [c, 2], (width, height) of the files.
+        on_disk: the images are mapped from a file of the cache, and must not be written to.
+    """
+
+    images: Tensor
+    sizes: Tensor
+    on_disk: bool
+
+
+def read_images(
+    paths: Sequence[Path], factor: int, *, keep: str = "auto", name: str = "images", most_channels: int = 4
+) -> Decoded:
     """Decodes images; memory holds the result and one image, or several small ones.
 
     Args:
         paths: at least one file.
         factor: of the reduction, >= 1.
-
-    Returns:
-        (uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel, with the smaller ones in the upper
-        left corner and zeros around them; int64 [c, 2], (width, height) of the files).
+        keep: in "memory"; on "disk", see `voronerf.data.store`; or "auto": on disk what does not fit into memory.
+        name: of the scene.
+        most_channels: 3 leaves alpha out.
 
     Raises:
-        SceneError: as `read_header` and `read_image`, or more than fit into memory.
+        SceneError: as `read_header` and `read_image`, more than fit into memory, or a store that cannot be written.
     """
     headers = [read_header(path, factor) for path in paths]
     sizes = torch.tensor([header.size for header in headers])
     size = sizes.amax(0).tolist()
     differ = bool((sizes != sizes[:1]).any())
-    channels = 4 if any(header.alpha for header in headers) else 3
+    channels = min(4 if any(header.alpha for header in headers) else 3, most_channels)
     shape = (len(paths), size[1] // factor, size[0] // factor, channels)
     decoded = max(header.decoded for header in headers)
+    threads = max(1, min(THREADS, IN_HAND // decoded))
     pixels = shape[1] * shape[2]
-    each = pixels * (channels + (NUMBER if channels == 4 or differ else 0))
-    needed, free = len(paths) * each + max(decoded, pixels * VIEW), available_memory()
+    needed, free = len(paths) * pixels * channels + max(decoded, pixels * VIEW), available_memory()
+
+    def make(index: int) -> NDArray[np.uint8]:
+        found = read_image(paths[index], factor)
+        if found.shape == shape[1:]:
+            return found
+        image = np.zeros(shape[1:], dtype=np.uint8)
+        place = image[: found.shape[0], : found.shape[1]]
+        place[..., 3:] = 255
+        place[..., : found.shape[2]] = found[..., :channels]
+        return image
+
+    if keep == "disk" or (keep == "auto" and needed > SHARE * free):
+        sources = [str(path.absolute()) for path in paths]
+        return Decoded(stored(name, [sources, factor], _times(paths), shape, make, threads), sizes, True)
     if needed > SHARE * free:
         raise SceneError(
             f"{paths[0]}: {len(paths)} images of {'up to ' * differ}{size[0]} x {size[1]} need {needed / 2**30:.2f} "
             f"GiB with --downscale {factor}, more than {SHARE:.0%} of the {free / 2**30:.2f} GiB that are free; use a "
-            "larger --downscale, fewer or smaller images"
+            "larger --downscale, fewer or smaller images, or --images disk"
         )
     images = np.zeros(shape, dtype=np.uint8)
 
     def fill(index: int) -> None:
-        pixels = read_image(paths[index], factor)
-        place = images[index, : pixels.shape[0], : pixels.shape[1]]
-        place[..., 3:] = 255
-        place[..., : pixels.shape[2]] = pixels
+        images[index] = make(index)
 
-    with ThreadPoolExecutor(max(1, min(THREADS, IN_HAND // decoded))) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         list(pool.map(fill, range(len(paths))))
-    return torch.from_numpy(images), sizes
+    return Decoded(torch.from_numpy(images), sizes, False)
 
 
-def read_masks(masks: Sequence[Path | None], paths: Sequence[Path], sizes: Tensor, factor: int) -> Tensor | None:
+def _times(paths: Sequence[Path | None]) -> list[tuple[int, int] | None]:
+    """Size and time of each file."""
+    found = [None if path is None else path.stat() for path in paths]
+    return [None if stat is None else (stat.st_size, stat.st_mtime_ns) for stat in found]
+
+
+def read_masks(
+    masks: Sequence[Path | None],
+    paths: Sequence[Path],
+    sizes: Tensor,
+    factor: int,
+    *,
+    on_disk: bool = False,
+    name: str = "images",
+) -> Tensor | None:
     """Decodes the masks of images: black pixels do not count, nor does a block that has one.
 
     Args:
@@ -168,6 +208,8 @@ def read_masks(masks: Sequence[Path | None], paths: Sequence[Path], sizes: Tenso
         paths: of the images.
         sizes: int64 [c, 2], (width, height) of the images, and of their masks.
         factor: of the reduction.
+        on_disk: map them from a file of the cache, as the images.
+        name: of the scene.
 
     Returns:
         bool [c, h, w], False around smaller images; None if no image has a mask.
@@ -178,22 +220,30 @@ def read_masks(masks: Sequence[Path | None], paths: Sequence[Path], sizes: Tenso
     if not any(masks):
         return None
     width, height = (sizes.amax(0) // factor).tolist()
-    found = torch.zeros(len(masks), height, width, dtype=torch.bool)
-    for place, mask, path, size in zip(found, masks, paths, sizes.tolist()):
+    shape = (len(masks), height, width)
+
+    def make(index: int) -> NDArray[np.uint8]:
+        mask, path, size = masks[index], paths[index], sizes[index].tolist()
         width, height = (side // factor for side in size)
-        place[:height, :width] = True
+        place = np.zeros(shape[1:], dtype=np.uint8)
+        place[:height, :width] = 1
         if mask is None:
-            continue
+            return place
         with _opened(mask) as file:
             if list(file.size) != size:
                 raise SceneError(
                     f"{mask}: is {file.size[0]} x {file.size[1]} pixels, {path.name} is {size[0]} x {size[1]}"
                 )
             kept = np.asarray(file.convert("L"))[: height * factor, : width * factor] > 0
-        place[:height, :width] = torch.from_numpy(kept.reshape(height, factor, width, factor).all(axis=(1, 3)))
-        if not bool(place.any()):
+        place[:height, :width] = kept.reshape(height, factor, width, factor).all(axis=(1, 3))
+        if not place.any():
             raise SceneError(f"{mask}: must leave a pixel, or with --downscale a block of pixels, of {path.name}")
-    return found
+        return place
+
+    if on_disk:
+        sources = [None if mask is None else str(mask.absolute()) for mask in masks]
+        return stored(f"{name}-masks", [sources, factor], _times(masks), shape, make, 1).view(torch.bool)
+    return torch.from_numpy(np.stack([make(index) for index in range(len(masks))])).view(torch.bool)
 
 
 @contextlib.contextmanager

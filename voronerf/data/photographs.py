@@ -67,6 +67,7 @@ class Reading:
     allow_outside: bool = False
     kind: str = "auto"
     normalise: bool = True
+    images: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -113,14 +114,17 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
     order = torch.cat(((~found.held_out).nonzero()[:, 0], found.held_out.nonzero()[:, 0])).tolist()
     views, count = [found.views[index] for index in order], int((~found.held_out).sum())
     paths = [view.path for view in views]
-    images, sizes = read_images(paths, found.factor)
-    masks = read_masks([view.mask for view in views], paths, sizes, found.factor)
-    alpha = images.shape[-1] == 4 and bool((images[..., 3] < 255).any())
+    name = folder.resolve().name
+    images, sizes, on_disk = read_images(paths, found.factor, keep=reading.images, name=name)
+    masks = read_masks([view.mask for view in views], paths, sizes, found.factor, on_disk=on_disk, name=name)
+    alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
 
     poses = torch.stack([view.pose for view in views])
     kind = _kind(poses, alpha, reading.kind, found.source)
-    if kind != "object":
-        images = images[..., :3].contiguous()
+    if kind != "object" and images.shape[-1] == 4:
+        # its own store: a part of each pixel cannot be drawn from a mapped file without a copy
+        opaque = read_images(paths, found.factor, keep="disk", name=name, most_channels=3).images if on_disk else None
+        images = images[..., :3].contiguous() if opaque is None else opaque
     bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
     frame = find_frame(poses, kind, bounds if len(bounds) else None)
     if not reading.normalise:
@@ -135,7 +139,7 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
 
     names = tuple(distinct_names(paths, folder))
     parts = [
-        Split(cameras[part], images[part], names[part], None if masks is None else masks[part])
+        Split(cameras[part], images[part], names[part], None if masks is None else masks[part], on_disk)
         for part in (slice(count), slice(count, None))
     ]
     notes = [*found.notes, _note(kind, frame, reading)]
@@ -144,7 +148,7 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
         notes.append(f"images are reduced by {found.factor}, to {size} (--downscale 1 keeps their size)")
     to_scene = frame.matrix if found.transform is None else frame.matrix @ found.transform
     return Scene(
-        folder.resolve().name,
+        name,
         parts[0],
         parts[1],
         near,
@@ -329,6 +333,7 @@ def _without_dark_corners(cameras: Cameras, masks: Tensor | None, source: Path, 
         raise SceneError(f"{source}: the lens distortion of {name} cannot be inverted inside the image")
     if masks is None:
         masks = torch.ones(len(cameras), cameras.height, cameras.width, dtype=torch.bool)
+    masks = masks.clone()  # it may be mapped from a file
     for index in (~inverts).nonzero()[:, 0].tolist():
         width, height = cameras.size(index)
         masks[index, :height, :width] &= pixels_with_rays(cameras, index)

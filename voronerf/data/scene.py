@@ -31,6 +31,7 @@ class Split:
             smaller than h x w, see `Cameras.size`, lie in the upper left corner, with zeros around them.
         names: of the images, for tables and file names.
         masks: bool [c, h, w], False for pixels that are neither trained nor scored, or None.
+        on_disk: images and masks are mapped from files, since they may not fit into memory; they are not written to.
 
     Examples:
         >>> from voronerf.data import load_scene
@@ -44,6 +45,7 @@ class Split:
     images: Tensor
     names: tuple[str, ...]
     masks: Tensor | None = None
+    on_disk: bool = False
 
     def __len__(self) -> int:
         return len(self.names)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from voronerf.data import Scene
+from voronerf.data.store import Pages
 from voronerf.ops.pixel_rays import pixel_rays
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.rays import intersect_box
@@ -39,11 +40,11 @@ class RayBatches:
     """Draws rays uniformly from those pixels of the training views whose ray meets the box of the scene.
 
     A ray that misses the box shows the background whatever the networks are, so there is nothing to learn from it.
-    Pixels that a mask leaves out are not drawn either.
+    Pixels that a mask leaves out are not drawn either. Images on disk stay there; their batches are the same.
 
     Args:
         scene: The scene; its training views are used.
-        device: Where images, cameras and batches live.
+        device: Where batches live, and images that are in memory.
         cones: Whether the rays have radii.
     """
 
@@ -51,49 +52,57 @@ class RayBatches:
         self.scene = scene
         self.cones = cones
         self.device = device
-        self.cameras = scene.train.cameras.to(device)
-        self.images = scene.train.images.to(device)
-        self.background = scene.background_colour(device)
-        self.box = None if scene.box is None else scene.box.to(device)
+        self.place = torch.device("cpu") if scene.train.on_disk else device
+        self.cameras = scene.train.cameras.to(self.place)
+        self.images = scene.train.images.to(self.place)
+        self.pages = Pages(self.images) if scene.train.on_disk else None
+        self.background = scene.background_colour(self.place)
+        self.box = None if scene.box is None else scene.box.to(self.place)
         self.useful = self._useful_pixels()
 
-    def _useful_pixels(self) -> Tensor | None:
-        """Flat indices of the pixels to draw from; None when that is all of them."""
+    def _useful_pixels(self) -> _Runs | None:
+        """The pixels to draw from; None when that is all of them."""
         cameras, masks = self.cameras, self.scene.train.masks
         if self.box is None and masks is None and cameras.sizes is None:
             return None
         found = []
         for image in range(len(cameras)):
             width, height = cameras.size(image)
-            chosen = torch.ones(height, width, dtype=torch.bool, device=self.device)
+            chosen = torch.ones(height, width, dtype=torch.bool, device=self.place)
             if masks is not None:
-                chosen &= masks[image, :height, :width].to(self.device)
+                chosen &= masks[image, :height, :width].to(self.place)
             if self.box is not None:
                 rays = cameras.image_rays(image)
                 _, _, hit = intersect_box(rays.origins, rays.directions, self.box, self.scene.near, self.scene.far)
                 chosen &= hit.reshape(height, width)
-            row, column = chosen.nonzero(as_tuple=True)
-            found.append((image * cameras.height + row) * cameras.width + column)
-        useful = torch.cat(found)
-        if not 0 < useful.numel() < self.images[..., 0].numel():
-            return None
-        return useful
+            edges = torch.nn.functional.pad(chosen.to(torch.int8), (1, 1)).diff(dim=1)
+            row, column = (edges == 1).nonzero(as_tuple=True)
+            last = (edges == -1).nonzero(as_tuple=True)[1]
+            found.append(torch.stack(((image * cameras.height + row) * cameras.width + column, last - column)))
+        useful = _Runs(*torch.cat(found, dim=1))
+        return useful if 0 < len(useful) < self._pixels else None
+
+    @property
+    def _pixels(self) -> int:
+        return self.images.numel() // self.images.shape[-1]
 
     def __len__(self) -> int:
         """Number of rays to draw from."""
-        return self.images[..., 0].numel() if self.useful is None else self.useful.shape[0]
+        return self._pixels if self.useful is None else len(self.useful)
 
     def draw(self, count: int, generator: torch.Generator, *, random_background: bool = True) -> Batch:
         """A batch of ``count`` rays, drawn with replacement.
 
         Images with an alpha channel lie over a colour that is drawn for each ray, or over that of the scene.
         """
-        index = torch.randint(len(self), (count,), generator=generator, device=generator.device).to(self.device)
+        index = torch.randint(len(self), (count,), generator=generator, device=generator.device).to(self.place)
         if self.useful is not None:
-            index = self.useful[index]
+            index = self.useful.numbers(index)
+        if self.pages is not None:
+            self.pages.fetch(index)
         background = self.background
         if random_background and self.images.shape[-1] == 4:
-            background = torch.rand(count, 3, generator=generator, device=generator.device).to(self.device)
+            background = torch.rand(count, 3, generator=generator, device=generator.device).to(self.place)
         cameras = self.cameras
         found = pixel_rays(
             cameras.poses,
@@ -110,4 +119,28 @@ class RayBatches:
         radii = None
         if self.cones:
             radii = cameras.radii(found.directions, index // (cameras.width * cameras.height))
-        return Batch(Rays(found.origins, found.directions, radii), found.near, found.far, found.colour, background)
+        origins, directions, near, far, colour = (tensor.to(self.device) for tensor in found)
+        radii = None if radii is None else radii.to(self.device)
+        background = None if background is None else background.to(self.device)
+        return Batch(Rays(origins, directions, radii), near, far, colour, background)
+
+
+class _Runs:
+    """Numbers in rising runs: few entries for pixels of which most of a row counts.
+
+    Args:
+        first: int64 [n], the first number of each run.
+        length: int64 [n], how many it has.
+    """
+
+    def __init__(self, first: Tensor, length: Tensor) -> None:
+        self.ends = length.cumsum(0)
+        self.shift = first - (self.ends - length)
+        self.count = int(self.ends[-1]) if len(first) else 0
+
+    def __len__(self) -> int:
+        return self.count
+
+    def numbers(self, place: Tensor) -> Tensor:
+        """The numbers at places [b] of all runs one after another."""
+        return place + self.shift[torch.searchsorted(self.ends, place, right=True)]

@@ -45,6 +45,10 @@ class TrainConfig:
     downscale: int | None = None
     """Factor by which the images are made smaller when they are loaded; default 1, and for photographs the least that
     leaves at most 512 pixels a side."""
+    images: Literal["auto", "memory", "disk"] = "auto"
+    """Keep the images of a scene folder or city in memory, or on disk: decoded once into a file of the cache
+    (VORONERF_CACHE, or voronerf in the user's caches), from which the pixels of each step are read. auto is on disk for
+    what does not fit into memory."""
     allow_outside: bool = False
     """Also read images that lie outside of the scene folder, which it may name by .., an absolute path or a link."""
     out: Path | None = None
@@ -216,7 +220,7 @@ class TrainConfig:
     @property
     def reading(self) -> dict[str, Any]:
         """The settings that are arguments of ``load_scene``, but for ``allow_outside``."""
-        return {name: getattr(self, name) for name in ("downscale", "format", "kind", "normalise")}
+        return {name: getattr(self, name) for name in ("downscale", "format", "kind", "normalise", "images")}
 
     @property
     def network_options(self) -> dict[str, Any]:
@@ -296,6 +300,7 @@ RESUMABLE = frozenset(
     {
         "data",
         "allow_outside",
+        "images",
         "out",
         "resume",
         "device",

@@ -9,39 +9,52 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from voronerf import backends
 from voronerf.data.builtin.city_solids import city
 from voronerf.data.builtin.opaque import SUPERSAMPLES, Hits, bounds, render_views, see
 from voronerf.data.builtin.rich import caster
 from voronerf.data.builtin.solids import Array, Rows, Solid, first_hits, rotation, slab
-from voronerf.data.scene import Scene, SceneError
+from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.store import Make, stored
 from voronerf.rendering.cameras import Cameras, look_at
 
 TRAIN_VIEWS, TEST_VIEWS = 40, 8  # of a block; half of them from the street
 MOST = 32  # blocks a side
+FORMULA = 1  # of what is in the city: raised by a change, so that no store has the old one
 NEAR = 0.02
 STREET_ANGLE, ABOVE_ANGLE = 1.2, 0.75  # fields of view, radians
 
 
 def city_scene(
-    size: int = 100, *, blocks: int = 1, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS
+    size: int = 100,
+    *,
+    blocks: int = 1,
+    train_views: int = TRAIN_VIEWS,
+    test_views: int = TEST_VIEWS,
+    images: str = "memory",
 ) -> Scene:
     """Computes the city.
 
     Args:
         size: of the square images, pixels.
         blocks: on each side, 1 to 32.
-        train_views: of each block, the odd ones from its streets and the others from above.
+        train_views: of each block, every other one from its streets and the rest from above.
         test_views: likewise, apart from the training views.
+        images: "memory"; "cached", which also keeps them in a store of the cache, where a next call finds them; or
+            "disk", which maps them from there.
 
     Raises:
-        ValueError: a size or number of views below 1, or too many blocks.
+        ValueError: a size or number of views below 1, too many blocks, or another place for the images.
+        SceneError: the store cannot be written.
 
     Examples:
         >>> from voronerf.data import city_scene
@@ -54,20 +67,31 @@ def city_scene(
             raise ValueError(f"city_scene: {name} must be >= 1, got {value}")
     if not 1 <= blocks <= MOST:
         raise ValueError(f"city_scene: blocks must be 1 to {MOST}, got {blocks}")
-    groups = city(blocks)
+    if images not in ("memory", "cached", "disk"):
+        raise ValueError(f"city_scene: images must be memory, cached or disk, got {images!r:.60}")
+    groups, name = city(blocks), f"builtin-city-{blocks}x{blocks}"
     solids = [solid for group in groups for solid in group]
-    box, hits = bounds(solids), block_caster(groups)
-    look = functools.partial(see, solids=solids, hits=hits)
-    train, test = (
-        render_views(city_cameras(size, blocks, views, seed), name, look, box=box, supersamples=SUPERSAMPLES)
-        for seed, (name, views) in enumerate((("train", train_views), ("test", test_views)))
-    )
+    box = bounds(solids)
+    look = functools.partial(see, solids=solids, hits=block_caster(groups))
+
+    def views(part: str, seed: int, count: int) -> Split:
+        cameras = city_cameras(size, blocks, count, seed)
+
+        def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
+            found = stored(f"{name}-{part}", [blocks, size, count, seed], FORMULA, shape, make, os.cpu_count() or 1)
+            return found if images == "disk" else found.clone()
+
+        kept = None if images == "memory" else keep
+        found = render_views(cameras, part, look, box=box, supersamples=SUPERSAMPLES, keep=kept)
+        return replace(found, on_disk=images == "disk")
+
+    train, test = views("train", 0, train_views), views("test", 1, test_views)
     far = math.hypot(blocks, blocks) + 3
-    return Scene(f"builtin-city-{blocks}x{blocks}", train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
+    return Scene(name, train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
 
 
-def city_of(size: int, blocks: str) -> Scene:
-    """The city of blocks such as "4x4".
+def city_of(size: int, blocks: str, images: str) -> Scene:
+    """The city of blocks such as "4x4"; in the cache if it is larger than one block.
 
     Raises:
         SceneError: they are none of these.
@@ -75,7 +99,8 @@ def city_of(size: int, blocks: str) -> Scene:
     found = re.fullmatch(r"([1-9]\d?)x\1", blocks)
     if found is None or int(found[1]) > MOST:
         raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, ... or {MOST}x{MOST}, got {blocks!r:.60}")
-    return city_scene(size, blocks=int(found[1]))
+    where = "disk" if images == "disk" else "memory" if blocks == "1x1" else "cached"
+    return city_scene(size, blocks=int(found[1]), images=where)
 
 
 def city_cameras(size: int, blocks: int, views: int, seed: int) -> Cameras:
@@ -104,7 +129,7 @@ def _in_the_street(random: np.random.Generator) -> tuple[Array, Array]:
     eye = np.array((along, -off, height))
     gaze = np.array((-np.sign(along) * np.cos(turn), np.sin(turn), climb))
     side = rotation("z", 90.0 * int(random.integers(4)))
-    return side @ eye, side @ (eye + gaze)
+    return np.float32(side @ eye), np.float32(side @ (eye + gaze))
 
 
 def _above(random: np.random.Generator) -> tuple[Array, Array]:
@@ -112,7 +137,7 @@ def _above(random: np.random.Generator) -> tuple[Array, Array]:
     aim = np.array((*random.uniform(-0.4, 0.4, size=2), 0.12))
     azimuth, climb, distance = random.uniform(0, 2 * np.pi), random.uniform(0.5, 1.25), random.uniform(1.5, 2.3)
     away = np.array((np.cos(climb) * np.cos(azimuth), np.cos(climb) * np.sin(azimuth), np.sin(climb)))
-    return aim + distance * away, aim
+    return np.float32(aim + distance * away), np.float32(aim)
 
 
 def block_caster(groups: Sequence[Sequence[Solid]]) -> Hits:

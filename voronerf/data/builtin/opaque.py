@@ -35,6 +35,8 @@ BAND = 1 << 15  # rays at a time, so that their arrays stay in the cache
 See = Callable[[Array, Array], Array]
 # from origins and unit directions, [r, 3] or one [1, 3] for all, to distances [r] and numbers of solids [r]
 Hits = Callable[[Array, Array], tuple[Array, Rows]]
+# from a shape [c, h, w, 4] and a function that makes image i to the images
+Keep = Callable[[tuple[int, int, int, int], Callable[[int], NDArray[np.uint8]]], Tensor]
 LIFT = 2e-3  # a shadow's ray starts this far above the surface
 
 
@@ -142,7 +144,9 @@ def see(origin: Array, directions: Array, solids: Sequence[Solid] = SOLIDS, hits
     return np.concatenate((colour, np.isfinite(depth)[:, None]), axis=-1, dtype=np.float32)
 
 
-def render_views(cameras: Cameras, name: str, see: See, *, box: Array, supersamples: int) -> Split:
+def render_views(
+    cameras: Cameras, name: str, see: See, *, box: Array, supersamples: int, keep: Keep | None = None
+) -> Split:
     """All images, a view a thread, each with an alpha channel.
 
     Args:
@@ -151,12 +155,19 @@ def render_views(cameras: Cameras, name: str, see: See, *, box: Array, supersamp
         see: from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity [r, 4] in 0..1.
         box: [2, 3] that holds everything; ``see`` gets the rays that meet it.
         supersamples: rays on each side of a pixel, which is their average.
+        keep: gives the images [c, h, w, 4] of a function that makes one; default: all are made now.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        numbers = range(len(cameras))
-        images = list(pool.map(lambda index: _image(cameras, index, see, box, supersamples), numbers))
+
+    def make(index: int) -> NDArray[np.uint8]:
+        return _image(cameras, index, see, box, supersamples)
+
+    if keep is None:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            images = torch.from_numpy(np.stack(list(pool.map(make, range(len(cameras))))))
+    else:
+        images = keep((len(cameras), cameras.height, cameras.width, 4), make)
     names = tuple(f"{name}_{index:03d}" for index in range(len(cameras)))
-    return Split(cameras, torch.from_numpy(np.stack(images)), names)
+    return Split(cameras, images, names)
 
 
 def _image(cameras: Cameras, index: int, see: See, box: Array, fine: int) -> NDArray[np.uint8]:

@@ -1,0 +1,118 @@
+"""Images on disk: the same pixels and batches as in memory, a build that goes on, a store of other images."""
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses
+from PIL import Image
+from scene_files import write_blender, write_images
+
+from voronerf.data import SceneError, builtin_scene, city_scene, images, load_scene, store
+from voronerf.data.images import read_images, read_masks
+from voronerf.training.batches import RayBatches
+from voronerf.training.config import TrainConfig
+from voronerf.training.trainer import Trainer
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("VORONERF_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "images"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_blender(tmp_path / "scene", builtin_scene(24, train_views=6, test_views=2), 0.6911112)
+    return tmp_path / "scene"
+
+
+def train(scene, out):
+    config = TrainConfig(
+        out=out, steps=4, cells=(4,), split_at_steps=(2,), width=8, rays=64, panels=0, evaluations=1, lpips=Path("off")
+    )
+    trainer = Trainer(config, scene)
+    return trainer.run()["psnr"], [p.detach() for router in trainer.routers.values() for p in router.parameters()]
+
+
+def test_training_from_disk_is_that_from_memory(folder, tmp_path, cache):
+    memory, disk = load_scene(folder), load_scene(folder, images="disk")
+    assert disk.train.on_disk and not memory.train.on_disk and len(list(cache.iterdir())) == 1
+    for part in ("train", "test"):
+        assert torch.equal(getattr(disk, part).images, getattr(memory, part).images)
+    assert torch.equal(disk.box, memory.box)
+    draws = [RayBatches(s, torch.device("cpu")).draw(200, torch.Generator().manual_seed(1)) for s in (memory, disk)]
+    assert torch.equal(draws[0].rays.directions, draws[1].rays.directions)
+    assert torch.equal(draws[0].target, draws[1].target)
+    (first, ours), (second, theirs) = train(memory, tmp_path / "a"), train(disk, tmp_path / "b")
+    assert first == second and all(torch.equal(a, b) for a, b in zip(ours, theirs))
+    city = [city_scene(4, train_views=2, test_views=1, images=place) for place in ("memory", "cached", "disk")]
+    assert [s.train.on_disk for s in city] == [False, False, True]
+    assert all(torch.equal(s.train.images, city[0].train.images) for s in city)
+    refuses(
+        "images must be auto or memory for a built-in scene", load_scene, "builtin", images="disk", error=SceneError
+    )
+    refuses("images must be auto, memory or disk, got 'x'", load_scene, folder, images="x", error=SceneError)
+
+
+def test_sizes_and_masks(tmp_path):
+    write_images(tmp_path, [(12, 10), (8, 11), (12, 6)])
+    paths = sorted((tmp_path / "images").iterdir())
+    mask = tmp_path / "mask.png"
+    Image.fromarray(np.eye(11, 8, dtype=np.uint8) * 255).save(mask)
+    found = [read_images(paths, 1, keep=keep) for keep in ("memory", "disk")]
+    assert torch.equal(found[0].images, found[1].images) and torch.equal(found[0].sizes, found[1].sizes)
+    masks = [read_masks([None, mask, None], paths, found[0].sizes, 1, on_disk=on_disk) for on_disk in (False, True)]
+    assert torch.equal(*masks) and int(masks[0][1].sum()) == 8
+
+
+def test_what_does_not_fit_into_memory_is_on_disk(folder, monkeypatch):
+    monkeypatch.setattr(images, "available_memory", lambda: 1000)
+    assert load_scene(folder).train.on_disk
+    refuses("or --images disk", load_scene, folder, images="memory", error=SceneError)
+
+
+def test_a_build_goes_on_and_other_images_are_built_again(folder, cache, monkeypatch, caplog):
+    made, ends = [], {7: True}
+
+    def decode(path, factor, read=images.read_image):
+        made.append(path.name)
+        if ends.pop(len(made), None):
+            raise KeyboardInterrupt
+        return read(path, factor)
+
+    monkeypatch.setattr(images, "read_image", decode)
+    monkeypatch.setattr(images, "THREADS", 1)
+    monkeypatch.setattr(store, "RECORD_EVERY", 0)
+    with pytest.raises(KeyboardInterrupt):
+        load_scene(folder, images="disk")
+    before = len(made)
+    again = load_scene(folder, images="disk")
+    assert len(made) == before + 4, "the four that were recorded are not decoded again"
+    assert torch.equal(again.train.images, load_scene(folder).train.images)
+    made.clear()
+    load_scene(folder, images="disk")
+    assert not made
+    Image.open(folder / "train/r_1.png").save(folder / "train/r_0.png")
+    other = load_scene(folder, images="disk")
+    assert torch.equal(other.train.images[0], other.train.images[1])
+    assert not torch.equal(again.train.images[0], other.train.images[0]), "who has the old store keeps it"
+    (place,) = cache.iterdir()
+    os.truncate(place / "pixels", 100)
+    del again, other
+    assert torch.equal(*load_scene(folder, images="disk").train.images[:2])
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == 2 and all("holds other images than those of the scene now" in line for line in lines)
+
+
+def test_a_full_disk_is_one_line(folder, monkeypatch):
+    def full(*args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    refuses("cannot hold the 0.00 GiB of images: No space left", load_scene, folder, images="disk", error=SceneError)
+    monkeypatch.undo()
+    assert len(load_scene(folder).train) == 6
