@@ -375,6 +375,9 @@ def grouped_mlp_backward(_0: MlpTable, _1: MlpInputs, _2: MlpGradients, _3: Cpu)
 @overload
 def grouped_mlp_backward(_0: MlpTable, _1: MlpInputs, _2: MlpGradients, _3: str, _4: str, _5: Tensor | None, _6: Cuda) -> None: ...
 
+# MlpTable, MlpPrecision, MlpCudaWay, Cuda
+def grouped_mlp_hashes(_0: MlpTable, _1: str, _2: str, _3: Cuda) -> bool: ...
+
 # MlpTable, int64, int64, bool, bool, MlpPrecision, MlpCudaWay, Cuda
 def grouped_mlp_workspace(_0: MlpTable, _1: int, _2: int, _3: bool, _4: bool, _5: str, _6: str, _7: Cuda) -> int: ...
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 STEPS: dict[str, tuple[int, str, bool, int]] = {
@@ -182,6 +183,27 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
 
         close(run, [torch.rand(300, 3), *(torch.randn(5, o, i) / i**0.5 for o, i in shapes)])
 
+    def hashed(precision: str, own: bool) -> None:
+        """A hash grid inside the network."""
+        grid = voronerf.HashGrid(levels=8, features=2, log2_entries=11, finest=60)
+        rest = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 4)), (1,))
+        layers = replace(rest, position_encoding="hash", grid=grid)
+        kind, offsets = getattr(torch, precision), torch.tensor([0, 90, 90, 200], dtype=torch.int32, device=where)
+        cells = torch.tensor([0] * 90 + [2] * 110, dtype=torch.int32, device=where)
+        x, table = torch.rand(200, 3, device=where), torch.randn(*[3] * own, *grid.table_shape, device=where)
+        weights = [(torch.randn(3, o, i, device=where) / i**0.5).to(kind) for o, i in layers.weight_shapes(3)]
+        given = [leaf.requires_grad_() for leaf in (x, table, *weights)]
+        inside = voronerf.grouped_mlp(
+            x, offsets, weights, [None] * 2, layers=layers, features=table, backend="native"
+        ).float()
+        features = voronerf.hash_encode(x, table, grid, cells=cells if own else None, backend="reference")
+        before = voronerf.grouped_mlp(features, offsets, weights, [None] * 2, layers=rest, backend="reference").float()
+        size = 1e-5 if precision == "float32" else 3e-2
+        torch.testing.assert_close(inside, before, rtol=size, atol=size * float(before.detach().abs().max()))
+        pairs = zip(*(torch.autograd.grad(out.square().sum(), given) for out in (inside, before)), strict=True)
+        for one, other in pairs:
+            assert (one.double() - other.double()).norm() <= size * other.double().norm()
+
     def views() -> None:
         """Of every other operation that takes floating-point numbers."""
         close(lambda x, b: voronerf.frequency_encode(shifted(x[0]), 10, backend=b), [torch.rand(90, 3)])
@@ -287,6 +309,14 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         ),
         ("grouped_mlp dense float32", functools.partial(network, DENSE, [37, 3], 3, "float32")),
         ("grouped_mlp beyond float16", beyond_float16),
+        *(
+            (
+                f"grouped_mlp of a hash grid{' for each cell' * own} {precision}",
+                functools.partial(hashed, precision, own),
+            )
+            for own in (False, True)
+            for precision in ("float32", "bfloat16")
+        ),
         ("routed_mlp", route),
         ("routed_mlp of unaligned views", functools.partial(route, shifted)),
         ("unaligned views", views),

@@ -7,6 +7,7 @@ VN_BINDINGS(module) {
   module.cpu("grouped_mlp_backward", VN_CPU(grouped_mlp_backward_cpu));
   module.cuda("grouped_mlp", VN_CUDA(grouped_mlp_cuda));
   module.cuda("grouped_mlp_backward", VN_CUDA(grouped_mlp_backward_cuda));
+  module.cuda("grouped_mlp_hashes", VN_CUDA(grouped_mlp_hashes_cuda));
   module.cuda("grouped_mlp_workspace", VN_CUDA(grouped_mlp_workspace_cuda));
 }
 

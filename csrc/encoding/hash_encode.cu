@@ -6,30 +6,13 @@
 // point, which sums over its levels.
 #include "common/cuda_wrappers.h"
 #include "encoding/hash_encode.h"
+#include "encoding/hash_encode_device.h"
 
 namespace voronerf {
 
 namespace {
 
 constexpr int kThreads = 256;
-
-template <TableType kType>
-struct Element {
-  using Type = uint16_t;
-};
-template <>
-struct Element<TableType::float32> {
-  using Type = float;
-};
-
-template <TableType kType>
-__device__ __forceinline__ float element(const typename Element<kType>::Type* from) {
-  if constexpr (kType == TableType::float32) {
-    return *from;
-  } else {
-    return unpack_half<kType == TableType::bfloat16>(*from);
-  }
-}
 
 // A point in the eyes of one level.
 struct Corners {
@@ -65,34 +48,22 @@ __device__ __forceinline__ int64_t first_of(const HashEncoding& in, const GridLe
   return (table * in.in.entries + level.offset) * kFeatures;
 }
 
-// run(number of the first feature, x, y, z) for each corner.
-template <int kFeatures, typename Run>
-__device__ __forceinline__ void for_corners(const HashAxis (&axes)[3], const GridLevel& level, int64_t first,
-                                            const Run& run) {
-#pragma unroll
-  for (int corner = 0; corner < 8; ++corner) {
-    const int x = corner & 1, y = corner >> 1 & 1, z = corner >> 2;
-    const uint32_t entry = hash_entry(level, axes[0].corner + x, axes[1].corner + y, axes[2].corner + z);
-    run(first + static_cast<int64_t>(entry) * kFeatures, x, y, z);
-  }
-}
-
 template <int kFeatures, TableType kType>
 __global__ void __launch_bounds__(kThreads) hash_encode_kernel(HashEncoding in, float* __restrict__ out) {
   const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (point >= in.in.n) return;
   const GridLevel& level = in.levels[blockIdx.y];
-  const auto* table = static_cast<const typename Element<kType>::Type*>(in.in.table);
+  const auto* table = static_cast<const typename HashElement<kType>::Type*>(in.in.table);
   HashPlace places[3];
   place_of(in, point, places);
   const Corners at = corners_of(in, point, level, places);
   const int64_t first = first_of<kFeatures>(in, level, point);
   float sums[kFeatures] = {};
   if (first >= 0) {
-    for_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
+    hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
       const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
 #pragma unroll
-      for (int f = 0; f < kFeatures; ++f) sums[f] += weight * element<kType>(table + entry + f);
+      for (int f = 0; f < kFeatures; ++f) sums[f] += weight * hash_element<kType>(table + entry + f);
     });
   }
   float* to = out + (point * in.count + blockIdx.y) * kFeatures;
@@ -115,7 +86,7 @@ __global__ void __launch_bounds__(kThreads)
   float arriving[kFeatures];
 #pragma unroll
   for (int f = 0; f < kFeatures; ++f) arriving[f] = gradient[(point * in.count + blockIdx.y) * kFeatures + f];
-  for_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
+  hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
     const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
 #pragma unroll
     for (int f = 0; f < kFeatures; ++f) atomicAdd(of_table + entry + f, weight * arriving[f]);
@@ -128,7 +99,7 @@ __global__ void __launch_bounds__(kThreads)
                                           float* __restrict__ of_positions) {
   const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (point >= in.in.n) return;
-  const auto* table = static_cast<const typename Element<kType>::Type*>(in.in.table);
+  const auto* table = static_cast<const typename HashElement<kType>::Type*>(in.in.table);
   HashPlace places[3];
   place_of(in, point, places);
   float sums[3] = {};
@@ -138,10 +109,10 @@ __global__ void __launch_bounds__(kThreads)
     const int64_t first = first_of<kFeatures>(in, level, point);
     if (first < 0) break;
     const float* arriving = gradient + (point * in.count + number) * kFeatures;
-    for_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
+    hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
       float product = 0.0f;
 #pragma unroll
-      for (int f = 0; f < kFeatures; ++f) product += arriving[f] * element<kType>(table + entry + f);
+      for (int f = 0; f < kFeatures; ++f) product += arriving[f] * hash_element<kType>(table + entry + f);
       const int corner[3] = {x, y, z};
 #pragma unroll
 #pragma unroll

@@ -70,8 +70,9 @@ struct MlpGradients {
   float* const* weights;
   float* const* biases;
   float* positions;
-  float* directions;          // [n,q], or [r,q] summed over each ray's samples in their order
-  float* features = nullptr;  // in float32 whatever their type, each entry summed over the rows in their sorted order
+  float* directions;  // [n,q], or [r,q] summed over each ray's samples in their order
+  // In float32 whatever their type, each entry summed over the rows in their sorted order; on CUDA in any order.
+  float* features = nullptr;
 };
 
 // Throws std::invalid_argument for offsets that fall or exceed n and for a direction_index out of range.
@@ -92,6 +93,9 @@ enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers, groups };
 // std::invalid_argument for a table that breaks a rule of its way.
 int64_t grouped_mlp_workspace_cuda(const MlpTable& table, int64_t n, int64_t k, bool backward, bool parameters,
                                    MlpPrecision precision, MlpCudaWay way);
+
+// Whether a network looks its hash grid up itself, on the current device; else its positions are to be encoded before.
+bool grouped_mlp_hashes_cuda(const MlpTable& table, MlpPrecision precision, MlpCudaWay way);
 
 // Offsets that fall or exceed n cannot be refused without a host read: rows outside are not touched.
 void grouped_mlp_cuda(const MlpTable& table, const MlpInputs& inputs, float* out, MlpPrecision precision,

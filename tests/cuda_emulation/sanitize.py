@@ -260,6 +260,35 @@ def grouped_mlp(module):
         module.device(90, 120, shared * 1024)
         offsets = np.cumsum([2, 37, 0, 20, 3]).astype(np.int32)
         written(*network(module, 64, 4, offsets, precision, (way, way)))
+    module.device(90, 120, 227 * 1024)
+    written(*hashed_network(module, integers(2, 39, 39, 62)))
+
+
+def hashed_network(module, offsets):
+    """A layer on a hash grid of two levels, with a table for each of three cells: its output and all gradients."""
+    n, k, gpu = 64, 3, module.Cuda(0, 0)
+    levels = module.GridLevel(3.0, 0.5, 4, 64, 0, False), module.GridLevel(80.0, 0.5, 81, 1024, 64, True)
+    grid = module.HashGrid(levels=levels, low=(0.1,) * 3, high=(0.9,) * 3, features=2, smooth=True)
+    layers = (module.MlpLayer(20, "relu", (-1,)),)
+    none, hashed = module.MlpEncoding("none", 0), module.MlpEncoding("hash", 4)
+    one = module.MlpTable(layers, (0,), 3, 0, hashed, none, grid, False, "grouped_mlp")
+    positions, weight, features, order = floats(n, 3), floats(k, 20, 4), floats(k, 1088, 2), RANDOM.permutation(n)
+    encoded = unwritten(n, 16)
+    given = module.MlpInputs(
+        at(positions), None, None, at(offsets), [at(weight)], [None], n, 0, k,
+        at(order.astype(np.int32)), at(features), "float32", k, at(encoded),
+    )  # fmt: skip
+
+    def rest(backward):
+        size = module.grouped_mlp_workspace(one, n, k, backward, True, "bfloat16", "auto", gpu)
+        return "bfloat16", "auto", at(np.full(size, 255, np.uint8)), gpu
+
+    out, results = unwritten(n, 20), [unwritten(k, 20, 4), unwritten(n, 3), unwritten(k, 1088, 2)]
+    module.grouped_mlp(one, given, at(out), *rest(False))
+    of_weight, of_positions, of_features = every(results)
+    gradients = module.MlpGradients(at(floats(n, 20)), [of_weight], [None], of_positions, None, of_features)
+    module.grouped_mlp_backward(one, given, gradients, *rest(True))
+    return [out, *results]
 
 
 def hostile(module):
@@ -303,6 +332,7 @@ def hostile(module):
         for ways in (("chain", "tiles"), ("wgmma", "tiles"), ("tiles", "tiles"), ("layers", "layers")):
             module.device(90, 120, 227 * 1024)
             network(module, 64, 4, integers(*offsets), "bfloat16", ways)
+        hashed_network(module, integers(*offsets[:4]))
 
 
 def main(path, kind="usual"):

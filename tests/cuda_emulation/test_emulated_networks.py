@@ -29,6 +29,7 @@ from network_plans import PRECISIONS, WAYS, plain, plan, way
 import voronerf
 from voronerf.fields import NeRF
 from voronerf.layers import MLP, POSITIONS, Layer
+from voronerf.native import layer_table
 from voronerf.native.grouped_mlp import _choose_way, using_way
 
 HALVES = ("bfloat16", "float16")
@@ -306,3 +307,26 @@ def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch) -> None:
     monkeypatch.setenv("VORONERF_CUDA_MLP", "fast")
     rule = "must be one of auto, chain, tiles, layers, wgmma, got 'fast'"
     refuses(rule, _choose_way)
+
+
+@pytest.mark.parametrize(
+    ("width", "dtype", "way", "inside"),
+    [(32, torch.float32, "auto", True), (32, torch.bfloat16, "auto", True), (32, torch.bfloat16, "chain", False),
+     (32, torch.float32, "layers", False), (300, torch.float32, "auto", False)],
+)  # fmt: skip
+def test_tiles_look_hash_grids_up_and_other_ways_encode_before(monkeypatch, width, dtype, way, inside):
+    grid = voronerf.HashGrid(levels=2, features=2, log2_entries=10, finest=30)
+    layers = MLP(
+        (Layer((POSITIONS,), width, "relu"), Layer((0,), 4)), (1,), position_encoding="hash", grid=grid
+    )  # fmt: skip
+    weights = [torch.randn(2, o, i).to(dtype) / i**0.5 for o, i in layers.weight_shapes(3)]
+    given = torch.rand(50, 3), torch.tensor([0, 30, 50], dtype=torch.int32), weights, [None] * 2
+    options = {"layers": layers, "features": torch.randn(grid.table_shape)}
+    expected = voronerf.grouped_mlp(*given, **options, backend="reference")
+    calls = []
+    encode = layer_table.hash_encode
+    monkeypatch.setattr(layer_table, "hash_encode", lambda *a, **o: calls.append(1) or encode(*a, **o))
+    with emulated(), using_way(way), torch.no_grad():
+        found = voronerf.grouped_mlp(*given, **options, backend="native")
+    assert len(calls) == (not inside)
+    torch.testing.assert_close(found, expected, rtol=0.02, atol=0.02 if dtype == torch.bfloat16 else 1e-4)

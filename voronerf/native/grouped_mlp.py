@@ -21,7 +21,16 @@ from voronerf import native
 from voronerf.derivatives import asked_for
 from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 from voronerf.native.custom_op import custom_op, on_huge_pages
-from voronerf.native.layer_table import Network, Table, compiled_table, in_float32, network
+from voronerf.native.layer_table import (
+    Network,
+    Table,
+    compiled_table,
+    in_float32,
+    network,
+    operands,
+    storage,
+    table_text,
+)
 from voronerf.reference.grouped_mlp import cells_of
 
 # Of one layer, whose width does not matter here.
@@ -69,9 +78,9 @@ def grouped_mlp(
 
     Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
     """
-    own = features is not None and features.dim() == 3
-    cells = cells_of(offsets, positions) if own and native.on_cuda(positions) else None
-    given = network(positions, weights, biases, layers, directions, features, cells)
+    own, before = features is not None and features.dim() == 3, hashes_before(positions, weights, layers, directions)
+    cells = cells_of(offsets, positions) if own and before else None
+    given = network(positions, weights, biases, layers, directions, features, cells, hashed_before=before)
     out: Tensor
     out, _ = _forward(
         given.positions,
@@ -116,6 +125,19 @@ def _forward(
     out, encoded = new_output(positions, table, weights), new_encoded(positions, table, keep)
     yield out, encoded
     run(out, encoded, positions, offsets, weights, biases, table, directions, direction_index, features, None)
+
+
+def hashes_before(positions: Tensor, weights: Sequence[Tensor], layers: MLP, directions: Tensor | None) -> bool:
+    """Whether a hash grid is looked up before the network: on CUDA, where its kernels do not do it themselves."""
+    if layers.grid is None or not native.on_cuda(positions):
+        return False
+    if torch.compiler.is_compiling():  # which cannot ask the compiled module
+        return True
+    multiplied = operands(positions, storage(positions, weights))
+    table = compiled_table(table_text(layers.text, "grouped_mlp", multiplied, ""), positions, weights, directions)
+    machine = native.machine(positions)
+    assert isinstance(machine, native.compiled.Cuda)
+    return not native.compiled.grouped_mlp_hashes(table, _precision(multiplied), _way, machine)
 
 
 def keeps_encoded(given: Network) -> bool:
@@ -265,14 +287,18 @@ def _on_cuda(
     parameters: bool,
 ) -> tuple[str, str, Tensor]:
     """What a call takes besides its tensors: the type of the products, the way, a workspace."""
-    precision, positions = Table.parse(table).operands, inputs.positions
-    if precision == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32":
-        precision = "tf32"
+    precision, positions = _precision(Table.parse(table).operands), inputs.positions
     size = native.compiled.grouped_mlp_workspace(
         given, inputs.n, inputs.k, backward, parameters, precision, _way, machine
     )
     assert positions is not None
     return precision, _way, positions.new_empty(size, dtype=torch.uint8)
+
+
+def _precision(multiplied: str) -> str:
+    """What products take on CUDA."""
+    tf32 = multiplied == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32"
+    return "tf32" if tf32 else multiplied
 
 
 def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:

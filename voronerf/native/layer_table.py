@@ -46,17 +46,19 @@ def network(
     features: Tensor | None = None,
     cells: Tensor | None = None,
     caller: str = "grouped_mlp",
+    hashed_before: bool = False,
 ) -> Network:
     """What the ops take for a layer table.
 
-    Octaves and harmonics of float64 are computed in float64, beforehand. On CUDA, so are positions that are hashed, of
-    which ``cells`` says the tables where each cell has one, and directions of spherical harmonics.
+    Octaves and harmonics of float64 are computed in float64, beforehand. On CUDA, so are directions of spherical
+    harmonics, and where ``hashed_before`` says so positions that are hashed; ``cells`` says the tables of those where
+    each cell has one.
     """
-    encoded, before = "", native.on_cuda(positions)
+    encoded = ""
     if features is not None and features.dtype == torch.float64:
         features = features.float()
-    if layers.grid is not None and before:
-        assert features is not None
+    if hashed_before:
+        assert features is not None and layers.grid is not None
         positions = hash_encode(positions, features, layers.grid, cells=cells if features.dim() == 3 else None)
         features = None
         encoded += POSITIONS
@@ -68,7 +70,7 @@ def network(
         if wide and (layers.direction_octaves is not None or layers.direction_degree is not None):
             directions = encode_directions(directions, layers)
             encoded += DIRECTIONS
-        elif layers.direction_degree is not None and before:
+        elif layers.direction_degree is not None and native.on_cuda(directions):
             directions = spherical_harmonics(directions.float(), layers.direction_degree)
             encoded += DIRECTIONS
     return in_float32(positions, weights, biases, layers.text, directions, caller, features, encoded)
@@ -89,23 +91,31 @@ def in_float32(
     No number is written into it, since it may be symbolic under ``torch.compile``; widths are those of the weights.
     ``encoded``: what is encoded already, whatever ``text`` says.
     """
-    dtype, kind = weights[0].dtype, positions.device.type
-    if torch.is_autocast_enabled(kind):
-        dtype = torch.get_autocast_dtype(kind)
-    operands = _operands(positions, dtype)
+    dtype = storage(positions, weights)
     return Network(
         positions.float(),
         [weight.float() for weight in weights],
         [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in biases],
-        f'{{"caller": "{caller}", "operands": "{operands}", "encoded": "{encoded}", "layers": {text}}}',
+        table_text(text, caller, operands(positions, dtype), encoded),
         None if directions is None else directions.float(),
         features,
         dtype,
     )
 
 
-def _operands(positions: Tensor, dtype: torch.dtype) -> str:
-    """Type of what is multiplied; CUDA alone has float16."""
+def table_text(layers: str, caller: str, multiplied: str, encoded: str) -> str:
+    """A table as the ops take it; see `Table`."""
+    return f'{{"caller": "{caller}", "operands": "{multiplied}", "encoded": "{encoded}", "layers": {layers}}}'
+
+
+def storage(positions: Tensor, weights: Sequence[Tensor]) -> torch.dtype:
+    """Type of the weights, or autocast's where that is on."""
+    kind = positions.device.type
+    return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else weights[0].dtype
+
+
+def operands(positions: Tensor, dtype: torch.dtype) -> str:
+    """Type of what is multiplied, of a storage type; CUDA alone has float16."""
     if dtype == torch.float16 and native.on_cuda(positions):
         return "float16"
     return "bfloat16" if dtype == torch.bfloat16 else "float32"

@@ -15,7 +15,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import native
 from voronerf.derivatives import asked_for
 from voronerf.layers import MLP
 from voronerf.native import cell_sort, grouped_mlp, locate_cell, nearest_centre
@@ -42,7 +41,8 @@ def routed_mlp(
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
     own = features is not None and features.dim() == 3
-    if own and weights[0].shape[0] > 1 and cells is None and native.on_cuda(positions):
+    before = grouped_mlp.hashes_before(positions, weights, layers, directions)
+    if own and before and weights[0].shape[0] > 1 and cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
             cells = nearest_centre.nearest_centre(coords, centres, weights=centre_weights)
@@ -51,7 +51,7 @@ def routed_mlp(
         centres = None
     if features is not None and own and weights[0].shape[0] == 1:
         features = features[0]
-    given = network(positions, weights, biases, layers, directions, features, cells, "routed_mlp")
+    given = network(positions, weights, biases, layers, directions, features, cells, "routed_mlp", before)
     tables = centres, child_offsets, child, centre_weights
     if cells is None and weights[0].shape[0] == 1:
         coords, tables = None, (None, None, None, None)

@@ -34,7 +34,16 @@ MlpCudaData data_of(const MlpInputs& in) {
   data.offsets = in.offsets;
   data.n = in.n;
   data.k = in.k;
+  data.encoded = in.encoded;
   return data;
+}
+
+HashEncoding grid_of(const MlpTable& table, const MlpInputs& in) {
+  if (table.position.kind != MlpEncodingKind::hash) return {};
+  const GridLevel& last = table.grid.levels.back();
+  const int64_t entries = last.offset + last.entries;
+  return hash_encoding({in.positions, nullptr, in.features, in.features_type, nullptr, in.n, in.tables, entries},
+                       table.grid);
 }
 
 // Of any number of layers.
@@ -68,6 +77,10 @@ int64_t grouped_mlp_workspace_cuda(const MlpTable& table, int64_t n, int64_t k, 
   }
 }
 
+bool grouped_mlp_hashes_cuda(const MlpTable& table, MlpPrecision precision, MlpCudaWay way) {
+  return mlp_cuda_hashes(table, precision, way, mlp_cuda_device());
+}
+
 void grouped_mlp_cuda(const MlpTable& table, const MlpInputs& in, float* out, MlpPrecision precision, MlpCudaWay way,
                       unsigned char* workspace, void* stream) {
   const MlpCudaChoice choice = choose(table, in.n, in.k, false, precision, way);
@@ -77,7 +90,7 @@ void grouped_mlp_cuda(const MlpTable& table, const MlpInputs& in, float* out, Ml
     case MlpCudaWay::chain:
       return mlp_chain_cuda(choice.chain, data, parameters_of(table, in), workspace, stream);
     case MlpCudaWay::tiles:
-      return mlp_tiles_cuda(choice.fused, data, parameters_of(table, in), workspace, stream);
+      return mlp_tiles_cuda(choice.fused, data, grid_of(table, in), parameters_of(table, in), workspace, stream);
     default:
       return mlp_layers_cuda(choice.layers, data, layers_of(table, in), workspace, stream);
   }
@@ -97,13 +110,19 @@ void grouped_mlp_backward_cuda(const MlpTable& table, const MlpInputs& in, const
     return mlp_layers_backward_cuda(choice.layers, data, layers_of(table, in), count == 0 ? nullptr : &results,
                                     workspace, stream);
   }
+  const HashEncoding grid = grid_of(table, in);
+  data.grad_features = gradients.features;
+  if (data.grad_features != nullptr) {
+    const size_t bytes = sizeof(float) * static_cast<size_t>(grid.in.tables * grid.in.entries * grid.features);
+    VN_CUDA_CHECK(cudaMemsetAsync(data.grad_features, 0, bytes, static_cast<cudaStream_t>(stream)));
+  }
   MlpCudaParameterGradients results{};
   for (size_t l = 0; l < count && l < kMlpCudaLayers; ++l) {
     results.weights[l] = gradients.weights[l];
     results.biases[l] = gradients.biases[l];
   }
-  mlp_tiles_backward_cuda(choice.fused, data, parameters_of(table, in), count == 0 ? nullptr : &results, workspace,
-                          stream);
+  mlp_tiles_backward_cuda(choice.fused, data, grid, parameters_of(table, in), count == 0 ? nullptr : &results,
+                          workspace, stream);
 }
 
 }  // namespace voronerf

@@ -18,6 +18,9 @@ struct MlpCudaData {
   const float* grad_out;   // backward
   float* grad_positions;   // null: not wanted
   float* grad_directions;  // one row a sample, null: not wanted
+  // Hashed positions [n, padded], in their sorted order: filled forward, null: not kept; read backward.
+  float* encoded;
+  float* grad_features;  // of a hash grid's tables, null: not wanted
 };
 
 struct MlpCudaParameters {
@@ -36,12 +39,14 @@ unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements);
 // Properties of the current device.
 MlpCudaDevice mlp_cuda_device();
 
-void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
-                    unsigned char* workspace, void* stream);
+// grid: of positions that are hashed.
+void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const HashEncoding& grid,
+                    const MlpCudaParameters& parameters, unsigned char* workspace, void* stream);
 
 // gradients: null without those of parameters.
-void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
-                             const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream);
+void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const HashEncoding& grid,
+                             const MlpCudaParameters& parameters, const MlpCudaParameterGradients* gradients,
+                             unsigned char* workspace, void* stream);
 
 // Steps around the kernel of rows: weights packed and tasks mapped before it, rows of no cell cleared, partials summed.
 void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t tasks, void* stream);

@@ -3,7 +3,7 @@
 // summed in registers with the one that comes from outside, and put where the layer's values were, which nobody needs
 // any more. Weight gradients run over the rows of all warps, hence two barriers a layer; they are added up in the
 // task's own partial in global memory, by the same thread each time, so that no order is left to chance.
-#include "network/cuda/grouped_mlp_cuda_tile.h"
+#include "network/cuda/grouped_mlp_cuda_hash.h"
 
 namespace voronerf {
 
@@ -131,7 +131,8 @@ __device__ void mlp_encode_backward(const MlpCudaInput& input, const typename Pr
 }
 
 template <typename Products, int kRowTiles>
-__global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan plan, const MlpCudaData data) {
+__global__ void __launch_bounds__(128, 2)
+    mlp_backward_kernel(const MlpCudaPlan plan, const MlpCudaData data, const HashEncoding grid) {
   using Element = typename Products::Element;
   MlpTask task;
   if (!mlp_find_task(data, plan.task_rows, blockIdx.x, task)) return;  // the whole block
@@ -149,7 +150,9 @@ __global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan 
   }
   for (int64_t tile = task.begin; tile < task.end; tile += plan.warps * kRows) {
     const int64_t first = tile + warp * kRows;
-    const auto positions = [&](int64_t row) { return mlp_positions(plan, data, row); };
+    const auto positions = [&](int64_t row) {
+      return plan.positions.hashed ? data.encoded + row * plan.positions.padded : mlp_positions(plan, data, row);
+    };
     const auto directions = [&](int64_t row) { return mlp_directions(plan, data, row); };
     mlp_encode<Products, kRows>(plan.positions, region, first, task.end, positions);
     mlp_encode<Products, kRows>(plan.directions, region, first, task.end, directions);
@@ -159,7 +162,8 @@ __global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan 
     for (int l = plan.layer_count - 1; l >= kFromDirections; --l) {
       const MlpCudaInput& input = l == kFromDirections ? plan.directions : plan.positions;
       float* results = l == kFromDirections ? data.grad_directions : data.grad_positions;
-      if (l >= 0 ? !plan.layers[l].live : results == nullptr || !input.used) continue;
+      const bool wanted = results != nullptr || (l == kFromPositions && data.grad_features != nullptr);
+      if (l >= 0 ? !plan.layers[l].live : !wanted || !input.used) continue;
       const MlpPlace place = mlp_place(plan, l);
       const int padded = l >= 0 ? plan.layers[l].padded : input.padded;
       const int activation = l >= 0 ? plan.layers[l].activation : static_cast<int>(Activation::none);
@@ -225,7 +229,14 @@ __global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan 
       }
       if (l < 0) {
         __syncwarp();
-        if (l == kFromPositions) {
+        if (input.hashed) {
+          if (data.grad_features != nullptr) {
+            mlp_hash_table_backward<Products, kRows>(plan, data, grid, task.cell, region, first, task.end);
+          }
+          if (data.grad_positions != nullptr) {
+            mlp_hash_positions_backward<Products, kRows>(plan, data, grid, task.cell, region, first, task.end);
+          }
+        } else if (l == kFromPositions) {
           mlp_encode_backward<Products>(input, region, kRows, first, task.end, positions, data, results);
         } else {
           mlp_encode_backward<Products>(input, region, kRows, first, task.end, directions, data, results);
@@ -243,21 +254,22 @@ __global__ void __launch_bounds__(128, 2) mlp_backward_kernel(const MlpCudaPlan 
 }
 
 template <typename Products>
-void launch(const MlpCudaPlan& plan, const MlpCudaData& data, void* stream) {
+void launch(const MlpCudaPlan& plan, const MlpCudaData& data, const HashEncoding& grid, void* stream) {
   const unsigned blocks = static_cast<unsigned>(plan.tasks), threads = 32 * plan.warps;
   if (plan.row_tiles == 2) {
     mlp_allow_shared(mlp_backward_kernel<Products, 2>);
-    VN_LAUNCH((mlp_backward_kernel<Products, 2>), blocks, threads, plan.shared_bytes, stream, plan, data);
+    VN_LAUNCH((mlp_backward_kernel<Products, 2>), blocks, threads, plan.shared_bytes, stream, plan, data, grid);
   } else {
     mlp_allow_shared(mlp_backward_kernel<Products, 1>);
-    VN_LAUNCH((mlp_backward_kernel<Products, 1>), blocks, threads, plan.shared_bytes, stream, plan, data);
+    VN_LAUNCH((mlp_backward_kernel<Products, 1>), blocks, threads, plan.shared_bytes, stream, plan, data, grid);
   }
 }
 
 }  // namespace
 
-void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
-                             const MlpCudaParameterGradients* gradients, unsigned char* workspace, void* stream) {
+void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const HashEncoding& grid,
+                             const MlpCudaParameters& parameters, const MlpCudaParameterGradients* gradients,
+                             unsigned char* workspace, void* stream) {
   const MlpCudaWorkspace parts = mlp_cuda_workspace(plan, data.k, gradients != nullptr);
   data.packed = workspace + parts.packed;
   data.first_task = reinterpret_cast<int32_t*>(workspace + parts.first_task);
@@ -268,16 +280,16 @@ void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const Ml
   if (data.n > 0) {
     switch (plan.precision) {
       case MlpPrecision::bfloat16:
-        launch<HalfProducts<true>>(plan, data, stream);
+        launch<HalfProducts<true>>(plan, data, grid, stream);
         break;
       case MlpPrecision::float16:
-        launch<HalfProducts<false>>(plan, data, stream);
+        launch<HalfProducts<false>>(plan, data, grid, stream);
         break;
       case MlpPrecision::tf32:
-        launch<FloatProducts<true>>(plan, data, stream);
+        launch<FloatProducts<true>>(plan, data, grid, stream);
         break;
       case MlpPrecision::float32:
-        launch<FloatProducts<false>>(plan, data, stream);
+        launch<FloatProducts<false>>(plan, data, grid, stream);
         break;
     }
   }

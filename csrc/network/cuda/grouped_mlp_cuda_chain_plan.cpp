@@ -201,6 +201,7 @@ const char* mlp_chain_plan(const MlpTable& table, MlpPrecision precision, int64_
   plan.precision = precision;
   MlpCudaPlan read{};
   if (const char* fault = mlp_cuda_read_table(table, read)) return fault;
+  if (read.positions.hashed) return "hash grids must be looked up by tiles";
   plan.positions = input_of(read.positions);
   plan.directions = input_of(read.directions);
   const Reads reads = copy_layers(read, plan);

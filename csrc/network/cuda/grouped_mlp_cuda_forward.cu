@@ -1,12 +1,13 @@
 // The forward pass of grouped_mlp on CUDA: a block a task, tiles of rows through all layers (grouped_mlp_cuda_plan.h).
-#include "network/cuda/grouped_mlp_cuda_tile.h"
+#include "network/cuda/grouped_mlp_cuda_hash.h"
 
 namespace voronerf {
 
 namespace {
 
 template <typename Products, int kRowTiles>
-__global__ void __launch_bounds__(128, 3) mlp_forward_kernel(const MlpCudaPlan plan, const MlpCudaData data) {
+__global__ void __launch_bounds__(128, 3)
+    mlp_forward_kernel(const MlpCudaPlan plan, const MlpCudaData data, const HashEncoding grid) {
   using Element = typename Products::Element;
   MlpTask task;
   if (!mlp_find_task(data, plan.task_rows, blockIdx.x, task)) return;  // the whole block
@@ -23,8 +24,12 @@ __global__ void __launch_bounds__(128, 3) mlp_forward_kernel(const MlpCudaPlan p
   }
   for (int64_t tile = task.begin; tile < task.end; tile += plan.warps * kRows) {
     const int64_t first = tile + warp * kRows;
-    mlp_encode<Products, kRows>(plan.positions, region, first, task.end,
-                                [&](int64_t row) { return mlp_positions(plan, data, row); });
+    if (plan.positions.hashed) {
+      mlp_hash_encode<Products, kRows>(plan, data, grid, task.cell, region, first, task.end);
+    } else {
+      mlp_encode<Products, kRows>(plan.positions, region, first, task.end,
+                                  [&](int64_t row) { return mlp_positions(plan, data, row); });
+    }
     mlp_encode<Products, kRows>(plan.directions, region, first, task.end,
                                 [&](int64_t row) { return mlp_directions(plan, data, row); });
     __syncwarp();
@@ -53,16 +58,16 @@ __global__ void __launch_bounds__(128, 3) mlp_forward_kernel(const MlpCudaPlan p
 }
 
 template <typename Products>
-void launch(const MlpCudaPlan& plan, const MlpCudaData& data, void* stream) {
+void launch(const MlpCudaPlan& plan, const MlpCudaData& data, const HashEncoding& grid, void* stream) {
   const unsigned blocks = static_cast<unsigned>(plan.tasks), threads = 32 * plan.warps;
   mlp_allow_shared(mlp_forward_kernel<Products, 2>);
-  VN_LAUNCH((mlp_forward_kernel<Products, 2>), blocks, threads, plan.shared_bytes, stream, plan, data);
+  VN_LAUNCH((mlp_forward_kernel<Products, 2>), blocks, threads, plan.shared_bytes, stream, plan, data, grid);
 }
 
 }  // namespace
 
-void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
-                    unsigned char* workspace, void* stream) {
+void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const HashEncoding& grid,
+                    const MlpCudaParameters& parameters, unsigned char* workspace, void* stream) {
   if (data.n == 0) return;
   const MlpCudaWorkspace parts = mlp_cuda_workspace(plan, data.k, false);
   data.packed = workspace + parts.packed;
@@ -71,13 +76,13 @@ void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const MlpCudaPara
   mlp_cuda_zero_strays(data, plan.out_features, data.out, stream);
   switch (plan.precision) {
     case MlpPrecision::bfloat16:
-      return launch<HalfProducts<true>>(plan, data, stream);
+      return launch<HalfProducts<true>>(plan, data, grid, stream);
     case MlpPrecision::float16:
-      return launch<HalfProducts<false>>(plan, data, stream);
+      return launch<HalfProducts<false>>(plan, data, grid, stream);
     case MlpPrecision::tf32:
-      return launch<FloatProducts<true>>(plan, data, stream);
+      return launch<FloatProducts<true>>(plan, data, grid, stream);
     case MlpPrecision::float32:
-      return launch<FloatProducts<false>>(plan, data, stream);
+      return launch<FloatProducts<false>>(plan, data, grid, stream);
   }
 }
 

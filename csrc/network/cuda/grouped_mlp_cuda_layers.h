@@ -80,6 +80,11 @@ struct MlpCudaChoice {
 const char* mlp_cuda_choose(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
                             MlpCudaWay wanted, const MlpCudaDevice& device, MlpCudaChoice& choice);
 
+// Whether a table's hash grid is looked up by tiles, forward and backward; else its positions are to be encoded before.
+// Tiles take networks of this kind from the chain: those are narrow, and what the chain is faster by (5 ps a sample at
+// width 32 by the counts of docs/cuda.md, 33 at 64) is as much as writing and reading 16 features (27 ps of an H200).
+bool mlp_cuda_hashes(const MlpTable& table, MlpPrecision precision, MlpCudaWay wanted, const MlpCudaDevice& device);
+
 // Bytes of workspace of a call, and where its parts begin.
 struct MlpLayersWorkspace {
   int64_t packed, first_task, values, partials, bytes;

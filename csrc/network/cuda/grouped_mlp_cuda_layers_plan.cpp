@@ -29,6 +29,7 @@ MlpLayersInput input_of(int64_t raw, const MlpEncoding& encoding) {
 }
 
 const char* copy_table(const MlpTable& table, MlpLayersPlan& plan) {
+  if (table.position.kind == MlpEncodingKind::hash) return "hash grids must be looked up by tiles";
   plan.positions = input_of(table.positions, table.position);
   plan.directions = input_of(table.directions, table.direction);
   for (const MlpLayer& given : table.layers) {
@@ -180,6 +181,19 @@ const char* mlp_cuda_choose(const MlpTable& table, MlpPrecision precision, int64
     return layers;
   }
   return nullptr;
+}
+
+bool mlp_cuda_hashes(const MlpTable& table, MlpPrecision precision, MlpCudaWay wanted, const MlpCudaDevice& device) {
+  MlpTable encoded = table;
+  encoded.positions = encoded_width(table.positions, table.position);
+  encoded.position = {};
+  for (const bool backward : {false, true}) {
+    MlpCudaChoice own, before;
+    if (mlp_cuda_choose(table, precision, 1, 1, backward, wanted, device, own) != nullptr) return false;
+    if (mlp_cuda_choose(encoded, precision, 1, 1, backward, wanted, device, before) != nullptr) return false;
+    if (before.way == MlpCudaWay::layers) return false;
+  }
+  return true;
 }
 
 MlpLayersWorkspace mlp_layers_workspace(const MlpLayersPlan& plan, int64_t k, bool parameters) {

@@ -26,8 +26,9 @@ bool is_half(MlpPrecision precision) {
 MlpCudaInput input_of(int64_t raw, const MlpEncoding& encoding) {
   MlpCudaInput input{};
   input.raw = static_cast<int>(raw);
-  input.octaves = encoding.kind == MlpEncodingKind::none ? -1 : encoding.size;
   input.integrated = encoding.kind == MlpEncodingKind::integrated;
+  input.hashed = encoding.kind == MlpEncodingKind::hash;
+  input.octaves = encoding.kind == MlpEncodingKind::frequency || input.integrated ? encoding.size : -1;
   input.width = static_cast<int>(encoded_width(raw, encoding));
   input.padded = pad(input.width);
   return input;

@@ -43,7 +43,7 @@ struct MlpCudaLayer {
 struct MlpCudaInput {
   int raw, octaves, width, padded;
   int value, stride;
-  bool integrated, used;
+  bool integrated, hashed, used;
 };
 
 struct MlpCudaPlan {
