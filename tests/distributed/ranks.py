@@ -12,7 +12,7 @@ import torch
 from torch.distributed import TCPStore
 
 #: Seconds until ranks that hang are ended.
-LIMIT = 100
+LIMIT = 300
 
 
 def _rank(rank, size, port, folder, restarts, function, args):
@@ -24,6 +24,8 @@ def _rank(rank, size, port, folder, restarts, function, args):
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
             code = function(*args) or 0
+        except SystemExit as end:
+            code = end.code
         except BaseException:
             traceback.print_exc()
     (folder / f"rank-{rank}.txt").write_text(said.getvalue())

@@ -27,7 +27,7 @@ from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.cli.ranks import train_on_ranks
 from voronerf.data import Scene, load_scene
 from voronerf.data.process import process as make_scene
-from voronerf.distributed.group import Group, own_rank, world_size
+from voronerf.distributed.group import Group, world_size
 from voronerf.distributed.trainer import RankTrainer
 from voronerf.evaluation.panels import picture_of_colour, write_panels
 from voronerf.evaluation.video import check_video, write_video
@@ -66,7 +66,6 @@ def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", p
         port: Port that --view listens at; 0 is any that is free.
     """
     if world_size() > 1:
-        console.quiet = own_rank() > 0
         return train_on_ranks(config, run_training, view=view)
     check_device(config.device)
     if view:

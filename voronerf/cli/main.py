@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import re
@@ -10,6 +11,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TextIO
 
 import torch
 import tyro
@@ -18,7 +20,7 @@ from rich.console import Console
 from voronerf.backends import BackendUnavailable
 from voronerf.cli import commands, compare, demo, export, info, view
 from voronerf.cli.display import one_line
-from voronerf.distributed.group import RankLost, may_tell
+from voronerf.distributed.group import RankLost, may_tell, own_rank
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
 from voronerf.training.run_directory import check_stored_paths, stored_config
@@ -70,6 +72,16 @@ def main(args: list[str] | None = None) -> int:
         with VORONERF_TRACEBACK=1 they are shown whole.
     """
     warnings.showwarning = _show_warning
+    if own_rank() == 0:
+        return _run(args, sys.stderr)
+    # Of the ranks that torchrun starts the first one speaks, and another one only to say what went wrong on it.
+    told = sys.stderr
+    with open(os.devnull, "w") as null, contextlib.redirect_stdout(null), contextlib.redirect_stderr(null):
+        return _run(args, told)
+
+
+def _run(args: list[str] | None, told: TextIO) -> int:
+    """:func:`main`, which says on ``told`` what went wrong."""
     try:
         return tyro.extras.subcommand_cli_from_dict(
             {**COMMANDS, "train": _train_command(sys.argv[1:] if args is None else args)},
@@ -79,13 +91,13 @@ def main(args: list[str] | None = None) -> int:
             config=(tyro.conf.OmitArgPrefixes,),
         )
     except KeyboardInterrupt:
-        print("voronerf: interrupted", file=sys.stderr)
+        print("voronerf: interrupted", file=told)
         return 130
     except EXPECTED as error:
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
         if may_tell(error):
-            print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
+            print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=told)
         return 1
     except (RuntimeError, SystemError) as error:
         text = str(error)
@@ -93,7 +105,7 @@ def main(args: list[str] | None = None) -> int:
             raise
         asked = re.search(r"tried to allocate (\d+) bytes", text)
         size = f", {int(asked[1]) / 2**30:.1f} GiB were asked for" if asked else ""
-        print(f"voronerf: error: not enough memory{size}; try a smaller --width, --rays or --samples", file=sys.stderr)
+        print(f"voronerf: error: not enough memory{size}; try a smaller --width, --rays or --samples", file=told)
         return 1
 
 

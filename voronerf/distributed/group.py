@@ -68,6 +68,8 @@ class Group:
         self.rank, self.size, self.device = own_rank(), world_size(), device
         self.sent: Counter[str] = Counter()
         backend = "nccl" if device.type == "cuda" else "gloo"
+        if device.type == "cuda":
+            torch.cuda.set_device(device)  # where torch puts what it sends of Python objects
         timeout = timedelta(seconds=PATIENCE)
         with self._waiting():
             self.store, rank, size = next(iter(dist.rendezvous("env://", timeout=timeout)))
