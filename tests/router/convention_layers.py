@@ -80,20 +80,6 @@ class Residual(nn.Module):
         return self.head(h)
 
 
-class Activations(nn.Module):
-    """Elementwise modules with parameters and without."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = nn.Sequential(
-            nn.Linear(7, 8), nn.PReLU(), nn.Linear(8, 8), nn.PReLU(8), nn.Linear(8, 8), nn.GELU(), nn.Dropout(0.0)
-        )
-        self.out = nn.Linear(8, 3)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.out(F.leaky_relu(self.net(x)))
-
-
 class RawWeights(nn.Module):
     """No nn.Linear at all: every way to write a product with a weight."""
 
@@ -110,9 +96,6 @@ class RawWeights(nn.Module):
         if self.way == "matmul":
             h = torch.sigmoid(x @ self.w.T + self.b)
             return torch.matmul(h, self.v) + self.c
-        if self.way == "addmm":
-            h = torch.sigmoid(torch.addmm(self.b, x, self.w.t()))
-            return torch.mm(h, self.v).add(self.c)
         if self.way == "transposed":
             h = torch.sigmoid(self.w @ x.T + self.b[:, None])
             return (self.v.T @ h).T + self.c
@@ -214,6 +197,19 @@ class Convolution(nn.Module):
         return self.fc(self.conv(x[:, None]).flatten(1))
 
 
+class SeveralInputs(nn.Module):
+    """Layers that read different features of a sample, and a layer before and after its activation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b, self.c = nn.Linear(3, 8), nn.Linear(10, 6), nn.Linear(10, 2)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        h = F.relu(self.a(x[..., :3]))
+        raw = self.b(torch.cat([h, x[..., 3:5]], -1))
+        return self.c(torch.cat([F.relu(raw), x[..., 5:], raw[..., 1:3]], -1)), torch.sigmoid(raw[..., 2:5])
+
+
 class FourierFeatures(nn.Module):
     """Random frequencies in a buffer (Tancik et al. 2020), the same in every module."""
 
@@ -240,12 +236,10 @@ LAYERS = [
     Case("weight_norm by parametrization", parametrized, one(3), by_parameters=False),
     Case("weight_norm that fuses", normed, fuses=True, by_parameters=False),
     Case("layer norm", lambda: Residual(lambda: nn.LayerNorm(8))),
-    Case("group norm", lambda: Residual(lambda: nn.GroupNorm(2, 8))),
     Case("rms norm", lambda: Residual(lambda: nn.RMSNorm(8))),
-    Case("activations", Activations),
     Case("raw weights, transposed", lambda: RawWeights("transposed"), way="cell by cell"),
     Case("raw weights, linear", lambda: RawWeights("linear"), fuses=True),
-    *(Case(f"raw weights, {way}", lambda way=way: RawWeights(way)) for way in ("matmul", "addmm", "einsum")),
+    *(Case(f"raw weights, {way}", lambda way=way: RawWeights(way)) for way in ("matmul", "einsum")),
     Case("reads its weights", ReadsWeights),
     Case("tied", Tied),
     *(
@@ -256,5 +250,6 @@ LAYERS = [
     Case("embedding's average", Lookup),
     Case("low rank", LowRank, fuses=True),
     Case("fourier features", FourierFeatures, one(3), fuses=True),
+    Case("several inputs", SeveralInputs, fuses=True),
     Case("convolution", Convolution, way="cell by cell"),
 ]

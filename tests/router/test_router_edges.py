@@ -50,24 +50,6 @@ def test_hooks_of_the_module_itself_run() -> None:
     close(router(x), module(x + 1))
 
 
-@pytest.mark.parametrize("new", [False, True])
-@pytest.mark.filterwarnings("ignore:.*weight_norm.* is deprecated")
-def test_weight_norm_of_the_module_itself(new: bool) -> None:
-    norm = torch.nn.utils.parametrizations.weight_norm if new else torch.nn.utils.weight_norm
-    module = norm(nn.Linear(5, 2))
-    router, x = VoronoiRouter(module, centres(), coords="first3"), samples()
-    cells = router.diagram.locate(x[:, :3]).long()
-    (scale,) = [p for name, p in router.module.named_parameters() if p.numel() == 2 * 4 and "bias" not in name]
-    factors = torch.arange(1.0, 5.0)
-    with torch.no_grad():
-        scale.mul_(factors.reshape(-1, *[1] * (scale.dim() - 1)))
-    for _ in range(3):
-        bias = module.bias
-        close(router(x), (module(x) - bias) * factors[cells][:, None] + bias)
-    router(x).sum().backward()
-    assert scale.grad is not None and bool(scale.grad.abs().min() > 0)
-
-
 # Fields with a layer table --------------------------------------------------------------------------------------------
 
 

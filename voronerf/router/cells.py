@@ -58,7 +58,7 @@ def check_module(module: nn.Module) -> None:
 
 def _refusal(part: nn.Module) -> str:
     if isinstance(part, nn.modules.batchnorm._BatchNorm):
-        return "mixes the samples of a batch (use LayerNorm or GroupNorm)"
+        return "mixes the samples of a batch (use LayerNorm)"
     if isinstance(part, nn.RNNBase):
         return "is recurrent, with weights that cannot be one set for each cell"
     if any(type(one).__name__.endswith("SpectralNorm") for one in (part, *part._forward_pre_hooks.values())):

@@ -8,6 +8,7 @@ module whose cells have parameters of their own, and results and gradients are c
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import os
 import threading
@@ -267,18 +268,14 @@ class Trial:
             return False
         return True
 
-    def fused(self, expected: Outcome) -> tuple[Program | None, str]:
-        """The network as one operation, or what stands in the way."""
-        try:
-            with NoRandomness():
-                rows = [rows[:ROWS] for rows in self.call.arranged(self.entries)]
-                program = Program(replace(self.call, module=self.made_of[0].module), rows)
-            same = self.agrees(lambda t, rows: program.with_parameters_of(t.call.module).run(rows, t.entries), expected)
-        except Unfusable as error:
-            return None, str(error)
-        except Exception as error:
-            return None, f"the traced network fails for other samples ({type(error).__name__}: {error})"
-        return (program, "") if same else (None, "the traced network gives other results than its forward")
+    def fused(self, expected: Outcome) -> Program:
+        """The network as one operation; raises where something stands in the way."""
+        with NoRandomness():
+            rows = [rows[:ROWS] for rows in self.call.arranged(self.entries)]
+            program = Program(replace(self.call, module=self.made_of[0].module), rows)
+        if not self.agrees(lambda t, rows: program.with_parameters_of(t.call.module).run(rows, t.entries), expected):
+            raise Unfusable("the traced network gives other results than its forward")
+        return program
 
     def check_rows(self) -> None:
         """Raises TypeError where results for samples change when others are left out."""
@@ -323,10 +320,11 @@ def admitted(trial: Trial, fuse: bool) -> Choice:
     else:
         return Choice("cell by cell", why)
     if fuse:
-        program, why = trial.fused(expected)
-        if program is not None:
-            return Choice("fused", program=program)
-        trial.check_rows()
+        try:
+            return Choice("fused", program=trial.fused(expected))
+        except Exception as error:
+            trial.check_rows()
+            why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
         raise ValueError(
             f"{_OP}: fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
         )
@@ -334,7 +332,10 @@ def admitted(trial: Trial, fuse: bool) -> Choice:
     try:
         if trial.agrees(Trial.grouped, expected):
             piece = min(max(_PIECE * _TRIED // trial.widest, 1 << 10), 1 << 16)
-            return replace(choice, way="grouped", piece=piece, fusable=trial.fused(expected)[0] is not None)
+            choice = replace(choice, way="grouped", piece=piece)
+            with contextlib.suppress(Exception):
+                choice.fusable = bool(trial.fused(expected))
+            return choice
         choice.why = "its forward on the samples of all cells gives other results than on those of one cell"
     except BackendUnavailable:
         raise

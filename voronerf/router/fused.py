@@ -144,13 +144,14 @@ class Program:
     def _make_table(self, trace: Trace, needed: list[int]) -> None:
         """The table of the layers that some values depend on. Layers read others, and blocks of values, whole."""
         columns = {value: trace.columns(value) for value in needed}
-        outputs = _sources(itertools.chain(*columns.values()), Linear)
-        if not outputs:
+        returned = list(itertools.chain(*columns.values()))
+        parts = {li: li.part([i for source, i in returned if source is li]) for li in _sources(returned, Linear)}
+        if not parts:
             raise Unfusable("nothing that is returned comes from a layer")
-        used = set(outputs)
-        for layer in reversed(trace.layers):
+        used, layers = set(parts.values()), list(dict.fromkeys([*trace.layers, *parts.values()]))
+        for layer in reversed(layers):
             used.update(_sources(layer.inputs, Linear) if layer in used else ())
-        self._layers = [layer for layer in trace.layers if layer in used]
+        self._layers = [layer for layer in layers if layer in used]
         reads = [_sources(layer.inputs, int) for layer in self._layers]
         first = next((read for read in reads if read), [])
         others = [value for value in dict.fromkeys(itertools.chain(*reads)) if value not in first]
@@ -172,8 +173,9 @@ class Program:
             order, total = [starts[name] + i for name, i in read], sum(widths[name] for name in inputs)
             self._orders.append(None if order == list(range(total)) else (torch.tensor(order), total))
             table.append(Layer(tuple(inputs), layer.width, layer.activation))
-        self._table = MLP(tuple(table), tuple(self._layers.index(layer) for layer in outputs))
-        begins = dict(zip(outputs, itertools.accumulate((layer.width for layer in outputs), initial=0)))
+        self._table = MLP(tuple(table), tuple(self._layers.index(part) for part in parts.values()))
+        ends = itertools.accumulate(part.width for part in parts.values())
+        begins = {li: end - part.width - part.start + li.start for (li, part), end in zip(parts.items(), ends)}
         self._shapes = {value: trace.values[value].shape[1:] for value in needed}
         self._ranges = {}  # columns of the raw outputs, or of a value from before, that make a value
         for value, own in columns.items():
@@ -220,6 +222,9 @@ class Program:
         biases: list[Tensor | None] = []
         for layer, order in zip(self._layers, self._orders, strict=True):
             weight, bias = known[layer.weight], None if layer.bias is None else known[layer.bias]
+            if layer.width < weight.shape[1]:
+                weight = weight[:, layer.start : layer.start + layer.width]
+                bias = None if bias is None else bias[:, layer.start : layer.start + layer.width]
             if order is not None:
                 weight = weight.new_zeros(*weight.shape[:2], order[1]).index_add(2, order[0].to(weight.device), weight)
             plain = layer.factor == 1

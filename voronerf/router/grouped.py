@@ -14,7 +14,7 @@ from __future__ import annotations
 import inspect
 import linecache
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -140,8 +140,8 @@ class PerCell(torch.Tensor):
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
-    def __new__(cls, stacked: Tensor, is_parameter: bool = False, origin: tuple[Tensor, int] | None = None) -> PerCell:
-        """Wraps [k, ...]; ``is_parameter`` makes it an instance of ``nn.Parameter``."""
+    def __new__(cls, stacked: Tensor, origin: tuple[Tensor, int] | None = None) -> PerCell:
+        """Wraps [k, ...]."""
         wrapper: PerCell = torch.Tensor._make_wrapper_subclass(
             cls,
             stacked.shape[1:],
@@ -150,7 +150,6 @@ class PerCell(torch.Tensor):
             requires_grad=stacked.requires_grad and stacked.is_floating_point(),
         )
         wrapper.stacked, wrapper.origin = stacked, origin or (stacked, 0)
-        wrapper._is_param = is_parameter
         return wrapper
 
     @classmethod
@@ -175,31 +174,15 @@ def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Excep
         return function(*given[0], **given[1])
 
     try:
-        result = torch.vmap(on_one, randomness="different")(*stacks)
-    except Exception:
-        try:
-            singles = [on_one(*single) for single in zip(*[stack.unbind(0) for stack in stacks], strict=True)]
-        except Exception as error:
-            raise fail(f"{name_of(func)} of parameters fails: {error}") from error
-        result = _stack(func, singles, fail)
-    return map_tensors(result, PerCell)
+        return map_tensors(torch.vmap(on_one, randomness="different")(*stacks), PerCell)
+    except Exception as error:
+        raise fail(f"{name_of(func)} of parameters fails for all cells at once: {error}") from error
 
 
 def _weight_norm(v: Tensor, g: Tensor, dim: int = 0) -> Tensor:
     """``torch._weight_norm`` of functions that can be mapped over cells."""
     others = [d for d in range(v.dim()) if d != dim]
     return v * (g / torch.linalg.vector_norm(v, dim=others, keepdim=True))
-
-
-def _stack(func: Any, singles: Sequence[Any], fail: Callable[[str], Exception]) -> Any:
-    first = singles[0]
-    if isinstance(first, Tensor) and all(single.shape == first.shape for single in singles):
-        return torch.stack(list(singles))
-    if isinstance(first, (list, tuple)):
-        return tuple(_stack(func, parts, fail) for parts in zip(*singles, strict=True))
-    if not isinstance(first, Tensor) and all(single == first for single in singles):
-        return first
-    raise fail(f"{name_of(func)} reads values of parameters, which differ between cells")
 
 
 def name_of(function: Any) -> str:
@@ -347,7 +330,7 @@ def run_grouped(call: Call, given: list[Tensor], grouping: Grouping, piece: int)
         for tensor in rows:
             run.mark(tensor)
         origin = part.start
-        stand_ins = {id(p): PerCell(own[origin], is_parameter=True, origin=(p, origin)) for p, own in pieces}
+        stand_ins = {id(p): PerCell(own[origin], (p, origin)) for p, own in pieces}
         with in_place_of_parameters(call.module, stand_ins), run:
             values.append(call.run(rows))
         if run.failed is not None:

@@ -49,7 +49,6 @@ class Grouping:
         self.where, self.n, self.k, self.device, self.backend, self.rows = where, n, k, device, backend, rows
         self.start = 0  # of the cells of a part
         self._locate = locate
-        self._entry_offsets: dict[tuple[int, int], Tensor] = {}
 
     @property
     def cells(self) -> Tensor | None:
@@ -120,16 +119,13 @@ class Grouping:
                 parts.append(part)
         return parts
 
+    def cells_of_rows(self, m: int) -> Tensor:
+        """int64 [n * m], the cell of each entry of tensors with m entries a sample."""
+        return self.sorted_cells if m == 1 else self.sorted_cells.repeat_interleave(m)
+
     def scaled_offsets(self, m: int) -> Tensor:
         """``offsets`` of tensors with m entries a sample."""
         return self.offsets if m == 1 else self.offsets * m
-
-    def entry_offsets(self, entries: int, m: int) -> Tensor:
-        """int64 [n * m], where the entries of each row's cell begin in a table of all cells."""
-        if (entries, m) not in self._entry_offsets:
-            first = self.sorted_cells * entries
-            self._entry_offsets[entries, m] = first if m == 1 else first.repeat_interleave(m)
-        return self._entry_offsets[entries, m]
 
     def sort(self, x: Tensor) -> Tensor:
         """[samples, ...] -> [n, ...], the entries sorted by cell."""
@@ -154,8 +150,7 @@ class Grouping:
         # Copies under all settings: a product in TF32 would round them.
         rounds = stacked.is_cuda and torch.backends.cuda.matmul.fp32_precision == "tf32"
         if not stacked.is_floating_point() or stacked[0].numel() == 0 or rounds:
-            rows = self.sorted_cells if m == 1 else self.sorted_cells.repeat_interleave(m)
-            return stacked.index_select(0, rows)
+            return stacked.index_select(0, self.cells_of_rows(m))
         # A grouped layer without inputs: its backward sums over each cell's rows, where that of indexing would scatter.
         ones = stacked.new_ones(self.n * m, 1)
         weight = stacked.reshape(self.k, -1, 1)

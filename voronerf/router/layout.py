@@ -312,14 +312,12 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Te
         positions, what = rule(*args, **kwargs), "what coords returns"
     else:
         given = [*args, *kwargs.values()]
-        source = next((value for value in given if isinstance(value, Tensor)), None)
+        source = next((value for value in given if isinstance(value, Tensor) and value.dim()), None)
         if source is None:
             got = ", ".join(type(value).__name__ for value in given) or "nothing"
             raise ValueError(
                 f"{_OP}: coords={rule!r} must find a tensor among the arguments, got {got}; pass a function"
             )
-        if source.dim() == 0:
-            raise ValueError(f"{_OP}: coords={rule!r} must find features in the first tensor, got a number")
         positions = source[..., :3] if rule == "first3" else source[..., rule]
         what = f"what coords={rule!r} takes from the first tensor, {list(source.shape)},"
     if not isinstance(positions, Tensor):

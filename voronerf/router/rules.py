@@ -78,27 +78,13 @@ def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None =
 
 @rule(torch.matmul, torch.Tensor.matmul, torch.mm, torch.Tensor.mm, torch.Tensor.__matmul__)
 def matmul(run: GroupedRun, input: Tensor, other: Tensor) -> Any:
-    """Rows [n * m, ..., i] with [i, o] or [i], and [o, i] with rows [n * m, i, c]."""
-    if isinstance(other, PerCell) and other.dim() == 1 and input.dim() >= 2:
-        product = linear(run, input, PerCell(other.stacked[:, None]))
-        return product if product is NotImplemented else product.squeeze(-1)
-    if isinstance(other, PerCell) and other.dim() == 2:
-        return linear(run, input, PerCell(other.stacked.transpose(1, 2)))
-    if isinstance(input, PerCell) and input.dim() == 2 and run.is_rows(other) and other.dim() >= 3:
-        product = linear(run, run.mark(other.transpose(-1, -2)), input)
-        return product if product is NotImplemented else product.transpose(-1, -2)
-    return NotImplemented
+    """Rows [n * m, ..., i] with [i, o]."""
+    if not isinstance(other, PerCell) or other.dim() != 2:
+        return NotImplemented
+    return linear(run, input, PerCell(other.stacked.transpose(1, 2)))
 
 
 register(torch.Tensor.__rmatmul__, lambda run, other, input: matmul(run, input, other))
-
-
-@rule(torch.addmm, torch.Tensor.addmm)
-def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: float = 1, alpha: float = 1) -> Any:
-    """``input + mat1 @ mat2`` of a bias [o], rows and a weight [i, o]."""
-    if not isinstance(mat2, PerCell) or (beta, alpha) != (1, 1) or input.dim() != 1:
-        return NotImplemented
-    return linear(run, mat1, PerCell(mat2.stacked.transpose(1, 2)), input)
 
 
 _CONTRACTION = re.compile(r"(\w+?)(\w+),(?:(\w)\2|\2(\w))->\1(?:\3|\4)")
@@ -147,15 +133,6 @@ for _function in _spellings(_ELEMENTWISE):
     register(_function, functools.partial(_elementwise, _function))
 
 
-@rule(torch.Tensor.to, torch.Tensor.type_as)
-def to(run: GroupedRun, parameter: Tensor, *args: Any, **kwargs: Any) -> Any:
-    """A parameter in the dtype of a tensor of rows."""
-    like = next((tensor for tensor in tensors_of((args, kwargs))), None)
-    if not isinstance(parameter, PerCell) or like is None:
-        return NotImplemented
-    return PerCell(parameter.stacked.to(like.device, like.dtype))
-
-
 @rule(*_spellings("expand broadcast_to"))
 def expand(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
     """A parameter repeated once a sample, ``p.expand(n, -1)``."""
@@ -177,39 +154,24 @@ def repeat(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
     return rows if rows is NotImplemented else rows.repeat(1, *counts[1:])
 
 
-# Norms and activations with parameters --------------------------------------------------------------------------------
-
-
-def _by_feature(parameter: Tensor, x: Tensor) -> Tensor:
-    """A parameter [c] as [c, 1, ...], beside rows [n * m, c, ...]."""
-    ones = [1] * (x.dim() - 2)
-    if isinstance(parameter, PerCell):
-        return PerCell(parameter.stacked.reshape(*parameter.stacked.shape, *ones))
-    return parameter.reshape(*parameter.shape, *ones)
+# Norms ----------------------------------------------------------------------------------------------------------------
 
 
 def _norm(func: Any, run: GroupedRun, x: Tensor, over: Any, weight: Any = None, bias: Any = None, **more: Any) -> Any:
-    """A norm over the last dimensions, or of groups of features: without its parameters, then those."""
+    """A norm over the last dimensions: without its parameters, then those."""
     if not run.is_rows(x):
         return NotImplemented
     x = func(x, over, **more)
     for parameter, join in ((weight, torch.mul), (bias, torch.add)):
-        if parameter is not None and x is not NotImplemented:
-            parameter = _by_feature(parameter, x) if func is F.group_norm else parameter
-            seen = isinstance(parameter, PerCell)
-            x = _elementwise(join, run, run.mark(x), parameter) if seen else join(x, parameter)
+        if isinstance(parameter, PerCell):
+            x = _elementwise(join, run, run.mark(x), parameter)
+        elif parameter is not None:
+            x = join(x, parameter)
     return x
 
 
-for _function in (F.layer_norm, F.rms_norm, F.group_norm):
+for _function in (F.layer_norm, F.rms_norm):
     register(_function, functools.partial(_norm, _function))
-
-
-@rule(F.prelu)
-def prelu(run: GroupedRun, input: Tensor, weight: Tensor) -> Any:
-    """One slope, or one for each of the features [n * m, features, ...]."""
-    negative = _elementwise(torch.mul, run, input, _by_feature(weight, input))
-    return negative if negative is NotImplemented else torch.where(input >= 0, input, negative)
 
 
 # Look-ups -------------------------------------------------------------------------------------------------------------
@@ -224,7 +186,7 @@ def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Ten
     index = index.long()
     if low < 0:
         index = torch.where(index < 0, index + entries, index)
-    index = index + run.grouping.entry_offsets(entries, m).reshape(-1, *[1] * (index.dim() - 1))
+    index = index + (run.grouping.cells_of_rows(m) * entries).reshape(-1, *[1] * (index.dim() - 1))
     return _rows_of_table(run, *table.origin, index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
 
 

@@ -91,14 +91,21 @@ class Step:
 
 @dataclass(eq=False)
 class Linear:
-    """A linear layer of the trace, and an activation of so many times its sums."""
+    """Features of a linear layer of the trace, and an activation of so many times their sums."""
 
     weight: int  # the values of its parameters
     bias: int | None
     inputs: list[Column]
     width: int
+    start: int = 0  # of the features among those of the weight
     activation: str = "none"
     factor: float = 1.0
+
+    def part(self, features: list[int], **changes: Any) -> Linear:
+        """The least range of its features that holds some of them."""
+        start, width = min(features), max(features) + 1 - min(features)
+        same = width == self.width and not changes
+        return self if same else replace(self, start=self.start + start, width=width, **changes)
 
 
 Column = tuple[Linear | int, int]  # a layer or the number of a value, and which of its columns
@@ -248,12 +255,12 @@ class Trace(TorchFunctionMode):
         source, value = int(step.refs[0]), step.values[0]
         if name == "sine":
             source, factor = self._scaled.get(source, (source, factor))
-        found = {column[0] for column in self.columns(source)} if self.stages[source] == TABLE else set()
-        layer = found.pop() if len(found) == 1 else None
-        if not isinstance(layer, Linear) or layer.activation != "none":
+        columns = self.columns(source) if self.stages[source] == TABLE else [(-1, 0)]
+        layer, features = columns[0][0], [feature for _, feature in columns]
+        if not isinstance(layer, Linear) or layer.activation != "none" or any(own is not layer for own, _ in columns):
             return False
-        self.layers.append(replace(layer, activation=name, factor=factor))
-        shift = self._number(self.layers[-1], layer.width) - self._first[layer]
+        self.layers.append(layer.part(features, activation=name, factor=factor))
+        shift = self._number(self.layers[-1], self.layers[-1].width) - self._first[layer] - min(features)
         self._codes[value], self.stages[value] = self._codes[source] + shift, TABLE
         return True
 
