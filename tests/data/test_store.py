@@ -14,7 +14,8 @@ from scene_files import write_blender, write_images
 from voronerf.data import SceneError, builtin_scene, city_scene, images, load_scene, store
 from voronerf.data.images import read_images, read_masks
 from voronerf.training.batches import RayBatches
-from voronerf.training.config import TrainConfig
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.networks import resolve_config
 from voronerf.training.trainer import Trainer
 
 
@@ -47,6 +48,8 @@ def test_training_from_disk_is_that_from_memory(folder, tmp_path, cache):
     draws = [RayBatches(s, torch.device("cpu")).draw(200, torch.Generator().manual_seed(1)) for s in (memory, disk)]
     assert torch.equal(draws[0].rays.directions, draws[1].rays.directions)
     assert torch.equal(draws[0].target, draws[1].target)
+    graph = TrainConfig(device="cuda", cuda_graph=True, occupancy=False)
+    refuses("--cuda-graph must be off with images on disk", resolve_config, graph, disk, error=ConfigError)
     (first, ours), (second, theirs) = train(memory, tmp_path / "a"), train(disk, tmp_path / "b")
     assert first == second and all(torch.equal(a, b) for a, b in zip(ours, theirs))
     city = [city_scene(4, train_views=2, test_views=1, images=place) for place in ("memory", "cached", "disk")]

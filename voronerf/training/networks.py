@@ -94,8 +94,11 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     ``parameters`` the width and learning rate.
 
     Raises:
-        ConfigError: When the smallest networks have more parameters than asked for.
+        ConfigError: When the smallest networks have more parameters than asked for, or a CUDA graph would have to read
+            images on disk.
     """
+    if config.cuda_graph and scene.train.on_disk:
+        raise ConfigError("--cuda-graph must be off with images on disk: --no-cuda-graph, or --images memory")
     kind = config.field_type
     if config.contraction == "auto":
         if kind.scene_options is None or scene.box is not None:
