@@ -93,6 +93,14 @@ def test_points_have_colours_and_normals(run, tmp_path):
     assert (tmp_path / "ball.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
 
 
+def test_points_of_a_contracted_scene_lie_in_the_world(run, tmp_path):
+    space = Contraction(torch.zeros(3), 0.3)
+    field = lambda positions, *rest: shell(space.inverse(positions), *rest)  # noqa: E731
+    contracted = replace(run, renderer=Renderer({"field": field}, samples=192, contraction=space))
+    place = np.asarray(export_points(contracted, tmp_path / "ball.ply", count=500, box=BOX).vertices)
+    assert np.abs(np.linalg.norm(place[np.linalg.norm(place, axis=-1) < 0.8], axis=-1) - RADIUS).max() < 0.05
+
+
 def diagrams():
     centres = 2 * torch.rand(8, 3, generator=seeded(1)) - 1
     nested, _ = VoronoiDiagram(centres).refine({i: centres[i] + 0.2 * torch.randn(4, 3) for i in (1, 5)})

@@ -162,7 +162,8 @@ def training_views(run: Run, count: int = VIEWS, side: int = VIEW_SIDE, track: T
     numbers = torch.linspace(0, len(cameras) - 1, min(count, len(cameras))).round().long().tolist()
     for number in track(numbers, "views"):
         image = run.render(cameras, number)
-        camera, surface = cameras[[number]], image.heaviest.cpu()
+        camera, surface, contraction = cameras[[number]], image.heaviest.cpu(), run.renderer.contraction
+        surface = surface if contraction is None else contraction.inverse(surface)
         distance = (surface - camera.origins[0].cpu()).norm(dim=-1)
         distance = torch.where(image.opacity.cpu() > SOLID, distance, torch.inf)
         yield View(camera, distance, image.colour.cpu(), surface)
