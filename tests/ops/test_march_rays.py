@@ -167,6 +167,7 @@ def test_refuses_what_makes_no_sense():
     refuses("start must have dtype int32, got int64", start=torch.zeros(4, dtype=torch.int64))
     refuses("most must be at least 1, got 0", most=0)
     refuses("capacity must be at least 1, got 0", capacity=0)
+    refuses("contraction must be a tensor, got str", contraction="sphere")
     refuses("contraction must have shape [4], got [3]", contraction=torch.zeros(3))
     refuses("contraction must have shape [5, 3], got [2, 3]", contraction=torch.zeros(2, 3))
     refuses("spacing must be one of linear, disparity, got 'log'", spacing="log")

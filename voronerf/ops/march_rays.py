@@ -111,7 +111,8 @@ def march_rays(
     check_dtype(_OP, "origins", origins, (torch.float32, torch.float64))
     check_dtype(_OP, "occupied", occupied, (torch.bool,))
     if contraction is not None:
-        check_shape(_OP, "contraction", contraction, (4,) if contraction.dim() == 1 else (5, 3))
+        sphere = isinstance(contraction, Tensor) and contraction.dim() == 1
+        check_shape(_OP, "contraction", contraction, (4,) if sphere else (5, 3))
     if uniforms is not None:
         check_shape(_OP, "uniforms", uniforms, ("r", "s"), {**sizes, "s": samples})
     if start is not None:
