@@ -315,6 +315,13 @@ def test_broken_llff_is_one_line(tmp_path, rows, reason):
     refuses(reason, load_scene, tmp_path, format="llff", error=SceneError)
 
 
+def test_an_array_with_a_broken_header_is_one_line(tmp_path):
+    write_both(tmp_path)
+    path = tmp_path / "poses_bounds.npy"
+    path.write_bytes(path.read_bytes().replace(b"}", b" ", 1))
+    refuses("is no array of NumPy that can be read", load_scene, tmp_path, format="llff", error=SceneError)
+
+
 def test_formats_and_kinds_are_named(tmp_path):
     write_both(tmp_path)
     refuses("format must be colmap or llff, which it has, got blender", load_scene, tmp_path, format="blender")
