@@ -282,7 +282,8 @@ class ShardedCells(CellModules):
                         f"VoronoiRouter.subdivide: diagram must have at least {shards.size} cells, one for each rank, "
                         f"got {len(loads)}"
                     )
-                found = finer.diagram.cpu().state_dict(), finer.parents, deal_cells(loads, shards.size)
+                tables = {name: table.cpu() for name, table in finer.diagram.state_dict().items()}
+                found = tables, finer.parents.cpu(), deal_cells(loads, shards.size)
         except (TypeError, ValueError) as error:
             found = error
         found = shards.from_first(found)
