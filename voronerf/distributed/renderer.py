@@ -67,17 +67,10 @@ class RankRenderer(Renderer):
     def own_cells(self, sharing: Sharing) -> None:
         """Renders only the cells of this rank from now on; the grid forgets what they do not reach."""
         self.sharing = sharing
-        self.limit_grid()
-
-    def limit_grid(self) -> None:
-        """Empties the voxels of the grid that own cells do not reach; they have no samples then."""
-        grid = self.occupancy
-        if grid is None or self.sharing is None:
-            return
-        reached = voxels_of_ranks(self.sharing, grid, self.group.size)
-        self._reached, self._several = reached[self.group.rank], reached.sum(0) > 1
-        grid.density.view(-1)[~self._reached] = 0
-        grid.occupied.view(-1)[~self._reached] = False
+        if self.occupancy is not None:
+            reached = voxels_of_ranks(sharing, self.occupancy, self.group.size)
+            self._reached, self._several = reached[self.group.rank], reached.sum(0) > 1
+            self.forget_others(self.occupancy)
 
     # --- samples ---------------------------------------------------------------------------------------------------
 
@@ -233,7 +226,7 @@ class RankRenderer(Renderer):
         return torch.zeros_like(positions), self.group.largest(density)
 
     def forget_others(self, grid: OccupancyGrid) -> None:
-        """Empties the voxels that own cells do not reach, after an update of all."""
+        """Empties the voxels that own cells do not reach; they have no samples then."""
         if self.sharing is not None:
             grid.density.view(-1)[~self._reached] = 0
             grid.occupied.view(-1)[~self._reached] = False

@@ -29,13 +29,14 @@ def check_same(group: Group, config: TrainConfig) -> None:
 
 
 def check_same_scene(group: Group, scene: Scene) -> None:
-    """Compares images and cameras of all ranks.
+    """Compares cameras and the middle row of every image on all ranks; images may not fit into memory.
 
     Raises:
         ValueError: When they differ.
     """
     views = scene.train
-    tensors = (views.images, views.cameras.poses, views.cameras.intrinsics, scene.test.cameras.poses)
+    rows = views.images[:, views.images.shape[1] // 2]
+    tensors = (rows, views.cameras.poses, views.cameras.intrinsics, scene.test.cameras.poses)
     found = [zlib.crc32(tensor.contiguous().cpu().numpy().data) for tensor in tensors]
     group.check_equal({"the scene": f"{scene.name} {'-'.join(f'{number:08x}' for number in found)}"})
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.data import Scene
+from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.balance import cell_weights
 from voronerf.diagram.subdivision import Split
 from voronerf.distributed.checkpoint import RankWriter, ownership
@@ -93,11 +93,10 @@ class RankTrainer(Trainer):
         self._asked = False
         super().__init__(config, scene, on_step=on_step, on_event=on_event, clock=lambda: self._agreed)
         self.renderer.join(group)
-        self.renderer.limit_grid()
         self.writer = RankWriter(self)
 
     @property
-    def diagram(self) -> Any:
+    def diagram(self) -> VoronoiDiagram:
         """All cells of the run."""
         return self.router.diagram if self.sharing is None else self.sharing.diagram
 
