@@ -258,12 +258,14 @@ def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, 
     """The inverse of :func:`optimizer_tensors`; groups and learning rates stay the optimiser's own.
 
     Raises:
-        ValueError: When a parameter's moments are missing or have another shape.
+        ValueError: When a parameter's moments are missing, have another shape, or are of no parameter.
     """
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
-        index, key = name.split(".", 1)
+        index, _, key = name.partition(".")
+        if not (index.isdecimal() and int(index) < len(parameters) and key):
+            raise ValueError(f"optimizer.{name} must be of one of {len(parameters)} parameters")
         state.setdefault(int(index), {})[key] = tensor.clone()  # the optimiser updates its state in place
     for number, entries in state.items():
         for key in ("exp_avg", "exp_avg_sq", *entries):
