@@ -258,6 +258,7 @@ def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails)
         ("--parameters 1000000000000 needs", f"--field kilonerf --parameters {10**12}"),
         ("--rays 1000000000 with 8 samples needs", "--rays 1000000000"),
         ("--rays 64 with 1000000000 samples needs", "--samples 1000000000"),
+        ("samples needs 1180591620717411303424.0 GiB of memory or more", f"--samples {10**400}"),
         ("--reservoir 1000000000000 needs", "--reservoir 1000000000000"),
     ):
         fails(message, train, given)

@@ -112,7 +112,7 @@ def without(prefix):
         ("optimizer.0.exp_avg_sq must have shape [", without("optimizer.0.exp_avg_sq")),
         (
             "optimizer.99.step must be of one of",
-            lambda c: c.tensors.update({"optimizer.99.step": c.tensors["optimizer.0.step"]}),
+            lambda c: c.tensors.update({"optimizer.99.step": c.tensors["optimizer.0.step"].clone()}),
         ),
         ("SampleReservoir: state must hold points", without("reservoir.")),
         ("'draws'", without("generator.draws")),
@@ -176,6 +176,13 @@ def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, scene, monkeyp
     trainer.on_step = on_step
     trainer.advance()
     assert load_checkpoint(checkpoint_path(tmp_path)).values["step"] >= 1
+
+
+def test_a_thread_that_cannot_begin_leaves_no_silence(tmp_path, scene, monkeypatch):
+    trainer = Trainer(small(tmp_path, steps=3), scene)
+    monkeypatch.setattr(threading.Thread, "run", lambda thread: None)
+    with pytest.raises(MemoryError, match="no memory for the thread that writes a checkpoint"):
+        trainer.run()
 
 
 def test_turns_leave_checkpoints(tmp_path, scene, monkeypatch):

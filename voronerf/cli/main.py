@@ -7,6 +7,7 @@ import itertools
 import os
 import re
 import sys
+import threading
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -31,11 +32,11 @@ EXPECTED = (
     *(MemoryError, torch.OutOfMemoryError),
 )
 
-#: By which torch's plain RuntimeErrors tell that there is no memory left on a CPU, for tensors or for a thread, and a
-#: SystemError of Python that there is none for an import.
+#: By which torch's plain RuntimeErrors tell that there is no memory left on a CPU, for tensors or for a thread, and
+#: SystemErrors of Python that there is none for an import.
 NO_MEMORY = (
     *("can't allocate memory", "not enough memory", "bad_alloc", "can't start new thread"),
-    "error return without exception set",
+    *("error return without exception set", "returned NULL without setting an exception"),
 )
 
 #: Said before a training that nothing was said about.
@@ -72,6 +73,7 @@ def main(args: list[str] | None = None) -> int:
         with VORONERF_TRACEBACK=1 they are shown whole.
     """
     warnings.showwarning = _show_warning
+    threading.excepthook = _show_thread_error
     if own_rank() == 0:
         return _run(args, sys.stderr)
     # Of the ranks that torchrun starts the first one speaks, and another one only to say what went wrong on it.
@@ -140,6 +142,12 @@ def _train_command(args: list[str]) -> Callable[..., int]:
 
     train.__doc__ = commands.train.__doc__
     return train
+
+
+def _show_thread_error(args: threading.ExceptHookArgs) -> None:
+    """A thread that finds no memory to begin says nothing: whoever waits for it does."""
+    if not isinstance(args.exc_value, (MemoryError, SystemError)):
+        threading.__excepthook__(args)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -111,7 +111,7 @@ class CheckpointWriter:
     def __init__(self, run: Path, keep: int) -> None:
         self.run, self.keep = run, keep
         self._thread: threading.Thread | None = None
-        self._error: OSError | None = None
+        self._error: BaseException | None = None
 
     @property
     def busy(self) -> bool:
@@ -128,6 +128,7 @@ class CheckpointWriter:
         self._begin(checkpoint)
 
     def _begin(self, checkpoint: Checkpoint) -> None:
+        self._error = MemoryError("no memory for the thread that writes a checkpoint")  # until that has done so
         # The end of the process does not wait for it: a second Ctrl-C is to end it at once.
         self._thread = threading.Thread(target=self._write, args=(checkpoint,), daemon=True)
         self._thread.start()
@@ -148,8 +149,10 @@ class CheckpointWriter:
     def _write(self, checkpoint: Checkpoint) -> None:
         try:
             self._save(checkpoint)
-        except OSError as error:
+        except BaseException as error:
             self._error = error
+        else:
+            self._error = None
 
     def _save(self, checkpoint: Checkpoint) -> None:
         keep_checkpoint(self.run, checkpoint, self.keep)

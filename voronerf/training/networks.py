@@ -215,6 +215,7 @@ def _memory(config: TrainConfig) -> int:
 
 def _check_fits(name: str, needed: int, there: int) -> None:
     if needed > there:
+        needed = min(needed, 2**100)  # which a float holds
         raise ConfigError(f"{name} needs {needed / 2**30:.1f} GiB of memory or more, there are {there / 2**30:.1f}")
 
 
