@@ -153,6 +153,7 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings, rate: 
         # The method as published.
         "field": "nerf",
         "occupancy": False,
+        "occupancy_resolution": 64,
         "contraction": "none",
         "average": 0.0,
         "centres": "balanced",

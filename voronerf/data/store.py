@@ -25,8 +25,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import Progress
 from torch import Tensor
 
 from voronerf.data.scene import SceneError
@@ -98,6 +96,9 @@ def _build(folder: Path, wanted: dict[str, Any], done: int, shape: Sequence[int]
     if done == 0:
         (folder / "store.json").unlink(missing_ok=True)
         pixels.unlink(missing_ok=True)  # who has mapped it keeps it
+    from rich.console import Console  # here, since importing it takes long
+    from rich.progress import Progress
+
     file = os.open(pixels, os.O_RDWR | os.O_CREAT, 0o644)
     console = Console(stderr=True)
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
