@@ -260,6 +260,7 @@ def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails)
         ("--rays 64 with 1000000000 samples needs", "--samples 1000000000"),
         ("samples needs 1180591620717411303424.0 GiB of memory or more", f"--samples {10**400}"),
         ("--reservoir 1000000000000 needs", "--reservoir 1000000000000"),
+        ("--reservoir-batches 1000000000000 needs", "--reservoir-batches 1000000000000"),
     ):
         fails(message, train, given)
     monkeypatch.setattr("voronerf.training.networks.SAMPLE_BYTES", 0)

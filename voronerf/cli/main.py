@@ -35,7 +35,7 @@ EXPECTED = (
 #: By which torch's plain RuntimeErrors tell that there is no memory left on a CPU, for tensors or for a thread, and
 #: SystemErrors of Python that there is none for an import.
 NO_MEMORY = (
-    *("can't allocate memory", "not enough memory", "bad_alloc", "can't start new thread"),
+    *("can't allocate memory", "Cannot allocate memory", "not enough memory", "bad_alloc", "can't start new thread"),
     *("error return without exception set", "returned NULL without setting an exception"),
 )
 

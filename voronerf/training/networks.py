@@ -194,6 +194,7 @@ def check_memory(config: TrainConfig) -> None:
     parts = {
         f"--rays {config.rays} with {config.samples} samples": SAMPLE_BYTES * config.rays * int(config.samples or 0),
         f"--reservoir {config.reservoir}": 16 * config.reservoir,
+        f"--reservoir-batches {config.reservoir_batches}": 16 * config.reservoir_batches,
     }
     for name, needed in parts.items():
         _check_fits(name, needed, there)
