@@ -220,6 +220,10 @@ def test_what_files_say_is_shown_and_not_obeyed(tmp_path, capsys, name, shown):
     assert shown in said and str(tmp_path) in said and len(said) < 1000 and said[:-1].isprintable()
 
 
+def test_arguments_that_a_terminal_would_obey(fails):
+    fails("arguments must have no control characters, got \\x1b[2J", "train --balance \x1b[2J")
+
+
 def test_a_failed_run_leaves_its_folder_usable(tmp_path, fails):
     train = "train --data builtin --out", tmp_path
     many = TINY.replace("--cells 3", "--cells 400 --reservoir 400 --reservoir-batches 10")

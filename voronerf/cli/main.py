@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import threading
+import unicodedata
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -84,9 +85,13 @@ def main(args: list[str] | None = None) -> int:
 
 def _run(args: list[str] | None, told: TextIO) -> int:
     """:func:`main`, which says on ``told`` what went wrong."""
+    args = sys.argv[1:] if args is None else args
     try:
+        for word in args:  # the parser shows what it does not take as it came
+            if any(unicodedata.category(char) == "Cc" for char in word):
+                raise ConfigError(f"arguments must have no control characters, got {word}")
         return tyro.extras.subcommand_cli_from_dict(
-            {**COMMANDS, "train": _train_command(sys.argv[1:] if args is None else args)},
+            {**COMMANDS, "train": _train_command(args)},
             prog="voronerf",
             description="Adaptive Voronoi NeRFs: one small network per Voronoi cell, trained and run as one.",
             args=args,
