@@ -1,4 +1,6 @@
-"""Every kernel once on a few blocks, for a process under a sanitizer: ``sanitize.py MODULE [hostile]``.
+"""Every kernel once on a few blocks, for a process under a sanitizer: ``sanitize.py MODULE [races | hostile]``.
+
+``races``: without networks that differ from others in the type of their numbers alone.
 
 ``hostile``: instead what the host cannot refuse without reading it, offsets that fall or leave the batch, trees and
 cells that are none. Nothing outside of the tensors may be touched; results, and who writes them, are undefined.
@@ -7,6 +9,7 @@ Without torch, which takes a sanitizer minutes. Results are test_ops.py's matter
 that every element of an output is written.
 """
 
+import functools
 import sys
 
 import numpy as np
@@ -250,13 +253,17 @@ def network(module, n, k, offsets, precision, ways):
     return [out, *grad_weights, *grad_biases, grad_positions, grad_directions]
 
 
-def grouped_mlp(module):
-    # Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; and what
-    # fits no fused network: layer by layer. Last, in registers with products of four warps.
-    for precision, shared, way in (
-        *(("float32", 227, "auto"), ("bfloat16", 40, "tiles"), ("tf32", 64, "auto"), ("bfloat16", 227, "auto")),
-        *(("float16", 30, "auto"), ("bfloat16", 1, "auto"), ("bfloat16", 227, "wgmma"), ("float16", 40, "wgmma")),
-    ):
+# Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; what fits no
+# fused network: layer by layer; and in registers with products of four warps.
+NETWORKS = (
+    *(("float32", 227, "auto"), ("bfloat16", 40, "tiles"), ("bfloat16", 227, "auto"), ("bfloat16", 1, "auto")),
+    ("bfloat16", 227, "wgmma"),
+)
+SAME_WITH_OTHER_TYPES = (("tf32", 64, "auto"), ("float16", 30, "auto"), ("float16", 40, "wgmma"))
+
+
+def grouped_mlp(module, networks=NETWORKS + SAME_WITH_OTHER_TYPES):
+    for precision, shared, way in networks:
         module.device(90, 120, shared * 1024)
         offsets = np.cumsum([2, 37, 0, 20, 3]).astype(np.int32)
         written(*network(module, 64, 4, offsets, precision, (way, way)))
@@ -350,6 +357,8 @@ def main(path, kind="usual"):
         resample,
         grouped_mlp,
     )
+    if kind == "races":
+        usual = (*usual[:-1], functools.partial(grouped_mlp, networks=NETWORKS))
     for run in (hostile,) if kind == "hostile" else usual:
         run(module)
     print("clean")

@@ -86,7 +86,7 @@ def test_finds(bug, sanitizer, expected):
         assert found.splitlines()[-1].startswith(expected), found
 
 
-@pytest.mark.parametrize("given", [["address"], ["thread"], ["address", "hostile"]], ids=" ".join)
+@pytest.mark.parametrize("given", [["address"], ["thread", "races"], ["address", "hostile"]], ids=" ".join)
 def test_kernels_touch_nothing_outside_and_race_with_nobody(given):
     """On sound arguments, and on hostile ones whatever the offsets say."""
     found = script("sanitize.py", *given)
