@@ -10,11 +10,13 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
-from voronerf.reference.camera_rays import NEWTON_STEPS
+from voronerf.reference.camera_rays import FISHEYE, FOV, NEWTON_STEPS, PERSPECTIVE, TINY
 
 wp.set_module_options({"enable_backward": False})
 
 _STEPS = wp.constant(NEWTON_STEPS)
+_PERSPECTIVE, _FISHEYE, _FOV = wp.constant(PERSPECTIVE), wp.constant(FISHEYE), wp.constant(FOV)
+_TINY = wp.constant(TINY)
 
 
 @wp.kernel
@@ -27,7 +29,7 @@ def _camera_rays_kernel(
     several: wp.bool,
     distortion: wp.array2d(dtype=wp.float32),
     distorted: wp.bool,
-    fisheye: wp.bool,
+    models: wp.array(dtype=wp.int32),
     origins: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.float32),
 ) -> None:
@@ -47,30 +49,48 @@ def _camera_rays_kernel(
         k4 = wp.float64(distortion[c, 5])
         k5 = wp.float64(distortion[c, 6])
         k6 = wp.float64(distortion[c, 7])
-        s1 = wp.float64(0.0)
-        s2 = wp.float64(0.0)
-        if fisheye:
-            s1 = k5
-            s2 = k6
+        nothing = wp.float64(0.0)
+        s1 = nothing
+        s2 = nothing
+        fourth = nothing
         one = wp.float64(1.0)
         two = wp.float64(2.0)
         three = wp.float64(3.0)
         four = wp.float64(4.0)
         six = wp.float64(6.0)
+        model = wp.int32(_PERSPECTIVE)
+        if models.shape[0] > 0:
+            model = models[c]
+        if model == _FOV:
+            radius = wp.max(wp.sqrt(u * u + v * v), wp.float64(_TINY))
+            if k1 != nothing:
+                share = wp.tan(radius * k1) / (radius * two * wp.tan(k1 / two))
+                u = u * share
+                v = v * share
+            k1 = nothing
+            k2 = nothing
+            p1 = nothing
+            p2 = nothing
+            k3 = nothing
+            k4 = nothing
+            k5 = nothing
+            k6 = nothing
+        if model == _FISHEYE:
+            fourth = k4
+            s1 = k5
+            s2 = k6
+            k4 = nothing
+            k5 = nothing
+            k6 = nothing
         a = u
         b = v
         for _ in range(_STEPS):
             r2 = a * a + b * b
-            radial = one
-            slope = one
-            if fisheye:
-                radial = one + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-                slope = two * (k1 + r2 * (two * k2 + r2 * (three * k3 + r2 * four * k4)))
-            else:
-                below = one + r2 * (k4 + r2 * (k5 + r2 * k6))
-                radial = (one + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
-                fall = radial * (k4 + r2 * (two * k5 + r2 * three * k6))
-                slope = two * (k1 + r2 * (two * k2 + r2 * three * k3) - fall) / below
+            below = one + r2 * (k4 + r2 * (k5 + r2 * k6))
+            radial = (one + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * fourth)))) / below
+            rise = k1 + r2 * (two * k2 + r2 * (three * k3 + r2 * four * fourth))
+            fall = radial * (k4 + r2 * (two * k5 + r2 * three * k6))
+            slope = two * (rise - fall) / below
             du = a * radial + two * p1 * a * b + p2 * (r2 + two * a * a) + s1 * r2 - u
             dv = b * radial + p1 * (r2 + two * b * b) + two * p2 * a * b + s2 * r2 - v
             shared = a * b * slope + two * p1 * a + two * p2 * b
@@ -83,7 +103,7 @@ def _camera_rays_kernel(
             b = b - (aa * dv - ba * du) / determinant
         u = a
         v = b
-        if fisheye:
+        if model == _FISHEYE:
             angle = wp.sqrt(u * u + v * v)
             if angle > wp.float64(0.0):
                 u = u * wp.sin(angle) / angle
@@ -107,10 +127,10 @@ def camera_rays(
     *,
     camera: Tensor | None,
     distortion: Tensor | None,
-    fisheye: bool,
+    models: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Origins and unit directions; see ``voronerf.ops.camera_rays``."""
-    origins, directions = _camera_rays(poses, intrinsics, x, y, camera, distortion, fisheye)
+    origins, directions = _camera_rays(poses, intrinsics, x, y, camera, distortion, models)
     return origins, directions
 
 
@@ -122,12 +142,13 @@ def _camera_rays(
     y: Tensor,
     camera: Tensor | None,
     distortion: Tensor | None,
-    fisheye: bool,
+    models: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     results = _allocate(poses, x)
     given = [array(tensor, poses) for tensor in (poses, intrinsics, x, y)]
     lens = array(intrinsics.new_empty(0, 8) if distortion is None else distortion, poses)
-    choice = [array(camera, poses, torch.int32), camera is not None, lens, distortion is not None, fisheye]
+    kinds = array(models, poses, torch.int32)
+    choice = [array(camera, poses, torch.int32), camera is not None, lens, distortion is not None, kinds]
     inputs = [*given, *choice, *(array(tensor, poses) for tensor in results)]
     launch(_camera_rays_kernel, x.shape[0], inputs, poses)
     return results
@@ -141,7 +162,7 @@ def _(
     y: Tensor,
     camera: Tensor | None,
     distortion: Tensor | None,
-    fisheye: bool,
+    models: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     return _allocate(poses, x)
 

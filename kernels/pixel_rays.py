@@ -79,7 +79,7 @@ def pixel_rays(
     far: float,
     box: Tensor | None,
     distortion: Tensor | None,
-    fisheye: bool,
+    models: Tensor | None,
     background: Tensor | None,
 ) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
@@ -87,7 +87,7 @@ def pixel_rays(
     pixel = index % (h * w)
     x, y = ((place + 0.5).to(poses.dtype) for place in (pixel % w, pixel // w))
     camera = (index // (h * w)).to(torch.int32)
-    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion, fisheye=fisheye)
+    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion, models=models)
     behind = None if background is None else background.expand(index.shape[0], 3)
     first, last, colour = _cut_and_colour(origins, directions, images, index, box, behind, near, far)
     return PixelRays(origins, directions, first, last, colour)

@@ -227,7 +227,7 @@ class PixelRaysInputs(NamedTuple):
     poses: Tensor | None  # const float32*
     intrinsics: Tensor | None  # const float32*
     distortion: Tensor | None  # const float32*
-    fisheye: bool
+    models: Tensor | None  # const int32*
     images: Tensor | None  # const uint8*
     pixels: Tensor | None  # const int64*
     box: Tensor | None  # const float32*

@@ -119,7 +119,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
 
         close(run, [3 * torch.randn(180, 4), torch.rand(180) / 10, torch.rand(5, 3)])
 
-    def pixels(fisheye: bool) -> None:
+    def pixels(mixed: bool) -> None:
         poses, lenses = torch.eye(4).repeat(3, 1, 1), torch.tensor([[15.0, 16.0, 8.2, 6.1]]).repeat(3, 1)
         bent, images = torch.rand(3, 8) / 100, torch.randint(0, 256, (3, 12, 17, 4), dtype=torch.uint8)
         box, colours, index = (
@@ -131,7 +131,8 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         def run(
             backend: str, poses: Any, lenses: Any, bent: Any, images: Any, box: Any, colours: Any, index: Any
         ) -> Any:
-            rest: dict[str, Any] = {"box": box, "distortion": bent, "fisheye": fisheye, "background": colours}
+            models = torch.arange(3, dtype=torch.int32, device=poses.device) if mixed else None
+            rest: dict[str, Any] = {"box": box, "distortion": bent, "models": models, "background": colours}
             return voronerf.ops.pixel_rays(poses, lenses, images, index, near=1.0, far=4.0, backend=backend, **rest)
 
         agree(run, [poses, lenses, bent, images, box, colours, index], 2e-6)
@@ -277,7 +278,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         ),
         ("composite", composite),
         ("render_loss", loss),
-        *((f"pixel_rays{' of a fisheye' * bent}", functools.partial(pixels, bent)) for bent in (False, True)),
+        *((f"pixel_rays{' of all lenses' * mixed}", functools.partial(pixels, mixed)) for mixed in (False, True)),
         ("observe_occupancy", observe),
         ("sparse_adam", adam),
         ("resample", resample),

@@ -232,7 +232,7 @@ def _camera_work(n: int, bent: bool, device: torch.device) -> Work:
     x, y, camera = sets[0]
     wide = [tensor.double() for tensor in (poses, intrinsics, x, y)]
     lens = None if distortion is None else distortion.double()
-    exact = reference_camera_rays(*wide, camera=camera, distortion=lens, fisheye=False)
+    exact = reference_camera_rays(*wide, camera=camera, distortion=lens, models=None)
     alternative = "torch, Newton in float32" if bent else "torch, gathered poses + einsum"
     return Work(
         lambda backend: contender(functools.partial(ops.camera_rays, backend=backend)),

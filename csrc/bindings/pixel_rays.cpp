@@ -4,7 +4,7 @@
 
 namespace voronerf {
 
-VN_STRUCT(PixelRaysInputs, poses, intrinsics, distortion, fisheye, images, pixels, box, background, background_per_ray,
+VN_STRUCT(PixelRaysInputs, poses, intrinsics, distortion, models, images, pixels, box, background, background_per_ray,
           c, h, w, channels, b, near, far);
 VN_STRUCT(PixelRaysOutputs, origins, directions, near, far, colour);
 

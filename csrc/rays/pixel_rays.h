@@ -10,7 +10,7 @@ struct PixelRaysInputs {
   const float* poses;       // [c,4,4], camera to world
   const float* intrinsics;  // [c,4]: fx, fy, cx, cy
   const float* distortion;  // [c,8], voronerf/reference/camera_rays.py; or null
-  bool fisheye;
+  const int32_t* models;    // [c], camera models, voronerf/reference/camera_rays.py; or null
   const uint8_t* images;    // [c,h,w,channels]
   const int64_t* pixels;    // [b], numbered through all images
   const float* box;         // [2,3], or null for all of space

@@ -10,10 +10,19 @@
 namespace voronerf {
 
 constexpr int kNewtonSteps = 12;
-constexpr double kSettled = 1e-6;
+constexpr double kSettled = 1e-6, kTiny = 1e-12;
+constexpr int32_t kPerspective = 0, kFisheye = 1, kFov = 2;
 
 // The point that the lens puts at (u, v): Newton's method and the models of voronerf/reference/camera_rays.py.
-VN_HD void undistort(const float* lens, bool fisheye, double u, double v, double& a, double& b) {
+VN_HD void undistort(const float* lens, int32_t model, double u, double v, double& a, double& b) {
+  if (model == kFov) {
+    const double omega = lens[0], radius = fmax(sqrt(u * u + v * v), kTiny);
+    const double share = omega == 0 ? 1 : tan(radius * omega) / (radius * 2 * tan(omega / 2));
+    a = u * share;
+    b = v * share;
+    return;
+  }
+  const bool fisheye = model == kFisheye;
   const double k1 = lens[0], k2 = lens[1], p1 = lens[2], p2 = lens[3], k3 = lens[4], k4 = lens[5];
   const double k5 = fisheye ? 0 : lens[6], k6 = fisheye ? 0 : lens[7];
   const double s1 = fisheye ? lens[6] : 0, s2 = fisheye ? lens[7] : 0;
@@ -54,9 +63,10 @@ VN_HD void pixel_direction(const PixelRaysInputs& in, int64_t camera, int64_t x,
     v = (py - lens[3]) / lens[1];
   } else {
     double a, b;
-    undistort(in.distortion + 8 * camera, in.fisheye, (static_cast<double>(px) - lens[2]) / lens[0],
+    const int32_t model = in.models == nullptr ? kPerspective : in.models[camera];
+    undistort(in.distortion + 8 * camera, model, (static_cast<double>(px) - lens[2]) / lens[0],
               (static_cast<double>(py) - lens[3]) / lens[1], a, b);
-    if (in.fisheye) {
+    if (model == kFisheye) {
       const double angle = sqrt(a * a + b * b), share = angle == 0 ? 1 : sin(angle) / angle;
       a *= share;
       b *= share;

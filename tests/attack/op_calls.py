@@ -118,7 +118,7 @@ def balance_centres(rng: random.Random, n: int) -> Call:
 
 def cameras(rng: random.Random, c: int) -> Call:
     intrinsics = torch.cat([30 + 10 * torch.rand(c, 2), 4 * torch.rand(c, 2)], dim=1)
-    lens = {"distortion": 0.01 * torch.randn(c, 8), "fisheye": rng.random() < 0.5}
+    lens = {"distortion": 0.01 * torch.randn(c, 8), "models": rng.choice((None, index(c, 3)))}
     return {"poses": torch.eye(4).repeat(c, 1, 1), "intrinsics": intrinsics, **lens}
 
 

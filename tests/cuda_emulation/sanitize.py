@@ -131,8 +131,9 @@ def step(module):
         written(*rendered(module, offsets, background))
     poses, lenses, bent, box = floats(3, 4, 4), floats(3, 4) + 9, floats(3, 8) / 99, np.array([[-1, -1, -1], [1, 1, 1]])
     images, pixels = RANDOM.integers(0, 256, (3, 12, 17, 4), dtype=np.uint8), RANDOM.integers(0, 612, 300)
+    models = np.arange(3, dtype=np.int32)
     given = module.PixelRaysInputs(
-        *every((poses, lenses, bent)), True, *every((images, pixels, box.astype(np.float32), floats(3))), False,
+        *every((poses, lenses, bent, models, images, pixels, box.astype(np.float32), floats(3))), False,
         3, 12, 17, 4, 300, 1.0, 4.0
     )  # fmt: skip
     results = [unwritten(300, 3), unwritten(300, 3), unwritten(300), unwritten(300), unwritten(300, 3)]

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from voronerf.data.lenses import MODELS
+
 Contents = dict[str, Any]
 
 
@@ -65,21 +67,23 @@ def quaternion(turn):
     return np.array([w, x, y, z])
 
 
-def write_colmap(folder, poses, sizes, points, *, binary=True, parameters=(20.0, 6.0, 5.0, 0.02)):
-    """A COLMAP model with a SIMPLE_RADIAL camera for each image, in an order that is not that of the names.
+def write_colmap(folder, poses, sizes, points, *, binary=True, lenses=None):
+    """A COLMAP model with a camera for each image, in an order that is not that of the names.
 
-    Every image sees every point.
+    The cameras are of `lenses`, a model and its parameters each, or of SIMPLE_RADIAL. Every image sees every point.
     """
+    lenses = lenses or [("SIMPLE_RADIAL", (20.0, 6.0, 5.0, 0.02))] * len(sizes)
+    numbers = {name: number for number, (name, _) in MODELS.items()}
     (folder / "sparse/0").mkdir(parents=True, exist_ok=True)
     cameras, images = {}, {}
-    for index, (pose, (width, height)) in enumerate(zip(np.asarray(poses, np.float64), sizes)):
+    for index, (pose, (width, height), lens) in enumerate(zip(np.asarray(poses, np.float64), sizes, lenses)):
         turn = (pose[:3, :3] * (1, -1, -1)).T
-        cameras[index + 1] = (width, height, parameters)
+        cameras[index + 1] = (width, height, *lens)
         images[index + 1] = (*quaternion(turn), *(-turn @ pose[:3, 3]), index + 1, f"{index:02d}.jpg")
     order = sorted(images, reverse=True)
     seen = [(1.0, 1.0, number) for number in range(len(points))]
     if not binary:
-        lines = [f"{key} SIMPLE_RADIAL {w} {h} {' '.join(map(repr, p))}" for key, (w, h, p) in cameras.items()]
+        lines = [f"{key} {name} {w} {h} {' '.join(map(repr, p))}" for key, (w, h, name, p) in cameras.items()]
         (folder / "sparse/0/cameras.txt").write_text("# cameras\n" + "\n".join(lines) + "\n")
         second = " ".join(f"{x} {y} {number}" for x, y, number in seen)
         lines = [f"{key} {' '.join(str(x) for x in images[key])}\n{second}" for key in order]
@@ -89,7 +93,7 @@ def write_colmap(folder, poses, sizes, points, *, binary=True, parameters=(20.0,
         (folder / "sparse/0/points3D.txt").write_text("\n".join(lines) + "\n")
         return
     data = [struct.pack("<Q", len(cameras))]
-    data += [struct.pack("<IiQQ4d", key, 2, w, h, *p) for key, (w, h, p) in cameras.items()]
+    data += [struct.pack(f"<IiQQ{len(p)}d", key, numbers[name], w, h, *p) for key, (w, h, name, p) in cameras.items()]
     (folder / "sparse/0/cameras.bin").write_bytes(b"".join(data))
     data = [struct.pack("<Q", len(images))]
     for key in order:

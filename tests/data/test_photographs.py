@@ -261,7 +261,6 @@ def broken(path, at, layout, *values):
         (lambda model: broken(model / "points3D.bin", 0, "<Q", 10**6), "points3D.bin: is cut short or broken: 1000000"),
         (lambda model: broken(model / "images.bin", 12, "<d", np.nan), "image 08.jpg: its pose must be a unit"),
         (lambda model: broken(model / "cameras.bin", 12, "<i", 77), "camera 1 has model number 77"),
-        (lambda model: broken(model / "cameras.bin", 12, "<i", 7), "camera 1: camera model FOV is not supported"),
         (
             lambda model: broken(model / "cameras.bin", 32, "<d", -1.0),
             "camera 1 must have a size, finite parameters",

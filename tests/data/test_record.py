@@ -41,7 +41,7 @@ def test_what_is_written_is_read(tmp_path, scene, contraction) -> None:
     cameras = replace(
         scene.train.cameras,
         distortion=torch.rand(4, 8),
-        fisheye=True,
+        models=torch.tensor([0, 2, 1, 0], dtype=torch.int32),
         sizes=torch.tensor([[12, 12], [12, 10], [8, 12], [12, 12]]),
     )
     whole = replace(scene, contraction=contraction, box=None, train=replace(scene.train, cameras=cameras))

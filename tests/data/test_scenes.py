@@ -245,9 +245,12 @@ def test_distortion_params_are_those_of_nerfstudio(tmp_path):
     ):
         write_capture(tmp_path / folder, orbit_cameras(3, radius=2, elevation=5, width=8, height=8, focal=8), **lens)
     named, listed, fisheye = (load_scene(tmp_path / name).train.cameras for name in ("named", "listed", "fisheye"))
-    assert named.distortion is not None and torch.equal(named.distortion, listed.distortion) and not named.fisheye
-    assert fisheye.fisheye
+    assert named.distortion is not None and torch.equal(named.distortion, listed.distortion) and named.models is None
+    assert fisheye.models.tolist() == [1, 1]
     torch.testing.assert_close(fisheye.distortion[0], torch.tensor((0.1, -0.2, 0, 0, 0.03, -0.04, 0, 0)))
+    rewrite(tmp_path / "fisheye", lambda contents: contents["frames"][0].update(camera_model="OPENCV", k4=0))
+    mixed = load_scene(tmp_path / "fisheye").train.cameras
+    assert mixed.models.tolist() == [1, 0] and mixed.distortion[:, 5].tolist() == [pytest.approx(-0.04), 0]
 
 
 def test_capture_with_alpha_is_an_object_on_white(tmp_path):

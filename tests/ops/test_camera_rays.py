@@ -15,10 +15,14 @@ def cameras(count, lens):
     poses = look_at(torch.randn(count, 3) * 3, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     intrinsics = torch.tensor([[80.0, 75.0, 31.0, 25.0]]) + torch.rand(count, 4)
     bent = None if lens is None else torch.randn(count, 8) * LENS
-    return Cameras(poses, intrinsics, 64, 48, bent, lens == "fisheye")
+    models = None
+    if lens == "mixed":
+        models = torch.arange(count, dtype=torch.int32) % 3
+        bent[2::3, 0] = 0.9  # of FOV
+    return Cameras(poses, intrinsics, 64, 48, bent, models)
 
 
-@pytest.mark.parametrize("lens", [None, "bent", "fisheye"])
+@pytest.mark.parametrize("lens", [None, "bent", "mixed"])
 @pytest.mark.parametrize("b", [0, 1, 300])
 def test_rays_pass_through_their_pixels(device, backend, b, lens):
     some = cameras(3, lens)
@@ -28,8 +32,9 @@ def test_rays_pass_through_their_pixels(device, backend, b, lens):
     def run(given, index):
         tensors = (strided(tensor.to(device)) for tensor in (given.poses, given.intrinsics, x, y))
         bent = None if given.distortion is None else strided(given.distortion.to(device))
+        models = None if given.models is None else strided(given.models.to(device))
         which = None if index is None else strided(index.to(device))
-        options = {"camera": which, "distortion": bent, "fisheye": given.fisheye, "backend": backend}
+        options = {"camera": which, "distortion": bent, "models": models, "backend": backend}
         return [part.cpu() for part in camera_rays(*tensors, **options)]
 
     origins, directions = run(some, camera)
@@ -55,6 +60,10 @@ def test_refuses_what_makes_no_sense():
     wrong = torch.tensor([0, 1, 2, 0, 0], dtype=torch.int32)
     refuses("camera must lie in 0 to 1, got values from 0 to 2", camera=wrong)
     refuses("distortion must have shape [c, 8] with c = 2, got [1, 8]", distortion=torch.zeros(1, 8))
-    refuses("distortion must be given with fisheye, got None", fisheye=True)
+    models = torch.tensor([0, 2], dtype=torch.int32)
+    refuses("distortion must be given with models, got None", models=models)
+    refuses("models must have shape [c] with c = 2, got [1]", models=models[1:])
+    refuses("models must have dtype int32, got int64", models=models.long())
+    refuses("models must lie in 0 to 2, got values from 1 to 3", models=models + 1)
     refuses("poses must have dtype float32, got float64", poses=some.poses.double())
     refuses("poses must hold at least one camera, got none", poses=some.poses[:0], intrinsics=some.intrinsics[:0])

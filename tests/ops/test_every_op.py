@@ -61,13 +61,14 @@ def march(n):
 
 def cameras(n):
     some = {"poses": torch.eye(4).repeat(3, 1, 1), "intrinsics": 30 + torch.rand(3, 4), "camera": index(n, 3)}
+    some["models"] = torch.arange(3, dtype=torch.int32)
     return {**some, "x": 64 * torch.rand(n), "y": 48 * torch.rand(n), "distortion": 0.01 * torch.randn(3, 8)}
 
 
 def pixels(n):
     """n pixels of three images."""
     some = cameras(n)
-    given = {"poses": some["poses"], "intrinsics": some["intrinsics"], "distortion": some["distortion"]}
+    given = {name: some[name] for name in ("poses", "intrinsics", "distortion", "models")}
     box = torch.tensor([[-1.0] * 3, [1.0] * 3])
     images = torch.randint(256, (3, 5, 7, 4), dtype=torch.uint8)
     return {**given, "images": images, "index": torch.randint(105, (n,)), "background": torch.rand(n, 3), "box": box}

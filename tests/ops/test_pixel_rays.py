@@ -19,12 +19,16 @@ def scene(channels, lens):
     poses = look_at(3 * torch.nn.functional.normalize(torch.randn(4, 3), dim=1), torch.zeros(3), torch.eye(3)[2])
     intrinsics = torch.tensor([[15.0, 16.0, 8.2, 6.1]]) + torch.rand(4, 4)
     bent = None if lens is None else torch.randn(4, 8) * LENS
+    models = None
+    if lens == "mixed":
+        models = torch.arange(4, dtype=torch.int32) % 3
+        bent[2::3, 0] = 0.9  # of FOV
     images = torch.randint(0, 256, (4, HEIGHT, WIDTH, channels), dtype=torch.uint8)
-    return Cameras(poses, intrinsics, WIDTH, HEIGHT, bent, lens == "fisheye"), images
+    return Cameras(poses, intrinsics, WIDTH, HEIGHT, bent, models), images
 
 
 SIZES = {"b": [0, 1, 63, 300], "background": [None, "one", "per ray"], "channels": [3, 4]}
-LENSES = {"lens": [None, "bent", "fisheye"], "boxed": [False, True]}
+LENSES = {"lens": [None, "bent", "mixed"], "boxed": [False, True]}
 
 
 @pytest.mark.parametrize(*all_pairs({**SIZES, **LENSES}))
@@ -43,7 +47,7 @@ def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, chan
         far=4.0,
         box=on(box),
         distortion=on(cameras.distortion),
-        fisheye=cameras.fisheye,
+        models=on(cameras.models),
         background=on(behind),
         backend=backend,
     )
@@ -89,7 +93,6 @@ def test_refuses_what_makes_no_sense():
     refuses("box must have shape [2, 3], got [3, 2]", box=BOX.T)
     refuses("background must have shape [b, 3] with b = 3, got [2, 3]", background=torch.rand(2, 3))
     refuses("distortion must have shape [c, 8] with c = 4, got [1, 8]", distortion=torch.zeros(1, 8))
-    refuses("distortion must be given with fisheye, got None", fisheye=True)
-    with refused(TypeError, "pixel_rays: fisheye must be True or False, got int"):
-        pixel_rays(**good, near=0.0, far=1.0, fisheye=1)
+    refuses("distortion must be given with models, got None", models=torch.arange(4, dtype=torch.int32) % 3)
+    refuses("models must lie in 0 to 2, got values from 0 to 3", models=torch.arange(4, dtype=torch.int32))
     refuses("near and far must satisfy 0 <= near < far, got 1.0 and 1.0", near=1.0)

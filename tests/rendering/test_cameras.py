@@ -122,17 +122,19 @@ def test_indexing_and_no_rays():
 
 
 @pytest.mark.parametrize(
-    ("poses", "intrinsics", "distortion", "size", "message"),
+    ("poses", "intrinsics", "distortion", "models", "size", "message"),
     [
-        ((2, 3, 4), (2, 4), None, 1, "poses must have shape [c, 4, 4], got [2, 3, 4]"),
-        ((2, 4, 4), (1, 4), None, 1, "intrinsics must have shape [2, 4], got [1, 4]"),
-        ((2, 4, 4), (2, 4), (2, 5), 1, "distortion must have shape [2, 8], got [2, 5]"),
-        ((2, 4, 4), (2, 4), None, 0, "width and height must be >= 1, got 0 x 1"),
+        ((2, 3, 4), (2, 4), None, None, 1, "poses must have shape [c, 4, 4], got [2, 3, 4]"),
+        ((2, 4, 4), (1, 4), None, None, 1, "intrinsics must have shape [2, 4], got [1, 4]"),
+        ((2, 4, 4), (2, 4), (2, 5), None, 1, "distortion must have shape [2, 8], got [2, 5]"),
+        ((2, 4, 4), (2, 4), (2, 8), (3,), 1, "models must have shape [2], got [3]"),
+        ((2, 4, 4), (2, 4), None, (2,), 1, "distortion must be given with models, got None"),
+        ((2, 4, 4), (2, 4), None, None, 0, "width and height must be >= 1, got 0 x 1"),
     ],
 )
-def test_cameras_reject(poses, intrinsics, distortion, size, message):
-    bent = None if distortion is None else torch.zeros(distortion)
-    refuses(message, Cameras, torch.zeros(poses), torch.zeros(intrinsics), size, 1, bent)
+def test_cameras_reject(poses, intrinsics, distortion, models, size, message):
+    bent, kinds = (None if shape is None else torch.zeros(shape) for shape in (distortion, models))
+    refuses(message, Cameras, torch.zeros(poses), torch.zeros(intrinsics), size, 1, bent, kinds)
 
 
 def test_look_at_is_a_rotation_that_looks_there():

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from voronerf.data.images import read_header
-from voronerf.data.lenses import FISHEYE, PERSPECTIVE, Lens
+from voronerf.data.lenses import COEFFICIENTS, FISHEYE, PERSPECTIVE, Lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, least_factor, photograph_scene
 from voronerf.data.scene import Scene, SceneError
 from voronerf.data.transforms import Frame, focal_length, number, pose_of, read_transforms
@@ -133,13 +133,12 @@ def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, read
 
 def _view(path: Path, entries: dict[str, Any], frame: Frame, downscale: int) -> View:
     values = {**_named_distortion(entries, path), **_named_distortion(frame.entries, path)}
-    fisheye = _is_fisheye(values, path)
+    model = FISHEYE if _is_fisheye(values, path) else PERSPECTIVE
     size = read_header(frame.path, downscale).size
     given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
-    coefficients = tuple(given.get(key, 0.0) for key in (FISHEYE if fisheye else PERSPECTIVE))
-    return View(
-        frame.path, frame.pose, Lens(_intrinsics(values, size, path, frame), coefficients, fisheye), size, frame.mask
-    )
+    coefficients = tuple(given.get(key, 0.0) for key in COEFFICIENTS[model])
+    lens = Lens(_intrinsics(values, size, path, frame), coefficients, model)
+    return View(frame.path, frame.pose, lens, size, frame.mask)
 
 
 def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> tuple[float, ...]:

@@ -12,15 +12,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.rendering.cameras import Cameras, distort, undistort
+from voronerf.reference.camera_rays import FISHEYE, FOV, PERSPECTIVE, distort, undistort
+from voronerf.rendering.cameras import Cameras
 
 
 class Lens(NamedTuple):
-    """Intrinsics (fx, fy, cx, cy) in pixels, and the coefficients of `Cameras.distortion`."""
+    """Intrinsics (fx, fy, cx, cy) in pixels, the coefficients of `Cameras.distortion`, and of `Cameras.models` one."""
 
     intrinsics: tuple[float, ...]
     coefficients: tuple[float, ...]
-    fisheye: bool
+    model: int
 
 
 #: COLMAP's number of each model, its name and what its parameters are. f stands for fx and fy.
@@ -37,10 +38,12 @@ MODELS: dict[int, tuple[str, str]] = {
     9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
     10: ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s2"),
 }
-PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-FISHEYE = ("k1", "k2", "p1", "p2", "k3", "k4", "s1", "s2")
-#: Models whose distortion is none of the two that `distort` has.
-REFUSED = ("FOV",)
+#: The names of the coefficients in `Cameras.distortion`.
+COEFFICIENTS = {
+    PERSPECTIVE: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    FISHEYE: ("k1", "k2", "p1", "p2", "k3", "k4", "s1", "s2"),
+    FOV: ("omega", *7 * ("",)),
+}
 
 
 def colmap_lens(model: str, parameters: Sequence[float]) -> Lens:
@@ -49,15 +52,15 @@ def colmap_lens(model: str, parameters: Sequence[float]) -> Lens:
     Raises:
         ValueError: an unknown model, or another number of parameters; a part of a line.
     """
-    names = {name: text.split() for name, text in MODELS.values() if name not in REFUSED}
+    names = {name: text.split() for name, text in MODELS.values()}
     if model not in names:
         raise ValueError(f"camera model {model!s:.60} is not supported, only {', '.join(names)}")
     if len(parameters) != len(names[model]):
         raise ValueError(f"{model} must have {len(names[model])} parameters, got {len(parameters)}")
     given = dict(zip(names[model], parameters))
-    fisheye = "FISHEYE" in model
+    kind = FISHEYE if "FISHEYE" in model else FOV if model == "FOV" else PERSPECTIVE
     intrinsics = (given.get("fx", given.get("f", 0)), given.get("fy", given.get("f", 0)), given["cx"], given["cy"])
-    return Lens(intrinsics, tuple(given.get(key, 0.0) for key in (FISHEYE if fisheye else PERSPECTIVE)), fisheye)
+    return Lens(intrinsics, tuple(given.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
 
 
 def lens_inverts(cameras: Cameras) -> Tensor:
@@ -88,7 +91,8 @@ def _has_ray(cameras: Cameras, index: int, x: Tensor, y: Tensor) -> Tensor:
     fx, fy, cx, cy = cameras.intrinsics[index].double()
     coefficients = cameras.distortion[index].double()
     u, v = (x.double() - cx) / fx, (y.double() - cy) / fy
-    a, b = undistort(u, v, coefficients, cameras.fisheye)
-    again, and_again = distort(a, b, coefficients, cameras.fisheye)
+    model = PERSPECTIVE if cameras.models is None else int(cameras.models[index])
+    a, b = undistort(u, v, coefficients, model)
+    again, and_again = distort(a, b, coefficients, model)
     found = torch.maximum((again - u).abs() * fx, (and_again - v).abs() * fy) < 1e-3
-    return found & (torch.hypot(a, b) < math.pi) if cameras.fisheye else found
+    return found & (torch.hypot(a, b) < math.pi) if model == FISHEYE else found

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from voronerf.data.folders import choose_images, listed_images, stay_inside
-from voronerf.data.lenses import Lens
+from voronerf.data.lenses import PERSPECTIVE, Lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, photograph_scene
 from voronerf.data.scene import Scene, SceneError
 from voronerf.data.transforms import LARGEST, ORTHONORMAL
@@ -51,7 +51,7 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
         if not (min(height, width, focal) >= 1 and 0 < near < far):
             given = ", ".join(f"{value:g}" for value in row[[4, 9, 14, 15, 16]])
             raise SceneError(f"{path}: row {number} must have a size, a focal length and 0 < near < far, got {given}")
-        lens = Lens((focal, focal, width / 2, height / 2), (0.0,) * 8, False)
+        lens = Lens((focal, focal, width / 2, height / 2), (0.0,) * 8, PERSPECTIVE)
         views.append(View(file, torch.from_numpy(pose), lens, (width, height), bounds=(float(near), float(far))))
     about = (f"LLFF's {FILE} of {len(views)} images", *chosen.notes)
     return photograph_scene(folder, Photographs(path, views, hold_out(len(views)), chosen.factor, about), reading)

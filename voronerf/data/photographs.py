@@ -18,7 +18,7 @@ from torch import Tensor
 
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images, read_masks
-from voronerf.data.lenses import Lens, lens_inverts, pixels_with_rays
+from voronerf.data.lenses import PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.data.scene import Scene, SceneError, Split
 from voronerf.data.transforms import distinct_names
 from voronerf.rendering.cameras import Cameras, focus_point
@@ -253,7 +253,7 @@ def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Per
     centre = frame.centre.float()
     if kind == "object":
         return None
-    if kind != "forward" or cameras.fisheye:  # which may see to the side, or behind
+    if kind != "forward" or cameras.models is not None:  # a fisheye may see to the side, or behind
         return Contraction(centre, frame.radius)
     slopes = torch.zeros(2)
     axes = frame.axes.float()
@@ -299,8 +299,6 @@ def _kind(poses: Tensor, alpha: bool, asked: str, source: Path) -> str:
 
 def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) -> Cameras:
     """Cameras of the image files, whose size may be another one of the same shape than the lens is for."""
-    if len({view.lens.fisheye for view in views}) > 1:
-        raise SceneError(f"{source}: has fisheyes and other cameras; the cameras of a scene must be of one kind")
     intrinsics = []
     for view, (width, height) in zip(views, sizes.tolist()):
         across, down = width / view.size[0], height / view.size[1]
@@ -313,23 +311,24 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
         fx, fy, cx, cy = view.lens.intrinsics
         intrinsics.append((fx * across, fy * down, cx * across, cy * down))
     bent = torch.tensor([view.lens.coefficients for view in views])
-    fisheye = views[0].lens.fisheye
-    distortion = bent if fisheye or bool(bent.any()) else None
-    cameras = Cameras.of_images(poses.float(), torch.tensor(intrinsics), sizes, distortion, fisheye)
-    return cameras
+    models = torch.tensor([view.lens.model for view in views], dtype=torch.int32)
+    others = models if bool((models != PERSPECTIVE).any()) else None
+    distortion = bent if others is not None or bool(bent.any()) else None
+    return Cameras.of_images(poses.float(), torch.tensor(intrinsics), sizes, distortion, others)
 
 
 def _without_dark_corners(cameras: Cameras, masks: Tensor | None, source: Path, views: Sequence[View]) -> Tensor | None:
-    """The masks without the pixels that no ray of a fisheye reaches.
+    """The masks without the pixels that no ray of a fisheye or an FOV lens reaches.
 
     Raises:
-        SceneError: such pixels of another lens, whose model is then a wrong one.
+        SceneError: such pixels of a perspective lens, whose model is then a wrong one.
     """
     inverts = lens_inverts(cameras)
     if bool(inverts.all()):
         return masks
-    if not cameras.fisheye:
-        name = views[int(inverts.int().argmin())].path.name
+    perspective = torch.tensor([view.lens.model == PERSPECTIVE for view in views])
+    if bool((wrong := perspective & ~inverts).any()):
+        name = views[int(wrong.int().argmax())].path.name
         raise SceneError(f"{source}: the lens distortion of {name} cannot be inverted inside the image")
     if masks is None:
         masks = torch.ones(len(cameras), cameras.height, cameras.width, dtype=torch.bool)

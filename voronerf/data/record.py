@@ -20,7 +20,7 @@ from voronerf.rendering.contraction import Contraction, Perspective
 CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
 #: What a text of a scene may be.
 WORDS = {"spacing": ("linear", "disparity"), "background": ("white", None), "kind": KINDS}
-INTEGERS = {"sizes": torch.int64}
+INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
 
 def write_scene(path: Path, scene: Scene) -> None:

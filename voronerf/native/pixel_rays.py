@@ -22,11 +22,11 @@ def pixel_rays(
     far: float,
     box: Tensor | None,
     distortion: Tensor | None,
-    fisheye: bool,
+    models: Tensor | None,
     background: Tensor | None,
 ) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    return PixelRays(*_pixel_rays(poses, intrinsics, images, index, box, distortion, fisheye, background, near, far))
+    return PixelRays(*_pixel_rays(poses, intrinsics, images, index, box, distortion, models, background, near, far))
 
 
 @custom_op("pixel_rays_native")
@@ -37,7 +37,7 @@ def _pixel_rays(
     index: Tensor,
     box: Tensor | None,
     distortion: Tensor | None,
-    fisheye: bool,
+    models: Tensor | None,
     background: Tensor | None,
     near: float,
     far: float,
@@ -52,7 +52,7 @@ def _pixel_rays(
         poses=poses,
         intrinsics=intrinsics,
         distortion=distortion,
-        fisheye=fisheye,
+        models=models,
         images=images,
         pixels=index,
         box=box,

@@ -11,7 +11,6 @@ from voronerf.checks import (
     INDEX,
     check_count,
     check_dtype,
-    check_flag,
     check_range,
     check_same_device,
     check_same_dtype,
@@ -32,7 +31,7 @@ def camera_rays(
     *,
     camera: Tensor | None = None,
     distortion: Tensor | None = None,
-    fisheye: bool = False,
+    models: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Rays through positions in images. Lens distortion is undone by Newton's method in float64.
@@ -47,8 +46,10 @@ def camera_rays(
         camera: int32 [b], the camera of each position, 0 to c - 1; None for the first camera. Others are an error on
             the CPU, and undefined on CUDA, where they are not checked.
         distortion: float32 [c, 8], (k1, k2, p1, p2, k3, k4, k5, k6) of OpenCV's rational model, or None for none.
-        fisheye: the lenses are fisheyes, and distortion is (k1, k2, p1, p2, k3, k4, s1, s2) of COLMAP's
-            THIN_PRISM_FISHEYE, whose k1 to k4 are those of OpenCV's fisheye model.
+        models: int32 [c], the camera model of each, which comes with distortion; None is 0 for all. 0 is perspective.
+            1 is a fisheye, and distortion is (k1, k2, p1, p2, k3, k4, s1, s2) of COLMAP's THIN_PRISM_FISHEYE, whose k1
+            to k4 are those of OpenCV's fisheye model. 2 is COLMAP's FOV, and distortion is (omega, 0, ...). Others are
+            an error on the CPU, and perspective on CUDA.
         backend: "auto", "reference" or "warp".
 
     Returns:
@@ -80,17 +81,22 @@ def camera_rays(
         check_shape(_OP, "camera", camera, ("b",), sizes)
         check_dtype(_OP, "camera", camera, INDEX)
         check_range(_OP, "camera", camera, sizes["c"])
-    check_flag(_OP, "fisheye", fisheye)
     if distortion is not None:
         check_shape(_OP, "distortion", distortion, ("c", 8), sizes)
-    elif fisheye:
-        raise ValueError(f"{_OP}: distortion must be given with fisheye, got None")
+    if models is not None:
+        check_shape(_OP, "models", models, ("c",), sizes)
+        check_dtype(_OP, "models", models, INDEX)
+        check_range(_OP, "models", models, 3)
+        if distortion is None:
+            raise ValueError(f"{_OP}: distortion must be given with models, got None")
     check_same_dtype(_OP, poses=poses, intrinsics=intrinsics, x=x, y=y, distortion=distortion)
-    check_same_device(_OP, poses=poses, intrinsics=intrinsics, x=x, y=y, camera=camera, distortion=distortion)
+    check_same_device(
+        _OP, poses=poses, intrinsics=intrinsics, x=x, y=y, camera=camera, distortion=distortion, models=models
+    )
     check_count(_OP, "x", sizes["b"])
     if sizes["c"] < 1:
         raise ValueError(f"{_OP}: poses must hold at least one camera, got none")
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
     tensors = (tensor.detach() for tensor in (poses, intrinsics, x, y))
-    origins, directions = run(*tensors, camera=camera, distortion=distortion, fisheye=fisheye)
+    origins, directions = run(*tensors, camera=camera, distortion=distortion, models=models)
     return origins, directions

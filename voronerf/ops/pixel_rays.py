@@ -8,10 +8,11 @@ from torch import Tensor
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import (
+    INDEX,
     check_count,
     check_dtype,
-    check_flag,
     check_number,
+    check_range,
     check_same_device,
     check_same_dtype,
     check_shape,
@@ -36,7 +37,7 @@ def pixel_rays(
     far: float,
     box: Tensor | None = None,
     distortion: Tensor | None = None,
-    fisheye: bool = False,
+    models: Tensor | None = None,
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> PixelRays:
@@ -54,7 +55,7 @@ def pixel_rays(
         far: farthest.
         box: float32 [2, 3], lowest and highest corner, or None for all of space.
         distortion: float32 [c, 8] of the lenses, see `camera_rays`, or None.
-        fisheye: the lenses are fisheyes.
+        models: int32 [c], the camera model of each, see `camera_rays`, or None.
         background: float32 [3] or [b, 3], the colour behind images with an alpha channel; None leaves their
             colours as they are.
         backend: "auto", "reference", "native" or "warp".
@@ -89,11 +90,14 @@ def pixel_rays(
     check_dtype(_OP, "index", index, (torch.int64,))
     if box is not None:
         check_shape(_OP, "box", box, (2, 3))
-    check_flag(_OP, "fisheye", fisheye)
     if distortion is not None:
         check_shape(_OP, "distortion", distortion, ("c", 8), sizes)
-    elif fisheye:
-        raise ValueError(f"{_OP}: distortion must be given with fisheye, got None")
+    if models is not None:
+        check_shape(_OP, "models", models, ("c",), sizes)
+        check_dtype(_OP, "models", models, INDEX)
+        check_range(_OP, "models", models, 3)
+        if distortion is None:
+            raise ValueError(f"{_OP}: distortion must be given with models, got None")
     if background is not None:
         check_tensor(_OP, "background", background)
         check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("b", 3), sizes)
@@ -105,7 +109,7 @@ def pixel_rays(
         "background": background,
     }
     check_same_dtype(_OP, **floats)
-    check_same_device(_OP, **floats, images=images, index=index)
+    check_same_device(_OP, **floats, images=images, index=index, models=models)
     check_count(_OP, "index", sizes["b"])
     if sizes["channels"] not in (3, 4):
         raise ValueError(f"{_OP}: images must have 3 or 4 channels, got {sizes['channels']}")
@@ -123,7 +127,7 @@ def pixel_rays(
         far=float(far),
         box=None if box is None else box.detach(),
         distortion=None if distortion is None else distortion.detach(),
-        fisheye=fisheye,
+        models=models,
         background=None if background is None else background.detach(),
     )
     return PixelRays(*found)

@@ -49,7 +49,7 @@ def pixel_rays(
     far: float,
     box: Tensor | None,
     distortion: Tensor | None,
-    fisheye: bool,
+    models: Tensor | None,
     background: Tensor | None,
 ) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
@@ -58,7 +58,7 @@ def pixel_rays(
     pixel = index % (h * w)
     x, y = ((place + 0.5).to(poses.dtype) for place in (pixel % w, pixel // w))
     camera = (index // (h * w)).to(torch.int32)
-    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion, fisheye=fisheye)
+    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion, models=models)
     if box is None:
         enter, leave = torch.full_like(x, near), torch.full_like(x, far)
     else:

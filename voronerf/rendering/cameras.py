@@ -5,21 +5,22 @@ c cameras, r rays, b chosen pixels, n points.
 Frames. A pose maps camera to world coordinates; camera axes are OpenGL's: x right, y up, the camera looks along -z. The
 world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel
 is at (0.5, 0.5). Distortion acts on image-plane coordinates u = (x - cx) / fx, v = (y - cy) / fy. It is OpenCV's
-rational model with (k1, k2, p1, p2, k3, k4, k5, k6), or for fisheyes COLMAP's THIN_PRISM_FISHEYE with (k1, k2, p1, p2,
-k3, k4, s1, s2); see `distort`.
+rational model with (k1, k2, p1, p2, k3, k4, k5, k6), for fisheyes COLMAP's THIN_PRISM_FISHEYE with (k1, k2, p1, p2, k3,
+k4, s1, s2), or COLMAP's FOV with (omega, 0, ...); see `distort`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf.ops.camera_rays import camera_rays
-from voronerf.reference.camera_rays import distort, undistort
+from voronerf.reference.camera_rays import FISHEYE, PERSPECTIVE, distort, undistort
 
 __all__ = [
     "Cameras",
@@ -69,7 +70,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """c cameras with lenses of one kind.
+    """c cameras.
 
     Attributes:
         poses: float32 [c, 4, 4], camera to world.
@@ -77,7 +78,8 @@ class Cameras:
         width: of every image, in pixels; of the widest where they differ.
         height: of every image, in pixels; of the highest where they differ.
         distortion: float32 [c, 8], coefficients of the lenses, or None for none.
-        fisheye: whether the lenses are fisheyes, which need coefficients.
+        models: int32 [c], the camera model of each: 0 perspective, 1 fisheye, 2 FOV. It needs coefficients. None is
+            perspective for all.
         sizes: int64 [c, 2], (width, height) of each image, or None if they are of one size. See `size`.
 
     Examples:
@@ -100,7 +102,7 @@ class Cameras:
     width: int
     height: int
     distortion: Tensor | None = None
-    fisheye: bool = False
+    models: Tensor | None = None
     sizes: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -112,8 +114,10 @@ class Cameras:
         expected = [len(self.poses), 8]
         if self.distortion is not None and list(self.distortion.shape) != expected:
             raise ValueError(f"Cameras: distortion must have shape {expected}, got {list(self.distortion.shape)}")
-        if self.fisheye and self.distortion is None:
-            raise ValueError("Cameras: distortion must be given with fisheye, got None")
+        if self.models is not None and list(self.models.shape) != expected[:1]:
+            raise ValueError(f"Cameras: models must have shape {expected[:1]}, got {list(self.models.shape)}")
+        if self.models is not None and self.distortion is None:
+            raise ValueError("Cameras: distortion must be given with models, got None")
         expected = [len(self.poses), 2]
         if self.sizes is not None and list(self.sizes.shape) != expected:
             raise ValueError(f"Cameras: sizes must have shape {expected}, got {list(self.sizes.shape)}")
@@ -127,23 +131,19 @@ class Cameras:
         intrinsics: Tensor,
         sizes: Tensor,
         distortion: Tensor | None = None,
-        fisheye: bool = False,
+        models: Tensor | None = None,
     ) -> Cameras:
         """Cameras of images whose (width, height) `sizes` int64 [c, 2] may differ; at least one."""
         width, height = sizes.amax(0).tolist()
         differ = bool((sizes != sizes[:1]).any())
-        return cls(poses, intrinsics, width, height, distortion, fisheye, sizes if differ else None)
+        return cls(poses, intrinsics, width, height, distortion, models, sizes if differ else None)
 
     def __len__(self) -> int:
         return self.poses.shape[0]
 
     def __getitem__(self, index: Tensor | slice | Sequence[int]) -> Cameras:
         """The cameras chosen by a slice, a list or an index tensor."""
-        distortion = None if self.distortion is None else self.distortion[index]
-        sizes = None if self.sizes is None else self.sizes[index]
-        return replace(
-            self, poses=self.poses[index], intrinsics=self.intrinsics[index], distortion=distortion, sizes=sizes
-        )
+        return self._each(lambda tensor: tensor[index])
 
     def size(self, index: int) -> tuple[int, int]:
         """(width, height) of one image."""
@@ -172,10 +172,13 @@ class Cameras:
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on a device."""
-        distortion = None if self.distortion is None else self.distortion.to(device)
-        sizes = None if self.sizes is None else self.sizes.to(device)
-        poses, intrinsics = self.poses.to(device), self.intrinsics.to(device)
-        return replace(self, poses=poses, intrinsics=intrinsics, distortion=distortion, sizes=sizes)
+        return self._each(lambda tensor: tensor.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Cameras:
+        """With another tensor for each."""
+        given = ((field.name, getattr(self, field.name)) for field in fields(self))
+        changed: dict[str, Any] = {name: change(value) for name, value in given if isinstance(value, Tensor)}
+        return replace(self, **changed)
 
     def downscaled(self, factor: int) -> Cameras:
         """Cameras of the images averaged over blocks of `factor` x `factor` pixels.
@@ -220,7 +223,7 @@ class Cameras:
             _position(y).to(self.poses.dtype),
             camera=camera,
             distortion=chosen.distortion,
-            fisheye=chosen.fisheye,
+            models=chosen.models,
         )
         if not cones:
             return Rays(origins, directions)
@@ -254,7 +257,8 @@ class Cameras:
         pose = self.poses[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         depth = -local[:, 2]
-        if self.fisheye:
+        model = PERSPECTIVE if self.models is None else int(self.models[index])
+        if model == FISHEYE:
             across = local[:, :2].norm(dim=-1)
             share = torch.atan2(across, depth) / across.clamp_min(1e-12)
             u, v = local[:, 0] * share, -local[:, 1] * share
@@ -262,7 +266,7 @@ class Cameras:
             safe = torch.where(depth > 0, depth, torch.ones_like(depth))
             u, v = local[:, 0] / safe, -local[:, 1] / safe
         if self.distortion is not None:
-            u, v = distort(u, v, self.distortion[index], self.fisheye)
+            u, v = distort(u, v, self.distortion[index], model)
         fx, fy, cx, cy = self.intrinsics[index].unbind(-1)
         return torch.stack((u * fx + cx, v * fy + cy), dim=-1), depth
 

@@ -113,7 +113,7 @@ class RayBatches:
             far=float(self.scene.far),
             box=self.box,
             distortion=cameras.distortion,
-            fisheye=cameras.fisheye,
+            models=cameras.models,
             background=background,
         )
         radii = None
