@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import itertools
 import os
 import re
@@ -73,6 +74,9 @@ def main(args: list[str] | None = None) -> int:
         0 when all went well, 1 for an error, 130 when training was stopped. Errors are one line on stderr;
         with VORONERF_TRACEBACK=1 they are shown whole.
     """
+    if not gc.isenabled():  # see voronerf/__init__.py
+        gc.freeze()
+        gc.enable()
     warnings.showwarning = _show_warning
     threading.excepthook = _show_thread_error
     if own_rank() == 0:

@@ -10,7 +10,6 @@ import io
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
@@ -147,6 +146,8 @@ def save_panel(
 
 
 def _mapped(values: Tensor, name: str) -> Tensor:
+    import matplotlib  # which the viewer's first picture need not wait for
+
     table = torch.from_numpy((matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).round().astype(np.uint8))
     return table[(values.nan_to_num(0).clamp(0, 1) * 255).round().long()]
 

@@ -5,7 +5,6 @@ size x size points; densities are per scene unit.
 
 from __future__ import annotations
 
-import matplotlib
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -88,6 +87,8 @@ def picture_of_density(density: Tensor, densest: float = DENSEST) -> Tensor:
 
     The scale log(1 + density) / log(1 + densest) shows both walls and the faint fog before and behind them.
     """
+    import matplotlib
+
     if not densest > 0:
         raise ValueError(f"picture_of_density: densest must be positive, got {densest}")
     shown = torch.log1p(density.float().nan_to_num(0).clamp(0, densest)) / float(np.log1p(densest))
