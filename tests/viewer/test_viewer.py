@@ -6,7 +6,9 @@ import io
 import socket
 import sys
 import threading
+from contextlib import closing
 from dataclasses import replace
+from http.client import HTTPConnection
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from PIL import Image
 
 pytest.importorskip("viser", reason="viser is not installed")
 
+import viser
 from tab import Tab
 
 from voronerf import open_run
@@ -286,6 +289,30 @@ def test_nothing_is_rendered_for_nobody(tmp_path, scene) -> None:
 )
 def test_bad_addresses(run, address, message) -> None:
     refuses(message, view_run, run, error=ConfigError, **address)
+
+
+@pytest.mark.parametrize(
+    ("host", "asked", "origin", "status"),
+    [
+        ("127.0.0.1", "127.0.0.1:{}", None, 101),  # of a program
+        ("127.0.0.1", "127.0.0.1:{}", "http://127.0.0.1:{}", 101),
+        ("127.0.0.1", "localhost:9", "http://localhost:9", 101),  # through a tunnel
+        ("127.0.0.1", "127.0.0.1:{}", "https://example.org", 403),
+        ("127.0.0.1", "127.0.0.1:{}", "http://127.0.0.1:9", 403),
+        ("127.0.0.1", "127.0.0.1:{}", "null", 403),
+        ("127.0.0.1", "example.org:{}", "http://example.org:{}", 403),  # a name that leads here
+        ("0.0.0.0", "example.org:{}", "http://example.org:{}", 101),
+        ("0.0.0.0", "example.org:{}", "https://example.com", 403),
+    ],
+)
+def test_pages_of_other_sites_are_refused(run, host, asked, origin, status) -> None:
+    with closing(view_run(run, host=host, port=0)) as viewer:
+        headers = {"Host": asked, "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+        headers |= {"Sec-WebSocket-Key": 22 * "A" + "==", "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}"}
+        headers |= {} if origin is None else {"Origin": origin}
+        with closing(HTTPConnection("127.0.0.1", viewer.port)) as browser:
+            browser.request("GET", "/", headers={name: text.format(viewer.port) for name, text in headers.items()})
+            assert browser.getresponse().status == status
 
 
 def test_a_port_in_use_is_one_line(run, tmp_path, capsys) -> None:

@@ -30,6 +30,7 @@ from voronerf.training.run_directory import read_curve
 from voronerf.viewer.cameras import axial_depth, look_point
 from voronerf.viewer.client import Client
 from voronerf.viewer.errors import ViewErrors
+from voronerf.viewer.origins import only_own_pages
 from voronerf.viewer.pictures import Look, Subject, picture_of, render_bands, render_look, stack_bands
 
 #: Seconds without a movement after which the sharp picture is begun.
@@ -64,7 +65,8 @@ class Viewer:
         self.wake = threading.Event()
         self.rate = 100_000.0  # pixels a second
         self.errors = ViewErrors(subject.scene, self._render_view)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser draws a box around its address
+        # viser draws a box around its address
+        with contextlib.redirect_stdout(io.StringIO()), only_own_pages(host):
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
         self.host, self.port = host, self.server.get_port()
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
