@@ -19,11 +19,11 @@ def test_partial_sums_are_one_composite(ranks):
     depths = torch.rand(rays, samples, generator=generator, dtype=torch.float64).sort(-1)[0]
     deltas = torch.full_like(depths, 0.1)
     owner = torch.randint(ranks, (rays, samples), generator=generator)
-    weights = torch.rand(rays, 3, generator=generator, dtype=torch.float64)
+    slopes, background = torch.rand(2, rays, 3, generator=generator, dtype=torch.float64)
 
     whole = density.clone().requires_grad_(), colour.clone().requires_grad_()
-    expected = composite(whole[0], whole[1], depths, deltas)
-    (expected.colour * weights).sum().backward()
+    expected = composite(whole[0], whole[1], depths, deltas, background=background)
+    (expected.colour * slopes).sum().backward()
 
     parts = density.clone().requires_grad_(), colour.clone().requires_grad_()
     index = torch.arange(rays, dtype=torch.int32).repeat_interleave(samples)
@@ -35,11 +35,13 @@ def test_partial_sums_are_one_composite(ranks):
         found.append(sum_runs(mine, parts[1].reshape(-1, 3)[own], parts[0].reshape(-1)[own], "auto"))
     ray, start = torch.cat([runs.ray for runs in found]), torch.cat([runs.start for runs in found])
     order = along_rays(ray, start)
-    sums = (torch.cat([getattr(runs, name) for runs in found])[order] for name in ("colour", "optical"))
-    seen = compose(*sums, ray[order], rays)
-    (seen.colour * weights).sum().backward()
+    sums = [torch.cat([getattr(runs, name) for runs in found])[order] for name in ("colour", "optical")]
+    seen = compose(*(part.detach() for part in sums), ray[order], rays)
+    gradients = seen.gradients(sums[0].detach(), ray[order], slopes, background)
+    torch.autograd.backward(sums, (gradients[:, :3], gradients[:, 3]))
 
-    assert torch.allclose(seen.colour, expected.colour, rtol=1e-12, atol=1e-14)
+    colour = seen.colour + seen.through[:, None] * background
+    assert torch.allclose(colour, expected.colour, rtol=1e-12, atol=1e-14)
     assert torch.allclose(1 - seen.through, expected.opacity, rtol=1e-12, atol=1e-14)
     finite = density.isfinite()
     assert torch.allclose(parts[0].grad[finite], whole[0].grad[finite], rtol=1e-10, atol=1e-13)

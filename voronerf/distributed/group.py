@@ -12,7 +12,7 @@ import re
 import signal
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from datetime import timedelta
 from typing import Any
 
@@ -55,7 +55,7 @@ class Group:
     Attributes:
         rank: The number of this one.
         size: How many there are.
-        sent: Bytes that this rank has sent to others by :meth:`send`, for each kind.
+        sent: Bytes that this rank has sent to others by :meth:`share`, for each kind.
 
     Args:
         device: Where the tensors are that are sent.
@@ -67,6 +67,7 @@ class Group:
     def __init__(self, device: torch.device) -> None:
         self.rank, self.size, self.device = own_rank(), world_size(), device
         self.sent: Counter[str] = Counter()
+        self._room: dict[str, int] = {}  # rows of a message of each kind
         backend = "nccl" if device.type == "cuda" else "gloo"
         if device.type == "cuda":
             torch.cuda.set_device(device)  # where torch puts what it sends of Python objects
@@ -101,8 +102,7 @@ class Group:
 
     def total(self, values: Tensor) -> Tensor:
         """The sum over all ranks, in place."""
-        with self._waiting():
-            dist.all_reduce(values)
+        self.begin_total(values)()
         return values
 
     def largest(self, values: Tensor) -> Tensor:
@@ -111,35 +111,48 @@ class Group:
             dist.all_reduce(values, dist.ReduceOp.MAX)
         return values
 
-    def send(
-        self, kind: str, rows: Tensor, counts: Sequence[int], expected: Sequence[int] | None = None
-    ) -> tuple[Tensor, list[int]]:
-        """Sends the first ``counts[0]`` rows to rank 0, the next ``counts[1]`` to rank 1 and so on.
+    def begin_total(self, values: Tensor) -> Callable[[], None]:
+        """Begins to sum values over all ranks, in place; what it returns waits for the end."""
+        with self._waiting():
+            work = dist.all_reduce(values, async_op=True)
+
+        def wait() -> None:
+            with self._waiting():
+                work.wait()
+
+        return wait
+
+    def share(self, kind: str, rows: Tensor) -> list[Tensor]:
+        """The rows of every rank, as many as each has.
+
+        One message does it: it has room for some more rows than the fullest of its kind before it, and says how many
+        there are. What does not fit follows in another.
 
         Args:
-            kind: What they are, for :attr:`sent`.
-            rows: [n, ...], contiguous.
-            counts: Of every rank, n in all.
-            expected: How many rows each rank sends to this one, where that is known.
-
-        Returns:
-            The rows that came, in the order of the ranks, and how many came from each.
+            kind: What they are.
+            rows: float32 [n, c].
         """
-        with self._waiting():
-            if expected is None:
-                came = torch.empty(self.size, dtype=torch.int64, device=self.device)
-                dist.all_to_all_single(came, torch.tensor(counts, device=self.device))
-                expected = came.tolist()
-            found = rows.new_empty(sum(expected), *rows.shape[1:])
-            dist.all_to_all_single(found, rows, list(expected), list(counts))
-        others = sum(counts) - counts[self.rank]
-        self.sent[kind] += others * rows[:1].numel() * rows.element_size()
-        return found, list(expected)
+        n, room = len(rows), self._room.get(kind, 0)
+        message = rows.new_empty(1 + room, rows.shape[1])
+        message[:1].view(torch.int32)[:] = n
+        message[1 : 1 + n] = rows[:room]
+        found = self._gather(kind, message)
+        counts = found.view(torch.int32)[:, 0, 0].tolist()
+        parts, most = found[:, 1:], max(counts)
+        if most > room:
+            rest = rows.new_empty(most - room, rows.shape[1])
+            rest[: max(n - room, 0)] = rows[room:]
+            parts = torch.cat((parts, self._gather(kind, rest)), 1)
+        self._room[kind] = most + most // 4 + 1
+        return [part[:count] for part, count in zip(parts, counts, strict=True)]
 
-    def share(self, kind: str, rows: Tensor) -> Tensor:
-        """The rows of all ranks, one rank after the other; each may have another number of them."""
-        every = rows.repeat(self.size, *[1] * (rows.dim() - 1))
-        return self.send(kind, every, [len(rows)] * self.size)[0]
+    def _gather(self, kind: str, message: Tensor) -> Tensor:
+        every = message.repeat(self.size, 1, 1)
+        found = torch.empty_like(every)
+        with self._waiting():
+            dist.all_to_all_single(found, every)  # gloo gathers in twice the time
+        self.sent[kind] += (self.size - 1) * message.numel() * message.element_size()
+        return found
 
     def from_first(self, value: Any) -> Any:
         """What rank 0 has, for all."""
@@ -147,13 +160,6 @@ class Group:
         with self._waiting():
             dist.broadcast_object_list(box, src=0)
         return box[0]
-
-    def at_first(self, value: Any) -> list[Any]:
-        """What all ranks have, for rank 0; empty elsewhere."""
-        found: list[Any] = [None] * self.size if self.rank == 0 else []
-        with self._waiting():
-            dist.gather_object(value, found or None, dst=0)
-        return found
 
 
 _current: Group | None = None

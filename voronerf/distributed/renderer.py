@@ -1,8 +1,8 @@
 """Renders and learns rays that pass through the cells of several ranks. Only partial sums of rays travel.
 
 Before the first split all ranks have the same network, and each evaluates its slice of the rays. Afterwards each
-evaluates its own cells on all rays, and sends a partial sum for each run to the rank in whose slice the ray is. That
-rank makes the colour and the loss, and sends the gradients of the sums back. Each way takes 24 bytes a run.
+evaluates its own cells on all rays. It tells all ranks a partial sum for each run, 24 bytes, from which every rank
+makes the colours, the loss, and the gradients of its own sums (Li et al. 2024, NeRF-XL).
 
 r rays, m own samples, q runs.
 """
@@ -31,7 +31,7 @@ class Learnt(NamedTuple):
     """What a step finds, beside the gradients that it leaves.
 
     Attributes:
-        loss: [], the part of this rank's slice of the rays; the parts of all ranks add up to the loss.
+        loss: [].
         positions: [m, 3] of own samples.
         density: [m].
         deltas: [m].
@@ -152,44 +152,36 @@ class RankRenderer(Renderer):
         colour, density = self.field(samples.positions, rays.directions, samples.ray_index)
         runs = sum_runs(samples, colour.to(near.dtype), density.to(near.dtype), self.backend)
         sums = torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1).detach()
-        bounds = self._slices(len(rays))
-        first, last = bounds[self.group.rank :][:2]
-        counts: list[int] = []
-        if self.sharing is not None:
-            ends = torch.tensor(bounds, device=near.device)
-            counts = torch.searchsorted(runs.ray, ends).diff().tolist()
-            sums, came = self.group.send("sums", sums, counts)
+        parts = self.group.share("sums", sums)
+        first = sum(map(len, parts[: self.group.rank]))
+        own, sums = slice(first, first + len(sums)), torch.cat(parts)
         order = along_rays(sums[:, 5].long(), sums[:, 4])
-        part, optical = sums[order, :3].requires_grad_(), sums[order, 3].requires_grad_()
-        ray = sums[order, 5].long() - first
-        with torch.enable_grad():
-            whole = compose(part, optical, ray, last - first)
-            seen = whole.colour
-            if background is not None:
-                behind = background if background.dim() == 1 else background[first:last]
-                seen = seen + whole.through[:, None] * behind
-            error = (seen - target[first:last]).square().sum(-1)
-            loss = error.sum() / (3 * len(rays))
-        gradients = torch.autograd.grad(loss, (part, optical))
+        part, optical, ray = sums[order, :3], sums[order, 3], sums[order, 5].long()
+        whole = compose(part, optical, ray, len(rays))
+        shown = torch.zeros_like(target) if background is None else background.expand_as(target)
+        off = whole.colour + whole.through[:, None] * shown - target
+        error = off.square().sum(-1)
+        slopes = off * (2 / (3 * len(rays)))
         answers = torch.empty_like(sums)
-        answers[order] = torch.cat(
-            (gradients[0], gradients[1][:, None], whole.front.detach()[:, None], error.detach()[ray, None]), 1
-        )
-        if self.sharing is not None:
-            answers, _ = self.group.send("gradients", answers, came, counts)
+        answers[order, :4] = whole.gradients(part, ray, slopes, shown)
+        answers[order, 4], answers[order, 5] = whole.front, error[ray]
+        answers = answers[own]
         torch.autograd.backward((runs.colour, runs.optical), (answers[:, :3], answers[:, 3]))
         run = torch.repeat_interleave(samples.run_offsets.diff())
         weights = runs.weights * answers[run, 4]
         importance = weights * answers[run, 5]
-        return Learnt(loss.detach(), samples.positions, density.detach(), samples.deltas, weights, importance)
+        loss = error.sum() / (3 * len(rays))
+        return Learnt(loss, samples.positions, density.detach(), samples.deltas, weights, importance)
 
     # --- the grid --------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def observe(self, grid: OccupancyGrid, found: Learnt, *, decay: float, backend: str) -> None:
-        """Teaches the grid what the samples of all ranks found in the voxels that own cells reach.
+    def observations(self, grid: OccupancyGrid, found: Learnt) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """What samples say of the voxels that they are in.
 
-        Samples in voxels of several ranks travel, as voxel and density, 8 bytes each.
+        Returns:
+            Positions [n, 3] and densities [n] of those in voxels of this rank alone. Of the others [m, 2], voxel and
+            density, which all ranks should know.
         """
         density = found.density.float().nan_to_num(nan=float("inf"), posinf=float("inf"))
         visible = found.weights > HIDDEN * -torch.expm1(-density * found.deltas)
@@ -204,13 +196,26 @@ class RankRenderer(Renderer):
         else:
             common = self._several[cells]
         told = torch.stack((cells[common].view(torch.float32), density[common]), 1)
-        told = self.group.share("occupancy", told)
-        cells = told[:, 0].contiguous().view(torch.int32)
+        return (positions[~common], density[~common]), told
+
+    def observe(
+        self, grid: OccupancyGrid, alone: tuple[Tensor, Tensor], common: Tensor, *, decay: float, backend: str
+    ) -> None:
+        """Teaches the grid what all ranks found in the voxels that own cells reach.
+
+        Args:
+            grid: Of this rank.
+            alone: The first part of this rank's :meth:`observations`.
+            common: [m, 2], the second of all ranks.
+            decay: As of a grid.
+            backend: As of a grid.
+        """
+        cells = common[:, 0].contiguous().view(torch.int32)
         if self.sharing is not None:
             ours = self._reached[cells]
-            cells, told = cells[ours], told[ours]
-        positions = torch.cat((positions[~common], grid.points(cells.long())))
-        density = torch.cat((density[~common], told[:, 1]))
+            cells, common = cells[ours], common[ours]
+        positions = torch.cat((alone[0], grid.points(cells.long())))
+        density = torch.cat((alone[1], common[:, 1]))
         ones = torch.ones_like(density)  # what counts has been decided
         grid.observe(positions, density, ones, ones, decay=decay, backend=backend)
 
@@ -244,7 +249,8 @@ class RankRenderer(Renderer):
             top = torch.zeros_like(runs.optical).scatter_reduce(0, run, runs.weights, "amax")
             at = torch.where(runs.weights == top[run], samples.depths, float("inf"))
             columns += [top[:, None], torch.full_like(top, float("inf")).scatter_reduce(0, run, at, "amin")[:, None]]
-        sums = self.group.share("pictures", torch.cat([column.to(near.dtype) for column in columns], 1))
+        parts = self.group.share("pictures", torch.cat([column.to(near.dtype) for column in columns], 1))
+        sums = torch.cat(parts)
         sums = sums[along_rays(sums[:, 5].long(), sums[:, 4])]
         ray = sums[:, 5].long()
         whole = compose(sums[:, :3], sums[:, 3], ray, len(rays))

@@ -110,15 +110,38 @@ class Composed(NamedTuple):
         colour: [r, 3], without a background.
         through: [r], the light that passes all of them.
         front: [q], the light that arrives at each run.
+        place: int64 [q], where each run is in a table with a row for each ray.
+        width: The columns of the table.
     """
 
     colour: Tensor
     through: Tensor
     front: Tensor
+    place: Tensor
+    width: int
+
+    def gradients(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
+        """The gradients of the runs' colours and optical depths, from those of the colours of the rays.
+
+        Args:
+            colour: [q, 3], as of :func:`compose`.
+            ray: int64 [q], likewise.
+            slopes: [r, 3], the gradient of each ray's colour over its background.
+            background: [r, 3].
+
+        Returns:
+            [q, 4], colours first. More depth takes light from all that is behind: later runs, and the background.
+        """
+        direct = self.front[:, None] * slopes[ray]
+        table = direct.new_zeros(len(slopes), self.width)
+        table.view(-1)[self.place] = (direct * colour).sum(1)
+        table = torch.cat((table[:, 1:], (self.through * (slopes * background).sum(1))[:, None]), 1)
+        behind = table.flip(1).cumsum(1).flip(1).view(-1)[self.place]
+        return torch.cat((direct, -behind[:, None]), 1)
 
 
 def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed:
-    """Puts runs together, differentiable in both.
+    """Puts runs together, without gradients of its own.
 
     Args:
         colour: [q, 3].
@@ -128,13 +151,14 @@ def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed
     """
     counts = torch.bincount(ray, minlength=rays)
     slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-    most = int(counts.max()) if len(ray) else 1
-    place = ray * most + slot
-    table = optical.new_zeros(rays * most).index_put((place,), optical).reshape(rays, most)
+    width = int(counts.max()) if len(ray) else 1
+    place = ray * width + slot
+    table = optical.new_zeros(rays, width)
+    table.view(-1)[place] = optical
     # The sum is shifted: less its last term it would be inf - inf for an opaque run.
-    front = torch.exp(-torch.nn.functional.pad(table[:, :-1], (1, 0)).cumsum(1)).reshape(-1)[place]
+    front = torch.exp(-torch.nn.functional.pad(table[:, :-1], (1, 0)).cumsum(1)).view(-1)[place]
     whole = colour.new_zeros(rays, 3).index_add(0, ray, front[:, None] * colour)
-    return Composed(whole, torch.exp(-table.sum(1)), front)
+    return Composed(whole, torch.exp(-table.sum(1)), front, place, width)
 
 
 def along_rays(ray: Tensor, start: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.balance import cell_weights
 from voronerf.diagram.subdivision import Split
 from voronerf.distributed.checkpoint import RankWriter, ownership
+from voronerf.distributed.gradients import add_entries, pack_entries
 from voronerf.distributed.group import Group
 from voronerf.distributed.renderer import RankRenderer
 from voronerf.distributed.sharing import Sharing, assign_cells
@@ -91,9 +92,13 @@ class RankTrainer(Trainer):
         self.weights = torch.ones(1)
         self._agreed = self._told = self._measured = 0.0
         self._asked = False
+        self._whole: list[nn.Parameter] = []
+        self._tables: list[nn.Parameter] = []
         super().__init__(config, scene, on_step=on_step, on_event=on_event, clock=lambda: self._agreed)
         self.renderer.join(group)
         self.writer = RankWriter(self)
+        self._parameters = list(self.router.parameters())
+        self._find_shared()
 
     @property
     def diagram(self) -> VoronoiDiagram:
@@ -111,13 +116,13 @@ class RankTrainer(Trainer):
         """Ends training on all ranks after the next step."""
         self._asked = True
 
-    def _shared(self) -> list[nn.Parameter]:
-        """The parameters that all ranks have."""
-        every = list(self.router.parameters())
-        if self.sharing is None:
-            return every
-        own = {id(parameter) for parameter in cell_parameters(self.router.module)}
-        return [parameter for parameter in every if id(parameter) not in own]
+    def _find_shared(self) -> None:
+        """Finds the parameters that all ranks have: those that a step updates whole, and tables."""
+        own = set() if self.sharing is None else set(map(id, cell_parameters(self.router.module)))
+        groups = self.optimizer.param_groups
+        shared = [([p for p in group["params"] if id(p) not in own], group.get("sparse")) for group in groups]
+        self._whole = [p for parameters, sparse in shared for p in parameters if not sparse]
+        self._tables = [p for parameters, sparse in shared for p in parameters if sparse]
 
     # --- a step ----------------------------------------------------------------------------------------------------
 
@@ -139,52 +144,79 @@ class RankTrainer(Trainer):
         self.renderer.forget_others(grid)
 
     def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        config = self.config
+        config, grid = self.config, self.occupancy
         batch = self.batches.draw(config.rays, self.draws, random_background=config.background == "random")
         self.optimizer.zero_grad(set_to_none=True)
         found = self.renderer.learn(
             batch.rays, batch.near, batch.far, batch.target, background=batch.background, generator=self.draws
         )
-        if self.occupancy is not None:
-            backend = "auto" if config.backend == "warp" else config.backend
-            self.renderer.observe(self.occupancy, found, decay=OCCUPANCY_DECAY, backend=backend)
-        loss = self._add_up(found.loss)
-        self.optimizer.step()
-        if self.level >= len(self.plan):
-            return loss, None, None
-        quota = self.reservoir.quota
-        heaviest, importance = select_heaviest(found.positions, found.importance, quota)
-        kept = heaviest.new_zeros(quota, 4)
-        kept[: len(heaviest), :3], kept[: len(heaviest), 3] = heaviest, importance
-        kept = self.group.share("samples", kept)
-        return loss, kept[:, :3], kept[:, 3]
-
-    def _add_up(self, loss: Tensor) -> Tensor:
-        """Sums the loss and the gradients of what all ranks have; agrees on the time, on a stop and on a bad step."""
-        for parameter in self.router.parameters():
+        for parameter in self._parameters:
             if parameter.grad is None:  # no sample of this rank
                 parameter.grad = torch.zeros_like(parameter)
-        shared = self._shared()
-        ids = {id(parameter) for parameter in shared}
-        dense = [p for g in self.optimizer.param_groups if not g.get("sparse") for p in g["params"]]
-        own = torch.stack([loss, *(p.grad.sum() for p in dense if id(p) not in ids)]).sum()
+        summed = self._begin_sum()
+        collects = self.level < len(self.plan)
+        kept = found.positions.new_zeros(self.reservoir.quota if collects else 0, 4)
+        if collects:
+            heaviest, importance = select_heaviest(found.positions, found.importance, len(kept))
+            kept[: len(heaviest), :3], kept[: len(heaviest), 3] = heaviest, importance
+        alone, common = (None, kept.new_empty(0, 2)) if grid is None else self.renderer.observations(grid, found)
+        total, kept, common = self._tell(kept, common)
+        if grid is not None and alone is not None:
+            backend = "auto" if config.backend == "warp" else config.backend
+            self.renderer.observe(grid, alone, common, decay=OCCUPANCY_DECAY, backend=backend)
+        self.guard.judge(found.loss + total, self.optimizer)
+        summed()
+        self.optimizer.step()
+        return (found.loss, kept[:, :3], kept[:, 3]) if collects else (found.loss, None, None)
+
+    def _begin_sum(self) -> Callable[[], None]:
+        """Begins to add up the gradients of what all ranks have but tables; what it returns waits for the end."""
+        if not self._whole:
+            return lambda: None
+        flat = torch.cat([p.grad.reshape(-1) for p in self._whole if p.grad is not None])
+        wait = self.group.begin_total(flat)
+
+        def end() -> None:
+            wait()
+            _set_gradients(self._whole, flat)
+
+        return end
+
+    def _tell(self, kept: Tensor, common: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tells all ranks what each has to say in a step: they add up the tables' gradients, and agree on the rest.
+
+        That is the time, a stop and a checkpoint.
+
+        Args:
+            kept: [n, 4], the heaviest samples, as many on all ranks.
+            common: [m, 2], see :meth:`RankRenderer.observations`.
+
+        Returns:
+            The sum of all gradients that the guard reads, and the arguments of all ranks.
+        """
+        dense = [p for group in self.optimizer.param_groups if not group.get("sparse") for p in group["params"]]
         passed = (self._measured - self._told) * (self.group.rank == 0)
         self._told = self._measured
-        agreed = own.new_tensor((passed, float(self._asked), float(self.writer.ready)))
-        news = torch.cat((torch.stack((loss, own)), agreed))
-        gradients = [p.grad for p in shared if p.grad is not None]
-        flat = self.group.total(torch.cat([news, *(gradient.reshape(-1) for gradient in gradients)]))
-        rest = flat[5:]
-        for parameter in shared:
-            part, rest = rest[: parameter.numel()], rest[parameter.numel() :]
-            parameter.grad = part.view_as(parameter)
-        total = sum((p.grad.sum() for p in dense if id(p) in ids), flat[1])
-        self.guard.judge(total, self.optimizer)
-        self._agreed += float(flat[2])
-        self.stopped |= bool(flat[3] > 0)
-        if flat[4] == self.group.size:
+        news = common.new_tensor((0.0, passed, float(self._asked), float(self.writer.ready), len(common)))
+        news[0] = sum(p.grad.sum() for p in dense if p.grad is not None)
+        gradients = [p.grad.reshape(-1) for p in self._tables if p.grad is not None]
+        flat = torch.cat(gradients) if len(gradients) > 1 else gradients[0] if gradients else news[:0]
+        message = torch.cat((news, kept.view(-1), common.view(-1), pack_entries(flat)))
+        parts = [part[:, 0] for part in self.group.share("news", message[:, None])]
+        said = torch.stack([part[:5] for part in parts])
+        counts, first = (2 * said[:, 4]).int().tolist(), 5 + 4 * len(kept)
+        if len(flat):
+            entries = [part[first + count :] for part, count in zip(parts, counts, strict=True)]
+            _set_gradients(self._tables, add_entries(entries, len(flat)))
+        total = said.sum(0)
+        _, passed, asked, ready, _ = total.tolist()
+        self._agreed += passed
+        self.stopped |= asked > 0
+        if ready == self.group.size:
             self.writer.commit()
-        return flat[0]
+        kept = torch.cat([part[5:first] for part in parts]).view(-1, 4)
+        common = torch.cat([part[first : first + count] for part, count in zip(parts, counts, strict=True)])
+        return total[0], kept, common.view(-1, 2)
 
     def _check_moments(self) -> bool:
         finite = bool(self.group.largest(torch.tensor(float(not all_finite(self.optimizer)), device=self.device)) == 0)
@@ -223,10 +255,12 @@ class RankTrainer(Trainer):
         self.sharing = sharing
         self.renderer.join(self.group)
         self.renderer.own_cells(sharing)
+        self._find_shared()
 
     def _resume(self, checkpoint: Checkpoint) -> None:
         self.sharing = self.renderer.sharing = None
         super()._resume(checkpoint)
+        self._find_shared()
         whole = self.router.diagram
         if whole.num_cells == 1:
             return
@@ -235,3 +269,8 @@ class RankTrainer(Trainer):
         cells = sharing.cells(self.group.rank).cpu()
         self.router.subdivide(whole.part(cells), cells, optimizer=self.optimizer)
         self._own(sharing)
+
+
+def _set_gradients(parameters: list[nn.Parameter], flat: Tensor) -> None:
+    for parameter, part in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
+        parameter.grad = part.view_as(parameter)
