@@ -4,10 +4,12 @@ import contextlib
 import io
 import itertools
 import json
+import re
 import runpy
 import subprocess
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -54,6 +56,13 @@ def same(first, second):
     if isinstance(first, Mapping):
         return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
     return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def anonymous_memory():
+    """Bytes of this process that are no pages of files; a test that asks is skipped where Linux does not say."""
+    if sys.platform != "linux":
+        pytest.skip("asks Linux what memory holds")
+    return 1024 * int(re.search(r"RssAnon:\s+(\d+)", Path("/proc/self/status").read_text())[1])
 
 
 def on_any_number_of_threads(run, counts=(1, 2, 3)):

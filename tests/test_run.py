@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import refuses
+from helpers import anonymous_memory, refuses
 
 from voronerf import open_run
 from voronerf.data import builtin_scene
@@ -63,6 +63,17 @@ def test_any_camera_is_rendered(trained, scene) -> None:
     for camera, index in ((3, 0), (-1, 0), (around, 3)):
         with pytest.raises(IndexError, match=r"render: there are 3 cameras, got number (3|-1)"):
             run.render(camera, index)
+
+
+def test_networks_stay_in_their_file(scene, tmp_path) -> None:
+    size = SIZE | {"width": 320, "depth": 3, "min_cell_samples": 1, "final_views": 1, "average": 0.0}
+    trainer = Trainer(TrainConfig(out=tmp_path, steps=2, cells=(8,), split_at_steps=(1,), **size), scene)
+    trainer.run()
+    before = anonymous_memory()
+    run = open_run(tmp_path, scene=scene)
+    assert run.diagram.num_cells == 8
+    run.render(0)
+    assert anonymous_memory() - before < 2 * trainer.parameter_count  # half of the networks' bytes
 
 
 def test_how_a_run_is_rendered_may_differ(trained, scene) -> None:

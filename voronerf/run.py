@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from voronerf.data import Scene, load_scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.lpips import Lpips, find_lpips
@@ -108,6 +110,11 @@ class Run:
         return score_views(self.renderer, self.scene, views=views, lpips=lpips)
 
 
+def _shows(name: str) -> bool:
+    """Whether a tensor of a checkpoint is for pictures, not for training alone."""
+    return not name.startswith("optimizer.") or name.endswith(".average")
+
+
 def open_run(
     path: Path | str,
     *,
@@ -123,6 +130,10 @@ def open_run(
     backend: str = "auto",
 ) -> Run:
     """Opens a run that ``voronerf train`` or :class:`voronerf.training.trainer.Trainer` has written.
+
+    On the CPU the networks are pages of a file: of the checkpoint, or where processes have written a file each, of a
+    temporary one (``TMPDIR``) with all cells. The system reads them when they are needed, and drops them when memory
+    gets short, so that networks may be larger than the memory.
 
     Args:
         path: The run directory.
@@ -170,13 +181,13 @@ def open_run(
     if blend is not None and not 0 <= blend < math.inf:
         raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
     check_folders(path)
-    checkpoint = last_checkpoint(path)
+    checkpoint = last_checkpoint(path, keep=_shows)
     config, _ = stored_values(checkpoint)
     if scene is None and data is None:
         check_stored_paths(path, data=config.data)
     check_shapes(config, checkpoint)
     routers = make_routers(config, device)
-    restore_routers(routers, checkpoint)
+    restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
     load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
     for router in routers.values():
         router.backend = backend

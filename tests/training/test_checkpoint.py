@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 import torch
-from helpers import refuses, same
+from helpers import anonymous_memory, refuses, same
 from safetensors.torch import save_file
 
 from voronerf.files import read_json_lines, write_text
@@ -64,6 +64,21 @@ def test_broken_files_are_named(tmp_path):
     save_file({"x": torch.zeros(1)}, path, {"format": "pt"})
     other = "not a voronerf-checkpoint-2 file, its format is 'pt'"
     refuses(other, load_checkpoint, path, error=CheckpointError)
+
+
+def test_tensors_are_pages_of_files(tmp_path):
+    """Also of shards, whose cells are put in their order."""
+    x, y = torch.randn(4, 5 << 19), torch.arange(4)  # 40 MiB, which malloc gives back when they are free
+    save_checkpoint(tmp_path / "whole", Checkpoint({"x": x, "y": y}, {}))
+    for rank, cells in enumerate(([3, 0], [1, 2])):
+        save_checkpoint(tmp_path / str(rank), Checkpoint({"x": x[cells], "y": y[cells]}, {"cells": cells}))
+    save_checkpoint(tmp_path / "index", Checkpoint({}, {"shards": ["0", "1"]}))
+    for name in ("whole", "index"):
+        before = anonymous_memory()
+        found = load_checkpoint(tmp_path / name).tensors
+        assert anonymous_memory() - before < x.nbytes / 4
+        assert found["x"].equal(x) and found["y"].equal(y)
+        assert load_checkpoint(tmp_path / name, keep=lambda entry: entry != "x").tensors.keys() == {"y"}
 
 
 def test_a_single_changed_bit_is_found(tmp_path):

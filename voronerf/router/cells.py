@@ -348,7 +348,11 @@ class CellModules(nn.Module):
             if diagram.num_cells == self.num_cells:
                 self.diagram = diagram.to(self.diagram.centres.device)
             else:
-                self.subdivide(diagram, torch.zeros(diagram.num_cells, dtype=torch.int64))
+                finer = self._finer(diagram, torch.zeros(diagram.num_cells, dtype=torch.int64), None, None, {})
+                if all(f"{prefix}module.{name}" in state_dict for name, _ in self.module.named_parameters()):
+                    own = len(range(diagram.num_cells)[finer.own])  # their values come with the state
+                    finer = finer._replace(take=lambda stacked: stacked.new_empty(own, *stacked.shape[1:]))
+                self._become(finer, None, torch.zeros(len(finer.parents), dtype=torch.bool)[finer.own])
                 self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 

@@ -65,16 +65,15 @@ def load_averages(parameters: Sequence[Tensor], checkpoint: Checkpoint) -> None:
     Raises:
         CheckpointError: When an average has another shape.
     """
-    with torch.no_grad():
-        for index, parameter in enumerate(parameters):
-            name = f"optimizer.{index}.{_KEY}"
-            average = checkpoint.tensors.get(name)
-            if average is None:
-                continue
-            if average.shape != parameter.shape:
-                wanted, came = list(parameter.shape), list(average.shape)
-                raise CheckpointError(f"{checkpoint.source}: {name} must have shape {wanted}, got {came}")
-            parameter.copy_(average)
+    for index, parameter in enumerate(parameters):
+        name = f"optimizer.{index}.{_KEY}"
+        average = checkpoint.tensors.get(name)
+        if average is None:
+            continue
+        if average.shape != parameter.shape:
+            wanted, came = list(parameter.shape), list(average.shape)
+            raise CheckpointError(f"{checkpoint.source}: {name} must have shape {wanted}, got {came}")
+        parameter.data = average.to(parameter)
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> list[torch.nn.Parameter]:

@@ -11,14 +11,16 @@ files as ``shards``. Whoever loads it gets the tensors of all cells.
 from __future__ import annotations
 
 import json
+import tempfile
 import threading
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -158,8 +160,16 @@ class CheckpointWriter:
         keep_checkpoint(self.run, checkpoint, self.keep)
 
 
-def last_checkpoint(run: Path) -> Checkpoint:
+def _all(name: str) -> bool:
+    return True
+
+
+def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
     """The last checkpoint of a run that can be read; a warning tells of those passed over.
+
+    Args:
+        run: The run directory.
+        keep: As of :func:`load_checkpoint`.
 
     Raises:
         CheckpointError: When there is none.
@@ -168,7 +178,7 @@ def last_checkpoint(run: Path) -> Checkpoint:
     errors = []
     for path in paths:
         try:
-            found = load_checkpoint(path)
+            found = load_checkpoint(path, keep=keep)
         except CheckpointError as error:
             errors.append(error)
             continue
@@ -191,8 +201,14 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     write_bytes(path, save(checkpoint.tensors, metadata))
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
+def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
     """Reads a checkpoint onto the CPU.
+
+    Its tensors are pages of the file, or where it has shards of a temporary one: the system drops what is not in use.
+
+    Args:
+        path: The file.
+        keep: Which tensors, by their names, are asked for. All are checked.
 
     Raises:
         CheckpointError: When the file is missing, truncated, damaged or no checkpoint of this version.
@@ -213,14 +229,17 @@ def load_checkpoint(path: Path) -> Checkpoint:
                 what = "has another checksum" if name in found else "is missing"
                 raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
         values = parse_json(metadata["values"])
-        return Checkpoint(_join_shards(path, tensors, values.pop("shards", ())), values, str(path))
+        tensors = {name: tensor for name, tensor in tensors.items() if keep(name)}
+        return Checkpoint(_join_shards(path, tensors, values.pop("shards", ()), keep), values, str(path))
     except CheckpointError:
         raise
     except (SafetensorError, ValueError, KeyError, AttributeError, OSError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint: {error}") from None
 
 
-def _join_shards(path: Path, tensors: dict[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+def _join_shards(
+    path: Path, tensors: dict[str, Tensor], names: Sequence[str], keep: Callable[[str], bool]
+) -> dict[str, Tensor]:
     """The tensors of a checkpoint and of its shards.
 
     Raises:
@@ -230,7 +249,7 @@ def _join_shards(path: Path, tensors: dict[str, Tensor], names: Sequence[str]) -
         return tensors
     if any(Path(name).name != name for name in names):
         raise CheckpointError(f"{path}: shards must be names of files beside it, got {', '.join(names):.200}")
-    shards = [load_checkpoint(path.with_name(name)) for name in names]
+    shards = [load_checkpoint(path.with_name(name), keep=keep) for name in names]
     cells = torch.cat([torch.tensor(shard.values["cells"], dtype=torch.int64) for shard in shards])
     order = cells.argsort()
     rows = [{name: t for name, t in shard.tensors.items() if name != VOXELS} for shard in shards]
@@ -238,11 +257,22 @@ def _join_shards(path: Path, tensors: dict[str, Tensor], names: Sequence[str]) -
     counts = zip(rows, shards, strict=True)
     if not fits or any(len(t) != len(shard.values["cells"]) for part, shard in counts for t in part.values()):
         raise CheckpointError(f"{path}: shards must have all tensors of each cell once, {', '.join(names)} have not")
-    joined = {name: torch.cat([part[name] for part in rows])[order] for name in rows[0]}
+    joined = {name: _join([part[name] for part in rows], order) for name in rows[0]}
     if VOXELS in shards[0].tensors:
         joined[VOXELS] = torch.stack([shard.tensors[VOXELS] for shard in shards]).amax(0)
         joined["occupancy.occupied"] = joined[VOXELS] >= float(tensors["occupancy.threshold"])
     return {**tensors, **joined}
+
+
+def _join(parts: list[Tensor], order: Tensor) -> Tensor:
+    """The rows of several tensors in an order, in a file that nobody else sees: it need not fit into memory."""
+    rows = [row for part in parts for row in part]
+    with tempfile.TemporaryFile() as file:
+        for number in order.tolist():
+            file.write(rows[number].reshape(-1).view(torch.uint8).numpy().data)
+        file.flush()
+        pages = torch.from_numpy(np.memmap(file, np.uint8, "c"))
+    return pages.view(rows[0].dtype).reshape(len(rows), *rows[0].shape)
 
 
 def _checksum(tensor: Tensor) -> int:

@@ -330,15 +330,20 @@ def router_states(routers: Mapping[str, VoronoiRouter]) -> dict[str, dict[str, A
     return {_group(name): router.state_dict() for name, router in routers.items()}
 
 
-def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint) -> None:
+def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint, *, assign: bool = False) -> None:
     """Loads the cells of a checkpoint into routers; their number may differ.
+
+    Args:
+        routers: By name.
+        checkpoint: Of networks of the same architecture.
+        assign: Takes the checkpoint's tensors in place of copies of them, for routers on the CPU.
 
     Raises:
         CheckpointError: When the checkpoint's parameters are of another architecture.
     """
     for name, router in routers.items():
         try:
-            router.load_state_dict(checkpoint.group(_group(name)))
+            router.load_state_dict(checkpoint.group(_group(name)), assign=assign)
         except RuntimeError as error:
             line = str(error).splitlines()[-1]
             raise CheckpointError(f"{checkpoint.source}: the checkpoint is of another architecture: {line}") from None
