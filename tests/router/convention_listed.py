@@ -139,7 +139,7 @@ LISTED = [
     studio_case("get_density", lambda lead: ((ray_samples(lead),), {})),
     studio_case("get_outputs", outputs_arguments),
     studio_case("density_fn", one(3)),
-    Case("torch-ngp", ngp_field, pair, options=NGP),  # a table for each cell; test_router_shared.py fuses a shared one
+    Case("torch-ngp", ngp_field, pair, options=NGP),  # a table for each cell; convention_shared.py has a shared one
     other("density", NGP, ngp_field, one(3), fuses=False),
     other("color", NGP, ngp_field, lambda lead: (pair(lead)[0], {"geo_feat": uniform(lead, 4)})),
     PART,

@@ -1,8 +1,8 @@
 """Fields of other people's codebases through VoronoiRouter: every case against a loop over masks.
 
 The cases: `convention_listed.py` has the codebases of examples/, `convention_layers.py`, `convention_calls.py` and
-`convention_arguments.py` what nobody listed, `convention_rules.py` single steps; each that fuses is a case of its own
-with ``fuse=True``.
+`convention_arguments.py` what nobody listed, `convention_rules.py` single steps, `convention_shared.py` encoders that
+cells share; each that fuses is a case of its own with ``fuse=True``.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ from convention_harness import (
 from convention_layers import LAYERS
 from convention_listed import LISTED
 from convention_rules import RULES
+from convention_shared import ENCODERS
 from torch import Tensor
 
 from voronerf import VoronoiDiagram, VoronoiRouter
 
-CASES = [*LISTED, *LAYERS, *CALLS, *ARGUMENTS, *RULES]
+CASES = [*LISTED, *LAYERS, *CALLS, *ARGUMENTS, *RULES, *ENCODERS]
 CASES += [case.fused() for case in CASES if case.fuses]
 every_case = pytest.mark.parametrize("case", CASES, ids=str)
 #: Without those that differ in one step of one module.

@@ -11,18 +11,20 @@ from __future__ import annotations
 
 import copy
 import itertools
+import operator
 from collections.abc import Iterable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, fx, nn
+from torch.fx.node import map_arg
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import routed_mlp
 from voronerf.router.grouped import PerCell, for_all_cells
 from voronerf.router.grouping import Grouping, owned_parameters
-from voronerf.router.layout import Call, Results, map_tree, tensors_of
-from voronerf.router.trace import TABLE, Column, Linear, Ref, Step, Trace, Unfusable
+from voronerf.router.layout import Call, Results, map_tensors, map_tree
+from voronerf.router.trace import BEFORE, BEHIND, CELLS, LAYERS, Column, Linear, Trace, Unfusable
 
 # Fields with a layer table --------------------------------------------------------------------------------------------
 
@@ -117,23 +119,32 @@ class Program:
 
     def __init__(self, call: Call, given: list[Tensor]) -> None:
         trace = Trace(call, given)
+        self._n, self._inputs, self._parameters = trace.n, trace.inputs, trace.parameters
         self._result, self._outputs = trace.result, trace.outputs
-        self._before, self._weights = trace.before, trace.weights
-        self._parameters, self._shared = trace.parameters, trace.shared
-        self._writes = any(step.inplace for step in trace.before)
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
-        needed = [item for item in self._outputs if isinstance(item, Ref)]
-        if len(needed) < len(self._outputs) or trace.made.intersection(needed):
+        if not all(isinstance(value, fx.Node) and value.meta["rows"] for value in self._outputs):
             raise Unfusable("a result depends on no sample")
-        self._behind: list[Step] = []
-        for step in reversed(trace.behind):
-            if step.inplace or any(value in needed for value in step.values):
-                self._behind.insert(0, step)
-                needed += step.refs
-        self._make_table(trace, [value for value in dict.fromkeys(needed) if trace.stages[value] == TABLE])
-        made = {value for step in trace.weights for value in step.values}
-        of_layers = {value for layer in self._layers for value in (layer.weight, layer.bias) if value is not None}
-        self._used = of_layers.union(*[step.refs for step in trace.weights]) - made
+        nodes = list(trace.graph.nodes)
+        self._weights, self._before = (
+            [node for node in nodes if node.op == "call_function" and node.meta["stage"] == stage]
+            for stage in (CELLS, BEFORE)
+        )
+        self._writes = any(node.meta.get("inplace") for node in self._before)
+        needed, returned = set(self._outputs), dict[fx.Node, list[Column]]()
+        self._behind: list[fx.Node] = []
+        for node in reversed(nodes):
+            stage, writes = node.meta["stage"], node.meta.get("inplace")
+            if stage not in (LAYERS, BEHIND) or not (node in needed or (stage == BEHIND and writes)):
+                continue
+            columns = trace.features(node) if stage == LAYERS else []
+            if columns:
+                returned[node] = columns
+            else:  # what moves columns of several layers is done again, too
+                self._behind.insert(0, node)
+                needed.update(node.all_input_nodes)
+        self._make_table(trace, returned)
+        for node in nodes:
+            node.meta.pop("value", None)
 
     def with_parameters_of(self, module: nn.Module) -> Program:
         """The same for a copy of the module, with parameters of its own."""
@@ -141,29 +152,29 @@ class Program:
         copied._owned = [(owner, name) for owner, name, _ in owned_parameters(module)]
         return copied
 
-    def _make_table(self, trace: Trace, needed: list[int]) -> None:
-        """The table of the layers that some values depend on. Layers read others, and blocks of values, whole."""
-        columns = {value: trace.columns(value) for value in needed}
-        returned = list(itertools.chain(*columns.values()))
-        parts = {li: li.part([i for source, i in returned if source is li]) for li in _sources(returned, Linear)}
-        if not parts:
+    def _make_table(self, trace: Trace, returned: dict[fx.Node, list[Column]]) -> None:
+        """The table of the layers that some values come from. Layers read others, and blocks of values, whole."""
+        if not returned:
             raise Unfusable("nothing that is returned comes from a layer")
+        parts = {}
+        for li in _sources([columns[0] for columns in returned.values()], Linear):
+            parts[li] = li.part([i for columns in returned.values() for source, i in columns if source is li])
         used, layers = set(parts.values()), list(dict.fromkeys([*trace.layers, *parts.values()]))
         for layer in reversed(layers):
             used.update(_sources(layer.inputs, Linear) if layer in used else ())
         self._layers = [layer for layer in layers if layer in used]
-        reads = [_sources(layer.inputs, int) for layer in self._layers]
+        reads = [_sources(layer.inputs, fx.Node) for layer in self._layers]
         first = next((read for read in reads if read), [])
         others = [value for value in dict.fromkeys(itertools.chain(*reads)) if value not in first]
         if not first:
             raise Unfusable("no layer reads the samples")
         self._blocks = [first, others] if others else [first]
         widths: dict[int | str, int] = {number: layer.width for number, layer in enumerate(self._layers)}
-        places: dict[Linear | int, tuple[int | str, int]] = {layer: (i, 0) for i, layer in enumerate(self._layers)}
+        places: dict[Linear | fx.Node, tuple[int | str, int]] = {layer: (i, 0) for i, layer in enumerate(self._layers)}
         for name, block in zip((POSITIONS, DIRECTIONS), self._blocks):
             for value in block:
                 places[value] = name, widths.get(name, 0)
-                widths[name] = widths.get(name, 0) + trace.values[value].shape[1:].numel()
+                widths[name] = widths.get(name, 0) + value.meta["value"].shape[1:].numel()
         table = []
         self._orders: list[tuple[Tensor, int] | None] = []  # where the columns of a weight go among those of its inputs
         for layer in self._layers:
@@ -176,24 +187,22 @@ class Program:
         self._table = MLP(tuple(table), tuple(self._layers.index(part) for part in parts.values()))
         ends = itertools.accumulate(part.width for part in parts.values())
         begins = {li: end - part.width - part.start + li.start for (li, part), end in zip(parts.items(), ends)}
-        self._shapes = {value: trace.values[value].shape[1:] for value in needed}
-        self._ranges = {}  # columns of the raw outputs, or of a value from before, that make a value
-        for value, own in columns.items():
-            found = [(-1, begins[s] + i) if isinstance(s, Linear) else (s, i) for s, i in own]
-            runs = [list(run) for _, run in itertools.groupby(enumerate(found), lambda x: (x[1][0], x[1][1] - x[0]))]
-            self._ranges[value] = [(run[0][1][0], run[0][1][1], run[-1][1][1] + 1) for run in runs]
+        self._values = []  # with their shapes, and the columns of raw outputs that make them
+        for value, ((source, i), *more) in returned.items():
+            start = begins[source] + i
+            self._values.append((value, value.meta["value"].shape[1:], start, start + 1 + len(more)))
 
     # Running ----------------------------------------------------------------------------------------------------------
 
     def run(self, inputs: Sequence[Tensor], grouping: Grouping) -> Results:
         """The method's results for arguments in the original order, or sorted where the grouping has ``rows``."""
         n = inputs[0].shape[0]
-        values: dict[int, Any] = dict(enumerate(x.clone() for x in inputs) if self._writes else enumerate(inputs))
-        for value, place in self._parameters.items():
+        values: dict[fx.Node, Any] = {self._n: n}
+        values.update(zip(self._inputs, [x.clone() for x in inputs] if self._writes else inputs))
+        for node, place in self._parameters.items():
             owner, name = self._owned[place]
-            values[value] = owner._parameters[name]
-        for step in self._before:
-            step.run(values, n)
+            values[node] = owner._parameters[name]
+        _run(self._before, values)
         blocks = [_joined([values[value].reshape(n, -1) for value in block]).contiguous() for block in self._blocks]
         weights, biases = self._stacked(values, grouping.k)
         where = grouping.where if grouping.rows is None else {"cells": grouping.sorted_cells.int()}
@@ -203,25 +212,26 @@ class Program:
         )
         if where and grouping.rows is None:
             grouping.where = {"cells": cells}
-        for value, ranges in self._ranges.items():
-            parts = [(raw if source < 0 else values[source].reshape(n, -1), a, b) for source, a, b in ranges]
-            joined = _joined([part if b - a == part.shape[1] else part[:, a:b] for part, a, b in parts])
-            values[value] = joined.reshape(n, *self._shapes[value])
-        for step in self._behind:
-            step.run(values, n)
+        for value, shape, start, stop in self._values:
+            values[value] = raw[:, start:stop].reshape(n, *shape)
+        _run(self._behind, values)
         return Results(self._result, [values[value] for value in self._outputs])
 
-    def _stacked(self, values: dict[int, Any], k: int) -> tuple[list[Tensor], list[Tensor | None]]:
+    def _stacked(self, values: dict[fx.Node, Any], k: int) -> tuple[list[Tensor], list[Tensor | None]]:
         """Weights [k, o, i] and biases [k, o] of the table, in its order."""
-        known = {v: values[v].expand(k, *values[v].shape) if v in self._shared else values[v] for v in self._used}
-        for step in self._weights:
-            args, kwargs = map_tree(step.given, lambda _, v, nested: PerCell(known[v]) if isinstance(v, Ref) else v)
-            results = tensors_of(for_all_cells(step.function, args, kwargs))
-            known.update(zip(step.values, [r.stacked for r in results if isinstance(r, PerCell)], strict=True))
+
+        def of_cells(node: fx.Node) -> Any:
+            value = values[node]
+            return value if node.meta["stage"] == CELLS else value.expand(k, *value.shape)
+
+        for node in self._weights:
+            args, kwargs = map_arg((node.args, node.kwargs), lambda node: map_tensors(of_cells(node), PerCell))
+            made = args[0][args[1]] if node.target is operator.getitem else for_all_cells(node.target, args, kwargs)
+            values[node] = map_tree(made, lambda _, own, nested: own.stacked if isinstance(own, PerCell) else own)
         weights: list[Tensor] = []
         biases: list[Tensor | None] = []
         for layer, order in zip(self._layers, self._orders, strict=True):
-            weight, bias = known[layer.weight], None if layer.bias is None else known[layer.bias]
+            weight, bias = of_cells(layer.weight), None if layer.bias is None else of_cells(layer.bias)
             if layer.width < weight.shape[1]:
                 weight = weight[:, layer.start : layer.start + layer.width]
                 bias = None if bias is None else bias[:, layer.start : layer.start + layer.width]
@@ -231,6 +241,14 @@ class Program:
             weights.append(weight if plain else weight * layer.factor)
             biases.append(bias if plain or bias is None else bias * layer.factor)
         return weights, biases
+
+
+def _run(nodes: list[fx.Node], values: dict[fx.Node, Any]) -> None:
+    """Calls the functions of some nodes in turn."""
+    for node in nodes:
+        args, kwargs = map_arg((node.args, node.kwargs), values.__getitem__)
+        result = node.target(*args, **kwargs)  # type: ignore[operator]
+        values[node] = args[0] if node.meta.get("inplace") else result
 
 
 def _sources(columns: Iterable[Column], kind: type[Any]) -> list[Any]:

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -176,29 +176,20 @@ class _Permute(torch.autograd.Function):
         return _Permute.apply(gradient, inverse, index), None, None
 
 
-class Assignments:
-    """The last assignment, for other methods that are called with the same positions."""
+class Assigned(NamedTuple):
+    """Samples in their cells, for other methods that are called with the same positions."""
 
-    def __init__(self) -> None:
-        self._key: Any = None
-        self._positions: Tensor | None = None
-        self._methods: set[str] = set()
-        self._grouping: Grouping | None = None
+    grouping: Grouping
+    positions: Tensor
+    key: Any  # of the diagram and the way of assigning
+    methods: set[str]  # that have been called with them
 
-    def find(self, method: str, positions: Tensor, key: Any, drawn: bool) -> Grouping | None:
-        """The assignment made for the same positions and key, or None. One that was drawn serves each method once."""
-        known = self._positions
-        if known is None or key != self._key or (drawn and method in self._methods):
-            return None
-        if known.shape != positions.shape or known.device != positions.device or not torch.equal(known, positions):
-            return None
-        self._methods.add(method)
-        return self._grouping
-
-    def keep(self, method: str, positions: Tensor, key: Any, grouping: Grouping) -> None:
-        """Remembers an assignment."""
-        self._key, self._methods, self._grouping = key, {method}, grouping
-        self._positions = positions.detach().clone()
+    def serves(self, method: str, positions: Tensor, key: Any, drawn: bool) -> bool:
+        """Whether these are the positions of a call. Cells that were drawn serve each method once."""
+        if key != self.key or (drawn and method in self.methods) or positions.device != self.positions.device:
+            return False
+        self.methods.add(method)
+        return torch.equal(self.positions, positions)
 
 
 # Parameters -----------------------------------------------------------------------------------------------------------
@@ -216,13 +207,8 @@ def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Paramet
 
 def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
     """The parameters that are stacked, [k, ...]; not those that all cells share."""
-    owned = [parameter for owner, name, parameter in owned_parameters(module) if not is_shared(owner, name)]
+    owned = [p for owner, name, p in owned_parameters(module) if name not in vars(owner).get(SHARED, ())]
     return list({id(parameter): parameter for parameter in owned}.values())
-
-
-def is_shared(owner: nn.Module, name: str) -> bool:
-    """Whether a parameter is one for all cells."""
-    return name in vars(owner).get(SHARED, ())
 
 
 @contextlib.contextmanager
@@ -247,6 +233,9 @@ def in_place_of_parameters(module: nn.Module, values: Mapping[int, Any]) -> Iter
 
 @functools.cache
 def _on_huge_pages() -> Callable[[Tensor], None]:
+    # The C library maps large blocks and gives them back when they are freed, so that each step would wait for the
+    # pages of its gradients again. Once it has seen a block of 31 MB freed, it keeps smaller ones.
+    torch.empty(31 << 20, dtype=torch.uint8)
     try:
         from voronerf.native.custom_op import on_huge_pages
     except BackendUnavailable:
@@ -258,9 +247,9 @@ def empty_like(tensor: Tensor) -> Tensor:
     """``torch.empty_like``, from the start of a huge page where it is large: page faults cost more than the values."""
     if tensor.nbytes < _LARGE or tensor.device.type != "cpu":
         return torch.empty_like(tensor)
-    spare = tensor.new_empty(tensor.numel() + _PAGE // tensor.element_size())
+    on_huge_pages, spare = _on_huge_pages(), tensor.new_empty(tensor.numel() + _PAGE // tensor.element_size())
     result = spare[-spare.data_ptr() % _PAGE // tensor.element_size() :][: tensor.numel()].view(tensor.shape)
-    _on_huge_pages()(result)
+    on_huge_pages(result)
     return result
 
 

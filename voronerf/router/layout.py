@@ -21,6 +21,7 @@ from voronerf.router.grouping import Grouping
 
 _OP = "VoronoiRouter"
 _DEEPEST = 6  # objects within objects that are searched for tensors
+_LEAVES = {type(None), type(...), bool, int, float, str, torch.Size, torch.dtype, torch.device}
 SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
 
 
@@ -85,12 +86,15 @@ def tensors_of(value: Any) -> list[Tensor]:
 
 
 def _collect(items: Iterable[Any], found: list[Tensor], depth: int) -> None:
-    # Every function of a grouped module comes here with its arguments: lists are not made dicts for it.
+    # Every function of a grouped module comes here with its arguments: what holds no tensor is passed over at once.
     for item in items:
+        kind = type(item)
+        if kind in _LEAVES:
+            continue
         if isinstance(item, Tensor):
             found.append(item)
-        elif item is not None and depth <= _DEEPEST and not isinstance(item, (int, float, str)):
-            _collect(item if type(item) in (list, tuple) else (_items(item) or {}).values(), found, depth + 1)
+        elif depth <= _DEEPEST:
+            _collect(item if kind in (list, tuple) else (_items(item) or {}).values(), found, depth + 1)
 
 
 def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:

@@ -20,7 +20,7 @@ from voronerf.diagram.blending import Mixture
 from voronerf.router.cells import check_module, fill_cell
 from voronerf.router.evaluate import Choices
 from voronerf.router.fused import LayeredField, described_by_table, each_direction, run_table
-from voronerf.router.grouping import Assignments, Grouping
+from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.shard import ShardedCells, evaluate_over_ranks
 
@@ -136,7 +136,8 @@ class VoronoiRouter(ShardedCells):
         self._own_coords = frozenset(
             name for name in ("forward", *methods) if "coords" in (accepted_names([getattr(module, name)]) or ())
         )
-        self._choices, self._assignments = Choices(), Assignments()
+        self._choices = Choices()
+        self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self._argument_names = {name: argument_names(getattr(self.module, name)) for name in ("forward", *methods)}
         self._by_table = self._layered and described_by_table(self.module)
 
@@ -323,17 +324,18 @@ class VoronoiRouter(ShardedCells):
         drawn, centres = self.assignment == "stochastic" and self.training, self.diagram.centres
         version = object() if centres.is_inference() else centres._version  # of those changes are not told
         key = id(self.diagram), version, drawn, self.temperature, self.backend
-        grouping = self._assignments.find(method, positions, key, drawn) if self.methods else None
-        if grouping is None:
-            flat, k = positions.detach().reshape(-1, 3), self.num_cells
-            if flat.shape[0]:
-                locate = functools.partial(self.assign, flat) if k > 1 else None
-                grouping = Grouping(self._where(flat, flat), flat.shape[0], k, flat.device, self.backend, locate)
-            else:  # the module runs on placeholders, since it may not take an empty batch
-                where = {"cells": torch.zeros(2, dtype=torch.int32, device=flat.device)}
-                grouping = Grouping(where, 2, k, flat.device, self.backend)
-            if self.methods:
-                self._assignments.keep(method, positions, key, grouping)
+        known = self._assigned
+        if known is not None and known.serves(method, positions, key, drawn):
+            return known.grouping
+        flat, k = positions.detach().reshape(-1, 3), self.num_cells
+        if flat.shape[0]:
+            locate = functools.partial(self.assign, flat) if k > 1 else None
+            grouping = Grouping(self._where(flat, flat), flat.shape[0], k, flat.device, self.backend, locate)
+        else:  # the module runs on placeholders, since it may not take an empty batch
+            where = {"cells": torch.zeros(2, dtype=torch.int32, device=flat.device)}
+            grouping = Grouping(where, 2, k, flat.device, self.backend)
+        if self.methods:
+            self._assigned = Assigned(grouping, positions.detach().clone(), key, {method})
         return grouping
 
     def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
@@ -349,15 +351,15 @@ class VoronoiRouter(ShardedCells):
             return tables
         return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
 
-    def _forget_assignments(self) -> None:
-        self._assignments = Assignments()
+    def _forget_assigned(self) -> None:
+        self._assigned = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_assignments": Assignments()}
+        return {**super().__getstate__(), "_assigned": None}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
         self._choices.forget()
-        self._assignments = Assignments()
+        self._assigned = None
         return super()._apply(fn, recurse)
 
     def extra_repr(self) -> str:

@@ -30,6 +30,7 @@ _ELEMENTWISE = """
 
 
 _INTEGERS = (torch.int32, torch.int64)
+_FEW = 1 << 12  # most values a cell that are read from planes in one look-up
 
 
 def rule(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -187,23 +188,24 @@ def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Ten
     if low < 0:
         index = torch.where(index < 0, index + entries, index)
     index = index + (run.grouping.cells_of_rows(m) * entries).reshape(-1, *[1] * (index.dim() - 1))
-    return _rows_of_table(run, *table.origin, index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
+    return _found(run, table, math.prod(table.shape[1:]), index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
 
 
-def _rows_of_table(run: GroupedRun, stacked: Tensor, start: int, index: Tensor) -> Tensor:
-    """Entries [m, c] of tables [k, e, c], for indices [m] that count from the table of cell ``start``.
+def _found(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
+    """Entries [m, c] of tables that hold e * c numbers for each cell, for indices [m] that count through all cells.
 
     A field reads a table many times in one forward: the eight corners of a voxel, for several levels. The gradient of
     each look-up has the size of the whole table, so all look-ups of one table add theirs to one buffer.
     """
-    key = id(stacked), torch.is_grad_enabled()
+    stacked, start = table.origin
+    key = id(stacked), c, torch.is_grad_enabled()
     if key not in run.tables:
         buffer: list[Tensor] = []
-        flat = stacked.reshape(-1, math.prod(stacked.shape[2:]))
-        source = _Source.apply(flat, buffer) if flat.requires_grad and key[1] else flat
+        flat = stacked.reshape(-1, c)
+        source = _Source.apply(flat, buffer) if flat.requires_grad and torch.is_grad_enabled() else flat
         run.tables[key] = stacked, source, buffer  # ``stacked`` as well: nothing else may get its id
     _, source, buffer = run.tables[key]
-    found: Tensor = _LookUp.apply(source, start * stacked.shape[1], index, buffer)
+    found: Tensor = _LookUp.apply(source, start * (table.numel() // c), index, buffer)
     return found
 
 
@@ -249,9 +251,9 @@ class _LookUp(torch.autograd.Function):
 
 
 def _as_moved(rows: Tensor) -> Tensor:
-    """Rows of two numbers as one complex number on a CPU, where torch moves these three times as fast."""
+    """Rows of one number as numbers, and of two as one complex number on a CPU, where torch moves these faster."""
     paired = rows.device.type == "cpu" and rows.shape[-1] == 2 and rows.dtype == torch.float32
-    return torch.view_as_complex(rows) if paired else rows
+    return torch.view_as_complex(rows) if paired else rows[:, 0] if rows.shape[-1] == 1 else rows
 
 
 @rule(F.embedding)
@@ -274,11 +276,40 @@ def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
 
 @rule(F.grid_sample)
 def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) -> Any:
-    """A plane [1, c, h, w] or volume [1, c, d, h, w] at rows [1, ..., 2] or [1, ..., 3], one cell after the other."""
+    """A plane [1, c, h, w] or volume [1, c, d, h, w] at rows [1, ..., 2] or [1, ..., 3].
+
+    Cells of many samples come one after the other. Those of few have one look-up together, which reads and writes the
+    corners alone.
+    """
     places = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
     if not isinstance(input, PerCell) or not run.is_rows(grid) or len(places) != 1 or grid.shape[0] != 1:
         return NotImplemented
+    plain = options["mode"] == "bilinear" and options["padding_mode"] in ("zeros", "border") and input.dim() == 4
+    few = grid[0, ..., 0].numel() * input.shape[1] <= _FEW * run.grouping.k
+    if plain and few and input.origin[0].numel() < 1 << 31:
+        cells = run.grouping.sorted_cells.reshape(-1, *[1] * (2 - places[0])).expand(grid.shape[1:3])
+        return _bilinear(run, input, grid[0], cells, options["padding_mode"] == "zeros", bool(options["align_corners"]))
     occupied, planes = run.grouping.occupied, cells_of(input.stacked)
     points = grid.split([last - first for _, first, last in occupied], places[0])
     found = [F.grid_sample(planes[cell], own, **options) for (cell, _, _), own in zip(occupied, points, strict=True)]
     return torch.cat(found, places[0] + 1)
+
+
+def _bilinear(run: GroupedRun, plane: PerCell, grid: Tensor, cells: Tensor, zeros: bool, align_corners: bool) -> Tensor:
+    """Planes [1, c, h, w] of ``cells``, [a, b], at points [a, b, 2] -> [1, c, a, b], as ``F.grid_sample`` has it."""
+    c, h, w = plane.shape[1:]
+    size = grid.new_tensor([w, h]).view(2, 1, 1)
+    x = grid.movedim(-1, 0).contiguous() + 1  # [2, a, b]
+    x = x * (0.5 * (size - 1)) if align_corners else (x * size - 1) * 0.5
+    if not zeros:  # beyond the border and on it nothing depends on x
+        x = torch.where((x > 0) & (x < size - 1), x, x.detach().clamp(min=0).minimum(size - 1))
+    low = x.detach().floor()
+    high, corner = x - low, torch.stack([low, low + 1])
+    inside = (corner >= 0) & (corner < size)
+    corner, share = corner.where(inside, 0).int(), torch.stack([1 - high, high]) * inside  # [2, 2, a, b]
+    along = 1 if w == 1 and align_corners else 2  # corners of a line, which lies at 0 across
+    index = (corner[:, None, 1] * w + corner[:along, 0]).flatten(0, 1)[:, None]
+    first = (cells.int() * c + torch.arange(c, dtype=torch.int32, device=cells.device).view(-1, 1, 1)) * (h * w)
+    index = index + first  # [2 or 4, c, a, b], of values of all planes
+    found = _found(run, plane, 1, index.reshape(-1)).reshape(index.shape)
+    return (found * (share[:, None, 1] * share[:along, 0]).flatten(0, 1)[:, None]).sum(0)[None]
