@@ -36,6 +36,8 @@ X86_ISAS = {
 LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
 # Short, for the sake of build time: 8.x runs the code of 80, and what comes after 9.0 compiles the PTX of 90.
 DEFAULT_ARCHITECTURES = "75;80;90"
+BINDINGS = 2
+"""Compilations that share the files of csrc/bindings."""
 
 
 class NinjaBuildExt(build_ext):
@@ -46,6 +48,8 @@ class NinjaBuildExt(build_ext):
         build = ROOT / "build" / f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
         build.mkdir(parents=True, exist_ok=True)
         cuda = find_cuda()
+        for name, text in bindings().items():
+            write_if_changed(build / name, text)
         write_if_changed(build / "build_info.h", build_info(cuda))
         module = build / Path(self.get_ext_filename(ext.name)).name
         write_if_changed(build / "build.ninja", ninja_file(module, cuda))
@@ -160,6 +164,14 @@ def build_info(cuda: Cuda) -> str:
     return "#pragma once\n" + "".join(f"#define {name} {value}\n" for name, value in values.items())
 
 
+def bindings() -> dict[str, str]:
+    """Files that include those of csrc/bindings by turns: to read pybind11 takes the compiler longer than to compile
+    one of them."""
+    files = sorted((SOURCES / "bindings").glob("*.cpp"))
+    parts = {f"bindings_{part}.cpp": files[part::BINDINGS] for part in range(BINDINGS)}
+    return {name: "".join(f'#include "{file.as_posix()}"\n' for file in part) for name, part in parts.items()}
+
+
 def ninja_file(module: Path, cuda: Cuda) -> str:
     """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder."""
     common = ["-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
@@ -198,8 +210,11 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
             "  deps = gcc",
             "  description = $out",
         ]
-    objects = []
+    objects = [f"{name}.o" for name in bindings()]
+    lines += [f"build {name}.o: cxx {name}" for name in bindings()]  # first: they take longest
     for source in sorted(SOURCES.rglob("*.c*")):
+        if source.parent.name == "bindings":
+            continue
         name = source.relative_to(SOURCES).as_posix()  # files of two rooms may share theirs
         if source.name.endswith("_isa.cpp"):
             for isa, flags_of_isa in isas().items():

@@ -54,8 +54,12 @@ def test_nvcc_gets_one_program_and_the_arguments(build, monkeypatch):
 def test_files_of_one_name_in_two_rooms_make_two_objects(build):
     lines = build["ninja_file"](Path("_C.so"), build["Cuda"]("built without CUDA")).splitlines()
     objects = [line.split(":")[0] for line in lines if line.startswith("build ")]
-    assert "build geometry/cell_sort.cpp.o" in objects and "build bindings/cell_sort.cpp.o" in objects
-    assert len(objects) == len(set(objects))
+    assert "build geometry/cell_sort.cpp.o" in objects and len(objects) == len(set(objects))
+
+
+def test_every_binding_is_compiled_once(build):
+    included = "".join(build["bindings"]().values()).splitlines()
+    assert sorted(included) == [f'#include "{file}"' for file in sorted((ROOT / "csrc" / "bindings").glob("*.cpp"))]
 
 
 @pytest.mark.parametrize("given", ["", "-Ofast -march=native", "-ffast-math -ffp-contract=fast"])

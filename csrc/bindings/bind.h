@@ -198,14 +198,16 @@ class Module {
   std::map<std::string, std::vector<Signature>> functions_;
 };
 
-// The binding files of the ops, which name themselves here.
+// The binding files of the ops, which name themselves here, several of them in one compilation.
 inline std::vector<void (*)(Module&)>& bindings() {
   static std::vector<void (*)(Module&)> all;
   return all;
 }
-#define VN_BINDINGS(module)                                                        \
-  static void bind_these(::voronerf::Module& module);                              \
-  static const bool bound = (::voronerf::bindings().push_back(&bind_these), true); \
-  static void bind_these([[maybe_unused]] ::voronerf::Module& module)
+#define VN_BINDINGS(module) VN_BINDINGS_NUMBERED(module, __COUNTER__)
+#define VN_BINDINGS_NUMBERED(module, number) VN_BINDINGS_NAMED(module, number)
+#define VN_BINDINGS_NAMED(module, number)                                                      \
+  static void bind_##number(::voronerf::Module& module);                                       \
+  static const bool bound_##number = (::voronerf::bindings().push_back(&bind_##number), true); \
+  static void bind_##number([[maybe_unused]] ::voronerf::Module& module)
 
 }  // namespace voronerf
