@@ -29,6 +29,14 @@ BRANCHED = MLP(
 )
 WIDE = MLP((Layer((POSITIONS,), 130, "sine"), Layer((0, POSITIONS), 70, "sigmoid"), Layer((1,), 4)), (2,))
 GAUSSIANS = MLP((Layer((POSITIONS,), 16, "sigmoid"), Layer((0,), 2)), (1,), 3, position_encoding="integrated")
+# Harmonics of the directions, in the first layer and in a later one; of degree 3 some columns stay free.
+HARMONICS = MLP(
+    (Layer((POSITIONS, DIRECTIONS), 24, "softplus"), Layer((0, DIRECTIONS), 5)),
+    (1,),
+    position_octaves=2,
+    direction_encoding="spherical",
+    direction_degree=3,
+)
 
 # Nineteen layers that all read the ones before: more than the fused kernel takes, of layers and of sources.
 DENSE = MLP(

@@ -13,6 +13,7 @@ from emulated_networks import (
     BROAD,
     DENSE,
     GAUSSIANS,
+    HARMONICS,
     KIB,
     NARROW,
     SKIPS,
@@ -65,6 +66,7 @@ WHOLE = {
     "branched, little memory": Case(BRANCHED, [70, 0, 1, 150], 3, HALVES, FUSED[-1:], seeds=(1, 2)),
     "wide": Case(WIDE, [37, 3], 7, EVERY, FUSED[:2], "tiles"),
     "gaussians": Case(GAUSSIANS, [20, 33], 6, EVERY),
+    "harmonics": Case(HARMONICS, [37, 3], 3, EVERY, way="tiles"),
     # sm_75 multiplies float16 on tensor cores, and everything else exactly; results are stored in 16 bits.
     "before Ampere": Case(BRANCHED, [70, 5], 3, ("bfloat16", "float16", "tf32"), (64,), capability=75),
     "layers, slabs that cells cross": Case(BRANCHED, [70, 0, 401, 150], 3, EVERY, (SMALL,), "layers", (1, 2)),
@@ -72,6 +74,7 @@ WHOLE = {
     "layers, dense": Case(DENSE, [37, 3], 7, EVERY[:1], (SMALL,), "layers"),
     "layers, wide": Case(WIDE, [37, 3], 7, EVERY[:1], (SMALL,), "layers"),
     "layers, gaussians": Case(GAUSSIANS, [37, 3], 6, EVERY[:1], (SMALL,), "layers"),
+    "layers, harmonics": Case(HARMONICS, [37, 3], 3, EVERY[:1], (SMALL,), "layers"),
     "layers, before Ampere": Case(BRANCHED, [70, 5], 3, HALVES, (SMALL,), "layers", capability=75),
     "layers, no rows": Case(BRANCHED, [0, 0], 3, EVERY[:1], (SMALL,), "layers"),
 }
@@ -295,6 +298,7 @@ def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch) -> None:
             run(case(layers, [4], d, torch.bfloat16), layers, torch.bfloat16, "native")
 
     refuses("grouped_mlp: a layer must have at most 128 features on CUDA", asked, "chain", WIDE, 7)
+    refuses("grouped_mlp: spherical harmonics must be computed by tiles or layers on", asked, "chain", HARMONICS, 3)
     rule = "grouped_mlp: wgmma must be asked for with compute capability 9.0 and kernels compiled for sm_90a on CUDA"
     refuses(rule, asked, "wgmma", plain(64, 2), 3, capability=100)
     many = MLP((Layer((POSITIONS,), 2), Layer((0,) * 65, 2)), (1,))

@@ -19,7 +19,6 @@ from torch import Tensor
 from voronerf import native
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.native.hash_encode import compiled_grid, hash_encode
-from voronerf.native.spherical_harmonics import spherical_harmonics
 from voronerf.reference.grouped_mlp import encode_directions, encode_positions
 
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
@@ -50,9 +49,8 @@ def network(
 ) -> Network:
     """What the ops take for a layer table.
 
-    Octaves and harmonics of float64 are computed in float64, beforehand. On CUDA, so are directions of spherical
-    harmonics, and where ``hashed_before`` says so positions that are hashed; ``cells`` says the tables of those where
-    each cell has one.
+    Octaves and harmonics of float64 are computed in float64, beforehand. So are positions that are hashed, where
+    ``hashed_before`` says so; ``cells`` says their tables where each cell has one.
     """
     encoded = ""
     if features is not None and features.dtype == torch.float64:
@@ -69,9 +67,6 @@ def network(
         wide = directions.dtype == torch.float64
         if wide and (layers.direction_octaves is not None or layers.direction_degree is not None):
             directions = encode_directions(directions, layers)
-            encoded += DIRECTIONS
-        elif layers.direction_degree is not None and native.on_cuda(directions):
-            directions = spherical_harmonics(directions.float(), layers.direction_degree)
             encoded += DIRECTIONS
     return in_float32(positions, weights, biases, layers.text, directions, caller, features, encoded)
 

@@ -202,6 +202,10 @@ const char* mlp_chain_plan(const MlpTable& table, MlpPrecision precision, int64_
   MlpCudaPlan read{};
   if (const char* fault = mlp_cuda_read_table(table, read)) return fault;
   if (read.positions.hashed) return "hash grids must be looked up by tiles";
+  // Its registers are full: sixteen harmonics would not stay in them on every device.
+  if (read.positions.degree > 0 || read.directions.degree > 0) {
+    return "spherical harmonics must be computed by tiles or layers";
+  }
   plan.positions = input_of(read.positions);
   plan.directions = input_of(read.directions);
   const Reads reads = copy_layers(read, plan);

@@ -2,14 +2,31 @@
 #pragma once
 
 #include "encoding/encode_math.h"
+#include "encoding/spherical_harmonics_math.h"
 #include "network/cuda/grouped_mlp_cuda.h"
 #include "network/cuda/grouped_mlp_cuda_operands.h"
 
 namespace voronerf {
 
+static_assert(kMostHarmonics == kMlpDepth, "a row of harmonics is one that is padded");
+
+// All harmonics of a direction, those beyond its degree 0.
+__device__ inline void mlp_harmonics(int degree, const float* raw, float (&values)[kMostHarmonics]) {
+#pragma unroll
+  for (int c = 0; c < kMostHarmonics; ++c) values[c] = 0.0f;
+  spherical_harmonics_of(raw[0], raw[1], raw[2], degree, values);
+}
+
 // One column of an encoding.
 __device__ inline float mlp_encoded(const MlpCudaInput& input, const float* raw, int column) {
   if (column >= input.width) return 0.0f;
+  if (input.degree > 0) {
+    float values[kMostHarmonics], found = 0.0f;
+    mlp_harmonics(input.degree, raw, values);
+#pragma unroll
+    for (int c = 0; c < kMostHarmonics; ++c) found = c == column ? values[c] : found;
+    return found;
+  }
   if (input.octaves < 0) return raw[column];
   const int features = input.integrated ? input.raw / 2 : input.raw;
   if (!input.integrated) {
@@ -88,6 +105,16 @@ __device__ void mlp_encode(const MlpCudaInput& input, typename Products::Element
                            const Raw& raw_of) {
   if (!input.used) return;
   const int lane = threadIdx.x % 32, pairs = input.padded / 2;
+  if (input.degree > 0) {
+    // A row a lane: the polynomials share their terms.
+    if (lane >= kRows) return;
+    float values[kMostHarmonics] = {};
+    if (first + lane < end) mlp_harmonics(input.degree, raw_of(first + lane), values);
+    auto* to = region + input.value + lane * input.stride;
+#pragma unroll
+    for (int c = 0; c < kMostHarmonics; c += 2) Products::store(to + c, values[c], values[c + 1]);
+    return;
+  }
   bool by_columns = true;
   if constexpr (Products::kRounded) {
     if (input.octaves > 0 && input.raw == (input.integrated ? 6 : 3)) {
@@ -123,6 +150,14 @@ __device__ void mlp_encode(const MlpCudaInput& input, typename Products::Element
 template <typename Products>
 __device__ void mlp_encode_gradient(const MlpCudaInput& input, const typename Products::Element* gradient,
                                     const float* raw, int feature, float* result) {
+  if (input.degree > 0) {
+    float given[kMostHarmonics], found[3];
+#pragma unroll
+    for (int c = 0; c < kMostHarmonics; ++c) given[c] = c < input.width ? Products::load(gradient + c) : 0.0f;
+    spherical_harmonics_gradient(raw[0], raw[1], raw[2], input.degree, given, found);
+    result[feature] = feature == 0 ? found[0] : feature == 1 ? found[1] : found[2];
+    return;
+  }
   const int features = input.integrated ? input.raw / 2 : input.raw;
   gradient += feature;
   float sum = 0.0f, of_variance = 0.0f;

@@ -233,6 +233,7 @@ class Call {
     MlpCudaInput given{};
     given.raw = input.raw;
     given.octaves = input.octaves;
+    given.degree = input.degree;
     given.width = input.width;
     given.padded = static_cast<int>(input.padded);
     given.integrated = input.integrated;

@@ -43,7 +43,7 @@ struct MlpLayersLayer {
 };
 
 struct MlpLayersInput {
-  int raw, octaves, width;
+  int raw, octaves, degree, width;  // as in MlpCudaInput
   int64_t padded, value;
   bool integrated, used;
 };

@@ -21,8 +21,9 @@ int64_t pad(int64_t width) {
 MlpLayersInput input_of(int64_t raw, const MlpEncoding& encoding) {
   MlpLayersInput input{};
   input.raw = static_cast<int>(raw);
-  input.octaves = encoding.kind == MlpEncodingKind::none ? -1 : encoding.size;
   input.integrated = encoding.kind == MlpEncodingKind::integrated;
+  input.octaves = encoding.kind == MlpEncodingKind::frequency || input.integrated ? encoding.size : -1;
+  input.degree = encoding.kind == MlpEncodingKind::spherical ? encoding.size : 0;
   input.width = static_cast<int>(encoded_width(raw, encoding));
   input.padded = pad(input.width);
   return input;

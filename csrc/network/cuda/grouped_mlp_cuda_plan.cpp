@@ -29,6 +29,7 @@ MlpCudaInput input_of(int64_t raw, const MlpEncoding& encoding) {
   input.integrated = encoding.kind == MlpEncodingKind::integrated;
   input.hashed = encoding.kind == MlpEncodingKind::hash;
   input.octaves = encoding.kind == MlpEncodingKind::frequency || input.integrated ? encoding.size : -1;
+  input.degree = encoding.kind == MlpEncodingKind::spherical ? encoding.size : 0;
   input.width = static_cast<int>(encoded_width(raw, encoding));
   input.padded = pad(input.width);
   return input;

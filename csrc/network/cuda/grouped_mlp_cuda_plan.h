@@ -41,7 +41,8 @@ struct MlpCudaLayer {
 };
 
 struct MlpCudaInput {
-  int raw, octaves, width, padded;
+  int raw, octaves, degree;  // octaves: -1 without; degree: of spherical harmonics, 0 without
+  int width, padded;
   int value, stride;
   bool integrated, hashed, used;
 };
