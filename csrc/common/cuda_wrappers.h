@@ -201,8 +201,7 @@ __device__ __forceinline__ void copy_wait() {
 template <bool kBfloat16>
 __device__ __forceinline__ void multiply_halves(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
 #ifdef VN_EMULATE
-  emulated_mma<16, 2>("mma.m16n8k16", d, a, b,
-                      [](uint32_t bits, int part) { return half_value(bits >> (16 * part), kBfloat16); });
+  emulated_multiply(kBfloat16 ? Multiplied::bfloat16 : Multiplied::float16, d, a, b);
 #elif __CUDA_ARCH__ >= 800
   if constexpr (kBfloat16) {
     asm volatile(
@@ -235,11 +234,7 @@ __device__ __forceinline__ void multiply_halves(float (&d)[4], const uint32_t (&
 // d [16][8] += a [16][8] b [8][8], operands rounded to tf32. From sm_80 on.
 __device__ __forceinline__ void multiply_tf32(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
 #ifdef VN_EMULATE
-  emulated_mma<8, 1>("mma.m16n8k8", d, a, b, [](uint32_t bits, int) {
-    float value;
-    std::memcpy(&value, &bits, sizeof value);
-    return value;
-  });
+  emulated_multiply(Multiplied::tf32, d, a, b);
 #elif __CUDA_ARCH__ >= 800
   asm volatile(
       "mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, "

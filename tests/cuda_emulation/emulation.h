@@ -101,9 +101,11 @@ void launch(void (*run)(void*), void* context, dim3 grid, dim3 block, size_t dyn
 void* shared(const void* key, size_t size);
 void* dynamic_shared();
 
-// All threads of the block meet; those of the warp meet, each with `size` bytes, and get all lanes' [32][kSlot].
+// All threads of the block meet; those of the warp meet, each with `size` bytes, and get all lanes' [32][kSlot]. What
+// they wrote to memory before is ordered for the others if `ordered` says so: of CUDA's operations of the warp that is
+// __syncwarp alone.
 void block_barrier();
-const unsigned char* meet(const char* operation, const void* mine, size_t size);
+const unsigned char* meet(const char* operation, const void* mine, size_t size, bool ordered = false);
 int lane();
 
 struct Index {
@@ -228,7 +230,7 @@ inline void __syncthreads() {
 
 inline void __syncwarp(unsigned mask = 0xffffffffu) {
   vn_emulation::require_all(mask);
-  vn_emulation::meet("__syncwarp", nullptr, 0);
+  vn_emulation::meet("__syncwarp", nullptr, 0, true);
 }
 
 template <typename T>
@@ -322,30 +324,9 @@ inline float half_value(unsigned bits, bool bfloat16) {
   return static_cast<float>(value);
 }
 
-// d += a b with a [16][kDepth] and b [kDepth][8], kPerRegister elements in a register; value(bits, part) is one of
-// them.
-template <int kDepth, int kPerRegister, typename Value>
-void emulated_mma(const char* name, float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2], const Value& value) {
-  struct Fragments {
-    uint32_t a[4], b[2];
-  };
-  constexpr int kQuad = 4 * kPerRegister;  // elements of k that four lanes hold in one register each
-  static_assert(kDepth == 2 * kQuad, "two registers along k");
-  const Fragments mine = {{a[0], a[1], a[2], a[3]}, {b[0], b[1]}};
-  const int lane = vn_emulation::lane();
-  const unsigned char* slots = vn_emulation::meet(name, &mine, sizeof mine);
-  for (int i = 0; i < 4; ++i) {
-    const int half = i / 2, column = 2 * (lane % 4) + i % 2;
-    double sum = d[i];
-    for (int k = 0; k < kDepth; ++k) {
-      const int member = k % kQuad / kPerRegister, part = k % kPerRegister, side = k / kQuad;
-      const auto left = vn_emulation::from_lane<Fragments>(slots, lane / 4 * 4 + member);
-      const auto right = vn_emulation::from_lane<Fragments>(slots, column * 4 + member);
-      sum += static_cast<double>(value(left.a[half + 2 * side], part)) * value(right.b[side], part);
-    }
-    d[i] = static_cast<float>(sum);
-  }
-}
+enum class Multiplied { bfloat16, float16, tf32 };
+// d [16][8] += a b, of operands of this type; in emulated_products.cpp.
+void emulated_multiply(Multiplied type, float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]);
 
 // Copies are done when they are waited for, as late as they may be on a GPU.
 inline void emulated_copy_async(void* to, const void* from, bool valid) {

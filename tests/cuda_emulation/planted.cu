@@ -5,16 +5,17 @@ namespace {
 
 enum Bug {
   kRight,
-  kNoBarrier,         // reads what another thread writes with no __syncthreads between
-  kNoWarpBarrier,     // the same within a warp, with no __syncwarp
-  kDivergentBarrier,  // half of the block leaves out a barrier
-  kDivergentShuffle,  // a lane leaves out a shuffle
-  kPastTheEnd,        // writes behind the dynamic shared memory
-  kPastTheOutput,     // writes behind the output
-  kUnwritten,         // reads shared memory that nobody wrote
-  kPlainIncrement,    // adds to one counter from all threads without an atomic
-  kBlocksMeet,        // two blocks write the same element
-  kBarrierTooSoon,    // writes for the next round while the last one is being read
+  kNoBarrier,          // reads what another thread writes with no __syncthreads between
+  kNoWarpBarrier,      // the same within a warp, with no __syncwarp
+  kDivergentBarrier,   // half of the block leaves out a barrier
+  kDivergentShuffle,   // a lane leaves out a shuffle
+  kPastTheEnd,         // writes behind the dynamic shared memory
+  kPastTheOutput,      // writes behind the output
+  kUnwritten,          // reads shared memory that nobody wrote
+  kPlainIncrement,     // adds to one counter from all threads without an atomic
+  kBlocksMeet,         // two blocks write the same element
+  kBarrierTooSoon,     // writes for the next round while the last one is being read
+  kShuffleForBarrier,  // a shuffle in the place of __syncwarp, which orders no memory
 };
 
 // out[i] of a block: three times the sum of the values of all its threads, taken in two rounds through shared memory.
@@ -32,7 +33,11 @@ __global__ void planted_kernel(const float* values, float* out, int* counter, in
   }
   // The right neighbour's value, within the warp.
   staged[i] = values[blockIdx.x * threads + i];
-  if (bug != kNoWarpBarrier) __syncwarp();
+  if (bug == kShuffleForBarrier) {
+    __shfl_sync(0xffffffffu, i, 0);
+  } else if (bug != kNoWarpBarrier) {
+    __syncwarp();
+  }
   const float neighbour = staged[i / 32 * 32 + (i + 1) % 32];
   float shuffled = neighbour;
   if (!(bug == kDivergentShuffle && i == 5))
