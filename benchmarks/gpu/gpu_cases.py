@@ -35,6 +35,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         BROAD,
         DENSE,
         GAUSSIANS,
+        HARMONICS,
         NARROW,
         SKIPS,
         THICK,
@@ -242,6 +243,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             check_forward(layers, [37, 0, 60], 3, precision)
 
     networks = {"branched": (BRANCHED, 3), "wide": (WIDE, 7), "gaussians": (GAUSSIANS, 6), "broad": (BROAD, 3)}
+    networks |= {"harmonics": (HARMONICS, 3)}
     cases: list[tuple[str, Callable[[], None]]] = [
         *(
             (f"nearest_centre {k} {d}", functools.partial(lookup, "nearest_centre", 300, k, d))
@@ -293,7 +295,10 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
                 f"grouped_mlp {name} {precision} by {way}",
                 functools.partial(network, networks[name][0], [70, 0, 1, 40], networks[name][1], precision, way),
             )
-            for name, way in (("branched", "tiles"), ("gaussians", "tiles"), ("branched", "layers"))
+            for name, way in (
+                *(("branched", "tiles"), ("gaussians", "tiles")),
+                *(("branched", "layers"), ("harmonics", "layers")),
+            )
             for precision in ("bfloat16", "float16")
         ),
         *(

@@ -9,7 +9,8 @@ some of them, ``--data DIR`` is a Blender scene for the training.
     build      the extension for this GPU alone
     small      every operation once against float64, each case for itself and with a time limit of its own
     captured   steps of the route in CUDA graphs, fused and layer by layer
-    roofs      the kernels at full size, beside the machine's own limits
+    roofs      networks, look-ups and sorts at full size, beside the machine's own limits
+    step       what surrounds the networks in a step, and hash grids, beside the same in plain torch
     training   short trainings, on --data or the built-in scene
     tests      the tests of the operations on CUDA, a process for each file
     memcheck   compute-sanitizer over the small cases, where it is installed
@@ -115,11 +116,12 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
     trained, scene = out / "training", "builtin" if data is None else str(data)
     return {
         "machine": Part([*own, "machine", str(out)], 30, (), out / "machine.json"),
-        "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 180, built),
+        "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 300, built),
         "small": part([*own, "small", str(out)], 60, (), out / "small.json"),
         "captured": part([*own, "captured", str(out)], 45, (), out / "captured.json"),
         "roofs": part([*own, "roofs", str(out)], 60, (), out / "roofs.json"),
-        "training": part([*own, "training", str(trained), scene], 80, (), trained / "training.json"),
+        "step": part([*own, "step", str(out)], 60, (), out / "step.json"),
+        "training": part([*own, "training", str(trained), scene], 110, (), trained / "training.json"),
         "tests": tested if importlib.util.find_spec("pytest") else Part("no pytest", 0),
         "memcheck": sanitized("memcheck", apart),
         "racecheck": sanitized("racecheck"),
@@ -175,24 +177,24 @@ def highlights(found: dict[str, Any]) -> list[str]:
         return kept.get(kind, []) if isinstance(kept, dict) else []
 
     lines = []
-    for row in rows("roofs", "rows"):
+    timed = [*rows("roofs", "rows"), *rows("step", "rows")]
+    for row in timed:
         aim = row["aim"]
         verdict = "" if aim is None else f", {'reached' if row['share'] >= aim else 'MISSED'} {100 * aim:.0f} %"
         share = f"{100 * row['share']:5.1f} % of {row['limit']}"
         lines.append(f"{row['name']:32} {1e3 * row['seconds']:8.3f} ms {share}{verdict}")
-    times = {row["name"]: row["seconds"] for row in rows("roofs", "rows")}
+    times = {row["name"]: row["seconds"] for row in timed}
     for name, seconds in times.items():
         radix = times.get(name.replace("by counting", "by radix"))
         if name.endswith("by counting") and radix is not None:
             lines.append(f"{name}: {seconds / radix:.2f} x the time of radix")
-        for way in ("tiles", "wgmma"):
-            other = times.get(f"{name} by {way}")
-            if other is not None:
-                lines.append(f"{name}: {seconds / other:.2f} x the time of {way}")
+        for other, its in times.items():
+            if other.startswith(f"{name} by "):
+                lines.append(f"{name}: {seconds / its:.2f} x the time of {other.removeprefix(f'{name} by ')}")
     for row in rows("training", "trainings"):
-        said = f"PSNR {row['psnr']:.2f} after {row['steps']} steps" if row["right"] else f"FAILED: {row['said']}"
+        said = f"{row['milliseconds']:.2f} ms a step, PSNR {row['psnr']:.2f} after {row['steps']} steps"
         lines.append(f"training {row['name']}: {said}")
-    for part in ("small", "captured", "roofs", "memcheck", "racecheck"):
+    for part in ("small", "captured", "roofs", "step", "training", "memcheck", "racecheck"):
         lines += [f"WRONG in {part}: {row['name']}: {row['said']}" for row in rows(part, "cases") if not row["right"]]
     lines += [f"WRONG in tests: {row['name']}: {row['said']}" for row in rows("tests", "files") if not row["right"]]
     return lines

@@ -61,6 +61,13 @@ Case = tuple[str, Callable[[], "str | None"]]
 """A name, and a function that raises, or returns a line to print."""
 
 
+def settling(device: str) -> Callable[[], None]:
+    """What waits for all that a device has been given."""
+    import torch
+
+    return torch.cuda.synchronize if device == "cuda" else lambda: None
+
+
 def one_by_one(cases: list[Case], again: Again, settle: Callable[[], None], journal: Journal) -> int:
     """Every case for itself; after one that leaves the device unusable, or does not end, the rest in a new process.
 

@@ -49,6 +49,7 @@ class Work:
         amount: operations, or bytes read and written, of a call at the least; samples where there is no bound.
         bound: which limit of the machine the amount is compared with: "float32", "bfloat16" or "copy"; "" for none.
         executed: operations of a call with what is computed again, where that is more than ``amount``.
+        moved: bytes read and written at the least, where ``amount`` counts operations and both may be the limit.
     """
 
     ours: Callable[[str], Contender]
@@ -58,6 +59,7 @@ class Work:
     amount: float
     bound: str
     executed: float | None = None
+    moved: float | None = None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ops.alternatives import compile_now
+from ops.alternatives import compile_now, evaluate, join, row_pieces, torch_linear
 from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation
 from voronerf import MLP, HashGrid, Layer
 from voronerf.ops import hash_encode, nearest_centre, routed_mlp, spherical_harmonics
@@ -22,6 +22,7 @@ CELLS = 16
 PRIMES = (1, 2654435761, 805459861)
 
 Encode = Callable[[Tensor, Tensor], Tensor]
+Network = Callable[..., Tensor]
 
 
 def cases() -> list[Case]:
@@ -29,14 +30,14 @@ def cases() -> list[Case]:
     found = []
     for n in (1 << 16, 1 << 18):
         for direction in (FORWARD, BACKWARD):
-            work = functools.partial(_network, n, direction)
+            work = functools.partial(network_work, n, direction)
             name, quick = f"hash + MLP n={n}", (n, direction) == (1 << 16, FORWARD)
             found.append(Case("routed_mlp", name, torch.float32, direction, n, CELLS, work, quick=quick, threads=1))
     for n, log2_entries in ((1 << 16, 15), (1 << 18, 15), (1 << 16, 19)):
         for direction in (FORWARD, BACKWARD):
             name = f"8 x 2^{log2_entries} x 2 n={n}"
             base = (n, log2_entries) == (1 << 16, 15)
-            work = functools.partial(_work, n, log2_entries, direction, base)
+            work = functools.partial(hash_work, n, log2_entries, direction, base)
             shown = ("native", "reference") if base else ("native",)
             quick = base and direction == FORWARD
             found.append(Case("hash_encode", name, torch.float32, direction, n, None, work, shown, quick, threads=1))
@@ -78,7 +79,8 @@ def _by_embedding_bag(x: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
     return found.view(len(x), -1)
 
 
-def _work(n: int, log2_entries: int, direction: str, compiled: bool, device: torch.device) -> Work:
+def hash_work(n: int, log2_entries: int, direction: str, compiled: bool, device: torch.device) -> Work:
+    """Eight levels of two features; compiled: also beside torch.compile."""
     grid = HashGrid(levels=8, features=2, log2_entries=log2_entries, base=16, finest=256)
     count = rotation(n * 4 * (3 + grid.out_features))
     sets = [_samples(n, seed, device) for seed in range(count)]
@@ -136,7 +138,7 @@ HIDDEN = (
 """The density from 16 features, and the colour from these and the direction."""
 
 
-def _network(n: int, direction: str, device: torch.device) -> Work:
+def network_work(n: int, direction: str, device: torch.device) -> Work:
     """A hash grid of all cells, harmonics of the directions, and a small network for each cell."""
     grid, draw = HashGrid(levels=8, features=2, log2_entries=15, base=16, finest=256), generator(9)
     inside = MLP(HIDDEN, (4, 2), None, None, "hash", grid, "spherical", 4)
@@ -153,31 +155,58 @@ def _network(n: int, direction: str, device: torch.device) -> Work:
     sets = [_samples(n, seed, device) for seed in range(count)]
     cells = [nearest_centre(x, centres) for x in sets]
 
-    def results(call: int, fused: bool, backend: str, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    def results(call: int, network: Network, dtype: torch.dtype = torch.float32) -> list[Tensor]:
         leaves = [parameter.to(dtype).requires_grad_(direction == BACKWARD) for parameter in parameters]
-        table, weights, biases = leaves[0], leaves[1 : len(shapes) + 1], leaves[len(shapes) + 1 :]
-        x, seen = sets[call % count].to(dtype), rays.to(dtype)
-        given: dict[str, Any] = {"cells": cells[call % count], "direction_index": index, "backend": backend}
-        if fused:
-            out, _ = routed_mlp(x, weights, biases, layers=inside, directions=seen, features=table, **given)
-        else:
-            x, seen = hash_encode(x, table, grid, backend=backend), spherical_harmonics(seen, 4, backend=backend)
-            out, _ = routed_mlp(x, weights, biases, layers=behind, directions=seen, **given)
+        own = leaves[0], leaves[1 : len(shapes) + 1], leaves[len(shapes) + 1 :]
+        out = network(sets[call % count].to(dtype), rays.to(dtype), cells[call % count], *own)
+        out = out.to(dtype)  # from autocast's type
         return [out] if direction == FORWARD else [out, *torch.autograd.grad(out, leaves, gradient.to(dtype))]
+
+    def fused(backend: str) -> Network:
+        def network(x: Tensor, seen: Tensor, owners: Tensor, table: Tensor, *own: list[Tensor]) -> Tensor:
+            given: dict[str, Any] = {"layers": inside, "features": table, "direction_index": index}
+            return routed_mlp(x, *own, directions=seen, cells=owners, backend=backend, **given)[0]
+
+        return network
+
+    def separate(x: Tensor, seen: Tensor, owners: Tensor, table: Tensor, *own: list[Tensor]) -> Tensor:
+        x, seen = hash_encode(x, table, grid, backend="native"), spherical_harmonics(seen, 4, backend="native")
+        given: dict[str, Any] = {"layers": behind, "direction_index": index, "backend": "native"}
+        return routed_mlp(x, *own, directions=seen, cells=owners, **given)[0]
+
+    def by_loop(x: Tensor, seen: Tensor, owners: Tensor, table: Tensor, *own: list[Tensor]) -> Tensor:
+        """Sort by cell, then each cell's network on its rows."""
+        keys, order = torch.sort(owners.to(torch.uint8), stable=True)
+        edges = torch.searchsorted(keys.int(), torch.arange(CELLS + 1, device=device)).tolist()
+        features, harmonics = _by_indexing(x, table, grid), spherical_harmonics(seen, 4, backend="reference")
+        parts = []
+        for cell, first, last in row_pieces(edges, None):
+            rows, of_cell = order[first:last], ([tensor[cell] for tensor in tensors] for tensors in own)
+            parts.append(join(evaluate(behind, features[rows], harmonics[index[rows]], *of_cell, torch_linear)))
+        joined = torch.cat(parts)
+        return torch.zeros_like(joined).index_copy(0, order, joined)
 
     @functools.cache
     def exact() -> list[Tensor]:
-        return results(0, True, "reference", torch.float64)
+        return results(0, fused("reference"), torch.float64)
 
     def error(found: Any) -> float:
         return max(relative_error(a, b) for a, b in zip(found, exact(), strict=True))
 
     operations = 2.0 * n * sum(o * i for o, i in shapes) * (1 if direction == FORWARD else 3)
+    # At the least: positions, indices, cells and outputs, and the table; backward those again, and the features twice.
+    moved = n * 4.0 * (3 + 1 + 1 + 4) + parameters[0].nbytes
+    if direction == BACKWARD:
+        moved = 2 * moved + n * 4.0 * 2 * grid.out_features
     return Work(
-        lambda backend: Contender(lambda call: results(call, True, backend)),
-        {"native, encoded before": lambda: Contender(lambda call: results(call, False, "native"))},
+        lambda backend: Contender(functools.partial(results, network=fused(backend))),
+        {
+            "native, encoded before": lambda: Contender(functools.partial(results, network=separate)),
+            "torch, indexing, sort + loop": lambda: Contender(functools.partial(results, network=by_loop)),
+        },
         error,
         3e-2,  # a ReLU within rounding of its kink may go either way
         operations,
         "float32",
+        moved=moved,
     )

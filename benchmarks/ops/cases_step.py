@@ -1,7 +1,7 @@
 """Cases of what surrounds the networks in a training step: pixel_rays, render_loss, observe_occupancy and sparse_adam.
 
-b rays of a batch, m samples of all rays, n rows of the table: rays, samples or entries. The sizes are those of a step
-on Lego at 100 x 100. One thread.
+b rays of a batch, m samples of all rays, n rows of the table: rays, samples or entries. The sizes of its rows are those
+of a step on Lego at 100 x 100. One thread.
 """
 
 from __future__ import annotations
@@ -32,15 +32,17 @@ Results = list[Tensor]
 
 def cases() -> list[Case]:
     """The rows of these ops."""
+    pixels, losses = functools.partial(pixel_work, RAYS), functools.partial(loss_work, RAYS, SAMPLES)
+    observed = functools.partial(observe_work, SAMPLES)
     rows: list[tuple[str, str, str, int, Callable[[torch.device], Work]]] = [
-        ("pixel_rays", f"100 views of 100 x 100 b={RAYS}", FORWARD, RAYS, _pixel_work),
-        ("render_loss", f"b={RAYS} m={SAMPLES}", BACKWARD, SAMPLES, _loss_work),
-        ("observe_occupancy", f"m={SAMPLES} in {GRID}^3 cells", FORWARD, SAMPLES, _observe_work),
+        ("pixel_rays", f"100 views of 100 x 100 b={RAYS}", FORWARD, RAYS, pixels),
+        ("render_loss", f"b={RAYS} m={SAMPLES}", BACKWARD, SAMPLES, losses),
+        ("observe_occupancy", f"m={SAMPLES} in {GRID}^3 cells", FORWARD, SAMPLES, observed),
     ]
     for log2_entries, touched in ((15, 1.0), (19, 1 / 64)):
         entries = 8 << log2_entries
         name = f"8 x 2^{log2_entries} entries, {touched:.0%} with a gradient"
-        rows.append(("sparse_adam", name, FORWARD, entries, functools.partial(_adam_work, entries, touched)))
+        rows.append(("sparse_adam", name, FORWARD, entries, functools.partial(adam_work, entries, touched)))
     backends = ("native", "reference")
     return [
         Case(op, name, torch.float32, direction, n, None, work, backends, "2^19" not in name, threads=1)
@@ -52,14 +54,15 @@ def _worst(expected: Results) -> Callable[[Any], float]:
     return lambda found: max(relative_error(a, b) for a, b in zip(found, expected, strict=True))
 
 
-def _pixel_work(device: torch.device) -> Work:
+def pixel_work(b: int, device: torch.device) -> Work:
+    """Rays and colours of b pixels."""
     draw, side, views = generator(0), 100, 100
     cameras = orbit_cameras(views, radius=4.0, elevation=0.5, width=side, height=side, focal=140.0).to(device)
     images = torch.randint(0, 256, (views, side, side, 4), generator=draw, dtype=torch.uint8).to(device)
     box = torch.tensor(BOX, device=device)
-    count = rotation(RAYS * 64)
-    sets = [torch.randint(0, views * side * side, (RAYS,), generator=draw).to(device) for _ in range(count)]
-    colours = torch.rand(RAYS, 3, generator=draw).to(device)
+    count = rotation(b * 64)
+    sets = [torch.randint(0, views * side * side, (b,), generator=draw).to(device) for _ in range(count)]
+    colours = torch.rand(b, 3, generator=draw).to(device)
 
     def contender(function: Callable[..., Any]) -> Contender:
         given = {"near": 2.0, "far": 6.0, "box": box, "background": colours}
@@ -71,7 +74,7 @@ def _pixel_work(device: torch.device) -> Work:
         {"torch, rays by matmul": lambda: contender(_rays_by_matmul)},
         _worst(exact),
         1e-4,
-        RAYS * 64.0,  # an index, a colour, eleven floats
+        b * 64.0,  # an index, a colour, eleven floats
         "copy",
     )
 
@@ -103,16 +106,17 @@ def _rays_by_matmul(
     return [origins, directions, enter, leave, values[:, :3] * values[:, 3:] + background * (1 - values[:, 3:])]
 
 
-def _loss_work(device: torch.device) -> Work:
+def loss_work(b: int, m: int, device: torch.device) -> Work:
+    """Loss and gradient of m samples on b rays of random lengths."""
     draw = generator(0)
-    cuts = torch.randint(0, SAMPLES + 1, (RAYS - 1,), generator=draw).sort().values
+    cuts = torch.randint(0, m + 1, (b - 1,), generator=draw).sort().values
     offsets = F.pad(cuts, (1, 1))
-    offsets[-1] = SAMPLES
+    offsets[-1] = m
     offsets = offsets.int().to(device)
-    count = rotation(SAMPLES * 4 * 10)
-    sets = [torch.randn(SAMPLES, 4, generator=draw).to(device) for _ in range(count)]
-    deltas = torch.rand(SAMPLES, generator=draw).to(device) / 16
-    target, background = torch.rand(2, RAYS, 3, generator=draw).to(device)
+    count = rotation(m * 4 * 10)
+    sets = [torch.randn(m, 4, generator=draw).to(device) for _ in range(count)]
+    deltas = torch.rand(m, generator=draw).to(device) / 16
+    target, background = torch.rand(2, b, 3, generator=draw).to(device)
 
     def results(loss: Callable[..., Tensor], raw: Tensor) -> Results:
         leaf = raw.detach().requires_grad_()
@@ -133,15 +137,15 @@ def _loss_work(device: torch.device) -> Work:
         seen = ops.composite(sigma, colour, depths, deltas, ray_offsets=offsets, background=background).colour
         return F.mse_loss(seen, target)
 
-    rays = torch.repeat_interleave(torch.arange(RAYS, device=device), offsets.diff().long())
+    rays = torch.repeat_interleave(torch.arange(b, device=device), offsets.diff().long())
 
     def by_sums(raw: Tensor) -> Tensor:
         """As nerfacc composites packed samples in PyTorch: sums over all samples, less what was before each ray."""
         colour, taken = torch.sigmoid(raw[:, :3]), SCALE * F.softplus(raw[:, 3]) * deltas
         before = F.pad(taken.cumsum(0), (1, 0))
         weights = torch.exp(before[offsets[:-1].long()][rays] - before[:-1]) * -torch.expm1(-taken)
-        seen = raw.new_zeros(RAYS, 3).index_add(0, rays, weights[:, None] * colour)
-        opacity = raw.new_zeros(RAYS).index_add(0, rays, weights)
+        seen = raw.new_zeros(b, 3).index_add(0, rays, weights[:, None] * colour)
+        opacity = raw.new_zeros(b).index_add(0, rays, weights)
         return F.mse_loss(seen + (1 - opacity)[:, None] * background, target)
 
     exact = results(by_ours, sets[0].double())
@@ -153,19 +157,20 @@ def _loss_work(device: torch.device) -> Work:
         },
         _worst(exact),
         1e-2,
-        SAMPLES * 4.0 * (4 + 4 + 1),
+        m * 4.0 * (4 + 4 + 1),
         "copy",
     )
 
 
-def _observe_work(device: torch.device) -> Work:
+def observe_work(m: int, device: torch.device) -> Work:
+    """What m samples near a sphere say."""
     draw = generator(0)
     box = torch.tensor(BOX, device=device)
-    count = rotation(SAMPLES * 24)
+    count = rotation(m * 24)
 
     def batch() -> Results:
-        shell = F.normalize(torch.randn(SAMPLES, 3, generator=draw), dim=1) * 0.7
-        values = torch.rand(3, SAMPLES, generator=draw)
+        shell = F.normalize(torch.randn(m, 3, generator=draw), dim=1) * 0.7
+        values = torch.rand(3, m, generator=draw)
         return [x.to(device) for x in (shell, 50 * values[0], values[1] / 32, values[2] / 64)]
 
     sets = [batch() for _ in range(count)]
@@ -187,7 +192,7 @@ def _observe_work(device: torch.device) -> Work:
         {"torch, as nerfacc": lambda: contender(_observe_all)},
         _worst(exact),
         1e-5,
-        SAMPLES * 24.0,
+        m * 24.0,
         "copy",
     )
 
@@ -214,7 +219,8 @@ def _observe_all(
     occupied.copy_(density >= threshold)
 
 
-def _adam_work(entries: int, touched: float, device: torch.device) -> Work:
+def adam_work(entries: int, touched: float, device: torch.device) -> Work:
+    """A table of entries of two features, some of which have a gradient."""
     draw = generator(0)
     table = torch.randn(entries, 2, generator=draw).to(device)
     present = torch.rand(entries, 1, generator=draw) < touched

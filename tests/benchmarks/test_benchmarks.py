@@ -217,16 +217,17 @@ def test_what_is_compared_is_right_in_every_small_case():
         "camera_rays, lens": marching._camera_work(300, True, CPU),
         "balance_centres": marching._balance_work(600, 5, CPU),
         "select_heaviest": marching._heaviest_work(2000, CPU),
-        "pixel_rays": cases_step._pixel_work(CPU),
-        "render_loss": cases_step._loss_work(CPU),
-        "observe_occupancy": cases_step._observe_work(CPU),
-        "sparse_adam": cases_step._adam_work(1000, 0.1, CPU),
+        "pixel_rays": cases_step.pixel_work(300, CPU),
+        "render_loss": cases_step.loss_work(100, 800, CPU),
+        "observe_occupancy": cases_step.observe_work(800, CPU),
+        "sparse_adam": cases_step.adam_work(1000, 0.1, CPU),
     }
     for direction in ("forward", "forward+backward"):
         for op in ("frequency_encode", "integrated_encode"):
             works[f"{op}, {direction}"] = sampling._encode_work(op, 64, torch.float32, direction, False, CPU)
         works[f"spherical_harmonics, {direction}"] = sampling._harmonics_work(64, direction, False, CPU)
-        works[f"hash_encode, {direction}"] = cases_hash._work(512, 12, direction, False, CPU)
+        works[f"hash_encode, {direction}"] = cases_hash.hash_work(512, 12, direction, False, CPU)
+        works[f"hash + MLP, {direction}"] = cases_hash.network_work(512, direction, CPU)
         for packed in (False, True):
             work = sampling._composite_work(512, packed, direction, False, CPU)
             works[f"composite, packed {packed}, {direction}"] = work

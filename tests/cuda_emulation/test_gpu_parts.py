@@ -35,6 +35,11 @@ def parts(monkeypatch):
 
 
 @pytest.fixture
+def timings(parts):
+    return sys.modules["gpu_timings"]
+
+
+@pytest.fixture
 def check():
     return program("gpu_check")
 
@@ -170,22 +175,23 @@ class Ticks:
         return 0.010 + 0.001 * (len(self.called) - before)
 
 
-def test_kernels_are_timed_without_the_host(parts, fake_cuda):
+def test_kernels_are_timed_without_the_host(timings, fake_cuda):
     call = fake_cuda.pop()
-    found = parts.clock(call, Ticks(fake_cuda))
+    found = timings.clock(call, Ticks(fake_cuda))
     assert found["graph"] == "captured" and found["launched"] == pytest.approx(0.011)
-    assert found["seconds"] == pytest.approx((0.010 + 0.001 * parts.CALLS) / parts.CALLS)
+    assert found["seconds"] == pytest.approx((0.010 + 0.001 * timings.CALLS) / timings.CALLS)
 
 
-def test_what_cannot_be_captured_is_timed_as_it_is(parts, fake_cuda, monkeypatch):
+def test_what_cannot_be_captured_is_timed_as_it_is(timings, fake_cuda, monkeypatch):
     def refused(graph):
         raise RuntimeError("operation not permitted when stream is capturing")
 
     monkeypatch.setattr("torch.cuda.graph", refused)
     call = fake_cuda.pop()
-    found = parts.clock(call, Ticks(fake_cuda))
+    found = timings.clock(call, Ticks(fake_cuda))
     assert found["seconds"] == found["launched"] == pytest.approx(0.011)
     assert found["graph"] == "RuntimeError: operation not permitted when stream is capturing"
+    assert timings.clock(call, Ticks(fake_cuda), captured=False) == {**found, "graph": "no graph"}
 
 
 @pytest.mark.native
@@ -198,10 +204,23 @@ def test_roofs(parts, monkeypatch, tmp_path):
     assert parts.roofs(tmp_path, again, "cpu", 256) == 0
     rows = read_json(tmp_path / "roofs.json")["rows"]
     assert len(rows) == 33 and all(row["seconds"] > 0 and row["share"] > 0 for row in rows)
+    assert all(row["floor"] == row["work"] / 1e12 for row in rows)
     again = parts.Again(("roofs",), start=32, failed=1, case_seconds=60.0)
     assert parts.roofs(tmp_path, again, "cpu", 256) == 1
     after = read_json(tmp_path / "roofs.json")["rows"]
     assert after[:33] == rows and [row["name"] for row in after[33:]] == [rows[32]["name"]]
+
+
+@pytest.mark.native
+def test_what_surrounds_the_networks_is_timed_beside_plain_torch(parts, monkeypatch, tmp_path):
+    import harness
+
+    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
+    assert parts.step(tmp_path, parts.Again(("step",), case_seconds=60.0), "cpu", 256) == 0
+    rows = read_json(tmp_path / "step.json")["rows"]
+    own = [row["name"] for row in rows if " by " not in row["name"]]
+    assert len(own) == 13 and all(row["limit"] == "copy" and row["work"] > 0 for row in rows)
+    assert all(any(row["name"].startswith(f"{name} by ") for row in rows) for name in own)
 
 
 def test_training(parts, tmp_path, capsys, monkeypatch):
@@ -209,13 +228,14 @@ def test_training(parts, tmp_path, capsys, monkeypatch):
     ticks = itertools.count()
     monkeypatch.setattr("voronerf.training.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0201 * next(ticks)))
     monkeypatch.setattr("voronerf.data.load_scene", lambda *_, **__: builtin_scene(16))
-    small = {name: {**options, "width": 16, "samples": 16} for name, options in parts.TRAININGS.items()}
+    small = {name: {**options, "width": 16, "samples": 16, "rays": 256} for name, options in parts.TRAININGS.items()}
     monkeypatch.setattr(parts, "TRAININGS", small)
-    assert parts.training(tmp_path, "builtin", "cpu", 0.5) == 0
-    ungraphed = [settings for settings in parts.TRAININGS.values() if "cuda_graph" not in settings]
-    assert capsys.readouterr().out.count("PSNR") == len(ungraphed) == 2
+    assert parts.training(tmp_path, "builtin", parts.Again(("training",), case_seconds=60.0), "cpu", 0.5) == 0
+    ungraphed = [name for name, settings in parts.TRAININGS.items() if "cuda_graph" not in settings]
+    assert capsys.readouterr().out.count("PSNR") == len(ungraphed) == 4
     kept = read_json(tmp_path / "training.json")["trainings"]
-    assert [row["name"] for row in kept] == ["plain", "bf16"] and all(row["right"] and row["psnr"] > 0 for row in kept)
+    assert [row["name"] for row in kept] == ungraphed
+    assert all(row["psnr"] > 0 and row["milliseconds"] > 0 for row in kept)
 
 
 def test_machine(parts, capsys, tmp_path):
@@ -237,10 +257,10 @@ def test_a_file_of_tests_that_hangs_fails_alone(parts, tmp_path, capsys):
     for name, body in bodies.items():
         files.append(tmp_path / f"test_planted_{name}.py")
         files[-1].write_text(body)
-    assert parts.tests(tmp_path / "out", files, 10.0) == 2
+    assert parts.tests(tmp_path / "out", files, 6.0) == 2
     said = capsys.readouterr().out.splitlines()
     outcomes = {line.split()[1].removeprefix("test_planted_"): line for line in said if "  test_planted_" in line}
-    assert outcomes["hangs.py:"].startswith("FAILED  test_planted_hangs.py: stopped after 10 s")
+    assert outcomes["hangs.py:"].startswith("FAILED  test_planted_hangs.py: stopped after 6 s")
     assert list(outcomes)[-1] == "hangs.py:", "the others are told before it"
     assert outcomes["passes.py:"].startswith("passed") and "1 passed" in outcomes["passes.py:"]
     assert outcomes["wrong.py:"].startswith("FAILED") and outcomes["other.py:"].startswith("passed")
@@ -301,25 +321,29 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
     timed += [{**row, "name": "cell_sort k=16 by radix", "seconds": 4e-5}]
     timed += [{**row, "name": "near", "aim": 0.6}, {**row, "name": "far", "aim": 0.4}]
     timed += [{**row, "name": f"far by {way}", "seconds": time} for way, time in (("tiles", 8e-5), ("wgmma", 1e-5))]
-    failed = {"name": "bf16", "right": False, "said": "no"}
     found = {
         "roofs": {"rows": timed, "cases": [{"name": "slow", "right": False, "said": "hangs"}]},
-        "training": {"trainings": [{"name": "plain", "right": True, "psnr": 21.5, "steps": 90}, failed]},
+        "training": {
+            "trainings": [{"name": "plain", "psnr": 21.5, "steps": 90, "milliseconds": 8.25}],
+            "cases": [{"name": "plain", "right": True, "said": ""}, {"name": "bf16", "right": False, "said": "no"}],
+        },
         "small": {"cases": [{"name": "fine", "right": True, "said": ""}]},
         "captured": "captured.json: torn",
         "tests": {"files": [{"name": "test_a.py", "right": False, "said": "1 failed"}]},
         "memcheck": None,
+        "step": {"rows": [{**row, "name": name} for name in ("loss", "loss by torch, sums by rays")]},
     }
     said = check.highlights(found)
-    assert len(said) == 14
+    assert len(said) == 17
     assert said[3].endswith("0.020 ms  50.0 % of copy, MISSED 60 %") and said[4].endswith("copy, reached 40 %")
-    assert said[7:] == [
+    assert said[9:] == [
         "cell_sort k=16 by counting: 0.50 x the time of radix",
         "far: 0.25 x the time of tiles",
         "far: 2.00 x the time of wgmma",
-        "training plain: PSNR 21.50 after 90 steps",
-        "training bf16: FAILED: no",
+        "loss: 1.00 x the time of torch, sums by rays",
+        "training plain: 8.25 ms a step, PSNR 21.50 after 90 steps",
         "WRONG in roofs: slow: hangs",
+        "WRONG in training: bf16: no",
         "WRONG in tests: test_a.py: 1 failed",
     ]
     assert check.highlights({}) == []
