@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -61,7 +61,7 @@ def custom_op(
         schema = torch.library.infer_schema(run, mutates_args=())
         op = torch.library.custom_op(f"voronerf::{name}", run, mutates_args=(), device_types=devices, schema=schema)
         op.register_fake(fake or (lambda *arguments: next(steps(*arguments))))
-        return Op(op, run, devices, single=results is Tensor)
+        return Op(op, run, devices, direct=typing.get_origin(results) is not list)
 
     return declare
 
@@ -70,11 +70,12 @@ class Op:
     """A custom op, which is called past PyTorch's dispatcher where nothing there would see the call.
 
     The dispatcher and the autograd of ``torch.library`` take some 130 us for a forward and a backward pass, as long as
-    a layer of width 64 takes for a thousand samples. Modes, transforms, tracers and profilers are given the custom op.
+    a layer of width 64 takes for a thousand samples, and more for lists of tensors. Modes, transforms, tracers and
+    profilers are given the custom op.
     """
 
-    def __init__(self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], single: bool) -> None:
-        self._op, self._run, self._devices, self._single = op, run, devices, single
+    def __init__(self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], direct: bool) -> None:
+        self._op, self._run, self._devices, self._direct = op, run, devices, direct
         self._function: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
@@ -82,30 +83,55 @@ class Op:
         if torch.compiler.is_compiling() or _PROFILES() or any(listens() for listens in _LISTENERS):
             return self._op(*arguments)
         differentiated, grad = False, torch.is_grad_enabled()
-        for argument in arguments:
-            for tensor in argument if isinstance(argument, (list, tuple)) else (argument,):
-                if isinstance(tensor, Tensor):
-                    plain = type(tensor) in (Tensor, torch.nn.Parameter) and tensor.device.type in self._devices
-                    if not plain or (grad and tensor.requires_grad and argument is not tensor):
-                        return self._op(*arguments)
-                    differentiated = differentiated or (grad and tensor.requires_grad)
+        flat, lengths = _flattened(arguments)
+        for tensor in flat:
+            if isinstance(tensor, Tensor):
+                if type(tensor) not in (Tensor, torch.nn.Parameter) or tensor.device.type not in self._devices:
+                    return self._op(*arguments)
+                differentiated = differentiated or (grad and tensor.requires_grad)
         if not differentiated:
             return self._run(*arguments)
-        return self._op(*arguments) if self._function is None else self._function.apply(*arguments)
+        return self._op(*arguments) if self._function is None else self._function.apply(*flat, lengths)
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
         """The op's backward, as of ``torch.library.custom_op``."""
         self._op.register_autograd(backward, setup_context=setup_context)
-        if not self._single:  # autograd.Function knows no lists
+        if not self._direct:  # autograd.Function knows no lists of results
             return
 
-        def forward(ctx: Any, *arguments: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
+        def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
+            *given, lengths = flat
+            arguments = _nested(given, lengths)
             result = self._run(*arguments)
             setup_context(ctx, arguments, result)
             return result
 
-        parts = {"forward": staticmethod(forward), "backward": staticmethod(backward)}
+        def gradients(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
+            found = backward(ctx, *of_results)
+            return (*_flattened(found if isinstance(found, tuple) else (found,))[0], None)
+
+        parts = {"forward": staticmethod(forward), "backward": staticmethod(gradients)}
         self._function = type("Direct", (torch.autograd.Function,), parts)
+
+
+def _flattened(arguments: Sequence[Any]) -> tuple[list[Any], list[int]]:
+    """Arguments with the entries of lists in their place, and the length of each list, -1 for what is none."""
+    flat: list[Any] = []
+    lengths = []
+    for argument in arguments:
+        if isinstance(argument, (list, tuple)):
+            flat.extend(argument)
+            lengths.append(len(argument))
+        else:
+            flat.append(argument)
+            lengths.append(-1)
+    return flat, lengths
+
+
+def _nested(flat: list[Any], lengths: list[int]) -> tuple[Any, ...]:
+    """The arguments that `_flattened` took."""
+    entries = iter(flat)
+    return tuple(next(entries) if n < 0 else [next(entries) for _ in range(n)] for n in lengths)
 
 
 def on_huge_pages(result: Tensor) -> None:
