@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers import on_any_number_of_threads
 from op_cases import need, offsets_of, refused
 
 from voronerf import MLP, HashGrid, Layer
@@ -87,6 +88,30 @@ def test_routed_equals_grouped(device, backend, grid, own, where):
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
     g = torch.randn_like(found)
     for a, b in zip(torch.autograd.grad(found, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+@own_tables
+@pytest.mark.parametrize("kept", [0, 3, 40, 89])
+@pytest.mark.parametrize("where", ["cells", "one cell"])
+@pytest.mark.op("routed_mlp")
+def test_rows_without_a_gradient_teach_nothing(device, backend, own, kept, where):
+    grid, k = GRIDS["plain"], 1 if where == "one cell" else len(COUNTS)
+    weights, biases, features = network(grid, own, device, k=k)
+    x, rays, index = inputs(90, device)
+    cells = None if k == 1 else (torch.arange(90, dtype=torch.int32, device=device) * 7) % k
+    leaves = [t.requires_grad_() for t in (features, *weights, *biases)]
+    rows = torch.randperm(90, generator=torch.Generator().manual_seed(3))[:kept].sort().values.to(device)
+    g = torch.zeros(90, 4, device=device).index_fill_(0, rows, 1.0)
+
+    def gradients(x, index, cells, g):
+        given = {"layers": table_of(grid), "features": features, "directions": rays, "direction_index": index}
+        found, _ = routed_mlp(x, weights, biases, cells=cells, backend=backend, **given)
+        return torch.autograd.grad(found, leaves, g)
+
+    alone = gradients(x[rows], index[rows], None if cells is None else cells[rows], g[rows])
+    counts = (1, 2, 3) if backend == "native" and device.type == "cpu" else (1,)
+    for a, b in zip(on_any_number_of_threads(lambda: gradients(x, index, cells, g), counts), alone, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <stdexcept>
 #include <string>
+#include <vector>
 
 #include "common/common.h"
 #include "common/parallel.h"
@@ -135,6 +136,37 @@ HashEncoding hash_of(const MlpTable& table, const MlpInputs& in) {
   return hash_encoding(given, table.grid);
 }
 
+// Rows that have a gradient. Those without, such as samples that no light reaches, add nothing to the gradients of
+// parameters and tables.
+struct Taught {
+  std::vector<int32_t> rows, order, offsets;  // numbers as sorted, and of the caller; [k+1]. Empty: all rows
+};
+
+// Empty too where the few without a gradient would not pay for copies.
+Taught taught_rows(const MlpTable& table, const MlpInputs& in, const float* gradient) {
+  int64_t width = 0;
+  for (const int output : table.outputs) width += table.layers[output].width;
+  Taught found;
+  found.offsets.assign(in.k + 1, 0);
+  found.rows.reserve(in.n);
+  for (int64_t c = 0; c < in.k; ++c) {
+    for (int32_t i = in.offsets[c]; i < in.offsets[c + 1]; ++i) {
+      const float* row = gradient + (in.order == nullptr ? i : in.order[i]) * width;
+      bool zero = true;
+      for (int64_t o = 0; o < width; ++o) zero &= row[o] == 0.0f;
+      if (!zero) found.rows.push_back(i);
+    }
+    found.offsets[c + 1] = static_cast<int32_t>(found.rows.size());
+  }
+  const int64_t all = in.offsets[in.k] - in.offsets[0], kept = static_cast<int64_t>(found.rows.size());
+  if (8 * kept > 7 * all) return {};
+  found.order = found.rows;
+  if (in.order != nullptr) {
+    for (int32_t& row : found.order) row = in.order[row];
+  }
+  return found;
+}
+
 // Gradient of the hash grid's tables: the levels of each, one at a time, since one fits a cache where all of them do
 // not, and since the rows are then added up in their sorted order by any number of threads.
 void scatter_hashed(const MlpInputs& in, const MlpPlan& plan, const HashEncoding& all, const float* positions,
@@ -178,9 +210,20 @@ void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa
             [&](const RowTask& task, float* own) { forward(isa, plan, data, task, own); });
 }
 
-void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const MlpGradients& gradients, Isa isa,
+void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& given, const MlpGradients& gradients, Isa isa,
                               int threads) {
-  check(table, in);
+  check(table, given);
+  MlpInputs in = given;
+  Taught taught;
+  if (gradients.positions == nullptr && gradients.directions == nullptr) {
+    taught = taught_rows(table, given, gradients.output);
+  }
+  const bool sifted = !taught.offsets.empty();
+  if (sifted) {
+    in.n = static_cast<int64_t>(taught.rows.size());
+    in.order = taught.order.data();
+    in.offsets = taught.offsets.data();
+  }
   const bool indexed = in.direction_index != nullptr;
   const MlpWanted wanted{gradients.weights != nullptr, gradients.positions != nullptr, gradients.directions != nullptr,
                          gradients.features != nullptr, use_half(table, isa)};
@@ -195,12 +238,21 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& in, const 
   const bool scattered = wanted.features && plan.positions.used;
   const int64_t hashed = scattered ? in.n * plan.positions.gradient.stride : 0;
   const int64_t sorted = scattered && in.order != nullptr ? in.n * table.positions : 0;
-  const Workspace workspace(stride(plan) * threads + partials * plan.partial + hashed + samples + sorted);
+  const int64_t encoded = sifted && in.encoded != nullptr ? in.n * plan.positions.value.stride : 0;
+  const Workspace workspace(stride(plan) * threads + partials * plan.partial + hashed + samples + sorted + encoded);
   float* memory = workspace.data();
   float* partial = memory + stride(plan) * threads;
   float* hashed_gradient = partial + partials * plan.partial;
   float* sample_directions = hashed_gradient + hashed;
   float* sorted_positions = sample_directions + samples;
+  if (encoded > 0) {
+    in.encoded = sorted_positions + sorted;
+    constexpr int64_t kRun = 512;
+    parallel_for(in.n, kRun, threads, [&](int64_t row) {
+      const int64_t width = plan.positions.value.stride;
+      std::copy_n(given.encoded + taught.rows[row] * width, width, in.encoded + row * width);
+    });
+  }
 
   MlpData data = pointers(in);
   data.grad_out = gradients.output;
