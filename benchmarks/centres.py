@@ -105,6 +105,7 @@ def configuration(options: Options, row: dict[str, Any], scene: str, out: Path) 
         rays=options.rays,
         samples=options.samples,
         occupancy=options.occupancy,
+        ray_growth=1.0,
         evaluations=1,
         eval_views=options.eval_views,
         final_views=options.eval_views,

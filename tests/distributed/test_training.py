@@ -42,7 +42,7 @@ def settings(out, name):
 
 
 def scene():
-    return replace(builtin_scene(24, train_views=8, test_views=2), kind="unbounded")  # scales gradients if contracted
+    return builtin_scene(24, train_views=8, test_views=2)
 
 
 def stop_at(trainer, step, progress):

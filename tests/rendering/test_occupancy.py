@@ -269,15 +269,25 @@ def test_refuses_what_is_no_grid():
     refuses("decay must lie in 0..1, got 2", update, Ball(), decay=2)
 
 
-@pytest.mark.parametrize("full_gradient", [None, 4.0])
+def test_pictures_have_samples_of_their_own():
+    given = {"near": 1.0, "far": 5.0, "box": BOX, "background": WHITE}
+    pictures = [
+        Renderer({"field": Ball()}, samples=samples, picture_samples=own, occupancy=tight_grid()).image(
+            cameras(), 0, **given
+        )
+        for samples, own in ((48, None), (24, 48), (24, None))
+    ]
+    assert torch.equal(pictures[0].colour, pictures[1].colour)
+    assert not torch.equal(pictures[0].colour, pictures[2].colour)
+
+
 @pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
-def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient):
+def test_a_comparison_is_the_rendering_and_its_loss(field):
     grid = tight_grid()
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
     rays = cameras().image_rays(0)
     target, background = torch.rand(len(rays), 3), torch.rand(len(rays), 3)
-    options = {"samples": 24, "occupancy": grid, "full_gradient": full_gradient}
-    renderer = Renderer({"field": router}, **options)
+    renderer = Renderer({"field": router}, samples=24, occupancy=grid)
 
     def compare(renderer):
         given = {"background": background, "generator": torch.Generator().manual_seed(3)}
@@ -285,8 +295,23 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient):
         return found, torch.autograd.grad(found.loss, list(router.parameters()))
 
     found, gradients = compare(renderer)
-    plain = Renderer({"field": lambda *given: router(*given)}, **options)  # a field without a table
+    plain = Renderer({"field": lambda *given: router(*given)}, samples=24, occupancy=grid)  # a field without a table
     expected, same = compare(plain)
     assert len(found.positions) > 0 and torch.equal(found.positions, expected.positions)
     for part, other in zip((*found, found.importance(), *gradients), (*expected, expected.importance(), *same)):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-6)
+
+
+def test_samples_that_no_light_reaches_have_no_gradient():
+    """Those behind the surface of a solid field; what is left is the gradient to a thousandth."""
+    field = HashGridField(width=16, levels=2, log2_entries=10)
+    torch.nn.init.constant_(field.density.bias, 10.0)
+    router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **field.router_options)
+    rays, gradients = cameras().image_rays(0), []
+    for of in (router, lambda *given: router(*given)):  # the second is a field without a table
+        renderer = Renderer({"field": of}, samples=96, occupancy=tight_grid())
+        found = renderer.compare(rays, 1.0, 5.0, torch.zeros(len(rays), 3), generator=torch.Generator().manual_seed(3))
+        gradients.append(torch.autograd.grad(found.loss, router.module.features)[0])
+    some, every = gradients
+    assert 0 < some.count_nonzero() < every.count_nonzero()
+    assert (some - every).norm() < 1e-3 * every.norm()

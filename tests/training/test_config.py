@@ -41,6 +41,7 @@ def test_json_of_something_else(text):
         ({"steps": 0}, "--steps must be at least 1, got 0"),
         ({"downscale": 0}, "--downscale must be at least 1, got 0"),
         ({"rays": 0}, "--rays must be at least 1, got 0"),
+        ({"ray_growth": 17.0}, "--ray-growth must lie in 1..16, got 17.0"),
         ({"width": 1}, "--width must be at least 2, got 1"),
         ({"lr": 0.0}, "--lr must be positive, got 0.0"),
         ({"lr_final": 2.0}, r"--lr-final must lie in \(0, 1\], got 2.0"),

@@ -121,6 +121,7 @@ def without(prefix):
         ("step, seconds and stages must be counts, got -1", lambda c: c.values.update(step=-1)),
         ("stage 1: cells must be an integer, got 4.5", lambda c: c.values["stages"][1].update(cells=4.5)),
         ("stage 0: split_cells missing", lambda c: c.values["stages"][0].pop("split_cells")),
+        ("rays must lie in 64 to 64 by its settings, got 65", lambda c: c.values.update(rays=65)),
         ("seconds missing", lambda c: c.values.pop("seconds")),
         ("settings: width must be an integer or null, got '8'", lambda c: c.values["config"].update(width="8")),
         ("settings: cells must be a list, each entry an integer", lambda c: c.values["config"].update(cells=[True])),
@@ -153,8 +154,9 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
 @pytest.mark.parametrize("contraction", ["none", "sphere"])
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction):
     monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
+    monkeypatch.setattr("voronerf.training.rates.FILL", 1.5)  # other numbers of rays in every step
     settings = {"contraction": contraction, "precision": "fp32" if contraction == "none" else "bf16"}
-    found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8, **settings)
+    found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8, ray_growth=8, **settings)
     assert len(found["occupancy.density"].unique()) > 1
 
 

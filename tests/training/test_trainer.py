@@ -382,6 +382,17 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
         assert evaluate(loaded, scene, views=1) == evaluate(trainer.renderer, scene, views=1)
 
 
+def test_a_step_takes_more_rays_where_space_is_empty(tmp_path, scene):
+    """A quarter of the samples of the first steps, 64 rays of 12, by at most four times the rays."""
+    config = small(tmp_path, occupancy=True, occupancy_resolution=8, ray_growth=4, steps=12, cells=())
+    trainer, rays = Trainer(config, scene), []
+    for kept in (512, 128, 32, 0):
+        trainer.occupancy.density.view(-1)[kept:] = trainer.occupancy.occupied.view(-1)[kept:] = 0
+        trainer.train_step()
+        rays.append(trainer.rays)
+    assert rays[0] == 64 and 64 <= rays[1] < rays[2] <= 256 and rays[3] == 256
+
+
 @pytest.mark.cuda
 def test_training_on_a_gpu(tmp_path, scene):
     config = small(tmp_path, device="cuda", assignment="stochastic")

@@ -22,7 +22,6 @@ from voronerf.rendering.marching import Seen
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid, density_of
 from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.rendering.sampling import stratified_depths
-from voronerf.rendering.volume import weaken_near
 
 #: Rays of a picture at a time: no ray ends at the first surface, since other ranks do not know it in time.
 PICTURE_CHUNK = 16_384
@@ -95,6 +94,7 @@ class RankRenderer(Renderer):
         if self.sharing is None:
             first, last = self._slices(len(rays))[self.group.rank :][:2]
         grid, kept = self.occupancy, slice(first, last)
+        strata = self.samples if jitter or grid is None else self.picture_samples
         if grid is None:
             depths, deltas, _ = stratified_depths(
                 near, far, self.samples, jitter=jitter, spacing=self.spacing, generator=generator
@@ -116,7 +116,7 @@ class RankRenderer(Renderer):
                 rays[kept],
                 near[kept],
                 far[kept],
-                self.samples,
+                strata,
                 uniforms=uniforms,
                 spacing=self.spacing,
                 backend=self.backend,
@@ -151,9 +151,7 @@ class RankRenderer(Renderer):
         """
         samples = self.samples_of(rays, near, far, jitter=True, generator=generator)
         colour, density = self.field(samples.positions, rays.directions, samples.ray_index)
-        colour, density = colour.to(near.dtype), density.to(near.dtype)
-        weaken_near(self.full_gradient, samples.depths, colour, density)
-        runs = sum_runs(samples, colour, density, self.backend)
+        runs = sum_runs(samples, colour.to(near.dtype), density.to(near.dtype), self.backend)
         sums = torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1).detach()
         parts = self.group.share("sums", sums)
         first = sum(map(len, parts[: self.group.rank]))
@@ -169,9 +167,13 @@ class RankRenderer(Renderer):
         answers[order, :4] = whole.gradients(part, ray, slopes, shown)
         answers[order, 4], answers[order, 5] = whole.front, error[ray]
         answers = answers[own]
-        torch.autograd.backward((runs.colour, runs.optical), (answers[:, :3], answers[:, 3]))
         run = torch.repeat_interleave(samples.run_offsets.diff())
         weights = runs.weights * answers[run, 4]
+        if self.occupancy is not None:
+            hidden = weights <= HIDDEN * -torch.expm1(-density.detach() * samples.deltas)
+            colour.register_hook(lambda gradient: gradient.masked_fill(hidden[:, None], 0))
+            density.register_hook(lambda gradient: gradient.masked_fill(hidden, 0))
+        torch.autograd.backward((runs.colour, runs.optical), (answers[:, :3], answers[:, 3]))
         importance = weights * answers[run, 5]
         loss = error.sum() / (3 * len(rays))
         return Learnt(loss, samples.positions, density.detach(), samples.deltas, weights, importance)

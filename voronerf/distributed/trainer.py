@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +25,7 @@ from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.divergence import all_finite
 from voronerf.training.occupancy import OCCUPANCY_DECAY, revisit_cells
 from voronerf.training.progress import Progress
+from voronerf.training.rates import next_rays
 from voronerf.training.trainer import Trainer
 
 
@@ -43,7 +43,6 @@ def check_ranks(config: TrainConfig, ranks: int) -> None:
         "init": (config.init == "inherit", "be inherit"),
         "blend": (config.blend == 0, "be 0"),
         "distortion": (config.distortion == 0, "be 0"),
-        "sightings": (not config.sightings, "be 0"),
         "precision": (config.precision == "fp32", "be fp32"),
         "cuda_graph": (not config.cuda_graph, "be off"),
         "cells": (not config.cells or config.cells[0] >= ranks, f"be at least the {ranks} ranks on the first level"),
@@ -89,7 +88,6 @@ class RankTrainer(Trainer):
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         check_ranks(config, group.size)
-        config = replace(config, sightings=0.0)  # which the sums of the ranks have not
         self.group, self.writes = group, group.rank == 0
         self.sharing: Sharing | None = None
         self.weights = torch.ones(1)
@@ -148,7 +146,7 @@ class RankTrainer(Trainer):
 
     def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
         config, grid = self.config, self.occupancy
-        batch = self.batches.draw(config.rays, self.draws, random_background=config.background == "random")
+        batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
         self.optimizer.zero_grad(set_to_none=True)
         found = self.renderer.learn(
             batch.rays, batch.near, batch.far, batch.target, background=batch.background, generator=self.draws
@@ -163,7 +161,7 @@ class RankTrainer(Trainer):
             heaviest, importance = select_heaviest(found.positions, found.importance, len(kept))
             kept[: len(heaviest), :3], kept[: len(heaviest), 3] = heaviest, importance
         alone, common = (None, kept.new_empty(0, 2)) if grid is None else self.renderer.observations(grid, found)
-        total, kept, common = self._tell(kept, common)
+        total, kept, common = self._tell(kept, common, len(found.positions))
         if grid is not None and alone is not None:
             backend = "auto" if config.backend == "warp" else config.backend
             self.renderer.observe(grid, alone, common, decay=OCCUPANCY_DECAY, backend=backend)
@@ -185,14 +183,15 @@ class RankTrainer(Trainer):
 
         return end
 
-    def _tell(self, kept: Tensor, common: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _tell(self, kept: Tensor, common: Tensor, samples: int) -> tuple[Tensor, Tensor, Tensor]:
         """Tells all ranks what each has to say in a step: they add up the tables' gradients, and agree on the rest.
 
-        That is the time, a stop and a checkpoint.
+        That is the time, a stop, a checkpoint and the rays of the next step.
 
         Args:
             kept: [n, 4], the heaviest samples, as many on all ranks.
             common: [m, 2], see :meth:`RankRenderer.observations`.
+            samples: How many this rank has evaluated.
 
         Returns:
             The sum of all gradients that the guard reads, and the arguments of all ranks.
@@ -200,24 +199,26 @@ class RankTrainer(Trainer):
         dense = [p for group in self.optimizer.param_groups if not group.get("sparse") for p in group["params"]]
         passed = (self._measured - self._told) * (self.group.rank == 0)
         self._told = self._measured
-        news = common.new_tensor((0.0, passed, float(self._asked), float(self.writer.ready), len(common)))
+        news = common.new_tensor((0.0, passed, float(self._asked), float(self.writer.ready), samples, len(common)))
         news[0] = sum(p.grad.sum() for p in dense if p.grad is not None)
         gradients = [p.grad.reshape(-1) for p in self._tables if p.grad is not None]
         flat = torch.cat(gradients) if len(gradients) > 1 else gradients[0] if gradients else news[:0]
         message = torch.cat((news, kept.view(-1), common.view(-1), pack_entries(flat)))
         parts = [part[:, 0] for part in self.group.share("news", message[:, None])]
-        said = torch.stack([part[:5] for part in parts])
-        counts, first = (2 * said[:, 4]).int().tolist(), 5 + 4 * len(kept)
+        said = torch.stack([part[:6] for part in parts])
+        counts, first = (2 * said[:, 5]).int().tolist(), 6 + 4 * len(kept)
         if len(flat):
             entries = [part[first + count :] for part, count in zip(parts, counts, strict=True)]
             _set_gradients(self._tables, add_entries(entries, len(flat)))
         total = said.sum(0)
-        _, passed, asked, ready, _ = total.tolist()
+        _, passed, asked, ready, samples, _ = total.tolist()
         self._agreed += passed
         self.stopped |= asked > 0
         if ready == self.group.size:
             self.writer.commit()
-        kept = torch.cat([part[5:first] for part in parts]).view(-1, 4)
+        if self.occupancy is not None:
+            self.rays = next_rays(self.config, self.rays, int(samples))
+        kept = torch.cat([part[6:first] for part in parts]).view(-1, 4)
         common = torch.cat([part[first : first + count] for part, count in zip(parts, counts, strict=True)])
         return total[0], kept, common.view(-1, 2)
 

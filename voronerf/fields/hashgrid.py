@@ -59,6 +59,7 @@ class HashGridField(RadianceField):
 
     router_options: ClassVar[dict[str, Any]] = {"share": ["features"]}
     sparse_parameters = ("features",)
+    ray_growth = 8.0
 
     def __init__(
         self,

@@ -10,6 +10,8 @@ have these attributes, all of which are optional:
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
     sparse_parameters        names of tables, as patterns, of which a step of training reads few entries. Their
                              entries without a gradient stay as they are, see ``voronerf.ops.sparse_adam``
+    ray_growth               the most rays of a training step, as a multiple of ``--rays``, where space is empty:
+                             more than 1, the default, for a field whose samples cost little beside the rest of a step
     scene_options(pixel, box, contracted)
                              static method: options from the width of a pixel at the middle of the scene and the
                              corners of the space that the field sees, both in scene units, and whether all of space
@@ -81,6 +83,11 @@ class FieldType:
         """Names of tables, as patterns, of which a step of training reads few entries."""
         names: Sequence[str] = getattr(self.network, "sparse_parameters", ())
         return names
+
+    @property
+    def ray_growth(self) -> float:
+        """The most rays of a training step, as a multiple of those of the first, where empty space is skipped."""
+        return float(getattr(self.network, "ray_growth", 1.0))
 
     def build(self, options: Mapping[str, Any]) -> nn.Module:
         """A field with these options and the defaults of the others.

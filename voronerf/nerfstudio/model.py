@@ -202,7 +202,13 @@ class VoronerfModel(Model):
         renderer = self.renderer
         if renderer.occupancy is not None:
             colour, opacity, depth, places = render_until_opaque(
-                renderer.field, rays, near, far, renderer.occupancy, samples=renderer.samples, spacing=renderer.spacing
+                renderer.field,
+                rays,
+                near,
+                far,
+                renderer.occupancy,
+                samples=renderer.picture_samples,
+                spacing=renderer.spacing,
             )
         else:
             last = renderer.render(rays, near, far)[-1]

@@ -15,8 +15,8 @@ from voronerf.ops.render_loss import render_loss
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, march_grid
-from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.rendering.volume import Rendered, weaken_near
+from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid
+from voronerf.rendering.volume import Rendered
 from voronerf.router import VoronoiRouter
 
 
@@ -74,7 +74,6 @@ class Marching(Protocol):
     spacing: str
     backend: str
     occupancy: OccupancyGrid | None
-    full_gradient: float | None
 
     @property
     def field(self) -> Field:
@@ -107,7 +106,6 @@ def compare_marched(
     module: Any = field.module
     march = march_grid(rays, near, far, grid, renderer.samples, True, generator, renderer.spacing, backend)
     raw = field.raw(march.positions, rays.directions, march.ray_index)
-    weaken_near(renderer.full_gradient, march.depths, raw)
     found = render_loss(
         raw,
         march.deltas,
@@ -117,6 +115,9 @@ def compare_marched(
         density_scale=float(module.density_scale),
         backend=backend,
     )
+    if raw.requires_grad:  # what next to no light reaches learns nothing, and takes no part in the backward pass
+        hidden = found.weights <= HIDDEN * -torch.expm1(-found.density * march.deltas)
+        raw.register_hook(lambda gradient: gradient.masked_fill(hidden[:, None], 0))
     return Comparison(
         found.loss, found.error, march.positions, found.weights, march.ray_index, found.density, march.deltas
     )

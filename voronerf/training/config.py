@@ -134,7 +134,10 @@ class TrainConfig:
     """A cell with fewer kept samples is not split further."""
 
     rays: int = 512
-    """Rays per training step."""
+    """Rays per training step; where empty space is skipped, of the first steps."""
+    ray_growth: float | None = None
+    """Where empty space is skipped, few samples of a ray are left. A step then takes more rays, up to this multiple of
+    --rays, so that it has a quarter of the samples of the first steps; 1 is off. Default 8 for hashgrid, else 1."""
     sampling: SamplingName = "stratified"
     """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
     (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""
@@ -152,13 +155,6 @@ class TrainConfig:
     the proposal's weights to the power of b t / ((b - 1) t + 1), so evenly at first; 0 is off."""
     distortion: float = 0.0
     """Factor of a loss on weights that are spread along a ray (mip-NeRF 360; published: 0.01); 0 is off."""
-    sightings: float | None = None
-    """Factor of a loss on light that does not come from where the points of a sparse model were seen (Deng et al. 2022,
-    "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points, where empty space
-    is skipped, and on several processes."""
-    gradient_scaling: bool = True
-    """In unbounded scenes, samples nearer to the camera than the radius of the contraction's sphere learn less, by the
-    square of their distance, against fog before the cameras (Philip and Deschaintre 2023)."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
     radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for
@@ -215,6 +211,8 @@ class TrainConfig:
         for name in ("width", "depth", "direction_octaves"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, self.field_type.options.get(name))
+        if self.ray_growth is None:
+            object.__setattr__(self, "ray_growth", self.field_type.ray_growth)
         if self.lr is None and self.parameters is None:
             object.__setattr__(self, "lr", self.field_type.learning_rate(self.network_options))
         check_config(self, CHOICES)
@@ -313,7 +311,6 @@ RESUMABLE = frozenset(
         "device",
         "cuda_graph",
         "backend",
-        "sightings",
         "budget",
         "steps",
         "evaluations",

@@ -87,6 +87,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.downscale is None or config.downscale >= 1, "downscale", "be at least 1")
     cells = config.occupancy_resolution
     need(cells is None or 1 <= cells <= 512, "occupancy_resolution", "be at least 1 and at most 512")
+    need(config.ray_growth is not None and 1 <= config.ray_growth <= 16, "ray_growth", "lie in 1..16")
     need(config.samples is None or config.samples >= 1, "samples", "be at least 1")
     need(config.steps is None or config.steps >= 1, "steps", "be at least 1")
     need(config.width is None or config.width >= 2, "width", "be at least 2")
@@ -125,7 +126,6 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(anneal == 0 or 1 <= anneal < float("inf"), "proposal_anneal", "be 0, or a slope of at least 1")
     need(anneal == 0 or not config.cuda_graph, "proposal_anneal", "be 0 with --cuda-graph")
     need(0 <= config.distortion < float("inf"), "distortion", "be a factor of 0 or more")
-    need(config.sightings is None or 0 <= config.sightings < float("inf"), "sightings", "be a factor of 0 or more")
 
 
 def why_no_occupancy(config: TrainConfig) -> str | None:

@@ -1,4 +1,5 @@
-"""What changes over a run: the learning rate, the temperature of the assignment, the sharpness of a proposal."""
+"""What changes over a run: the learning rate, the rays of a step, the temperature of the assignment, the sharpness of a
+proposal."""
 
 from __future__ import annotations
 
@@ -9,6 +10,8 @@ from voronerf.training.config import TrainConfig
 #: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
 #: which forgets in some thirty steps, would empty itself for good.
 WARMUP_STEPS = 100
+#: The share of a step's samples that are to be left once empty space is known, if more rays can bring them.
+FILL = 0.25
 
 
 def learning_rate(config: TrainConfig, done: float, step: int, splits: int) -> float:
@@ -19,6 +22,13 @@ def learning_rate(config: TrainConfig, done: float, step: int, splits: int) -> f
     if done < config.warmup and step < WARMUP_STEPS:
         rise = 0.01 + 0.99 * max(done / config.warmup, step / WARMUP_STEPS)
     return config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**splits
+
+
+def next_rays(config: TrainConfig, rays: int, samples: int) -> int:
+    """Rays of the next step, after one whose ``rays`` had so many samples in occupied space; see ``ray_growth``."""
+    assert config.samples is not None and config.ray_growth is not None
+    wanted = rays * FILL * config.rays * config.samples / max(samples, 1)
+    return int(min(max(wanted, config.rays), config.rays * config.ray_growth))
 
 
 def temperature(config: TrainConfig, done: float) -> float:

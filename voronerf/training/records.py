@@ -48,7 +48,7 @@ def summarise(trainer: Trainer) -> dict[str, Any]:
         "complete": trainer.fraction >= 1 and not trainer.stopped,
         "seconds": trainer.seconds,
         "steps": trainer.step,
-        "rays_per_second": trainer.step * trainer.config.rays / max(trainer.seconds, 1e-9),
+        "rays_per_second": trainer.rays_done / max(trainer.seconds, 1e-9),
         "parameters": trainer.parameter_count,
         "cells": trainer.diagram.num_cells,
         "splits_left": len(trainer.plan) - trainer.level,

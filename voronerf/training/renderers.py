@@ -16,6 +16,9 @@ from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter
 from voronerf.training.config import ConfigError, TrainConfig
 
+#: Samples of a ray of a picture, for each of training: those are at random places, and meet all of a stratum in time.
+PICTURE_SAMPLES = 2
+
 
 def make_renderer(
     config: TrainConfig,
@@ -34,7 +37,7 @@ def make_renderer(
         config: The settings.
         scene: Whose space is sampled.
         routers: The networks by name, see ``network_names``.
-        samples: Samples per ray of the first pass; None for those of the configuration.
+        samples: Samples per ray of the first pass, in pictures too; None for those of the configuration.
         fine_samples: Samples per ray of the second pass; None for those of the configuration.
         occupancy: The grid of what is empty.
         backend: Of the operations; None for that of the configuration.
@@ -44,22 +47,17 @@ def make_renderer(
         ConfigError: For a contraction that the scene does not allow.
     """
     device = next(routers["field"].parameters()).device
-    contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
-    full_gradient = None
-    if config.gradient_scaling and scene.kind == "unbounded" and isinstance(contraction, Contraction):
-        full_gradient = contraction.radius
     return kind(
         {name: as_field(router) for name, router in routers.items()},
         samples=int(config.samples or 0) if samples is None else samples,
         fine_samples=0 if config.sampling == "stratified" else fine_samples or config.fine_samples,
         cones=config.field_type.cones,
-        contraction=contraction,
+        contraction=None if config.contraction == "none" else make_contraction(scene, config.contraction, device),
         spacing=scene.spacing,
         occupancy=occupancy,
         rounds=config.proposal_rounds,
         distortion=config.distortion,
-        sightings=config.sightings or 0.0,
-        full_gradient=full_gradient,
+        picture_samples=PICTURE_SAMPLES * int(config.samples or 0) if samples is None else samples,
         backend=config.backend if backend is None else backend,
     )
 

@@ -36,6 +36,8 @@ class Stored:
     config: dict[str, Any]
     step: int
     seconds: float
+    rays: int
+    rays_done: int
     stages: tuple[dict[str, Any], ...]
     evaluated: int
     skipped: int
@@ -62,7 +64,11 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
     except ValueError as error:
         raise CheckpointError(str(error)) from None
     stored = Stored(**values)
-    return TrainConfig.from_json(json.dumps(stored.config), source), stored
+    config = TrainConfig.from_json(json.dumps(stored.config), source)
+    most = int(config.rays * (config.ray_growth or 1))
+    if not config.rays <= stored.rays <= most:
+        raise CheckpointError(f"{source}: rays must lie in {config.rays} to {most} by its settings, got {stored.rays}")
+    return config, stored
 
 
 def training_state(trainer: Trainer) -> Checkpoint:
@@ -85,6 +91,8 @@ def training_state(trainer: Trainer) -> Checkpoint:
         "config": json.loads(trainer.config.to_json()),
         "step": trainer.step,
         "seconds": trainer.seconds,
+        "rays": trainer.rays,
+        "rays_done": trainer.rays_done,
         "stages": [asdict(stage) for stage in trainer.stages],
         "evaluated": trainer.evaluated,
         "skipped": int(trainer.guard.skipped),
@@ -144,6 +152,7 @@ def resume_training(trainer: Trainer, checkpoint: Checkpoint) -> None:
         )
     trainer.step = stored.step
     trainer.seconds = stored.seconds
+    trainer.rays, trainer.rays_done = stored.rays, stored.rays_done
     trainer.stages = [Stage(**stage) for stage in stored.stages]
     trainer.evaluated = stored.evaluated
     trainer.guard = GradientGuard(trainer.device, stored.skipped)

@@ -42,7 +42,7 @@ from voronerf.training.networks import (
 )
 from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
-from voronerf.training.rates import learning_rate, sharpness, temperature
+from voronerf.training.rates import learning_rate, next_rays, sharpness, temperature
 from voronerf.training.records import record_scores, summarise
 from voronerf.training.renderers import make_renderer
 from voronerf.training.resume import resume_training, resumed_checkpoint, training_state
@@ -106,7 +106,7 @@ class Trainer:
         if self.device.type == "cuda":
             self.draws = torch.Generator(self.device).manual_seed(config.seed)
         self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
-        self.batches = RayBatches(scene, self.device, cones=config.field_type.cones, sightings=bool(config.sightings))
+        self.batches = RayBatches(scene, self.device, cones=config.field_type.cones)
         self.routers = make_routers(config, self.device)
         for router in self.routers.values():
             router.generator = self.draws
@@ -122,6 +122,8 @@ class Trainer:
         self.one_colour: float | None = None
         self.step = 0
         self.seconds = 0.0
+        #: Rays of the next step, and of all steps so far.
+        self.rays, self.rays_done = config.rays, 0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
         self.evaluated = 0
         self.metrics: list[dict[str, Any]] = []
@@ -219,13 +221,14 @@ class Trainer:
             started = self.clock()
             if self.split_is_due():
                 self.split()
+            self.rays_done += self.rays
             loss = self.train_step()
             self.step += 1
             self.seconds += self.clock() - started
             if self.device.type == "cpu" or self.step % READ_EVERY == 0:
                 self._read(loss)
             if self.on_step is not None:
-                speed = self.step * self.config.rays / max(self.seconds, 1e-9)
+                speed = self.rays_done / max(self.seconds, 1e-9)
                 psnr = self.metrics[-1].get("psnr") if self.metrics else None
                 self.on_step(
                     Progress(self.step, self.seconds, self.fraction, self.loss, speed, self.diagram.num_cells, psnr)
@@ -308,13 +311,15 @@ class Trainer:
     def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Updates the parameters; returns the loss, and until the last split positions [n, 3] and importance [n]."""
         config = self.config
-        batch = self.batches.draw(config.rays, self.draws, random_background=config.background == "random")
+        batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
         half = HALVES.get(config.precision)
         with torch.autocast(self.device.type, half, enabled=half is not None, cache_enabled=False):
-            given: dict[str, Any] = {"background": batch.background, "generator": self.draws, "seen": batch.seen}
-            found = self.renderer.compare(batch.rays, batch.near, batch.far, batch.target, **given)
+            found = self.renderer.compare(
+                batch.rays, batch.near, batch.far, batch.target, background=batch.background, generator=self.draws
+            )
         if self.occupancy is not None:
             observe_samples(self.occupancy, found, backend=config.backend)
+            self.rays = next_rays(config, self.rays, len(found.positions))
         loss = found.loss
         self.optimizer.zero_grad(set_to_none=True)
         # Nothing is read on the host: the fused optimiser skips a step whose gradients have overflowed by itself.
