@@ -3,6 +3,7 @@
 import json
 import os
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,8 @@ from voronerf.evaluation.panels import write_panels
 from voronerf.rendering.cameras import Cameras, orbit_cameras
 from voronerf.training.batches import RayBatches
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.networks import resolve_config
-from voronerf.training.renderers import make_contraction
+from voronerf.training.networks import make_routers, resolve_config
+from voronerf.training.renderers import make_contraction, make_renderer
 from voronerf.training.trainer import Trainer
 
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
@@ -79,6 +80,31 @@ def test_the_scene_is_normalised_by_a_similarity_that_it_keeps(tmp_path):
     assert scene.near == pytest.approx(scale * plain.near) and scene.far == pytest.approx(max(scale * plain.far, 4))
     torch.testing.assert_close(plain.contraction.centre, torch.tensor([1.0, 2, 3]), atol=1e-3, rtol=0)
     assert plain.contraction.radius == pytest.approx(1 / scale) and scene.contraction.radius == 1
+
+
+def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
+    """Of images of two sizes, reduced; a quarter of the rays ends at points."""
+    write_both(tmp_path, [(48, 40) if index % 2 else (32, 56) for index in range(COUNT)])
+    scene = load_scene(tmp_path, downscale=4)
+    points = torch.from_numpy(POINTS) @ scene.transform[:3, :3].T + scene.transform[:3, 3]
+    config = resolve_config(TrainConfig(), scene)
+    assert (config.sightings, make_renderer(config, scene, make_routers(config, "cpu")).full_gradient) == (0.003, 1.0)
+    batch = RayBatches(scene, torch.device("cpu"), sightings=True).draw(400, torch.Generator().manual_seed(0))
+    assert len(batch.rays) == 400 and len(batch.seen) == 100
+    rays = batch.rays[300:]
+    apart = torch.cdist(rays.origins + batch.seen[:, None] * rays.directions, points.float()).amin(1)
+    assert bool((apart <= 0.75 * batch.seen / scene.train.cameras.intrinsics[:, :2].min()).all())  # within their pixel
+    seen = sum(
+        int(((places >= 0) & (places < torch.tensor(cameras.size(index)))).all(-1).sum())
+        for cameras in [scene.train.cameras]
+        for index in range(len(cameras))
+        for places, _ in [cameras.project(points.float(), index)]
+    )
+    assert len(scene.train.sightings.pixels) == seen > 100
+    without = replace(scene, train=replace(scene.train, sightings=None))
+    assert resolve_config(TrainConfig(), without).sightings == 0
+    with pytest.raises(ConfigError, match="--sightings needs a COLMAP model with points, and --no-occupancy"):
+        resolve_config(TrainConfig(sightings=0.1), without)
 
 
 @pytest.mark.parametrize(("kind", "turn"), [("forward", 0.0), ("inside-out", 180.0), ("unbounded", 0.0)])

@@ -42,7 +42,7 @@ def settings(out, name):
 
 
 def scene():
-    return builtin_scene(24, train_views=8, test_views=2)
+    return replace(builtin_scene(24, train_views=8, test_views=2), kind="unbounded")  # scales gradients if contracted
 
 
 def stop_at(trainer, step, progress):

@@ -281,13 +281,15 @@ def test_pictures_have_samples_of_their_own():
     assert not torch.equal(pictures[0].colour, pictures[2].colour)
 
 
+@pytest.mark.parametrize("full_gradient", [None, 4.0])
 @pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
-def test_a_comparison_is_the_rendering_and_its_loss(field):
+def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient):
     grid = tight_grid()
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
     rays = cameras().image_rays(0)
     target, background = torch.rand(len(rays), 3), torch.rand(len(rays), 3)
-    renderer = Renderer({"field": router}, samples=24, occupancy=grid)
+    options = {"samples": 24, "occupancy": grid, "full_gradient": full_gradient}
+    renderer = Renderer({"field": router}, **options)
 
     def compare(renderer):
         given = {"background": background, "generator": torch.Generator().manual_seed(3)}
@@ -295,7 +297,7 @@ def test_a_comparison_is_the_rendering_and_its_loss(field):
         return found, torch.autograd.grad(found.loss, list(router.parameters()))
 
     found, gradients = compare(renderer)
-    plain = Renderer({"field": lambda *given: router(*given)}, samples=24, occupancy=grid)  # a field without a table
+    plain = Renderer({"field": lambda *given: router(*given)}, **options)  # a field without a table
     expected, same = compare(plain)
     assert len(found.positions) > 0 and torch.equal(found.positions, expected.positions)
     for part, other in zip((*found, found.importance(), *gradients), (*expected, expected.importance(), *same)):

@@ -6,11 +6,14 @@ import pytest
 import torch
 from helpers import refuses, render_image, seeded
 
+from voronerf.rendering import OccupancyGrid, Renderer
 from voronerf.rendering.cameras import Rays, orbit_cameras
 from voronerf.rendering.volume import render_rays
 
 BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])
 WHITE = torch.ones(3)
+#: Of eight samples from 1 to 3: those before the first that is near to 2.0 and 2.9, and how many are.
+ENDS = ((3, 2), (6, 2))
 
 
 def ball(positions, directions, ray_index):
@@ -102,6 +105,35 @@ def test_a_half_precision_field_is_summed_in_float32():
     result = render_rays(half, rays(), 1.5, 4.5, samples=16)
     assert result.colour.dtype == torch.float32
     torch.testing.assert_close(result.colour, render_rays(ball, rays(), 1.5, 4.5, samples=16).colour, atol=5e-3, rtol=0)
+
+
+@pytest.mark.parametrize("marched", [False, True])
+def test_what_is_near_the_camera_learns_less(marched):
+    """By the square of the distance, up to that from which gradients are whole."""
+    ahead = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
+    grid = OccupancyGrid(torch.tensor([[-9.0] * 3, [9.0] * 3]), 4, threshold=0.1) if marched else None
+    found = []
+    for full in (None, 2.0):
+        answers = torch.full((8, 4), 0.3, requires_grad=True)
+        fog = lambda *_, answers=answers: (answers[:, :3], answers[:, 3])  # noqa: E731
+        renderer = Renderer({"field": fog}, samples=8, occupancy=grid, full_gradient=full)
+        (rendered,) = renderer.render(ahead, 1.0, 3.0)
+        rendered.colour.sum().backward()
+        found.append(answers.grad)
+    depths = 1.125 + 0.25 * torch.arange(8)
+    torch.testing.assert_close(found[1], found[0] * (depths / 2).square().clamp(max=1)[:, None])
+
+
+def test_the_last_rays_end_at_points():
+    """The weights within 0.03 of the distance and a sample's length of 0.25 count, by minus their logarithm."""
+    ahead = Rays(torch.zeros(3, 3), torch.tensor([[0.0, 0, 1]]).expand(3, 3))
+    fog = lambda positions, *_: (torch.zeros_like(positions), torch.full_like(positions[:, 0], 0.5))  # noqa: E731
+    renderer = Renderer({"field": fog}, samples=8, sightings=0.1)
+    (rendered,) = passes = renderer.render(ahead, 1.0, 3.0)
+    expected = 0.1 * sum(-math.log(math.exp(-0.125 * before) * (1 - math.exp(-0.125 * many))) for before, many in ENDS)
+    target, seen = rendered.colour, torch.tensor([2.0, 2.9])
+    assert float(renderer.loss(passes, target, seen)) == pytest.approx(expected / 2, rel=1e-5)
+    assert float(renderer.loss(passes, target)) == 0
 
 
 def test_image_is_the_rays_of_its_pixels_whatever_the_chunk():

@@ -289,8 +289,9 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     for file, image in zip(named_images(model.path, chosen.path, names, reading.allow_outside), model.images):
         if file is not None:
             size = (float(image.camera.width), float(image.camera.height))
-            bounds = _bounds(image, model)
-            views.append(View(file, torch.from_numpy(image.pose), image.camera.lens, size, bounds=bounds))
+            points = _seen(image, model)
+            bounds, pose = _bounds(image, points), torch.from_numpy(image.pose)
+            views.append(View(file, pose, image.camera.lens, size, None, bounds, torch.from_numpy(points)))
     models = sorted({image.camera.model for image in model.images})
     about = [f"COLMAP model {place.relative_to(folder)} of {len(views)} images, {' and '.join(models)}", *chosen.notes]
     if (folder / "sparse" / "1").is_dir():
@@ -299,12 +300,16 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     return photograph_scene(folder, found, reading)
 
 
-def _bounds(image: ColmapImage, model: ColmapModel) -> tuple[float, float] | None:
-    """The depths between which an image's points lie, but for outliers; None if too few are known."""
+def _seen(image: ColmapImage, model: ColmapModel) -> Array:
+    """The points of the model that an image sees, float64 [s, 3]."""
     at = np.searchsorted(model.numbers, image.points)
     known = at < len(model.numbers)
-    at = at[known][model.numbers[at[known]] == image.points[known]]
-    depth = -(model.points[at] - image.pose[:3, 3]) @ image.pose[:3, 2]
+    return np.asarray(model.points[at[known][model.numbers[at[known]] == image.points[known]]])
+
+
+def _bounds(image: ColmapImage, points: Array) -> tuple[float, float] | None:
+    """The depths between which the points [s, 3] of an image lie, but for outliers; None if they are too few."""
+    depth = -(points - image.pose[:3, 3]) @ image.pose[:3, 2]
     depth = depth[depth > 0]
     if len(depth) < LEAST_POINTS:
         return None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from torch import Tensor
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images, read_masks
 from voronerf.data.lenses import PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
-from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.scene import Scene, SceneError, Sightings, Split
 from voronerf.data.transforms import distinct_names
 from voronerf.rendering.cameras import Cameras, focus_point
 from voronerf.rendering.contraction import Contraction, Perspective
@@ -49,7 +49,7 @@ KIND_LINES = {
 
 class View(NamedTuple):
     """A photograph: its file, its pose float64 [4, 4], camera to world, its lens and the (width, height) that this is
-    for; and where known its mask, and the depths between which its points lie."""
+    for; and where known its mask, the depths between which its points lie, and the points float64 [s, 3] themselves."""
 
     path: Path
     pose: Tensor
@@ -57,6 +57,7 @@ class View(NamedTuple):
     size: tuple[float, float]
     mask: Path | None = None
     bounds: tuple[float, float] | None = None
+    points: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,7 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
         Split(cameras[part], images[part], names[part], None if masks is None else masks[part], on_disk)
         for part in (slice(count), slice(count, None))
     ]
+    parts[0] = replace(parts[0], sightings=find_sightings(parts[0], views[:count], frame))
     notes = [*found.notes, _note(kind, frame, reading)]
     if reading.downscale is None and found.factor > 1:
         size = f"{cameras.width} x {cameras.height}"
@@ -161,6 +163,25 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
         to_scene,
         tuple(notes),
     )
+
+
+def find_sightings(split: Split, views: Sequence[View], frame: Frame) -> Sightings | None:
+    """Where the views of a split see their points: those that lie in the image, and where the mask counts."""
+    pixels, distances = [], []
+    for index, view in enumerate(views):
+        if view.points is None:
+            continue
+        points = (view.points @ frame.matrix[:3, :3].T + frame.matrix[:3, 3]).float()
+        places, depth = split.cameras.project(points, index)
+        inside = (depth > 0) & (places >= 0).all(-1) & (places < torch.tensor(split.cameras.size(index))).all(-1)
+        points, (column, row) = points[inside], places[inside].long().unbind(-1)
+        if (mask := split.mask(index)) is not None:
+            points, row, column = (part[mask[row, column]] for part in (points, row, column))
+        pixels.append((index * split.cameras.height + row) * split.cameras.width + column)
+        distances.append((points - split.cameras.origins[index]).norm(dim=-1))
+    if not sum(map(len, pixels)):
+        return None
+    return Sightings(torch.cat(pixels), torch.cat(distances))
 
 
 @dataclass(frozen=True)

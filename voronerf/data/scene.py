@@ -6,6 +6,7 @@ c images of h x w pixels. World units and axes as in `voronerf.rendering.cameras
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +22,18 @@ class SceneError(ValueError):
     """The data of a scene cannot be used. The message is one line and names the file."""
 
 
+class Sightings(NamedTuple):
+    """Where images show points that are known, and how far from the camera they are.
+
+    Attributes:
+        pixels: int64 [s], numbered through all images: image * h * w + row * w + column.
+        distances: float32 [s], world units.
+    """
+
+    pixels: Tensor
+    distances: Tensor
+
+
 @dataclass(frozen=True, eq=False)
 class Split:
     """The images of one part of a scene.
@@ -32,6 +45,7 @@ class Split:
         names: of the images, for tables and file names.
         masks: bool [c, h, w], False for pixels that are neither trained nor scored, or None.
         on_disk: images and masks are mapped from files, since they may not fit into memory; they are not written to.
+        sightings: of the points of a sparse model, or None.
 
     Examples:
         >>> from voronerf.data import load_scene
@@ -46,6 +60,7 @@ class Split:
     names: tuple[str, ...]
     masks: Tensor | None = None
     on_disk: bool = False
+    sightings: Sightings | None = None
 
     def __len__(self) -> int:
         return len(self.names)

@@ -22,6 +22,7 @@ from voronerf.rendering.marching import Seen
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid, density_of
 from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.rendering.sampling import stratified_depths
+from voronerf.rendering.volume import weaken_near
 
 #: Rays of a picture at a time: no ray ends at the first surface, since other ranks do not know it in time.
 PICTURE_CHUNK = 16_384
@@ -151,7 +152,9 @@ class RankRenderer(Renderer):
         """
         samples = self.samples_of(rays, near, far, jitter=True, generator=generator)
         colour, density = self.field(samples.positions, rays.directions, samples.ray_index)
-        runs = sum_runs(samples, colour.to(near.dtype), density.to(near.dtype), self.backend)
+        colour, density = colour.to(near.dtype), density.to(near.dtype)
+        weaken_near(self.full_gradient, samples.depths, colour, density)
+        runs = sum_runs(samples, colour, density, self.backend)
         sums = torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1).detach()
         parts = self.group.share("sums", sums)
         first = sum(map(len, parts[: self.group.rank]))

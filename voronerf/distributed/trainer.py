@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -43,6 +44,7 @@ def check_ranks(config: TrainConfig, ranks: int) -> None:
         "init": (config.init == "inherit", "be inherit"),
         "blend": (config.blend == 0, "be 0"),
         "distortion": (config.distortion == 0, "be 0"),
+        "sightings": (not config.sightings, "be 0"),
         "precision": (config.precision == "fp32", "be fp32"),
         "cuda_graph": (not config.cuda_graph, "be off"),
         "cells": (not config.cells or config.cells[0] >= ranks, f"be at least the {ranks} ranks on the first level"),
@@ -88,6 +90,7 @@ class RankTrainer(Trainer):
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         check_ranks(config, group.size)
+        config = replace(config, sightings=0.0)  # which the sums of the ranks have not
         self.group, self.writes = group, group.rank == 0
         self.sharing: Sharing | None = None
         self.weights = torch.ones(1)

@@ -16,7 +16,7 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, march_grid
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid
-from voronerf.rendering.volume import Rendered
+from voronerf.rendering.volume import Rendered, weaken_near
 from voronerf.router import VoronoiRouter
 
 
@@ -74,6 +74,7 @@ class Marching(Protocol):
     spacing: str
     backend: str
     occupancy: OccupancyGrid | None
+    full_gradient: float | None
 
     @property
     def field(self) -> Field:
@@ -106,6 +107,7 @@ def compare_marched(
     module: Any = field.module
     march = march_grid(rays, near, far, grid, renderer.samples, True, generator, renderer.spacing, backend)
     raw = field.raw(march.positions, rays.directions, march.ray_index)
+    weaken_near(renderer.full_gradient, march.depths, raw)
     found = render_loss(
         raw,
         march.deltas,

@@ -15,6 +15,7 @@ from voronerf.ops.march_rays import March
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.volume import weaken_near
 
 OPAQUE = 4e-3  # a ray ends when it lets less than this through, one level of an 8-bit image
 WAVE = 6  # samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain
@@ -80,6 +81,7 @@ def render_marched(
     jitter: bool = False,
     generator: torch.Generator | None = None,
     spacing: str = "linear",
+    full_gradient: float | None = None,
     backend: str = "auto",
 ) -> Marched:
     """`render_rays` without the samples in empty cells of a grid; differentiable, for training.
@@ -96,6 +98,7 @@ def render_marched(
         jitter: random samples in the strata, the same ones as in `render_rays`, else their middles.
         generator: of the jitter.
         spacing: of the strata, "linear" or "disparity".
+        full_gradient: distance from which the gradients of samples are whole, nearer ones have smaller; None for any.
         backend: of the ops.
 
     Examples:
@@ -116,6 +119,7 @@ def render_marched(
     rgb, sigma = field(march.positions, rays.directions, index)
     # a field under autocast answers in a half type: the sums along a ray are float32's
     rgb, sigma = rgb.to(near.dtype), sigma.to(near.dtype)
+    weaken_near(full_gradient, march.depths, rgb, sigma)
     result = composite(
         sigma,
         rgb,

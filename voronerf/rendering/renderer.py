@@ -24,6 +24,7 @@ from voronerf.rendering.sampling import (
     distortion_loss,
     interlevel_loss,
     normalised,
+    sighting_loss,
     strata_uniforms,
     stratified_depths,
     stratified_edges,
@@ -91,6 +92,9 @@ class Renderer:
         distortion: factor of the `distortion_loss` of the last pass; 0 is off.
         picture_samples: samples a ray of a picture through the occupancy grid; None for `samples`. A picture is walked
             to the first surface alone, so that more of them cost little.
+        sightings: factor of the `sighting_loss` of the last pass; 0 is off.
+        full_gradient: distance from which the gradients of samples are whole; nearer ones learn less, by the square of
+            their distance (Philip and Deschaintre 2023). None for any distance.
         backend: of the ops.
 
     Raises:
@@ -121,6 +125,8 @@ class Renderer:
         rounds: int = 1,
         distortion: float = 0.0,
         picture_samples: int | None = None,
+        sightings: float = 0.0,
+        full_gradient: float | None = None,
         backend: str = "auto",
     ) -> None:
         if set(fields) not in ({"field"}, {"field", "coarse"}, {"field", "proposal"}):
@@ -141,7 +147,8 @@ class Renderer:
         self.samples, self.fine_samples, self.cones = samples, fine_samples, cones
         self.picture_samples = picture_samples or samples
         self.contraction, self.spacing, self.backend = contraction, spacing, backend
-        self.rounds, self.distortion = rounds, distortion
+        self.rounds, self.distortion, self.sightings = rounds, distortion, sightings
+        self.full_gradient = full_gradient
         self.occupancy = occupancy
         self.sharpness = 1.0
 
@@ -197,6 +204,7 @@ class Renderer:
                 jitter=jitter,
                 generator=generator,
                 spacing=self.spacing,
+                full_gradient=self.full_gradient,
                 backend=self.backend,
             )
             return (marched,)
@@ -234,6 +242,7 @@ class Renderer:
             cones=self.cones,
             contraction=self.contraction,
             background=background,
+            full_gradient=self.full_gradient,
             backend=self.backend,
         )
 
@@ -252,15 +261,17 @@ class Renderer:
         inside = torch.rand(r, count, device=device, dtype=edges.dtype, generator=generator).to(edges.device)
         return torch.lerp(edges[:, :-1], edges[:, 1:], inside), edges
 
-    def loss(self, passes: tuple[Rendered | Marched, ...], target: Tensor) -> Tensor:
+    def loss(self, passes: tuple[Rendered | Marched, ...], target: Tensor, seen: Tensor | None = None) -> Tensor:
         """The training loss: the mean squared error of the colours of every pass (NeRF, equation 6).
 
         If one field is evaluated twice, its first pass counts a tenth (mip-NeRF, section 3.2). Passes of a proposal
-        have the `interlevel_loss` instead. The last pass has the `distortion_loss` too, if its factor is not 0.
+        have the `interlevel_loss` instead. The last pass has the `distortion_loss` and the `sighting_loss` too, where
+        their factors are not 0.
 
         Args:
             passes: the result of :meth:`render`.
             target: [r, 3].
+            seen: [s], the distances of points at which the last s rays end, or None.
         """
         *before, last = passes
         loss = (last.colour - target).square().mean()
@@ -269,6 +280,10 @@ class Renderer:
             near, far = passes[0].edges[:, 0], passes[0].edges[:, -1]
             spread = distortion_loss(normalised(last.edges, near, far, self.spacing), last.weights)
             loss = loss + self.distortion * spread
+        if self.sightings and seen is not None and isinstance(last, Rendered):
+            some = slice(len(target) - len(seen), None)
+            missed = sighting_loss(last.depths[some], last.edges[some], last.weights[some], seen)
+            loss = loss + self.sightings * missed
         for first in before:
             if "proposal" in self.fields:
                 assert isinstance(first, Rendered) and isinstance(last, Rendered)
@@ -287,6 +302,7 @@ class Renderer:
         *,
         background: Tensor | None = None,
         generator: torch.Generator | None = None,
+        seen: Tensor | None = None,
     ) -> Comparison:
         """Renders rays at random samples and computes the :meth:`loss`: what a training step needs.
 
@@ -297,6 +313,7 @@ class Renderer:
             target: [r, 3].
             background: as in :meth:`render`.
             generator: of the samples.
+            seen: as in :meth:`loss`.
         """
         near, far = per_ray(near, rays), per_ray(far, rays)
         given: dict[str, Any] = {"background": background, "generator": generator}
@@ -304,7 +321,7 @@ class Renderer:
         if found is not None:
             return found
         passes = self.render(rays, near, far, jitter=True, **given)
-        return compared(self.loss(passes, target), passes[-1], target)
+        return compared(self.loss(passes, target, seen), passes[-1], target)
 
     def look(self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None, heaviest: bool) -> Seen:
         """What rays of a picture see, without randomness; without `heaviest` that part of the result means nothing."""

@@ -10,6 +10,8 @@ from voronerf.ops.resample import resample
 SPACINGS = ("linear", "disparity")
 #: Added to the weights of all intervals before drawing from them (mip-NeRF, equation 18).
 PADDING = 0.01
+#: How far from a surface a point of a sparse model may lie, as a share of its distance from the camera.
+NEARBY = 0.03
 
 
 def stratified_depths(
@@ -179,6 +181,23 @@ def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tenso
     bound = total.gather(1, torch.maximum(first, last)) - total.gather(1, first)
     missed = (weights - bound).clamp_min(0)
     return (missed.square() / (weights + 1e-7)).sum(dim=1).mean()
+
+
+def sighting_loss(depths: Tensor, edges: Tensor, weights: Tensor, distances: Tensor) -> Tensor:
+    """How little of the light comes from where a point was seen, the mean over rays.
+
+    ``-log`` of the weights within `NEARBY` of the distance and a sample's own length: the likelihood of Deng et al.
+    2022, "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them.
+
+    Args:
+        depths: [r, s].
+        edges: [r, s + 1]; no gradient.
+        weights: [r, s].
+        distances: [r], of the points.
+    """
+    distances = distances[:, None]
+    inside = (depths - distances).abs() <= NEARBY * distances + edges.diff(dim=1)
+    return -torch.log((weights * inside).sum(1).clamp(1e-3, 1)).mean()
 
 
 def normalised(edges: Tensor, near: Tensor, far: Tensor, spacing: str) -> Tensor:

@@ -6,6 +6,7 @@ directions, densities per unit length.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -104,6 +105,7 @@ def render_samples(
     cones: bool = False,
     contraction: Contraction | Perspective | None = None,
     background: Tensor | None = None,
+    full_gradient: float | None = None,
     backend: str = "auto",
 ) -> Rendered:
     """`render_rays` for given samples.
@@ -117,6 +119,7 @@ def render_samples(
         cones: evaluate the frustums of the cones between the edges.
         contraction: of the space that the field works in; the returned positions are contracted too.
         background: [3] or [r, 3].
+        full_gradient: see `weaken_near`.
         backend: of the composite op.
     """
     samples = depths.shape[1]
@@ -131,12 +134,34 @@ def render_samples(
     # under autocast the field returns a half type; the sums along a ray are float32
     rgb = rgb.reshape(len(rays), samples, 3).to(depths.dtype)
     sigma = sigma.reshape(len(rays), samples).to(depths.dtype)
+    weaken_near(full_gradient, depths, rgb, sigma)
     result = composite(sigma, rgb, depths, edges.diff(dim=-1), background=background, backend=backend)
     seen = result.opacity > 0
     depth = torch.where(seen, result.depth / torch.where(seen, result.opacity, 1), edges[:, -1])
     return Rendered(
         result.colour, result.opacity, depth, result.weights, inputs[..., :3], rgb, depths=depths, edges=edges
     )
+
+
+def weaken_near(full: float | None, depths: Tensor, *outputs: Tensor) -> None:
+    """Lets what a field has answered near the camera learn less: its gradients shrink with the square of the distance.
+
+    A camera sees the space before it with more rays, and more samples, than others do: without this, fog that only one
+    view shows is learnt there first. Source: Philip and Deschaintre 2023, "Floaters No More: Radiance Field Gradient
+    Scaling for Improved Near-Camera Training".
+
+    Args:
+        full: the distance from which gradients are whole; None for any.
+        depths: [...], of the samples.
+        outputs: [...] or [..., f].
+    """
+    if full is None:
+        return
+    share = (depths / full).square().clamp(max=1)
+    for output in outputs:
+        if output.requires_grad:
+            scale = share if output.dim() == share.dim() else share[..., None]
+            output.register_hook(functools.partial(torch.mul, scale))
 
 
 def per_ray(distance: Tensor | float, rays: Rays) -> Tensor:

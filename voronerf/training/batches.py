@@ -11,10 +11,14 @@ import torch
 from torch import Tensor
 
 from voronerf.data import Scene
+from voronerf.data.scene import Sightings
 from voronerf.data.store import Pages
 from voronerf.ops.pixel_rays import pixel_rays
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.rays import intersect_box
+
+#: Share of the rays that are drawn from the sightings of points, where these are learnt from.
+SEEN = 0.25
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,7 @@ class Batch:
         far: [r] depth at which it leaves the scene.
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] where it was drawn; None for none.
+        seen: [s], the distances of the points that the last s rays end at, or None.
     """
 
     rays: Rays
@@ -34,6 +39,7 @@ class Batch:
     far: Tensor
     target: Tensor
     background: Tensor | None
+    seen: Tensor | None = None
 
 
 class RayBatches:
@@ -46,9 +52,10 @@ class RayBatches:
         scene: The scene; its training views are used.
         device: Where batches live, and images that are in memory.
         cones: Whether the rays have radii.
+        sightings: Whether a share of the rays, `SEEN`, are through sightings of points.
     """
 
-    def __init__(self, scene: Scene, device: torch.device, *, cones: bool = False) -> None:
+    def __init__(self, scene: Scene, device: torch.device, *, cones: bool = False, sightings: bool = False) -> None:
         self.scene = scene
         self.cones = cones
         self.device = device
@@ -59,6 +66,9 @@ class RayBatches:
         self.background = scene.background_colour(self.place)
         self.box = None if scene.box is None else scene.box.to(self.place)
         self.useful = self._useful_pixels()
+        self.sightings = None
+        if sightings and scene.train.sightings is not None:
+            self.sightings = Sightings(*(tensor.to(self.place) for tensor in scene.train.sightings))
 
     def _useful_pixels(self) -> _Runs | None:
         """The pixels to draw from; None when that is all of them."""
@@ -93,11 +103,18 @@ class RayBatches:
     def draw(self, count: int, generator: torch.Generator, *, random_background: bool = True) -> Batch:
         """A batch of ``count`` rays, drawn with replacement.
 
-        Images with an alpha channel lie over a colour that is drawn for each ray, or over that of the scene.
+        Where sightings are learnt from, the last `SEEN` of them are drawn from these. Images with an alpha channel lie
+        over a colour that is drawn for each ray, or over that of the scene.
         """
-        index = torch.randint(len(self), (count,), generator=generator, device=generator.device).to(self.place)
+        several = 0 if self.sightings is None else int(SEEN * count)
+        index = self._numbers(len(self), count - several, generator)
         if self.useful is not None:
             index = self.useful.numbers(index)
+        seen = None
+        if several and self.sightings is not None:
+            chosen = self._numbers(len(self.sightings.pixels), several, generator)
+            index = torch.cat((index, self.sightings.pixels[chosen]))
+            seen = self.sightings.distances[chosen].to(self.device)
         if self.pages is not None:
             self.pages.fetch(index)
         background = self.background
@@ -122,7 +139,10 @@ class RayBatches:
         origins, directions, near, far, colour = (tensor.to(self.device) for tensor in found)
         radii = None if radii is None else radii.to(self.device)
         background = None if background is None else background.to(self.device)
-        return Batch(Rays(origins, directions, radii), near, far, colour, background)
+        return Batch(Rays(origins, directions, radii), near, far, colour, background, seen)
+
+    def _numbers(self, below: int, count: int, generator: torch.Generator) -> Tensor:
+        return torch.randint(below, (count,), generator=generator, device=generator.device).to(self.place)
 
 
 class _Runs:

@@ -155,6 +155,13 @@ class TrainConfig:
     the proposal's weights to the power of b t / ((b - 1) t + 1), so evenly at first; 0 is off."""
     distortion: float = 0.0
     """Factor of a loss on weights that are spread along a ray (mip-NeRF 360; published: 0.01); 0 is off."""
+    sightings: float | None = None
+    """Factor of a loss on light that does not come from where the points of a sparse model were seen (Deng et al. 2022,
+    "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points, where empty space
+    is skipped, and on several processes."""
+    gradient_scaling: bool = True
+    """In unbounded scenes, samples nearer to the camera than the radius of the contraction's sphere learn less, by the
+    square of their distance, against fog before the cameras (Philip and Deschaintre 2023)."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
     radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for
@@ -311,6 +318,7 @@ RESUMABLE = frozenset(
         "device",
         "cuda_graph",
         "backend",
+        "sightings",
         "budget",
         "steps",
         "evaluations",

@@ -126,6 +126,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(anneal == 0 or 1 <= anneal < float("inf"), "proposal_anneal", "be 0, or a slope of at least 1")
     need(anneal == 0 or not config.cuda_graph, "proposal_anneal", "be 0 with --cuda-graph")
     need(0 <= config.distortion < float("inf"), "distortion", "be a factor of 0 or more")
+    need(config.sightings is None or 0 <= config.sightings < float("inf"), "sightings", "be a factor of 0 or more")
 
 
 def why_no_occupancy(config: TrainConfig) -> str | None:

@@ -26,6 +26,8 @@ from voronerf.training.renderers import make_contraction
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
+#: Factor of the loss on the sightings of points.
+SIGHTINGS = 0.003
 #: Cells of the occupancy grid along each axis.
 OCCUPANCY_RESOLUTION = 64
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
@@ -90,12 +92,12 @@ def space_of(config: TrainConfig, scene: Scene) -> tuple[tuple[float, ...], ...]
 def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     """Fills in the settings that depend on the scene.
 
-    They are the contraction, whether empty space is skipped, samples of a ray, octaves, options of the field, and with
-    ``parameters`` the width and learning rate.
+    They are the contraction, whether empty space is skipped, the loss on sightings, samples of a ray, octaves, options
+    of the field, and with ``parameters`` the width and learning rate.
 
     Raises:
-        ConfigError: When the smallest networks have more parameters than asked for, or a CUDA graph would have to read
-            images on disk.
+        ConfigError: When the smallest networks have more parameters than asked for, a CUDA graph would have to read
+            images on disk, or there are no sightings to learn from.
     """
     if config.cuda_graph and scene.train.on_disk:
         raise ConfigError("--cuda-graph must be off with images on disk: --no-cuda-graph, or --images memory")
@@ -112,6 +114,11 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
         config = replace(config, occupancy=False)
     if config.occupancy and config.occupancy_resolution is None:
         config = replace(config, occupancy_resolution=OCCUPANCY_RESOLUTION)
+    seen = scene.train.sightings is not None and not config.occupancy
+    if config.sightings and not seen:
+        raise ConfigError("--sightings needs a COLMAP model with points, and --no-occupancy")
+    if config.sightings is None:
+        config = replace(config, sightings=SIGHTINGS if seen else 0.0)
     if config.samples is None:
         config = replace(config, samples=samples_for(scene) if config.occupancy and boxed else 64)
     if config.position_octaves is None and "position_octaves" in kind.options:

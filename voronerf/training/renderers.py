@@ -47,17 +47,23 @@ def make_renderer(
         ConfigError: For a contraction that the scene does not allow.
     """
     device = next(routers["field"].parameters()).device
+    contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
+    full_gradient = None
+    if config.gradient_scaling and scene.kind == "unbounded" and isinstance(contraction, Contraction):
+        full_gradient = contraction.radius
     return kind(
         {name: as_field(router) for name, router in routers.items()},
         samples=int(config.samples or 0) if samples is None else samples,
         fine_samples=0 if config.sampling == "stratified" else fine_samples or config.fine_samples,
         cones=config.field_type.cones,
-        contraction=None if config.contraction == "none" else make_contraction(scene, config.contraction, device),
+        contraction=contraction,
         spacing=scene.spacing,
         occupancy=occupancy,
         rounds=config.proposal_rounds,
         distortion=config.distortion,
         picture_samples=PICTURE_SAMPLES * int(config.samples or 0) if samples is None else samples,
+        sightings=config.sightings or 0.0,
+        full_gradient=full_gradient,
         backend=config.backend if backend is None else backend,
     )
 

@@ -106,7 +106,7 @@ class Trainer:
         if self.device.type == "cuda":
             self.draws = torch.Generator(self.device).manual_seed(config.seed)
         self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
-        self.batches = RayBatches(scene, self.device, cones=config.field_type.cones)
+        self.batches = RayBatches(scene, self.device, cones=config.field_type.cones, sightings=bool(config.sightings))
         self.routers = make_routers(config, self.device)
         for router in self.routers.values():
             router.generator = self.draws
@@ -314,9 +314,8 @@ class Trainer:
         batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
         half = HALVES.get(config.precision)
         with torch.autocast(self.device.type, half, enabled=half is not None, cache_enabled=False):
-            found = self.renderer.compare(
-                batch.rays, batch.near, batch.far, batch.target, background=batch.background, generator=self.draws
-            )
+            given: dict[str, Any] = {"background": batch.background, "generator": self.draws, "seen": batch.seen}
+            found = self.renderer.compare(batch.rays, batch.near, batch.far, batch.target, **given)
         if self.occupancy is not None:
             observe_samples(self.occupancy, found, backend=config.backend)
             self.rays = next_rays(config, self.rays, len(found.positions))
