@@ -32,16 +32,20 @@ def _rank(rank, size, port, folder, restarts, function, args):
     os._exit(code)
 
 
-def on_ranks(function, *args, folder, size=2, each=None, restarts=0, watch=None):
+def new_store():
+    return TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+
+
+def on_ranks(function, *args, folder, size=2, each=None, restarts=0, store=None):
     """Calls a function on every rank, with arguments of its own where ``each`` has them.
 
-    ``watch`` is called with the processes while they run. Returns the exit status of each rank, and
-    what it printed.
+    The store is that of earlier starts, as torchrun keeps it. Returns the exit status of each rank, and what it
+    printed.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["voronerf.cli", "voronerf.distributed.trainer"])
     folder = Path(folder)
-    store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # as torchrun keeps it
+    store = store or new_store()
     given = each or [args] * size
     ranks = [
         context.Process(target=_rank, args=(rank, size, store.port, folder, restarts, function, given[rank]))
@@ -49,8 +53,6 @@ def on_ranks(function, *args, folder, size=2, each=None, restarts=0, watch=None)
     ]
     for rank in ranks:
         rank.start()
-    if watch is not None:
-        watch(ranks)
     for rank in ranks:
         rank.join(LIMIT)
         if rank.is_alive():

@@ -5,7 +5,7 @@ import os
 import signal
 from unittest import mock
 
-from ranks import on_ranks
+from ranks import new_store, on_ranks
 
 from voronerf.cli import main
 from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
@@ -46,10 +46,13 @@ def complaints(texts):
 
 
 def test_settings_that_ranks_cannot_use(tmp_path):
-    codes, texts = on_ranks(main, command(tmp_path / "run", "--sampling", "proposal"), folder=tmp_path)
-    assert codes == [1, 1] and not (tmp_path / "run").exists()
-    expected = "voronerf: error: --sampling must be stratified with several ranks, got 'proposal'"
-    assert complaints(texts) == [expected]
+    """One says so at every start: what ranks of an earlier start have left in torchrun's store is not theirs."""
+    expected, store = "voronerf: error: --sampling must be stratified with several ranks, got 'proposal'", new_store()
+    for restarts in range(2):
+        given = command(tmp_path / "run", "--sampling", "proposal")
+        codes, texts = on_ranks(main, given, folder=tmp_path, restarts=restarts, store=store)
+        assert codes == [1, 1] and not (tmp_path / "run").exists()
+        assert complaints(texts) == [expected]
 
 
 def test_an_option_that_does_not_exist(tmp_path):

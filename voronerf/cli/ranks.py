@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from voronerf.data import load_scene
-from voronerf.distributed.group import joined, local_rank, restarted, world_size
+from voronerf.distributed.group import joined, local_rank, restarts, world_size
 from voronerf.distributed.same import check_same, check_same_scene
 from voronerf.distributed.trainer import check_ranks
 from voronerf.training.checkpoint import checkpoint_paths
@@ -42,7 +42,7 @@ def train_on_ranks(config: TrainConfig, run_training: Callable[..., dict[str, An
         scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
         check_same_scene(group, scene)
         if group.rank == 0:  # alone, for what it writes is there already when others look
-            again = restarted() and bool(checkpoint_paths(config.out))
+            again = restarts() > 0 and bool(checkpoint_paths(config.out))
             config = choose_directory(replace(config, resume=config.resume or again), scene)
         config = replace(config, resume=group.from_first(config.resume))
         summary = run_training(config, scene, group=group)

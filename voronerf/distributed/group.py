@@ -44,9 +44,9 @@ def local_rank() -> int:
     return int(os.environ.get("LOCAL_RANK", "0"))
 
 
-def restarted() -> bool:
-    """Whether torchrun has started the ranks again after one of them failed."""
-    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+def restarts() -> int:
+    """How often torchrun has started the ranks again after one of them failed."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
 
 class Group:
@@ -73,7 +73,9 @@ class Group:
             torch.cuda.set_device(device)  # where torch puts what it sends of Python objects
         timeout = timedelta(seconds=PATIENCE)
         with self._waiting():
-            self.store, rank, size = next(iter(dist.rendezvous("env://", timeout=timeout)))
+            store, rank, size = next(iter(dist.rendezvous("env://", timeout=timeout)))
+            # torchrun keeps one store for all starts: a rank would find the addresses of those that were killed.
+            self.store = dist.PrefixStore(f"voronerf/{restarts()}", store)
             dist.init_process_group(backend, store=self.store, rank=rank, world_size=size, timeout=timeout)
 
     @contextlib.contextmanager
