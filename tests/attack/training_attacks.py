@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import random
 import resource
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -32,10 +35,16 @@ VARIANTS = (
     [*FIELDS["nerf"], "--balance", "transport", "--assignment", "stochastic"],
     [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6", "--init", "random"],
 )
+#: Those of a joint training.
+RANK_VARIANTS = (*FIELDS.values(), [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6"])
 #: What ends a training; None is a full disk.
 SIGNALS = (*[signal.SIGKILL] * 6, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT, None)
 #: Interruptions of a chain.
 KILLS = 5
+#: Those of a joint training of two processes, and its command.
+RANK_KILLS = 10
+TORCHRUN = [*(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")]
+TORCHRUN += ["--max-restarts", str(3 * RANK_KILLS), "-m", "voronerf", "train"]
 
 
 def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[str]:
@@ -59,6 +68,56 @@ def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[st
     _ends_well(_train(part, options))
     _same_runs(whole, part)
     return Counter({RIGHT: KILLS})
+
+
+def killed_ranks(rng: random.Random, folder: Path, given: Path) -> Counter[str]:
+    """A joint training whose ranks are killed at random moments ends, to the bit, as one that is left alone."""
+    os.chdir(given)
+    options = [*("--data", "blender"), *TINY, *rng.choice(RANK_VARIANTS)]
+    options += ["--steps", "600", "--checkpoint-every", rng.choice(("1e-9", "0.1"))]
+    whole, began, done, runs = folder / "whole", time.monotonic(), 0, 0
+    _ended_well(_train_on_ranks(whole, options))
+    length = time.monotonic() - began
+    while done < RANK_KILLS:  # a run may end before all of them
+        part, runs = folder / f"part-{runs}", runs + 1
+        torchrun = _train_on_ranks(part, options)
+        ranks = _new_ranks(torchrun, set())
+        while ranks and done < RANK_KILLS:
+            time.sleep(rng.uniform(0, length / 2))
+            try:
+                os.kill(rng.choice(sorted(ranks)), signal.SIGKILL)
+            except ProcessLookupError:  # they have ended, or given each other up on a busy machine
+                ranks = _new_ranks(torchrun, ranks)
+                continue
+            ranks = _new_ranks(torchrun, ranks)
+            done += bool(ranks)
+        _ended_well(torchrun)
+        _same_runs(whole, part)
+    return Counter({RIGHT: done})
+
+
+def _train_on_ranks(out: Path, options: list[str]) -> subprocess.Popen[bytes]:
+    with out.with_suffix(".txt").open("wb") as said:
+        return subprocess.Popen([*TORCHRUN, "--out", str(out), *options], stdout=said, stderr=said)
+
+
+def _new_ranks(torchrun: subprocess.Popen[bytes], old: set[int]) -> set[int]:
+    """The processes of both ranks when torchrun has started others than the old ones; none when it has ended."""
+    children = Path(f"/proc/{torchrun.pid}/task/{torchrun.pid}/children")
+    while torchrun.poll() is None:
+        with contextlib.suppress(OSError):
+            ranks = {int(number) for number in children.read_text().split()} - old
+            if len(ranks) == 2:
+                return ranks
+        time.sleep(0.05)
+    return set()
+
+
+def _ended_well(torchrun: subprocess.Popen[bytes]) -> None:
+    if torchrun.wait() != 0:
+        lines = Path(torchrun.args[len(TORCHRUN) + 1]).with_suffix(".txt").read_text().splitlines()
+        said = [line for line in lines if line.startswith("voronerf: ")]
+        raise Failed(f"torchrun ended with status {torchrun.returncode}: {said}")
 
 
 def _train(out: Path, options: list[str], file_size: int | None = None) -> int:
