@@ -180,9 +180,6 @@ class CellModules(nn.Module):
         """Cells of the diagram, networks of the router."""
         return self.diagram.num_cells
 
-    def _forget_assigned(self) -> None:
-        """Called after a change of the diagram."""
-
     def cell(self, index: int) -> nn.Module:
         """A plain copy of one cell's module, with parameters of its own.
 
@@ -287,7 +284,6 @@ class CellModules(nn.Module):
                     values[new.to(values.device)] = fresh[names[id(parameter)]][finer.own][new].to(values)
                 _replace_values(parameter, values)
         self.diagram = copy.deepcopy(finer.diagram).to(self.diagram.centres.device)
-        self._forget_assigned()
         if optimizer is not None:
             move_state(optimizer, self.module, finer.take, before, None if fresh is None else new)
 
@@ -342,7 +338,6 @@ class CellModules(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes over the stored diagram first, so that parameters of any number of cells fit."""
-        self._forget_assigned()
         if f"{prefix}diagram.centres" in state_dict:
             diagram = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram.")
             if diagram.num_cells == self.num_cells:

@@ -323,7 +323,7 @@ class VoronoiRouter(ShardedCells):
         """The samples in their cells; other methods that are called with the same positions share it."""
         drawn, centres = self.assignment == "stochastic" and self.training, self.diagram.centres
         version = object() if centres.is_inference() else centres._version  # of those changes are not told
-        key = id(self.diagram), version, drawn, self.temperature, self.backend
+        key = self.diagram, version, drawn, self.temperature, self.backend
         known = self._assigned
         if known is not None and known.serves(method, positions, key, drawn):
             return known.grouping
@@ -350,9 +350,6 @@ class VoronoiRouter(ShardedCells):
         if diagram.depth == 1:
             return tables
         return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
-
-    def _forget_assigned(self) -> None:
-        self._assigned = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_assigned": None}
