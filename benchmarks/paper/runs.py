@@ -53,6 +53,8 @@ LATER = {
     "format": "auto",
     "kind": "auto",
     "normalise": True,
+    "ray_growth": 1.0,
+    "gradient_scaling": True,
 }
 #: Of a run's settings, those that do not change what is learnt or how it is scored.
 NOT_IDENTITY = RESUMABLE - {"budget", "steps", "evaluations", "eval_views", "final_views", "backend", "device", "blend"}

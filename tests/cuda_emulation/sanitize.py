@@ -196,12 +196,9 @@ def resample(module):
         written(depths)
 
 
-SHAPES = [(20, 15), (70, 35), (18, 74)]
-
-
-def table(module):
+def table(module, harmonics):
     """Sine 20 of 2 octaves of positions (-1), softplus 70 of that and positions, sigmoid 18 of that and the
-    harmonics of directions (-2) of degree 2; out come the last and the first."""
+    directions (-2), or their harmonics of degree 2; out come the last and the first."""
     layers = (module.MlpLayer(20, "sine", (-1,)), module.MlpLayer(70, "softplus", (0, -1)))
     return module.MlpTable(
         layers=(*layers, module.MlpLayer(18, "sigmoid", (1, -2))),
@@ -209,7 +206,7 @@ def table(module):
         positions=3,
         directions=3,
         position=module.MlpEncoding("frequency", 2),
-        direction=module.MlpEncoding("spherical", 2),
+        direction=module.MlpEncoding(*(("spherical", 2) if harmonics else ("none", 0))),
         grid=module.HashGrid([], [], [], 0, False),
         half=False,
         caller="grouped_mlp",
@@ -219,9 +216,11 @@ def table(module):
 def network(module, n, k, offsets, precision, ways):
     """Forward and backward of random numbers; the output and the gradients of everything."""
     r, gpu = 5, module.Cuda(0, 0)
+    harmonics = precision == "float32" or ways[0] in ("tiles", "layers")  # a chain of products refuses them
+    layers, shapes = table(module, harmonics), [(20, 15), (70, 35), (18, 74 if harmonics else 73)]
     positions, directions, gradient = floats(n, 3), floats(r, 3), floats(n, 38)
     index, order = RANDOM.integers(0, r, n).astype(np.int32), RANDOM.permutation(n).astype(np.int32)
-    weights, biases = [floats(k, o, i) for o, i in SHAPES], [floats(k, o) for o, _ in SHAPES]
+    weights, biases = [floats(k, o, i) for o, i in shapes], [floats(k, o) for o, _ in shapes]
     given = module.MlpInputs(
         *every((positions, directions, index, offsets)),
         every(weights),
@@ -238,16 +237,16 @@ def network(module, n, k, offsets, precision, ways):
 
     def rest(backward):
         way = ways[backward]
-        size = module.grouped_mlp_workspace(table(module), n, k, backward, True, precision, way, gpu)
+        size = module.grouped_mlp_workspace(layers, n, k, backward, True, precision, way, gpu)
         return precision, way, at(np.full(size, 255, np.uint8)), gpu
 
     out, grad_positions, grad_directions = unwritten(n, 38), unwritten(n, 3), unwritten(n, 3)
     grad_weights, grad_biases = [unwritten(*x.shape) for x in weights], [unwritten(*x.shape) for x in biases]
-    module.grouped_mlp(table(module), given, at(out), *rest(False))
+    module.grouped_mlp(layers, given, at(out), *rest(False))
     gradients = module.MlpGradients(
         at(gradient), every(grad_weights), every(grad_biases), at(grad_positions), at(grad_directions), None
     )
-    module.grouped_mlp_backward(table(module), given, gradients, *rest(True))
+    module.grouped_mlp_backward(layers, given, gradients, *rest(True))
     return [out, *grad_weights, *grad_biases, grad_positions, grad_directions]
 
 

@@ -115,7 +115,7 @@ def test_importance_is_that_of_the_last_pass(tmp_path, scene, monkeypatch):
     results, loss = [], trainer.renderer.loss
     monkeypatch.setattr(trainer.renderer, "loss", lambda *a: results.append(a) or loss(*a))
     trainer.advance()
-    ((_, fine), target) = results[0]
+    (_, fine), target, _ = results[0]
     error = (fine.colour - target).square().sum(1)
     expected = (fine.weights * error[:, None]).detach().reshape(-1).topk(50).values
     torch.testing.assert_close(trainer.reservoir.samples()[1].sort(descending=True).values, expected)
