@@ -81,14 +81,7 @@ def camera_rays(
         check_shape(_OP, "camera", camera, ("b",), sizes)
         check_dtype(_OP, "camera", camera, INDEX)
         check_range(_OP, "camera", camera, sizes["c"])
-    if distortion is not None:
-        check_shape(_OP, "distortion", distortion, ("c", 8), sizes)
-    if models is not None:
-        check_shape(_OP, "models", models, ("c",), sizes)
-        check_dtype(_OP, "models", models, INDEX)
-        check_range(_OP, "models", models, 3)
-        if distortion is None:
-            raise ValueError(f"{_OP}: distortion must be given with models, got None")
+    check_lenses(_OP, distortion, models, sizes)
     check_same_dtype(_OP, poses=poses, intrinsics=intrinsics, x=x, y=y, distortion=distortion)
     check_same_device(
         _OP, poses=poses, intrinsics=intrinsics, x=x, y=y, camera=camera, distortion=distortion, models=models
@@ -100,3 +93,15 @@ def camera_rays(
     tensors = (tensor.detach() for tensor in (poses, intrinsics, x, y))
     origins, directions = run(*tensors, camera=camera, distortion=distortion, models=models)
     return origins, directions
+
+
+def check_lenses(op: str, distortion: Tensor | None, models: Tensor | None, sizes: dict[str, int]) -> None:
+    """Checks what `camera_rays` and `pixel_rays` take of lenses; `sizes` as in `check_shape`, with c."""
+    if distortion is not None:
+        check_shape(op, "distortion", distortion, ("c", 8), sizes)
+    if models is not None:
+        check_shape(op, "models", models, ("c",), sizes)
+        check_dtype(op, "models", models, INDEX)
+        check_range(op, "models", models, 3)
+        if distortion is None:
+            raise ValueError(f"{op}: distortion must be given with models, got None")

@@ -8,16 +8,15 @@ from torch import Tensor
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import (
-    INDEX,
     check_count,
     check_dtype,
     check_number,
-    check_range,
     check_same_device,
     check_same_dtype,
     check_shape,
     check_tensor,
 )
+from voronerf.ops.camera_rays import check_lenses
 from voronerf.reference.pixel_rays import PixelRays
 
 _OP = backends.declare(
@@ -90,14 +89,7 @@ def pixel_rays(
     check_dtype(_OP, "index", index, (torch.int64,))
     if box is not None:
         check_shape(_OP, "box", box, (2, 3))
-    if distortion is not None:
-        check_shape(_OP, "distortion", distortion, ("c", 8), sizes)
-    if models is not None:
-        check_shape(_OP, "models", models, ("c",), sizes)
-        check_dtype(_OP, "models", models, INDEX)
-        check_range(_OP, "models", models, 3)
-        if distortion is None:
-            raise ValueError(f"{_OP}: distortion must be given with models, got None")
+    check_lenses(_OP, distortion, models, sizes)
     if background is not None:
         check_tensor(_OP, "background", background)
         check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("b", 3), sizes)
