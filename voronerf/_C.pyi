@@ -398,6 +398,9 @@ def hash_encode_backward(_0: HashInputs, _1: HashGrid, _2: Tensor | None, _3: Te
 # Isa
 def isa_supported(_0: str) -> bool: ...
 
+# 
+def keep_freed_memory() -> None: ...
+
 # const float32*, const float32*, const float32*, const int32*, const int32*, int32*, int32*, int64, int64, int32, Cpu
 @overload
 def locate_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: int, _8: int, _9: int, _10: Cpu) -> bool: ...

@@ -12,6 +12,7 @@ VN_BINDINGS(module) {
   module.plain("isa_supported", VN_CPU(isa_supported));
   module.cpu("measure_peak", VN_CPU(measure_peak));
   module.plain("advise_huge_pages", VN_CPU(advise_huge_pages));
+  module.plain("keep_freed_memory", VN_CPU(keep_freed_memory));
 }
 
 }  // namespace voronerf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -159,3 +160,22 @@ print(faults() - before, int(out.count_nonzero()))
 """
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert int(found[0]) < 2000 and found[1] == "0"  # 16,384 small pages
+
+
+def test_what_a_step_frees_is_kept() -> None:
+    """In a fresh process: the second of two equal steps finds the memory of the first."""
+    if platform.libc_ver()[0] != "glibc":
+        pytest.skip("glibc alone can be asked")
+    program = """
+import resource, torch
+from voronerf.native import compiled
+compiled.keep_freed_memory()
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+step = lambda: [torch.ones(1 << 22) for _ in range(16)]
+step()
+before = faults()
+step()
+print(faults() - before)
+"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert int(found) < 2000  # 65,536 pages

@@ -27,7 +27,7 @@ from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.cells import clone_module
 from voronerf.router.fused import Program
 from voronerf.router.grouped import NoRandomness, Ungroupable, run_cells, run_grouped
-from voronerf.router.grouping import Grouping, cell_parameters, in_place_of_parameters
+from voronerf.router.grouping import Grouping, cell_parameters, in_place_of_parameters, keep_freed_memory
 from voronerf.router.layout import RAY, Call, Results, map_tensors, rebuild, tensors_of
 from voronerf.router.trace import ROWS, Unfusable
 from voronerf.tolerances import agree, agree_gradients
@@ -35,7 +35,7 @@ from voronerf.tolerances import agree, agree_gradients
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs
 _TRIED, _CELLS = 41, 3  # samples of a comparison, unlike any number of features, and their cells
-_PIECE = 4 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
+_PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
 _KINDS = 256  # kinds of calls that are remembered
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
 
@@ -111,6 +111,8 @@ def kind_of(call: Call, device: torch.device, fuse: bool) -> Any:
 
 def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, *, fuse: bool) -> Any:
     """What a method returns for the samples of all cells (or two placeholders), some mixed with those of others."""
+    if grouping.device.type == "cpu":
+        keep_freed_memory()
     choice = choose(call, grouping, choices, fuse)
     results, choice = carry_out(call, grouping, choices, choice)
     order = grouping if choice.program is None or not call.layout.n else None

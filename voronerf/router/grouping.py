@@ -232,24 +232,27 @@ def in_place_of_parameters(module: nn.Module, values: Mapping[int, Any]) -> Iter
 
 
 @functools.cache
-def _on_huge_pages() -> Callable[[Tensor], None]:
-    # The C library maps large blocks and gives them back when they are freed, so that each step would wait for the
-    # pages of its gradients again. Once it has seen a block of 31 MB freed, it keeps smaller ones.
-    torch.empty(31 << 20, dtype=torch.uint8)
+def keep_freed_memory() -> Any:
+    """Has the C library keep what a step frees, so that the next one does not wait for the same pages again.
+
+    Gives the compiled module, or None where there is none: then it is left as it is.
+    """
     try:
-        from voronerf.native.custom_op import on_huge_pages
+        from voronerf.native import compiled
     except BackendUnavailable:
-        return lambda result: None
-    return on_huge_pages
+        return None
+    compiled.keep_freed_memory()
+    return compiled
 
 
 def empty_like(tensor: Tensor) -> Tensor:
     """``torch.empty_like``, from the start of a huge page where it is large: page faults cost more than the values."""
     if tensor.nbytes < _LARGE or tensor.device.type != "cpu":
         return torch.empty_like(tensor)
-    on_huge_pages, spare = _on_huge_pages(), tensor.new_empty(tensor.numel() + _PAGE // tensor.element_size())
+    spare = tensor.new_empty(tensor.numel() + _PAGE // tensor.element_size())
     result = spare[-spare.data_ptr() % _PAGE // tensor.element_size() :][: tensor.numel()].view(tensor.shape)
-    on_huge_pages(result)
+    if (native := keep_freed_memory()) is not None:
+        native.advise_huge_pages(result, result.nbytes)
     return result
 
 

@@ -292,7 +292,7 @@ def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) ->
     occupied, planes = run.grouping.occupied, cells_of(input.stacked)
     points = grid.split([last - first for _, first, last in occupied], places[0])
     found = [F.grid_sample(planes[cell], own, **options) for (cell, _, _), own in zip(occupied, points, strict=True)]
-    return torch.cat(found, places[0] + 1)
+    return torch.cat(found, places[0] + 1) if len(found) > 1 else found[0]
 
 
 def _bilinear(run: GroupedRun, plane: PerCell, grid: Tensor, cells: Tensor, zeros: bool, align_corners: bool) -> Tensor:
