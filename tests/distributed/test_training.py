@@ -12,6 +12,7 @@ from ranks import on_ranks
 
 from voronerf import open_run
 from voronerf.data import builtin_scene
+from voronerf.data.scene import Sightings
 from voronerf.distributed.group import joined
 from voronerf.distributed.trainer import RankTrainer
 from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
@@ -20,7 +21,7 @@ from voronerf.training.trainer import Trainer
 
 CONFIGS = {
     "nerf": {"field": "nerf", "samples": 24, "depth": 2, "cells": (3, 3), "min_cell_samples": 4},
-    "dense": {"field": "nerf", "samples": 24, "depth": 2, "cells": (4,), "occupancy": False},
+    "dense": {"field": "nerf", "samples": 24, "depth": 2, "cells": (4,), "occupancy": False, "sightings": 0.1},
     "hashgrid": {"cells": (4,)},
     "contracted": {"cells": (4,), "contraction": "sphere", "occupancy_resolution": 32},
 }
@@ -42,7 +43,10 @@ def settings(out, name):
 
 
 def scene():
-    return replace(builtin_scene(24, train_views=8, test_views=2), kind="unbounded")  # scales gradients if contracted
+    """Scales gradients if contracted, and says where some pixels show points."""
+    found = builtin_scene(24, train_views=8, test_views=2)
+    sightings = Sightings(torch.arange(200, 4600, 7), torch.linspace(2, 4, 629))
+    return replace(found, kind="unbounded", train=replace(found.train, sightings=sightings))
 
 
 def stop_at(trainer, step, progress):

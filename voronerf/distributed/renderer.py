@@ -21,7 +21,7 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.marching import Seen
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid, density_of
 from voronerf.rendering.renderer import RenderedImage, Renderer
-from voronerf.rendering.sampling import stratified_depths
+from voronerf.rendering.sampling import NEARBY, stratified_depths
 from voronerf.rendering.volume import weaken_near
 
 #: Rays of a picture at a time: no ray ends at the first surface, since other ranks do not know it in time.
@@ -137,8 +137,9 @@ class RankRenderer(Renderer):
         *,
         background: Tensor | None = None,
         generator: torch.Generator | None = None,
+        seen: Tensor | None = None,
     ) -> Learnt:
-        """Renders rays, the same on all ranks, and leaves the gradients of the mean squared error of their colours.
+        """Renders rays, the same on all ranks, and leaves the gradients of their loss, see :meth:`Renderer.loss`.
 
         Gradients of parameters that several ranks have are sums over the samples of this one.
 
@@ -149,36 +150,46 @@ class RankRenderer(Renderer):
             target: [r, 3].
             background: [3] or [r, 3]; None is black.
             generator: Of the samples, in the same state on all ranks.
+            seen: [s], the distances of points at which the last s rays end, or None.
         """
         samples = self.samples_of(rays, near, far, jitter=True, generator=generator)
         colour, density = self.field(samples.positions, rays.directions, samples.ray_index)
         colour, density = colour.to(near.dtype), density.to(near.dtype)
         weaken_near(self.full_gradient, samples.depths, colour, density)
+        shown = torch.zeros_like(target) if background is None else background.expand_as(target)
+        if seen is not None:  # the light from where points were seen is a fourth colour
+            colour = torch.cat((colour, _lies_at(seen, samples, len(rays))[:, None]), 1)
+            shown, target = (torch.nn.functional.pad(rows, (0, 1)) for rows in (shown, target))
+        c = colour.shape[1]
         runs = sum_runs(samples, colour, density, self.backend)
         sums = torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1).detach()
         parts = self.group.share("sums", sums)
         first = sum(map(len, parts[: self.group.rank]))
         own, sums = slice(first, first + len(sums)), torch.cat(parts)
-        order = along_rays(sums[:, 5].long(), sums[:, 4])
-        part, optical, ray = sums[order, :3], sums[order, 3], sums[order, 5].long()
+        order = along_rays(sums[:, c + 2].long(), sums[:, c + 1])
+        part, optical, ray = sums[order, :c], sums[order, c], sums[order, c + 2].long()
         whole = compose(part, optical, ray, len(rays))
-        shown = torch.zeros_like(target) if background is None else background.expand_as(target)
         off = whole.colour + whole.through[:, None] * shown - target
-        error = off.square().sum(-1)
-        slopes = off * (2 / (3 * len(rays)))
+        error = off[:, :3].square().sum(-1)
+        slopes, loss = off * (2 / (3 * len(rays))), error.sum() / (3 * len(rays))
+        if seen is not None:  # as `sighting_loss`
+            some = slice(len(rays) - len(seen), None)
+            light = whole.colour[some, 3]
+            slopes[:, 3] = 0
+            slopes[some, 3] = torch.where((light >= 1e-3) & (light <= 1), -self.sightings / len(seen) / light, 0)
+            loss = loss - self.sightings * torch.log(light.clamp(1e-3, 1)).mean()
         answers = torch.empty_like(sums)
-        answers[order, :4] = whole.gradients(part, ray, slopes, shown)
-        answers[order, 4], answers[order, 5] = whole.front, error[ray]
+        answers[order, : c + 1] = whole.gradients(part, ray, slopes, shown)
+        answers[order, c + 1], answers[order, c + 2] = whole.front, error[ray]
         answers = answers[own]
         run = torch.repeat_interleave(samples.run_offsets.diff())
-        weights = runs.weights * answers[run, 4]
+        weights = runs.weights * answers[run, c + 1]
         if self.occupancy is not None:
             hidden = weights <= HIDDEN * -torch.expm1(-density.detach() * samples.deltas)
             colour.register_hook(lambda gradient: gradient.masked_fill(hidden[:, None], 0))
             density.register_hook(lambda gradient: gradient.masked_fill(hidden, 0))
-        torch.autograd.backward((runs.colour, runs.optical), (answers[:, :3], answers[:, 3]))
-        importance = weights * answers[run, 5]
-        loss = error.sum() / (3 * len(rays))
+        torch.autograd.backward((runs.colour, runs.optical), (answers[:, :c], answers[:, c]))
+        importance = weights * answers[run, c + 2]
         return Learnt(loss, samples.positions, density.detach(), samples.deltas, weights, importance)
 
     # --- the grid --------------------------------------------------------------------------------------------------
@@ -188,8 +199,8 @@ class RankRenderer(Renderer):
         """What samples say of the voxels that they are in.
 
         Returns:
-            Positions [n, 3] and densities [n] of those in voxels of this rank alone. Of the others [m, 2], voxel and
-            density, which all ranks should know.
+            Positions [m, 3] and densities [m] of own samples, and of those in voxels that other ranks reach too voxel
+            and density, [c, 2], which these should know.
         """
         density = found.density.float().nan_to_num(nan=float("inf"), posinf=float("inf"))
         visible = found.weights > HIDDEN * -torch.expm1(-density * found.deltas)
@@ -199,31 +210,27 @@ class RankRenderer(Renderer):
             middle = grid.contraction.stretch(grid.points(cells.long()))
             density = density * grid.contraction.stretch(positions) / middle
             positions = grid.points(cells.long())
-        if self.sharing is None:
-            common = torch.ones_like(cells, dtype=torch.bool)
-        else:
-            common = self._several[cells]
-        told = torch.stack((cells[common].view(torch.float32), density[common]), 1)
-        return (positions[~common], density[~common]), told
+        told = torch.stack((cells.view(torch.float32), density), 1)
+        return (positions, density), told if self.sharing is None else told[self._several[cells]]
 
     def observe(
-        self, grid: OccupancyGrid, alone: tuple[Tensor, Tensor], common: Tensor, *, decay: float, backend: str
+        self, grid: OccupancyGrid, own: tuple[Tensor, Tensor], others: Tensor, *, decay: float, backend: str
     ) -> None:
         """Teaches the grid what all ranks found in the voxels that own cells reach.
 
         Args:
             grid: Of this rank.
-            alone: The first part of this rank's :meth:`observations`.
-            common: [m, 2], the second of all ranks.
+            own: The first part of this rank's :meth:`observations`.
+            others: [c, 2], the second of all other ranks.
             decay: As of a grid.
             backend: As of a grid.
         """
-        cells = common[:, 0].contiguous().view(torch.int32)
+        cells = others[:, 0].contiguous().view(torch.int32)
         if self.sharing is not None:
             ours = self._reached[cells]
-            cells, common = cells[ours], common[ours]
-        positions = torch.cat((alone[0], grid.points(cells.long())))
-        density = torch.cat((alone[1], common[:, 1]))
+            cells, others = cells[ours], others[ours]
+        positions = torch.cat((own[0], grid.points(cells.long())))
+        density = torch.cat((own[1], others[:, 1]))
         ones = torch.ones_like(density)  # what counts has been decided
         grid.observe(positions, density, ones, ones, decay=decay, backend=backend)
 
@@ -281,3 +288,11 @@ class RankRenderer(Renderer):
     def image(self, *args: Any, chunk: int | None = None, **given: Any) -> RenderedImage:
         """As that of a renderer; every rank gets the same."""
         return super().image(*args, chunk=PICTURE_CHUNK if chunk is None else chunk, **given)
+
+
+def _lies_at(seen: Tensor, samples: Samples, rays: int) -> Tensor:
+    """Whether each sample [m] lies where a point was seen, for the last rays, as in `sighting_loss`; 0 or 1."""
+    distances = samples.depths.new_full((rays,), float("nan"))
+    distances[rays - len(seen) :] = seen
+    distances = distances[samples.ray_index]
+    return ((samples.depths - distances).abs() <= NEARBY * distances + samples.deltas).to(samples.depths.dtype)

@@ -1,8 +1,8 @@
 """Partial sums: what a rank knows of a ray that passes through its cells, and how those of all ranks become a colour.
 
-r rays, m samples of all rays (packed), q runs. A run is a piece of a ray on which no other rank has a sample between
-two of its own. With the optical depth tau of the runs before, a ray has the colour ``sum exp(-tau) * colour of run``
-(NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
+r rays, m samples of all rays (packed), q runs, c colours. A run is a piece of a ray on which no other rank has a sample
+between two of its own. With the optical depth tau of the runs before, a ray has the colour ``sum exp(-tau) * colour of
+run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Runs(NamedTuple):
     """The partial sums of runs. The first two have gradients.
 
     Attributes:
-        colour: [q, 3], as if nothing were in front.
+        colour: [q, c], as if nothing were in front.
         optical: [q], the optical depth.
         depth: [q], the sum of weight times depth.
         ray: int64 [q].
@@ -93,7 +93,7 @@ def own_samples(
 
 
 def sum_runs(samples: Samples, colour: Tensor, density: Tensor, backend: str) -> Runs:
-    """The partial sums of the runs of samples with these colours [m, 3] and densities [m]."""
+    """The partial sums of the runs of samples with these colours [m, c] and densities [m]."""
     offsets = samples.run_offsets
     first = offsets[:-1].long()
     run = torch.repeat_interleave(offsets.diff())
@@ -107,7 +107,7 @@ class Composed(NamedTuple):
     """Rays made of runs.
 
     Attributes:
-        colour: [r, 3], without a background.
+        colour: [r, c], without a background.
         through: [r], the light that passes all of them.
         front: [q], the light that arrives at each run.
         place: int64 [q], where each run is in a table with a row for each ray.
@@ -124,13 +124,13 @@ class Composed(NamedTuple):
         """The gradients of the runs' colours and optical depths, from those of the colours of the rays.
 
         Args:
-            colour: [q, 3], as of :func:`compose`.
+            colour: [q, c], as of :func:`compose`.
             ray: int64 [q], likewise.
-            slopes: [r, 3], the gradient of each ray's colour over its background.
-            background: [r, 3].
+            slopes: [r, c], the gradient of each ray's colour over its background.
+            background: [r, c].
 
         Returns:
-            [q, 4], colours first. More depth takes light from all that is behind: later runs, and the background.
+            [q, c + 1], colours first. More depth takes light from all that is behind: later runs, and the background.
         """
         direct = self.front[:, None] * slopes[ray]
         table = direct.new_zeros(len(slopes), self.width)
@@ -144,7 +144,7 @@ def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed
     """Puts runs together, without gradients of its own.
 
     Args:
-        colour: [q, 3].
+        colour: [q, c].
         optical: [q].
         ray: int64 [q], ascending; the runs of a ray from near to far.
         rays: r.
@@ -157,11 +157,11 @@ def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed
     table.view(-1)[place] = optical
     # The sum is shifted: less its last term it would be inf - inf for an opaque run.
     front = torch.exp(-torch.nn.functional.pad(table[:, :-1], (1, 0)).cumsum(1)).view(-1)[place]
-    whole = colour.new_zeros(rays, 3).index_add(0, ray, front[:, None] * colour)
+    whole = colour.new_zeros(rays, colour.shape[1]).index_add(0, ray, front[:, None] * colour)
     return Composed(whole, torch.exp(-table.sum(1)), front, place, width)
 
 
 def along_rays(ray: Tensor, start: Tensor) -> Tensor:
-    """The order of runs by their rays, and from near to far."""
-    order = start.argsort(stable=True)
-    return order[ray[order].argsort(stable=True)]
+    """The order of runs [q] by their rays, int64, and from near to far, by their starts >= 0."""
+    bits = start.float().view(torch.int32)  # as large as the floats themselves
+    return ((ray << 32) + bits).argsort(stable=True)

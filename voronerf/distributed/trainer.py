@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
-from voronerf.diagram.balance import cell_weights
 from voronerf.diagram.subdivision import Split
 from voronerf.distributed.checkpoint import RankWriter, ownership
 from voronerf.distributed.gradients import add_entries, pack_entries
@@ -44,7 +43,6 @@ def check_ranks(config: TrainConfig, ranks: int) -> None:
         "init": (config.init == "inherit", "be inherit"),
         "blend": (config.blend == 0, "be 0"),
         "distortion": (config.distortion == 0, "be 0"),
-        "sightings": (not config.sightings, "be 0"),
         "precision": (config.precision == "fp32", "be fp32"),
         "cuda_graph": (not config.cuda_graph, "be off"),
         "cells": (not config.cells or config.cells[0] >= ranks, f"be at least the {ranks} ranks on the first level"),
@@ -90,7 +88,6 @@ class RankTrainer(Trainer):
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         check_ranks(config, group.size)
-        config = replace(config, sightings=0.0)  # which the sums of the ranks have not
         self.group, self.writes = group, group.rank == 0
         self.sharing: Sharing | None = None
         self.weights = torch.ones(1)
@@ -151,9 +148,8 @@ class RankTrainer(Trainer):
         config, grid = self.config, self.occupancy
         batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
         self.optimizer.zero_grad(set_to_none=True)
-        found = self.renderer.learn(
-            batch.rays, batch.near, batch.far, batch.target, background=batch.background, generator=self.draws
-        )
+        given: dict[str, Any] = {"background": batch.background, "generator": self.draws, "seen": batch.seen}
+        found = self.renderer.learn(batch.rays, batch.near, batch.far, batch.target, **given)
         for parameter in self._parameters:
             if parameter.grad is None:  # no sample of this rank
                 parameter.grad = torch.zeros_like(parameter)
@@ -163,11 +159,11 @@ class RankTrainer(Trainer):
         if collects:
             heaviest, importance = select_heaviest(found.positions, found.importance, len(kept))
             kept[: len(heaviest), :3], kept[: len(heaviest), 3] = heaviest, importance
-        alone, common = (None, kept.new_empty(0, 2)) if grid is None else self.renderer.observations(grid, found)
-        total, kept, common = self._tell(kept, common, len(found.positions))
-        if grid is not None and alone is not None:
+        own, seen = (None, kept.new_empty(0, 2)) if grid is None else self.renderer.observations(grid, found)
+        total, kept, others = self._tell(kept, seen, len(found.positions))
+        if grid is not None and own is not None:
             backend = "auto" if config.backend == "warp" else config.backend
-            self.renderer.observe(grid, alone, common, decay=OCCUPANCY_DECAY, backend=backend)
+            self.renderer.observe(grid, own, others, decay=OCCUPANCY_DECAY, backend=backend)
         self.guard.judge(found.loss + total, self.optimizer)
         summed()
         self.optimizer.step()
@@ -186,32 +182,33 @@ class RankTrainer(Trainer):
 
         return end
 
-    def _tell(self, kept: Tensor, common: Tensor, samples: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _tell(self, kept: Tensor, seen: Tensor, samples: int) -> tuple[Tensor, Tensor, Tensor]:
         """Tells all ranks what each has to say in a step: they add up the tables' gradients, and agree on the rest.
 
         That is the time, a stop, a checkpoint and the rays of the next step.
 
         Args:
             kept: [n, 4], the heaviest samples, as many on all ranks.
-            common: [m, 2], see :meth:`RankRenderer.observations`.
+            seen: [c, 2], see :meth:`RankRenderer.observations`.
             samples: How many this rank has evaluated.
 
         Returns:
-            The sum of all gradients that the guard reads, and the arguments of all ranks.
+            The sum of all gradients that the guard reads, what all ranks have kept, and what the others have seen.
         """
         dense = [p for group in self.optimizer.param_groups if not group.get("sparse") for p in group["params"]]
         passed = (self._measured - self._told) * (self.group.rank == 0)
         self._told = self._measured
-        news = common.new_tensor((0.0, passed, float(self._asked), float(self.writer.ready), samples, len(common)))
+        news = kept.new_tensor((0.0, passed, float(self._asked), float(self.writer.ready), samples, len(seen)))
         news[0] = sum(p.grad.sum() for p in dense if p.grad is not None)
         gradients = [p.grad.reshape(-1) for p in self._tables if p.grad is not None]
         flat = torch.cat(gradients) if len(gradients) > 1 else gradients[0] if gradients else news[:0]
-        message = torch.cat((news, kept.view(-1), common.view(-1), pack_entries(flat)))
+        message = torch.cat((news, kept.view(-1), seen.view(-1), pack_entries(flat)))
         parts = [part[:, 0] for part in self.group.share("news", message[:, None])]
         said = torch.stack([part[:6] for part in parts])
-        counts, first = (2 * said[:, 5]).int().tolist(), 6 + 4 * len(kept)
+        first = 6 + 4 * len(kept)
+        ends = (first + 2 * said[:, 5]).int().tolist()
         if len(flat):
-            entries = [part[first + count :] for part, count in zip(parts, counts, strict=True)]
+            entries = [part[end:] for part, end in zip(parts, ends, strict=True)]
             _set_gradients(self._tables, add_entries(entries, len(flat)))
         total = said.sum(0)
         _, passed, asked, ready, samples, _ = total.tolist()
@@ -222,8 +219,10 @@ class RankTrainer(Trainer):
         if self.occupancy is not None:
             self.rays = next_rays(self.config, self.rays, int(samples))
         kept = torch.cat([part[6:first] for part in parts]).view(-1, 4)
-        common = torch.cat([part[first : first + count] for part, count in zip(parts, counts, strict=True)])
-        return total[0], kept, common.view(-1, 2)
+        others = [
+            part[first:end] for i, (part, end) in enumerate(zip(parts, ends, strict=True)) if i != self.group.rank
+        ]
+        return total[0], kept, torch.cat(others).view(-1, 2)
 
     def _check_moments(self) -> bool:
         finite = bool(self.group.largest(torch.tensor(float(not all_finite(self.optimizer)), device=self.device)) == 0)
@@ -239,10 +238,20 @@ class RankTrainer(Trainer):
         split, state = self.group.from_first((split, self.generator.get_state()))
         self.generator.set_state(state)
         if split is not None:
-            cells = split.diagram.locate(points, backend=self.config.backend)
-            self.weights = cell_weights(cells.cpu(), importance.cpu(), split.diagram.num_cells)
+            self.weights = self._loads(split.diagram)
         found: Split | None = split
         return found
+
+    def _loads(self, diagram: VoronoiDiagram) -> Tensor:
+        """How many samples of a step each cell has, [k]: what its networks cost.
+
+        They are of a batch drawn for this alone, so that the same is found again after a restart.
+        """
+        generator = torch.Generator(self.draws.device).manual_seed(self.step)
+        batch = self.batches.draw(self.rays, generator)
+        samples = self.renderer.samples_of(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
+        cells = diagram.locate(samples.positions, backend=self.config.backend)
+        return self.group.total(torch.bincount(cells, minlength=diagram.num_cells).float()).cpu()
 
     def divide(self, split: Split) -> None:
         """Takes the own cells of a split."""

@@ -157,8 +157,8 @@ class TrainConfig:
     """Factor of a loss on weights that are spread along a ray (mip-NeRF 360; published: 0.01); 0 is off."""
     sightings: float | None = None
     """Factor of a loss on light that does not come from where the points of a sparse model were seen (Deng et al. 2022,
-    "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points, where empty space
-    is skipped, and on several processes."""
+    "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points or where empty
+    space is skipped."""
     gradient_scaling: bool = True
     """In unbounded scenes, samples nearer to the camera than the radius of the contraction's sphere learn less, by the
     square of their distance, against fog before the cameras (Philip and Deschaintre 2023)."""
