@@ -12,7 +12,7 @@ import re
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from datetime import timedelta
 from typing import Any
 
@@ -55,7 +55,7 @@ class Group:
     Attributes:
         rank: The number of this one.
         size: How many there are.
-        sent: Bytes that this rank has sent to others by :meth:`share`, for each kind.
+        sent: Bytes that this rank has sent to others, for each kind of message.
 
     Args:
         device: Where the tensors are that are sent.
@@ -68,6 +68,7 @@ class Group:
         self.rank, self.size, self.device = own_rank(), world_size(), device
         self.sent: Counter[str] = Counter()
         self._room: dict[str, int] = {}  # rows of a message of each kind
+        self._rooms = [0] * self.size, [0] * self.size  # rows of an exchange, to and from each rank
         backend = "nccl" if device.type == "cuda" else "gloo"
         if device.type == "cuda":
             torch.cuda.set_device(device)  # where torch puts what it sends of Python objects
@@ -147,6 +148,50 @@ class Group:
             parts = torch.cat((parts, self._gather(kind, rest)), 1)
         self._room[kind] = most + most // 4 + 1
         return [part[:count] for part, count in zip(parts, counts, strict=True)]
+
+    def exchange(self, kind: str, parts: Sequence[Tensor]) -> list[Tensor]:
+        """Sends each rank its part, and gets one of each; how many rows these have need not be known.
+
+        As in :meth:`share`, a message has room for some more rows than the one before it to the same rank.
+
+        Args:
+            kind: What they are; all exchanges are of one kind.
+            parts: float32 [n, c] for each rank; the own one stays.
+        """
+        there, came = self._rooms
+        messages = [part.new_empty(1 + room, part.shape[1]) for part, room in zip(parts, there, strict=True)]
+        for message, part in zip(messages, parts, strict=True):
+            message[:1].view(torch.int32)[:] = len(part)
+            message[1 : 1 + len(part)] = part[: len(message) - 1]
+        found = self.swap(kind, messages, [1 + room for room in came])
+        counts = torch.stack([message[0] for message in found]).view(torch.int32)[:, 0].tolist()
+        rests = [part.new_empty(max(n - room, 0), part.shape[1]) for part, n, room in zip(parts, counts, came)]
+        others = [rank for rank in range(self.size) if rank != self.rank]
+        left = [(rank, parts[rank][there[rank] :].contiguous()) for rank in others if len(parts[rank]) > there[rank]]
+        with self._waiting():
+            sends = [dist.P2POp(dist.isend, rest, rank) for rank, rest in left]
+            sends += [dist.P2POp(dist.irecv, rests[rank], rank) for rank in others if len(rests[rank])]
+            for work in dist.batch_isend_irecv(sends) if sends else []:
+                work.wait()
+        self.sent[kind] += sum(rest.numel() * rest.element_size() for _, rest in left)
+        result = [torch.cat((part[1 : 1 + n], rest)) for part, n, rest in zip(found, counts, rests, strict=True)]
+        result[self.rank] = parts[self.rank]
+        self._rooms = [n + n // 4 + 1 for n in map(len, parts)], [n + n // 4 + 1 for n in counts]
+        return result
+
+    def swap(self, kind: str, parts: Sequence[Tensor], came: Sequence[int]) -> list[Tensor]:
+        """Sends each rank its part [n, c], and gets ``came`` rows of each; the own part stays."""
+        own = self.rank
+        others = [part[:0] if rank == own else part for rank, part in enumerate(parts)]
+        there, came = list(map(len, others)), [0 if rank == own else n for rank, n in enumerate(came)]
+        message = torch.cat(others)
+        found = message.new_empty(sum(came), message.shape[1])
+        with self._waiting():
+            dist.all_to_all_single(found, message, came, there)
+        self.sent[kind] += message.numel() * message.element_size()
+        result = list(found.split(came))
+        result[own] = parts[own]
+        return result
 
     def _gather(self, kind: str, message: Tensor) -> Tensor:
         every = message.repeat(self.size, 1, 1)

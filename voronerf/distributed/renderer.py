@@ -1,14 +1,15 @@
 """Renders and learns rays that pass through the cells of several ranks. Only partial sums of rays travel.
 
 Before the first split all ranks have the same network, and each evaluates its slice of the rays. Afterwards each
-evaluates its own cells on all rays. It tells all ranks a partial sum for each run, 24 bytes, from which every rank
-makes the colours, the loss, and the gradients of its own sums (Li et al. 2024, NeRF-XL).
+evaluates its own cells on all rays. Each rank puts a slice of the rays together: it gets a partial sum of each run from
+those that evaluated it, 24 bytes, and answers with its gradients (Li et al. 2024, NeRF-XL).
 
 r rays, m own samples, q runs.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import torch
@@ -32,7 +33,7 @@ class Learnt(NamedTuple):
     """What a step finds, beside the gradients that it leaves.
 
     Attributes:
-        loss: [].
+        loss: [], the part of the rays that this rank puts together.
         positions: [m, 3] of own samples.
         density: [m].
         deltas: [m].
@@ -156,32 +157,22 @@ class RankRenderer(Renderer):
         colour, density = self.field(samples.positions, rays.directions, samples.ray_index)
         colour, density = colour.to(near.dtype), density.to(near.dtype)
         weaken_near(self.full_gradient, samples.depths, colour, density)
-        shown = torch.zeros_like(target) if background is None else background.expand_as(target)
+        c, points = 3, None
         if seen is not None:  # the light from where points were seen is a fourth colour
-            colour = torch.cat((colour, _lies_at(seen, samples, len(rays))[:, None]), 1)
-            shown, target = (torch.nn.functional.pad(rows, (0, 1)) for rows in (shown, target))
-        c = colour.shape[1]
+            c, points = 4, torch.full_like(near, float("nan"))
+            points[len(rays) - len(seen) :] = seen
+            colour = torch.cat((colour, _lies_at(points, samples)[:, None]), 1)
         runs = sum_runs(samples, colour, density, self.backend)
         sums = torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1).detach()
-        parts = self.group.share("sums", sums)
-        first = sum(map(len, parts[: self.group.rank]))
-        own, sums = slice(first, first + len(sums)), torch.cat(parts)
-        order = along_rays(sums[:, c + 2].long(), sums[:, c + 1])
-        part, optical, ray = sums[order, :c], sums[order, c], sums[order, c + 2].long()
-        whole = compose(part, optical, ray, len(rays))
-        off = whole.colour + whole.through[:, None] * shown - target
-        error = off[:, :3].square().sum(-1)
-        slopes, loss = off * (2 / (3 * len(rays))), error.sum() / (3 * len(rays))
-        if seen is not None:  # as `sighting_loss`
-            some = slice(len(rays) - len(seen), None)
-            light = whole.colour[some, 3]
-            slopes[:, 3] = 0
-            slopes[some, 3] = torch.where((light >= 1e-3) & (light <= 1), -self.sightings / len(seen) / light, 0)
-            loss = loss - self.sightings * torch.log(light.clamp(1e-3, 1)).mean()
-        answers = torch.empty_like(sums)
-        answers[order, : c + 1] = whole.gradients(part, ray, slopes, shown)
-        answers[order, c + 1], answers[order, c + 2] = whole.front, error[ray]
-        answers = answers[own]
+        bounds = self._slices(len(rays))
+        cuts = torch.searchsorted(runs.ray, torch.tensor(bounds, device=near.device)).tolist()
+        sizes = [end - begin for begin, end in itertools.pairwise(cuts)]
+        parts = self.group.exchange("sums", sums.split(sizes))
+        own = slice(*bounds[self.group.rank :][:2])
+        shown = None if background is None else background.expand_as(target)[own]
+        given = torch.cat(parts), own.start, target[own], shown, None if points is None else points[own]
+        answers, loss = self._answer(*given, rays=len(rays), seen=0 if seen is None else len(seen))
+        answers = torch.cat(self.group.swap("sums", answers.split(list(map(len, parts))), sizes))
         run = torch.repeat_interleave(samples.run_offsets.diff())
         weights = runs.weights * answers[run, c + 1]
         if self.occupancy is not None:
@@ -191,6 +182,53 @@ class RankRenderer(Renderer):
         torch.autograd.backward((runs.colour, runs.optical), (answers[:, :c], answers[:, c]))
         importance = weights * answers[run, c + 2]
         return Learnt(loss, samples.positions, density.detach(), samples.deltas, weights, importance)
+
+    def _answer(
+        self,
+        sums: Tensor,
+        first: int,
+        target: Tensor,
+        shown: Tensor | None,
+        points: Tensor | None,
+        *,
+        rays: int,
+        seen: int,
+    ) -> tuple[Tensor, Tensor]:
+        """What runs must be told of their rays, those from a first one on.
+
+        Args:
+            sums: [q, c + 3] of all ranks: colours, optical depth, start, ray.
+            first: The number of the first ray.
+            target: [r, 3], the colours of these rays.
+            shown: [r, 3], what is behind them, or None.
+            points: [r], the distance of the point at the end of each or NaN, or None.
+            rays: How many all ranks have.
+            seen: Those of them that end at points.
+
+        Returns:
+            For each run [q, c + 3] the gradients of its colours and its optical depth, the light that arrives at it,
+            and the error of its ray; and the part [] that these rays have in the loss.
+        """
+        c = sums.shape[1] - 3
+        order = along_rays(sums[:, c + 2].long(), sums[:, c + 1])
+        part, optical, ray = sums[order, :c], sums[order, c], sums[order, c + 2].long() - first
+        whole = compose(part, optical, ray, len(target))
+        behind = torch.zeros_like(whole.colour)
+        if shown is not None:
+            behind[:, :3] = shown
+        off = whole.colour[:, :3] + whole.through[:, None] * behind[:, :3] - target
+        error = off.square().sum(-1)
+        slopes, loss = torch.zeros_like(behind), error.sum() / (3 * rays)
+        slopes[:, :3] = off * (2 / (3 * rays))
+        if points is not None:  # as `sighting_loss`
+            light, ends = whole.colour[:, 3], ~points.isnan()
+            share = self.sightings / seen
+            slopes[:, 3] = torch.where(ends & (light >= 1e-3) & (light <= 1), -share / light, 0)
+            loss = loss - share * torch.log(light[ends].clamp(1e-3, 1)).sum()
+        answers = torch.empty_like(sums)
+        answers[order, : c + 1] = whole.gradients(part, ray, slopes, behind)
+        answers[order, c + 1], answers[order, c + 2] = whole.front, error[ray]
+        return answers, loss
 
     # --- the grid --------------------------------------------------------------------------------------------------
 
@@ -290,9 +328,7 @@ class RankRenderer(Renderer):
         return super().image(*args, chunk=PICTURE_CHUNK if chunk is None else chunk, **given)
 
 
-def _lies_at(seen: Tensor, samples: Samples, rays: int) -> Tensor:
-    """Whether each sample [m] lies where a point was seen, for the last rays, as in `sighting_loss`; 0 or 1."""
-    distances = samples.depths.new_full((rays,), float("nan"))
-    distances[rays - len(seen) :] = seen
-    distances = distances[samples.ray_index]
-    return ((samples.depths - distances).abs() <= NEARBY * distances + samples.deltas).to(samples.depths.dtype)
+def _lies_at(distances: Tensor, samples: Samples) -> Tensor:
+    """Whether each sample [m] lies where a point was seen, at the distance [r] of its ray or NaN: 0 or 1."""
+    at = distances[samples.ray_index]
+    return ((samples.depths - at).abs() <= NEARBY * at + samples.deltas).to(samples.depths.dtype)

@@ -15,7 +15,7 @@ from voronerf.diagram.subdivision import Split
 from voronerf.distributed.checkpoint import RankWriter, ownership
 from voronerf.distributed.gradients import add_entries, pack_entries
 from voronerf.distributed.group import Group
-from voronerf.distributed.renderer import RankRenderer
+from voronerf.distributed.renderer import Learnt, RankRenderer
 from voronerf.distributed.sharing import Sharing, assign_cells
 from voronerf.ops.select_heaviest import select_heaviest
 from voronerf.rendering.occupancy import OccupancyGrid
@@ -160,14 +160,14 @@ class RankTrainer(Trainer):
             heaviest, importance = select_heaviest(found.positions, found.importance, len(kept))
             kept[: len(heaviest), :3], kept[: len(heaviest), 3] = heaviest, importance
         own, seen = (None, kept.new_empty(0, 2)) if grid is None else self.renderer.observations(grid, found)
-        total, kept, others = self._tell(kept, seen, len(found.positions))
+        total, loss, kept, others = self._tell(found, kept, seen)
         if grid is not None and own is not None:
             backend = "auto" if config.backend == "warp" else config.backend
             self.renderer.observe(grid, own, others, decay=OCCUPANCY_DECAY, backend=backend)
-        self.guard.judge(found.loss + total, self.optimizer)
+        self.guard.judge(total, self.optimizer)
         summed()
         self.optimizer.step()
-        return (found.loss, kept[:, :3], kept[:, 3]) if collects else (found.loss, None, None)
+        return (loss, kept[:, :3], kept[:, 3]) if collects else (loss, None, None)
 
     def _begin_sum(self) -> Callable[[], None]:
         """Begins to add up the gradients of what all ranks have but tables; what it returns waits for the end."""
@@ -182,47 +182,50 @@ class RankTrainer(Trainer):
 
         return end
 
-    def _tell(self, kept: Tensor, seen: Tensor, samples: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _tell(self, found: Learnt, kept: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Tells all ranks what each has to say in a step: they add up the tables' gradients, and agree on the rest.
 
-        That is the time, a stop, a checkpoint and the rays of the next step.
+        That is the loss, the time, a stop, a checkpoint and the rays of the next step.
 
         Args:
+            found: By this rank.
             kept: [n, 4], the heaviest samples, as many on all ranks.
             seen: [c, 2], see :meth:`RankRenderer.observations`.
-            samples: How many this rank has evaluated.
 
         Returns:
-            The sum of all gradients that the guard reads, what all ranks have kept, and what the others have seen.
+            The sum of the loss and of all gradients that the guard reads; the loss; what all ranks have kept; and what
+            the others have seen.
         """
         dense = [p for group in self.optimizer.param_groups if not group.get("sparse") for p in group["params"]]
         passed = (self._measured - self._told) * (self.group.rank == 0)
         self._told = self._measured
-        news = kept.new_tensor((0.0, passed, float(self._asked), float(self.writer.ready), samples, len(seen)))
-        news[0] = sum(p.grad.sum() for p in dense if p.grad is not None)
+        samples = len(found.positions)
+        news = kept.new_tensor((len(seen), passed, float(self._asked), float(self.writer.ready), samples, 0, 0))
+        news[5] = found.loss
+        news[6] = found.loss + sum(p.grad.sum() for p in dense if p.grad is not None)
         gradients = [p.grad.reshape(-1) for p in self._tables if p.grad is not None]
         flat = torch.cat(gradients) if len(gradients) > 1 else gradients[0] if gradients else news[:0]
         message = torch.cat((news, kept.view(-1), seen.view(-1), pack_entries(flat)))
         parts = [part[:, 0] for part in self.group.share("news", message[:, None])]
-        said = torch.stack([part[:6] for part in parts])
-        first = 6 + 4 * len(kept)
-        ends = (first + 2 * said[:, 5]).int().tolist()
+        said = torch.stack([part[:7] for part in parts])
+        first = 7 + 4 * len(kept)
+        ends = (first + 2 * said[:, 0]).int().tolist()
         if len(flat):
             entries = [part[end:] for part, end in zip(parts, ends, strict=True)]
             _set_gradients(self._tables, add_entries(entries, len(flat)))
         total = said.sum(0)
-        _, passed, asked, ready, samples, _ = total.tolist()
+        _, passed, asked, ready, samples, *_ = total.tolist()
         self._agreed += passed
         self.stopped |= asked > 0
         if ready == self.group.size:
             self.writer.commit()
         if self.occupancy is not None:
             self.rays = next_rays(self.config, self.rays, int(samples))
-        kept = torch.cat([part[6:first] for part in parts]).view(-1, 4)
+        kept = torch.cat([part[7:first] for part in parts]).view(-1, 4)
         others = [
             part[first:end] for i, (part, end) in enumerate(zip(parts, ends, strict=True)) if i != self.group.rank
         ]
-        return total[0], kept, torch.cat(others).view(-1, 2)
+        return total[6], total[5], kept, torch.cat(others).view(-1, 2)
 
     def _check_moments(self) -> bool:
         finite = bool(self.group.largest(torch.tensor(float(not all_finite(self.optimizer)), device=self.device)) == 0)
