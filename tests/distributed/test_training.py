@@ -103,7 +103,7 @@ def test_two_ranks_are_one_process(runs, name):
 
 
 def test_what_a_rank_holds_and_sends(runs):
-    """Its own cells, and 24 bytes a run with some room, in place of the 64 that both ways might take."""
+    """Its own cells, and 28 bytes a run there and back with some room, where points are learnt from too."""
     one = tensors(runs / "one-dense")
     whole = sum(v.numel() for k, v in one.items() if k.startswith(("router.module.", "optimizer.")))
     for rank in (0, 1):
