@@ -89,6 +89,20 @@ def _point(origin: wp.vec3, direction: wp.vec3, at: wp.float32, space: wp.array2
 
 
 @wp.func
+def _mixed(bits: wp.uint32) -> wp.uint32:
+    x = (bits ^ (bits >> wp.uint32(16))) * wp.uint32(0x7FEB352D)
+    x = (x ^ (x >> wp.uint32(15))) * wp.uint32(0x846CA68B)
+    return x ^ (x >> wp.uint32(16))
+
+
+@wp.func
+def _hashed(key: wp.uint32, stratum: wp.int32) -> wp.float32:
+    # A number in [0, 1) for each stratum of a ray.
+    h = _mixed(key ^ (wp.uint32(stratum) * wp.uint32(0x9E3779B9)))
+    return wp.float32(h >> wp.uint32(8)) / 16777216.0
+
+
+@wp.func
 def _cell(point: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) -> wp.int32:
     scale = wp.float32(size) / (high - low)
     place = (point - low) * scale
@@ -108,6 +122,8 @@ def _march_kernel(
     box: wp.array2d(dtype=wp.float32),
     uniforms: wp.array2d(dtype=wp.float32),
     jittered: wp.bool,
+    seed: wp.array(dtype=wp.int32),
+    hashed: wp.bool,
     start: wp.array(dtype=wp.int32),
     started: wp.bool,
     space: wp.array2d(dtype=wp.float32),
@@ -136,6 +152,9 @@ def _march_kernel(
     if not counting:
         row = offsets[ray]
         room = offsets[ray + 1] - row
+    key = wp.uint32(0)
+    if hashed:
+        key = _mixed(wp.uint32(seed[0]) + wp.uint32(ray))
     found = wp.int32(0)
     going = end > begin and stratum < samples
     while going:
@@ -144,6 +163,8 @@ def _march_kernel(
         inside = wp.float32(0.5)
         if jittered:
             inside = uniforms[ray, stratum]
+        if hashed:
+            inside = _hashed(key, stratum)
         at = _sample(begin, end, stratum, inside, samples, disparity, first, last)
         point = _point(origin, direction, at, space)
         x = _cell(point[0], box[0, 0], box[1, 0], occupied.shape[0])
@@ -185,6 +206,7 @@ def march_rays(
     samples: int,
     *,
     uniforms: Tensor | None = None,
+    seed: Tensor | None = None,
     disparity: bool = False,
     start: Tensor | None = None,
     most: int | None = None,
@@ -193,7 +215,7 @@ def march_rays(
 ) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
     rest = (samples, disparity, samples if most is None else most)
-    tensors = (origins, directions, near, far, occupied, box, uniforms, start, contraction)
+    tensors = (origins, directions, near, far, occupied, box, uniforms, seed, start, contraction)
     offsets = _count(*tensors, *rest, MAX_COUNT if capacity is None else capacity)
     rows = int(offsets[-1]) if capacity is None else capacity
     return March(offsets, *_fill(*tensors, offsets, *rest, rows))
@@ -208,6 +230,7 @@ def _count(
     occupied: Tensor,
     box: Tensor,
     uniforms: Tensor | None,
+    seed: Tensor | None,
     start: Tensor | None,
     contraction: Tensor | None,
     samples: int,
@@ -218,7 +241,7 @@ def _count(
     offsets = near.new_zeros(near.shape[0] + 1, dtype=torch.int32)
     counts = offsets[1:]
     inputs = _inputs(
-        origins, directions, near, far, occupied, box, uniforms, start, contraction, samples, disparity, most
+        origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
     )
     none, no_index = array(near[:0], near), array(offsets[:0], near)
     results = [array(counts, near), no_index, none, none, array(origins[:0], near), no_index]
@@ -236,6 +259,7 @@ def _fill(
     occupied: Tensor,
     box: Tensor,
     uniforms: Tensor | None,
+    seed: Tensor | None,
     start: Tensor | None,
     contraction: Tensor | None,
     offsets: Tensor,
@@ -248,7 +272,7 @@ def _fill(
     depths, deltas, positions = near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3)
     stop = near.new_empty(near.shape[0], dtype=torch.int32)
     inputs = _inputs(
-        origins, directions, near, far, occupied, box, uniforms, start, contraction, samples, disparity, most
+        origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
     )
     results = [
         array(offsets[:0], near),
@@ -266,6 +290,7 @@ def _inputs(
     occupied: Tensor,
     box: Tensor,
     uniforms: Tensor | None,
+    seed: Tensor | None,
     start: Tensor | None,
     contraction: Tensor | None,
     samples: int,
@@ -275,10 +300,11 @@ def _inputs(
     """The inputs of both launches, in the order of the kernel."""
     places = near.new_empty(0, 0) if uniforms is None else uniforms
     views = [array(tensor, near) for tensor in (origins, directions, near, far, occupied, box, places)]
+    hashed = [array(seed, near, torch.int32), seed is not None]
     first = [array(start, near, torch.int32), start is not None]
     # [0, 0] for the world's own, [1, 4] or [5, 3].
     space = near.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1])
-    return [*views, uniforms is not None, *first, array(space, near), samples, disparity, most]
+    return [*views, uniforms is not None, *hashed, *first, array(space, near), samples, disparity, most]
 
 
 @_count.register_fake
@@ -290,6 +316,7 @@ def _(
     occupied: Tensor,
     box: Tensor,
     uniforms: Tensor | None,
+    seed: Tensor | None,
     start: Tensor | None,
     contraction: Tensor | None,
     samples: int,
@@ -309,6 +336,7 @@ def _(
     occupied: Tensor,
     box: Tensor,
     uniforms: Tensor | None,
+    seed: Tensor | None,
     start: Tensor | None,
     contraction: Tensor | None,
     offsets: Tensor,

@@ -46,6 +46,7 @@ def _render_loss_kernel(
     target: wp.array2d(dtype=wp.float32),
     background: wp.array2d(dtype=wp.float32),
     scale: wp.float32,
+    hidden: wp.float32,
     colour: wp.array2d(dtype=wp.float32),
     weights: wp.array(dtype=wp.float32),
     error: wp.array(dtype=wp.float32),
@@ -89,6 +90,9 @@ def _render_loss_kernel(
         if density > _OPAQUE:
             slope = wp.float32(0.0)
         gradient[i, 3] = to_optical * deltas[i] * slope
+        if wp.exp(-ahead) <= hidden:
+            for k in range(4):
+                gradient[i, k] = 0.0
 
 
 @wp.kernel
@@ -105,9 +109,10 @@ def render_loss(
     *,
     background: Tensor | None = None,
     density_scale: float,
+    hidden: float = 0.0,
 ) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
-    *parts, _ = _render_loss(raw.float(), deltas, ray_offsets, target, background, density_scale)
+    *parts, _ = _render_loss(raw.float(), deltas, ray_offsets, target, background, density_scale, hidden)
     return RenderLoss(*parts)
 
 
@@ -119,6 +124,7 @@ def _render_loss(
     target: Tensor,
     background: Tensor | None,
     density_scale: float,
+    hidden: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
     _, colour, weights, density, error, gradient = _allocate(raw, target)
@@ -127,7 +133,7 @@ def _render_loss(
     behind = target.new_empty(0, 3) if background is None else background.expand_as(target)
     given = [array(tensor, raw) for tensor in (raw, deltas, ray_offsets, target, behind)]
     results = [array(tensor, raw) for tensor in (colour, weights, error, gradient)]
-    launch(_render_loss_kernel, target.shape[0], [*given, density_scale, *results], raw)
+    launch(_render_loss_kernel, target.shape[0], [*given, density_scale, hidden, *results], raw)
     launch(_density_kernel, raw.shape[0], [given[0], density_scale, array(density, raw)], raw)
     loss = (error.mean(dtype=torch.float64) / 3).float()
     return loss, colour, weights, density, error, gradient
@@ -141,6 +147,7 @@ def _(
     target: Tensor,
     background: Tensor | None,
     density_scale: float,
+    hidden: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     return _allocate(raw, target)
 

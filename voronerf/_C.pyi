@@ -141,6 +141,7 @@ class MarchInputs(NamedTuple):
     occupied: Tensor | None  # const uint8*
     box: Tensor | None  # const float32*
     uniforms: Tensor | None  # const float32*
+    seed: Tensor | None  # const int32*
     start: Tensor | None  # const int32*
     r: int  # int64
     s: int  # int64
@@ -256,6 +257,7 @@ class RenderLossInputs(NamedTuple):
     background: Tensor | None  # const float32*
     background_per_ray: bool
     density_scale: float  # float32
+    hidden: float  # float32
     r: int  # int64
     m: int  # int64
 

@@ -141,7 +141,7 @@ def composite_backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tu
 
 def render_loss_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     """Of the forward op of render_loss, the last of whose results is the gradient of the loss."""
-    *tensors, ctx.density_scale = inputs
+    *tensors, ctx.density_scale, ctx.hidden = inputs
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(*output[1:])
     ctx.save_for_backward(*tensors, output[-1])
@@ -154,12 +154,12 @@ def render_loss_backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) ->
         found = None
     elif torch.is_grad_enabled():
         raw, deltas, ray_offsets, target, background = tensors
-        given = {"background": background, "density_scale": ctx.density_scale}
+        given = {"background": background, "density_scale": ctx.density_scale, "hidden": ctx.hidden}
         loss = render_loss(raw, deltas, ray_offsets, target, **given).loss
         (found,) = torch.autograd.grad(loss, raw, of_loss, create_graph=True)
     else:
         found = of_loss * gradient
-    return found, None, None, None, None, None
+    return found, None, None, None, None, None, None
 
 
 def encode_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -65,14 +65,16 @@ constexpr Field<S, M> field(const char* name, M S::* member) {
 #define VN_EACH_14(S, m, ...) VN_EACH_1(S, m), VN_EACH_13(S, __VA_ARGS__)
 #define VN_EACH_15(S, m, ...) VN_EACH_1(S, m), VN_EACH_14(S, __VA_ARGS__)
 #define VN_EACH_16(S, m, ...) VN_EACH_1(S, m), VN_EACH_15(S, __VA_ARGS__)
-#define VN_PICK(_1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11, _12, _13, _14, _15, _16, chosen, ...) chosen
-#define VN_STRUCT(S, ...)                                                                                           \
-  template <>                                                                                                       \
-  struct Fields<S> {                                                                                                \
-    static constexpr const char* type = #S;                                                                         \
-    static constexpr auto members = std::make_tuple(VN_PICK(                                                        \
-        __VA_ARGS__, VN_EACH_16, VN_EACH_15, VN_EACH_14, VN_EACH_13, VN_EACH_12, VN_EACH_11, VN_EACH_10, VN_EACH_9, \
-        VN_EACH_8, VN_EACH_7, VN_EACH_6, VN_EACH_5, VN_EACH_4, VN_EACH_3, VN_EACH_2, VN_EACH_1, )(S, __VA_ARGS__)); \
+#define VN_EACH_17(S, m, ...) VN_EACH_1(S, m), VN_EACH_16(S, __VA_ARGS__)
+#define VN_PICK(_1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11, _12, _13, _14, _15, _16, _17, chosen, ...) chosen
+#define VN_STRUCT(S, ...)                                                                                            \
+  template <>                                                                                                        \
+  struct Fields<S> {                                                                                                 \
+    static constexpr const char* type = #S;                                                                          \
+    static constexpr auto members =                                                                                  \
+        std::make_tuple(VN_PICK(__VA_ARGS__, VN_EACH_17, VN_EACH_16, VN_EACH_15, VN_EACH_14, VN_EACH_13, VN_EACH_12, \
+                                VN_EACH_11, VN_EACH_10, VN_EACH_9, VN_EACH_8, VN_EACH_7, VN_EACH_6, VN_EACH_5,       \
+                                VN_EACH_4, VN_EACH_3, VN_EACH_2, VN_EACH_1, )(S, __VA_ARGS__));                      \
   }
 
 // Objects of a class that Python has from the module, and only hands back.

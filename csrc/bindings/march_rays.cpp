@@ -5,8 +5,8 @@
 namespace voronerf {
 
 VN_STRUCT(MarchSpace, sphere, perspective);
-VN_STRUCT(MarchInputs, origins, directions, near, far, occupied, box, uniforms, start, r, s, x, y, z, disparity, most,
-          space);
+VN_STRUCT(MarchInputs, origins, directions, near, far, occupied, box, uniforms, seed, start, r, s, x, y, z, disparity,
+          most, space);
 
 VN_BINDINGS(module) {
   module.cpu("march_rays_count", VN_CPU(march_rays_count_cpu));

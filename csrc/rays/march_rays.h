@@ -22,7 +22,8 @@ struct MarchInputs {
   const float *near, *far;            // [r]
   const uint8_t* occupied;            // [x,y,z], 0 or 1
   const float* box;                   // [2,3]
-  const float* uniforms;              // [r,s], or null for the middles
+  const float* uniforms;              // [r,s], or null
+  const int32_t* seed;                // [1], of hashed uniforms, or null; neither: the middles
   const int32_t* start;               // [r], or null for 0
   int64_t r, s;
   int64_t x, y, z;

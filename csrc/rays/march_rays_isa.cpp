@@ -36,6 +36,21 @@ VN_INLINE float sample_at(const Ray& ray, int64_t i, float inside, float first, 
   return above > last ? last : above;
 }
 
+// Chris Wellons' lowbias32.
+VN_INLINE uint32_t mixed(uint32_t x) {
+  x = (x ^ x >> 16) * 0x7feb352du;
+  x = (x ^ x >> 15) * 0x846ca68bu;
+  return x ^ x >> 16;
+}
+
+// The key of a ray, and a number in [0, 1) of one of its strata.
+VN_INLINE uint32_t key_of(const MarchInputs& in, int64_t i) {
+  return in.seed == nullptr ? 0 : mixed(static_cast<uint32_t>(*in.seed) + static_cast<uint32_t>(i));
+}
+VN_INLINE float hashed(uint32_t key, uint32_t stratum) {
+  return static_cast<float>(static_cast<int32_t>(mixed(key ^ stratum * 0x9e3779b9u) >> 8)) * 0x1p-24f;
+}
+
 enum class Space { kWorld, kSphere, kPerspective };
 
 // The point at a distance along a ray, in the space of the grid.
@@ -111,12 +126,15 @@ VN_INLINE void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int
     uint32_t* own = mask + i * words;
     for (int64_t w = 0; w < words; ++w) own[w] = 0;
     const int64_t start = in.start == nullptr || in.start[i] < 0 ? 0 : in.start[i];
+    const uint32_t key = key_of(in, i);
     int64_t found = 0;
     for (int64_t w = start / kMarchWord; ray.far > ray.near && w < words && found < in.most; ++w) {
       const int64_t first = w * kMarchWord, left = in.s - first;
       int32_t cells[kMarchWord];
       float uniforms[kMarchWord];
-      if (Jittered) {
+      if (Jittered && in.seed != nullptr) {
+        for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = hashed(key, static_cast<uint32_t>(first + j));
+      } else if (Jittered) {
         const int64_t there = left < kMarchWord ? left : kMarchWord;
         for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = 0.0f;
         __builtin_memcpy(uniforms, in.uniforms + i * in.s + first, sizeof(float) * there);
@@ -149,6 +167,7 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
     const uint32_t* own = mask + i * words;
     int64_t row = offsets[i], got = 0, next = in.s;
     const int64_t room = offsets[i + 1] - row;
+    const uint32_t key = key_of(in, i);
     bool cut = false;
     for (int64_t w = 0; w < words && !cut; ++w) {
       for (uint32_t word = own[w]; word != 0; word &= word - 1) {
@@ -159,7 +178,9 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
           break;
         }
         const float first = edge_at<Disparity>(ray, stratum), last = edge_at<Disparity>(ray, stratum + 1);
-        const float inside = in.uniforms == nullptr ? 0.5f : in.uniforms[i * in.s + stratum];
+        float inside = 0.5f;
+        if (in.uniforms != nullptr) inside = in.uniforms[i * in.s + stratum];
+        if (in.seed != nullptr) inside = hashed(key, static_cast<uint32_t>(stratum));
         ray_index[row] = static_cast<int32_t>(i);
         depths[row] = sample_at<Disparity>(ray, stratum, inside, first, last);
         deltas[row] = last - first;
@@ -174,12 +195,12 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
 
 template <Space S>
 VN_INLINE void count_in(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
+  const bool middles = in.uniforms == nullptr && in.seed == nullptr;
   if (in.disparity) {
-    in.uniforms == nullptr ? count<S, false, true>(in, mask, counts, begin, end)
-                           : count<S, true, true>(in, mask, counts, begin, end);
+    middles ? count<S, false, true>(in, mask, counts, begin, end) : count<S, true, true>(in, mask, counts, begin, end);
   } else {
-    in.uniforms == nullptr ? count<S, false, false>(in, mask, counts, begin, end)
-                           : count<S, true, false>(in, mask, counts, begin, end);
+    middles ? count<S, false, false>(in, mask, counts, begin, end)
+            : count<S, true, false>(in, mask, counts, begin, end);
   }
 }
 

@@ -13,8 +13,6 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kRays = 64;  // of a task
-
 void rays_of(Isa isa, const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {
   VN_FOR_ISA(isa, render_loss_rays(in, out, begin, end))
 }
@@ -37,9 +35,10 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
   }
   strays_of(isa, in, out, 0, in.offsets[0]);
   strays_of(isa, in, out, in.offsets[in.r], in.m);
-  const int64_t blocks = (in.r + kRays - 1) / kRays;
-  parallel_for(blocks, 1, threads,
-               [&](int64_t block) { rays_of(isa, in, out, block * kRays, std::min(in.r, (block + 1) * kRays)); });
+  const int64_t blocks = (in.r + kRenderLossRays - 1) / kRenderLossRays;
+  parallel_for(blocks, 1, threads, [&](int64_t block) {
+    rays_of(isa, in, out, block * kRenderLossRays, std::min(in.r, (block + 1) * kRenderLossRays));
+  });
   double sum = 0.0;
   for (int64_t i = 0; i < in.r; ++i) sum += static_cast<double>(out.error[i]);
   *out.loss = static_cast<float>(sum / (3.0 * static_cast<double>(in.r)));

@@ -97,7 +97,8 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
     const float taken = share_behind(active ? own * weight : 0.0f, lane, behind);
     const float of_optical = own * (arriving * expf(-sample.optical)) - taken;
     if (!active) continue;
-    const float4 row = make_float4(of_raw[0], of_raw[1], of_raw[2], of_optical * sample.delta * sample.slope);
+    float4 row = make_float4(of_raw[0], of_raw[1], of_raw[2], of_optical * sample.delta * sample.slope);
+    if (arriving <= in.hidden) row = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     *reinterpret_cast<float4*>(out.gradient + 4 * i) = row;
   }
 }

@@ -16,6 +16,7 @@ struct RenderLossInputs {
   const float* background;  // [r,3], or [3], or null
   bool background_per_ray;
   float density_scale;
+  float hidden;  // share of the light; samples that no more than it reaches have no gradient
   int64_t r, m;
 };
 

@@ -1,10 +1,11 @@
 // The CPU kernels of render_loss, once for each instruction set.
 //
 // The arithmetic is that of composite (composite_isa.cpp) between the activations of the networks' outputs and the
-// squared error of the colour. A ray goes by twice: forwards in chunks that stay in the first-level cache, until its
-// colour and so the gradient to it is known, and backwards with the sum of what is behind. A ray of one chunk, almost
-// every ray, is activated once. Longer rays are activated again on the way back; the optical depth in front of their
-// samples waits where the gradient of the density is to be.
+// squared error of the colour. With an occupancy grid a ray has few samples, fewer than a vector: so those of several
+// rays go by together, forwards in chunks that stay in the first-level cache, until the colours and so the gradients to
+// them are known, and backwards with the sum of what is behind. Only sums along a ray are taken one by one. Rays of one
+// chunk are activated once. The samples of a longer ray are activated again on the way back; the optical depth in front
+// of them waits where the gradient of the density is to be.
 #include "rays/render_loss_isa.h"
 
 #include "common/elementwise_math.h"
@@ -17,11 +18,19 @@ namespace {
 constexpr int64_t kChunk = 128;
 constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
 
-// Samples [first, first + count), in the order of a ray, filled up to whole vectors by samples of no extent.
+// Samples [first, first + count), in the order of their rays, filled up to whole vectors by samples of no extent.
 struct Chunk {
-  alignas(64) float rgb[3][kChunk];
-  alignas(64) float density[kChunk], slope[kChunk];  // slope: of the density to its raw output
+  alignas(64) float rgb[3][kChunk], shade[3][kChunk];  // shade: the gradient to the colour of the ray
+  alignas(64) float density[kChunk], slope[kChunk];    // slope: of the density to its raw output
   alignas(64) float deltas[kChunk], optical[kChunk], front[kChunk];
+  alignas(64) float light[kChunk], weights[kChunk];  // the share of the light that reaches a sample
+  alignas(64) float part[kChunk], own[kChunk];
+};
+
+// What is summed along the rays of a task.
+struct Sums {
+  double front[kRenderLossRays], behind[kRenderLossRays], light[3][kRenderLossRays];
+  float slopes[3][kRenderLossRays];
 };
 
 VN_INLINE F32 finite(F32 density) {
@@ -53,94 +62,149 @@ VN_INLINE void put(float* to, const float* from, int64_t count) {
   __builtin_memcpy(to, from, sizeof(float) * count);
 }
 
+VN_INLINE F32 only(Bits lanes, F32 value) {
+  return reinterpret_cast<F32>(lanes & reinterpret_cast<Bits>(value));
+}
+
 // exp(-x) for x >= 0, 0 where float32 has nothing smaller.
 VN_INLINE F32 transmittance(F32 x) {
   const F32 minus = splat(0.0f) - x;
   return minus < splat(-87.0f) ? splat(0.0f) : exponential(minus);
 }
 
-VN_INLINE float sum(F32 a) {
-  float lanes[kLanes];
-  store(lanes, a);
-  for (int half = kLanes / 2; half > 0; half /= 2) {
-    for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
+// Light and weights from the optical depth in front of samples and their own.
+VN_INLINE void weigh(int64_t count, Chunk& chunk) {
+  for (int64_t i = count; i % kLanes != 0; ++i) chunk.front[i] = 0.0f;
+  for (int64_t i = 0; i < count; i += kLanes) {
+    const F32 light = transmittance(load(chunk.front + i));
+    store(chunk.light + i, light);
+    store(chunk.weights + i, light * (splat(0.0f) - exponential_minus_one(splat(0.0f) - load(chunk.optical + i))));
   }
-  return lanes[0];
 }
 
-VN_INLINE void render_ray(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t ray, int64_t begin,
-                          int64_t end, Chunk& chunk) {
-  F32 light[3] = {splat(0.0f), splat(0.0f), splat(0.0f)};
-  double before = 0.0;
-  const bool together = end - begin <= kChunk;
-  for (int64_t first = begin; first < end; first += kChunk) {
-    const int64_t count = end - first < kChunk ? end - first : kChunk;
+// run(ray, begin, end) for the rays from `from` to `to`, with their samples of a chunk by their places in it.
+template <typename Run>
+VN_INLINE void each_ray(const RenderLossInputs& in, int64_t from, int64_t to, int64_t first, int64_t count,
+                        const Run& run) {
+  for (int64_t ray = from; ray < to; ++ray) {
+    const int64_t begin = in.offsets[ray] - first, end = in.offsets[ray + 1] - first;
+    run(ray - from, begin < 0 ? 0 : begin, end < count ? end : count);
+  }
+}
+
+VN_INLINE void forward(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
+                       int64_t first, int64_t count, bool together, Chunk& chunk, Sums& sums) {
+  activate(in, first, count, chunk);
+  put(out.density + first, chunk.density, count);
+  each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
+    double front = sums.front[ray];
+    for (int64_t i = begin; i < end; ++i) {
+      chunk.front[i] = static_cast<float>(front);
+      front += static_cast<double>(chunk.optical[i]);
+    }
+    sums.front[ray] = front;
+  });
+  weigh(count, chunk);
+  for (int64_t i = 0; i < count; i += kLanes) {
+    for (int k = 0; k < 3; ++k) store(chunk.shade[k] + i, load(chunk.weights + i) * load(chunk.rgb[k] + i));
+  }
+  each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
+    for (int k = 0; k < 3; ++k) {
+      for (int64_t i = begin; i < end; ++i) sums.light[k][ray] += static_cast<double>(chunk.shade[k][i]);
+    }
+  });
+  for (int64_t i = 0; !together && i < count; ++i) out.gradient[4 * (first + i) + 3] = chunk.front[i];
+}
+
+// The colours of rays, their errors, and the gradients to them.
+VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to, Sums& sums) {
+  const float share = 2.0f / (3.0f * static_cast<float>(in.r));
+  for (int64_t ray = from; ray < to; ++ray) {
+    const float* background = in.background;
+    if (background != nullptr && in.background_per_ray) background += 3 * ray;
+    float lanes[kLanes];
+    store(lanes, transmittance(splat(static_cast<float>(sums.front[ray - from]))));
+    const float left = lanes[0];
+    float error = 0.0f;
+    double behind = 0.0;
+    for (int k = 0; k < 3; ++k) {
+      const float shown = background == nullptr ? 0.0f : background[k];
+      const float colour = static_cast<float>(sums.light[k][ray - from]) + left * shown;
+      const float off = colour - in.target[3 * ray + k], slope = off * share;
+      out.colour[3 * ray + k] = colour;
+      error += off * off;
+      sums.slopes[k][ray - from] = slope;
+      behind += static_cast<double>(slope) * shown * left;
+    }
+    out.error[ray] = error;
+    sums.behind[ray - from] = behind;
+  }
+}
+
+VN_INLINE void backward(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
+                        int64_t first, int64_t count, bool together, Chunk& chunk, Sums& sums) {
+  if (!together) {
     activate(in, first, count, chunk);
-    put(out.density + first, chunk.density, count);
-    for (int64_t i = 0; i < count; ++i) {
-      chunk.front[i] = static_cast<float>(before);
-      before += static_cast<double>(chunk.optical[i]);
-    }
-    for (int64_t i = count; i % kLanes != 0; ++i) chunk.front[i] = 0.0f;
-    for (int64_t i = 0; i < count; i += kLanes) {
-      const F32 weight = transmittance(load(chunk.front + i)) *
-                         (splat(0.0f) - exponential_minus_one(splat(0.0f) - load(chunk.optical + i)));
-      for (int k = 0; k < 3; ++k) light[k] = fma(weight, load(chunk.rgb[k] + i), light[k]);
-    }
-    for (int64_t i = 0; !together && i < count; ++i) out.gradient[4 * (first + i) + 3] = chunk.front[i];
+    for (int64_t i = 0; i < count; ++i) chunk.front[i] = out.gradient[4 * (first + i) + 3];
+    weigh(count, chunk);
   }
-  const float* background = in.background;
-  if (background != nullptr && in.background_per_ray) background += 3 * ray;
-  float lanes[kLanes];
-  store(lanes, transmittance(splat(static_cast<float>(before))));
-  const float left = lanes[0], share = 2.0f / (3.0f * static_cast<float>(in.r));
-  float slopes[3], error = 0.0f;
-  double behind = 0.0;
+  each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
+    for (int k = 0; k < 3; ++k) {
+      for (int64_t i = begin; i < end; ++i) chunk.shade[k][i] = sums.slopes[k][ray];
+    }
+  });
   for (int k = 0; k < 3; ++k) {
-    const float shown = background == nullptr ? 0.0f : background[k];
-    const float colour = sum(light[k]) + left * shown, off = colour - in.target[3 * ray + k];
-    out.colour[3 * ray + k] = colour;
-    error += off * off;
-    slopes[k] = off * share;
-    behind += static_cast<double>(slopes[k]) * shown * left;
+    for (int64_t i = count; i % kLanes != 0; ++i) chunk.shade[k][i] = 0.0f;
   }
-  out.error[ray] = error;
+  for (int64_t i = 0; i < count; i += kLanes) {
+    const F32 light = load(chunk.light + i), weight = load(chunk.weights + i);
+    const Bits seen = ~(light <= splat(in.hidden));  // as is NaN
+    F32 gradient = splat(0.0f);
+    for (int k = 0; k < 3; ++k) {
+      const F32 value = load(chunk.rgb[k] + i), shade = load(chunk.shade[k] + i);
+      gradient = fma(shade, value, gradient);
+      store(chunk.rgb[k] + i, only(seen, weight * shade * (value * (splat(1.0f) - value))));
+    }
+    store(chunk.part + i, gradient * weight);
+    store(chunk.own + i, gradient * (light * transmittance(load(chunk.optical + i))));
+    store(chunk.slope + i, only(seen, load(chunk.slope + i)));
+  }
+  each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
+    double behind = sums.behind[ray];
+    for (int64_t i = end; i-- > begin;) {
+      chunk.own[i] = static_cast<float>(static_cast<double>(chunk.own[i]) - behind);
+      behind += static_cast<double>(chunk.part[i]);
+    }
+    sums.behind[ray] = behind;
+  });
+  put(out.weights + first, chunk.weights, count);
+  for (int64_t i = 0; i < count; i += kLanes) {
+    store(chunk.own + i, load(chunk.own + i) * load(chunk.deltas + i) * load(chunk.slope + i));
+  }
+  float* gradient = out.gradient + 4 * first;
+  for (int64_t i = 0; i < count; ++i) {
+    for (int k = 0; k < 3; ++k) gradient[4 * i + k] = chunk.rgb[k][i];
+    gradient[4 * i + 3] = chunk.own[i];
+  }
+}
+
+// Rays whose samples fill a chunk at most, or one longer ray.
+VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
+                           Chunk& chunk, Sums& sums) {
+  const int64_t begin = in.offsets[from], end = in.offsets[to];
+  const bool together = end - begin <= kChunk;
+  for (int64_t ray = 0; ray < to - from; ++ray) {
+    sums.front[ray] = 0.0;
+    for (int k = 0; k < 3; ++k) sums.light[k][ray] = 0.0;
+  }
+  for (int64_t first = begin; first < end; first += kChunk) {
+    forward(in, out, from, to, first, end - first < kChunk ? end - first : kChunk, together, chunk, sums);
+  }
+  compare(in, out, from, to, sums);
   for (int64_t last = end; last > begin;) {
-    const int64_t count = (last - begin - 1) % kChunk + 1, first = last - count;
-    if (!together) {
-      activate(in, first, count, chunk);
-      for (int64_t i = 0; i < count; ++i) chunk.front[i] = out.gradient[4 * (first + i) + 3];
-      for (int64_t i = count; i % kLanes != 0; ++i) chunk.front[i] = 0.0f;
-    }
-    alignas(64) float weights[kChunk], part[kChunk], own[kChunk];
-    for (int64_t i = 0; i < count; i += kLanes) {
-      const F32 minus = splat(0.0f) - load(chunk.optical + i), front = transmittance(load(chunk.front + i));
-      const F32 absorbed = splat(0.0f) - exponential_minus_one(minus);
-      const F32 through = transmittance(load(chunk.optical + i)), weight = front * absorbed;
-      F32 gradient = splat(0.0f);
-      for (int k = 0; k < 3; ++k) {
-        const F32 value = load(chunk.rgb[k] + i);
-        gradient = fma(splat(slopes[k]), value, gradient);
-        store(chunk.rgb[k] + i, weight * splat(slopes[k]) * (value * (splat(1.0f) - value)));
-      }
-      store(weights + i, weight);
-      store(part + i, gradient * weight);
-      store(own + i, gradient * (front * through));
-    }
-    for (int64_t i = count; i-- > 0;) {
-      own[i] = static_cast<float>(static_cast<double>(own[i]) - behind);
-      behind += static_cast<double>(part[i]);
-    }
-    put(out.weights + first, weights, count);
-    for (int64_t i = 0; i < count; i += kLanes) {
-      store(own + i, load(own + i) * load(chunk.deltas + i) * load(chunk.slope + i));
-    }
-    float* gradient = out.gradient + 4 * first;
-    for (int64_t i = 0; i < count; ++i) {
-      for (int k = 0; k < 3; ++k) gradient[4 * i + k] = chunk.rgb[k][i];
-      gradient[4 * i + 3] = own[i];
-    }
-    last = first;
+    const int64_t count = (last - begin - 1) % kChunk + 1;
+    last -= count;
+    backward(in, out, from, to, last, count, together, chunk, sums);
   }
 }
 
@@ -148,7 +212,12 @@ VN_INLINE void render_ray(const RenderLossInputs& in, const RenderLossOutputs& o
 
 void render_loss_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {
   Chunk chunk;
-  for (int64_t ray = begin; ray < end; ++ray) render_ray(in, out, ray, in.offsets[ray], in.offsets[ray + 1], chunk);
+  Sums sums;
+  for (int64_t from = begin, to; from < end; from = to) {
+    to = from + 1;
+    while (to < end && in.offsets[to + 1] - in.offsets[from] <= kChunk) ++to;
+    render_rays(in, out, from, to, chunk, sums);
+  }
 }
 
 void render_loss_strays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {

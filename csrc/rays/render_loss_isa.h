@@ -6,6 +6,8 @@
 
 namespace voronerf {
 
+constexpr int64_t kRenderLossRays = 64;  // of a call, at most
+
 VN_DECLARE_FOR_ISA(void render_loss_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin,
                                          int64_t end))
 // Samples of no ray: only their density is of interest.

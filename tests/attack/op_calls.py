@@ -151,6 +151,8 @@ def march_rays(rng: random.Random, n: int) -> Call:
     call["near"] += 0.01
     if rng.random() < 0.5:
         call["uniforms"] = torch.rand(n, samples, dtype=dtype)
+    elif rng.random() < 0.5:
+        call["seed"] = torch.randint(-(2**31), 2**31, (1,), dtype=torch.int32)
     if rng.random() < 0.3:
         call |= {"start": index(n, samples), "most": rng.randint(1, 9), "capacity": rng.randint(1, 200)}
     call["contraction"] = rng.choice((None, torch.rand(4, dtype=dtype) + 0.1, torch.rand(5, 3, dtype=dtype) + 0.1))
@@ -202,6 +204,7 @@ def render_loss(rng: random.Random, n: int) -> Call:
     wide = torch.promote_types(dtype, torch.float32)
     call: Call = {"raw": spread(rng, torch.randn(n, 4).to(dtype)), "deltas": torch.rand(n, dtype=wide)}
     call |= {"ray_offsets": offsets(rng, n, r), "target": torch.rand(r, 3, dtype=wide), "density_scale": 3.0}
+    call["hidden"] = rng.choice((0.0, 1e-3, 0.5))
     return {**call, "background": rng.choice((None, torch.rand(3, dtype=wide), torch.rand(r, 3, dtype=wide)))}
 
 

@@ -105,11 +105,29 @@ def test_equals_the_reference_to_the_last_bit(device, backend, rest, r, samples)
             {"uniforms": torch.rand(r, samples)},
             {"start": torch.randint(0, samples + 2, (r,), dtype=torch.int32)},
             {"most": 3, "uniforms": torch.rand(r, samples)},
+            {"most": 9, "seed": torch.randint(-(2**31), 2**31, (1,), dtype=torch.int32)},
             {"capacity": 41},
             {"capacity": 5000, "most": 2, "start": torch.randint(0, samples, (r,), dtype=torch.int32)},
         ):
             expected = march(given, samples, torch.device("cpu"), "reference", **rest, **more)
             same(march(given, samples, device, backend, **rest, **more), expected)
+
+
+def test_a_seed_stands_for_uniforms_of_its_own(device, backend):
+    r, samples = 200, 40
+    box = torch.tensor([[-99.0] * 3, [99.0] * 3])
+    given = case(r) | {"occupied": torch.ones(1, 1, 1, dtype=torch.bool), "box": box}
+    given["near"], given["far"] = torch.zeros(r), torch.full((r,), float(samples))  # strata of length 1
+    drawn = []
+    for seed in (7, 8, -(2**31)):
+        found = march(given, samples, device, backend, seed=torch.tensor([seed], dtype=torch.int32))
+        drawn.append(found.depths.reshape(r, samples) - torch.arange(samples))
+    assert all(bool((part >= 0).all() and (part <= 1).all()) for part in drawn)
+    near, other = drawn[0].flatten(), drawn[1].flatten()
+    shares = torch.histc(near, 20, 0, 1) / len(near)
+    torch.testing.assert_close(shares, torch.full((20,), 0.05), atol=0.012, rtol=0)
+    neighbours = (near[:-1], near[1:]), (drawn[0][:-1].flatten(), drawn[0][1:].flatten()), (near, other)
+    assert all(abs(float(torch.corrcoef(torch.stack(pair))[0, 1])) < 0.05 for pair in neighbours)
 
 
 def test_waves_give_together_what_one_call_gives(device, backend):
@@ -164,6 +182,9 @@ def test_refuses_what_makes_no_sense():
     refuses("samples must be at least 1, got 0", samples=0)
     refuses("samples must be at most 65535, got 65536", samples=65_536)
     refuses("uniforms must have shape [r, s] with r = 4, s = 8, got [4, 7]", uniforms=torch.zeros(4, 7))
+    seed = torch.zeros(1, dtype=torch.int32)
+    refuses("seed must be None where uniforms are given, got both", uniforms=torch.zeros(4, 8), seed=seed)
+    refuses("seed must have dtype int32, got int64", seed=seed.long())
     refuses("start must have dtype int32, got int64", start=torch.zeros(4, dtype=torch.int64))
     refuses("most must be at least 1, got 0", most=0)
     refuses("capacity must be at least 1, got 0", capacity=0)

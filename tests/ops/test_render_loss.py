@@ -28,7 +28,7 @@ def step_by_step(raw, deltas, offsets, target, background):
     return RenderLoss(off.mean(), seen.colour, seen.weights, density, off.sum(-1))
 
 
-def evaluate(device, given, dtype, backend):
+def evaluate(device, given, dtype, backend, hidden=0.0):
     """All results, and the gradient of three times the loss."""
     raw, deltas, offsets, target, background = (t.to(device) for t in given)
     wide = torch.promote_types(dtype, torch.float32)
@@ -38,7 +38,8 @@ def evaluate(device, given, dtype, backend):
     if backend is None:
         found = step_by_step(leaf, *rest, background)
     else:
-        found = render_loss(leaf, *rest, background=background, density_scale=SCALE, backend=backend)
+        options = {"density_scale": SCALE, "hidden": hidden, "backend": backend}
+        found = render_loss(leaf, *rest, background=background, **options)
     (gradient,) = torch.autograd.grad(3 * found.loss, leaf)
     return [*(part.detach() for part in found), gradient]
 
@@ -79,6 +80,18 @@ def test_backgrounds(device, backend):
     assert torch.equal(shared.colour[1], one)
     black = render_loss(raw, deltas, offsets, target, **rest)
     assert torch.equal(black.colour[1], torch.zeros(3, device=device))
+
+
+@pytest.mark.parametrize("counts", [[40, 0, 3, 90], [300]])
+def test_what_little_light_reaches_has_no_gradient(device, backend, counts):
+    given = rays(counts, outside=(1, 2))
+    *plain, whole = evaluate(device, given, torch.float32, backend)
+    *others, found = evaluate(device, given, torch.float32, backend, hidden=0.3)
+    assert all(torch.equal(a, b) for a, b in zip(plain, others))
+    light = plain[2] / -torch.expm1(-plain[3] * given[1].to(plain[3]))
+    seen = (light > 0.3) & (torch.arange(len(light), device=light.device) > 0)
+    assert 0 < int(seen.sum()) < len(light) - 3
+    assert torch.equal(found, whole * seen[:, None])
 
 
 def test_rows_apart_in_memory(device, backend):
@@ -125,9 +138,8 @@ def test_the_gradient_has_a_gradient(device, backend):
     for dtype, chosen in ((torch.float64, "reference"), (torch.float32, "reference"), (torch.float32, backend)):
         raw, deltas, target, background = (given[i].to(device, dtype) for i in (0, 1, 3, 4))
         raw.requires_grad_()
-        found = render_loss(
-            raw, deltas, given[2].to(device), target, background=background, density_scale=SCALE, backend=chosen
-        )
+        rest = {"background": background, "density_scale": SCALE, "hidden": 0.2, "backend": chosen}
+        found = render_loss(raw, deltas, given[2].to(device), target, **rest)
         (gradient,) = torch.autograd.grad(found.loss, raw, create_graph=True)
         (second,) = torch.autograd.grad(gradient.square().sum(), raw)
         if dtype == torch.float64:
@@ -160,7 +172,7 @@ def test_native_does_not_depend_on_threads_and_passes_opcheck(isa):
         torch.set_num_threads(before)
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
     few = rays([2, 0, 3], torch.float32)
-    arguments = (few[0].requires_grad_(), *few[1:], SCALE)
+    arguments = (few[0].requires_grad_(), *few[1:], SCALE, 0.1)
     torch.library.opcheck(torch.ops.voronerf.render_loss_native.default, arguments)
 
 
@@ -187,6 +199,8 @@ def test_bad_arguments():
         render_loss(raw, deltas, offsets, target.double(), **rest)
     with refused(ValueError, "render_loss: density_scale must be positive, got 0.0"):
         render_loss(raw, deltas, offsets, target, density_scale=0.0)
+    with refused(ValueError, "render_loss: hidden must lie in [0, 1), got 1.0"):
+        render_loss(raw, deltas, offsets, target, hidden=1.0, **rest)
 
 
 def test_offsets_that_fall(backend):

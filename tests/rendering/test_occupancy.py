@@ -209,7 +209,7 @@ def test_training_samples_and_gradients_are_those_of_the_dense_form(backend):
     found = []
     for render, more in ((render_rays, ()), (render_marched, (grid,))):
         scale = torch.tensor(2.0, requires_grad=True)
-        options = {"samples": 20, "background": background, "jitter": True, "generator": seeded(3), "backend": backend}
+        options = {"samples": 20, "background": background, "backend": backend}
         field = lambda p, d, i, scale=scale: ((p * scale).sigmoid(), p.square().sum(-1) * scale)  # noqa: E731
         result = render(field, rays, near, far, *more, **options)
         result.colour.square().sum().backward()

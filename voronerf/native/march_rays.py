@@ -27,6 +27,7 @@ def march_rays(
     samples: int,
     *,
     uniforms: Tensor | None = None,
+    seed: Tensor | None = None,
     disparity: bool = False,
     start: Tensor | None = None,
     most: int | None = None,
@@ -35,7 +36,7 @@ def march_rays(
 ) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
     rest = (samples, disparity, samples if most is None else most)
-    tensors = (origins, directions, near, far, occupied, box, uniforms, start, contraction)
+    tensors = (origins, directions, near, far, occupied, box, uniforms, seed, start, contraction)
     mask, offsets = _count(*tensors, *rest, MAX_COUNT if capacity is None else capacity)
     rows = int(offsets[-1]) if capacity is None else capacity
     return March(offsets, *_fill(*tensors, mask, offsets, *rest, rows))
@@ -50,6 +51,7 @@ def _count(
     occupied: Tensor,
     box: Tensor,
     uniforms: Tensor | None,
+    seed: Tensor | None,
     start: Tensor | None,
     contraction: Tensor | None,
     samples: int,
@@ -62,7 +64,7 @@ def _count(
     offsets = near.new_empty(r + 1, dtype=torch.int32)
     yield mask, offsets
     given = _inputs(
-        origins, directions, near, far, occupied, box, uniforms, start, contraction, samples, disparity, most
+        origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
     )
     native.compiled.march_rays_count(given, mask, offsets, capacity, native.cpu())
 
@@ -76,6 +78,7 @@ def _fill(
     occupied: Tensor,
     box: Tensor,
     uniforms: Tensor | None,
+    seed: Tensor | None,
     start: Tensor | None,
     contraction: Tensor | None,
     mask: Tensor,
@@ -90,7 +93,7 @@ def _fill(
     results = ray_index, depths, deltas, positions, stop
     yield results
     given = _inputs(
-        origins, directions, near, far, occupied, box, uniforms, start, contraction, samples, disparity, most
+        origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
     )
     native.compiled.march_rays_fill(given, mask, offsets, rows, *results, native.cpu())
 
@@ -103,6 +106,7 @@ def _inputs(
     occupied: Tensor,
     box: Tensor,
     uniforms: Tensor | None,
+    seed: Tensor | None,
     start: Tensor | None,
     contraction: Tensor | None,
     samples: int,
@@ -119,6 +123,7 @@ def _inputs(
         occupied=occupied.view(torch.uint8),
         box=box,
         uniforms=uniforms,
+        seed=seed,
         start=start,
         r=near.shape[0],
         s=samples,

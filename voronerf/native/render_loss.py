@@ -23,21 +23,24 @@ def render_loss(
     *,
     background: Tensor | None = None,
     density_scale: float,
+    hidden: float = 0.0,
 ) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
-    *parts, _ = _render_loss(raw.float(), deltas, ray_offsets, target, background, density_scale)
+    *parts, _ = forward(raw.float(), deltas, ray_offsets, target, background, density_scale, hidden)
     return RenderLoss(*parts)
 
 
 @custom_op("render_loss_native")
-def _render_loss(
+def forward(
     raw: Tensor,
     deltas: Tensor,
     ray_offsets: Tensor,
     target: Tensor,
     background: Tensor | None,
     density_scale: float,
+    hidden: float,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    """Loss, colour, weights, density, error, and the gradient of the loss to ``raw``."""
     r, m = target.shape[0], raw.shape[0]
     loss, colour, error = raw.new_empty(()), raw.new_empty(r, 3), raw.new_empty(r)
     weights, density, gradient = raw.new_empty(m), raw.new_empty(m), raw.new_empty(m, 4)
@@ -51,6 +54,7 @@ def _render_loss(
         background=background,
         background_per_ray=background is not None and background.dim() == 2,
         density_scale=density_scale,
+        hidden=hidden,
         r=r,
         m=m,
     )
@@ -60,4 +64,4 @@ def _render_loss(
     compiled.render_loss(given, results, native.machine(raw))
 
 
-_render_loss.register_autograd(render_loss_backward, setup_context=render_loss_setup)
+forward.register_autograd(render_loss_backward, setup_context=render_loss_setup)

@@ -10,7 +10,7 @@ read on the host. The backward op is that of ``grouped_mlp``, given the order. S
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,6 +40,37 @@ def routed_mlp(
     features: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
+    where = Where(centres, child_offsets, child, depth, centre_weights, cells, coords)
+    arguments, dtype = prepared(positions, weights, biases, layers, where, directions, direction_index, features)
+    out, found, *_ = forward(*arguments)
+    given = arguments[7]
+    return out.to(dtype), found if given is None else given
+
+
+class Where(NamedTuple):
+    """What tells the cells, as ``voronerf.ops.routed_mlp`` takes it."""
+
+    centres: Tensor | None = None
+    child_offsets: Tensor | None = None
+    child: Tensor | None = None
+    depth: int = 1
+    centre_weights: Tensor | None = None
+    cells: Tensor | None = None
+    coords: Tensor | None = None
+
+
+def prepared(
+    positions: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    layers: MLP,
+    where: Where,
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    features: Tensor | None,
+) -> tuple[tuple[Any, ...], torch.dtype]:
+    """The arguments of ``forward``, and the type of the result."""
+    centres, child_offsets, child, depth, centre_weights, cells, coords = where
     own = features is not None and features.dim() == 3
     before = grouped_mlp.hashes_before(positions, weights, layers, directions)
     if own and before and weights[0].shape[0] > 1 and cells is None:
@@ -55,25 +86,13 @@ def routed_mlp(
     tables = centres, child_offsets, child, centre_weights
     if cells is None and weights[0].shape[0] == 1:
         coords, tables = None, (None, None, None, None)
-    out, found, *_ = _forward(
-        given.positions,
-        given.weights,
-        given.biases,
-        given.table,
-        given.directions,
-        direction_index,
-        given.features,
-        cells,
-        coords,
-        *tables,
-        depth,
-        grouped_mlp.keeps_encoded(given),
-    )
-    return out.to(given.dtype), found if cells is None else cells
+    samples = given.positions, given.weights, given.biases, given.table, given.directions, direction_index
+    keep = grouped_mlp.keeps_encoded(given)
+    return (*samples, given.features, cells, coords, *tables, depth, keep), given.dtype
 
 
 @custom_op("routed_mlp_native")
-def _forward(
+def forward(
     positions: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
@@ -150,4 +169,4 @@ def _backward(ctx: Any, gradient: Tensor | None, *_others: None) -> tuple[Any, .
     return of_positions, of_weights, of_biases, None, of_directions, None, of_features, *[None] * 8
 
 
-_forward.register_autograd(_backward, setup_context=_setup)
+forward.register_autograd(_backward, setup_context=_setup)

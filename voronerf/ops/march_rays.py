@@ -37,6 +37,7 @@ def march_rays(
     samples: int,
     *,
     uniforms: Tensor | None = None,
+    seed: Tensor | None = None,
     spacing: str = "linear",
     start: Tensor | None = None,
     most: int | None = None,
@@ -70,6 +71,7 @@ def march_rays(
         box: [2, 3], lowest and highest corner, the second above the first.
         samples: strata of a ray, s, 1 to 65,535.
         uniforms: [r, s] in 0 to 1, the place of each sample in its stratum; None for the middles.
+        seed: int32 [1], in place of ``uniforms``: they are hashes of seed, ray and stratum, the same for every backend.
         spacing: of the strata, "linear" or "disparity" (equal steps of 1 / distance).
         start: int32 [r], the first stratum to consider, >= 0; None for 0.
         most: largest number of samples of a ray, at least 1; None for all.
@@ -115,6 +117,11 @@ def march_rays(
         check_shape(_OP, "contraction", contraction, (4,) if sphere else (5, 3))
     if uniforms is not None:
         check_shape(_OP, "uniforms", uniforms, ("r", "s"), {**sizes, "s": samples})
+    if seed is not None:
+        if uniforms is not None:
+            raise ValueError(f"{_OP}: seed must be None where uniforms are given, got both")
+        check_shape(_OP, "seed", seed, (1,))
+        check_dtype(_OP, "seed", seed, INDEX)
     if start is not None:
         check_shape(_OP, "start", start, ("r",), sizes)
         check_dtype(_OP, "start", start, INDEX)
@@ -137,6 +144,7 @@ def march_rays(
         occupied=occupied,
         box=box,
         uniforms=uniforms,
+        seed=seed,
         start=start,
         contraction=contraction,
     )
@@ -158,6 +166,7 @@ def march_rays(
             *tensors,
             samples,
             uniforms=None if uniforms is None else uniforms.detach(),
+            seed=seed,
             disparity=spacing == "disparity",
             start=start,
             most=most,

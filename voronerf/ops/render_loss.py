@@ -34,6 +34,7 @@ def render_loss(
     *,
     background: Tensor | None = None,
     density_scale: float,
+    hidden: float = 0.0,
     backend: str = "auto",
 ) -> RenderLoss:
     """The mean squared error of rendered rays, from what the networks put out for their samples.
@@ -50,6 +51,8 @@ def render_loss(
         target: [r, 3], the colours to learn.
         background: [3] or [r, 3], added with weight 1 - opacity, or None.
         density_scale: factor on the density, > 0.
+        hidden: share of the light, in [0, 1). Samples that no more than it reaches have no gradient; they count as all
+            others in those of the samples in front of them.
         backend: "auto", "reference", "native" or "warp".
 
     ``deltas``, ``target`` and ``background`` are float32, or float64 where ``raw`` is; so are the results. The loss is
@@ -80,23 +83,34 @@ def render_loss(
     check_shape(_OP, "raw", raw, ("m", 4), sizes)
     check_shape(_OP, "deltas", deltas, ("m",), sizes)
     check_shape(_OP, "ray_offsets", ray_offsets, ("r+1",), sizes)
-    check_shape(_OP, "target", target, ("r", 3), sizes)
     check_dtype(_OP, "raw", raw)
     check_dtype(_OP, "ray_offsets", ray_offsets, INDEX)
     wide = (torch.promote_types(raw.dtype, torch.float32),)
     check_dtype(_OP, "deltas", deltas, wide)
-    check_dtype(_OP, "target", target, wide)
-    if background is not None:
-        check_tensor(_OP, "background", background)
-        check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
-        check_dtype(_OP, "background", background, wide)
+    check_targets(_OP, target, background, wide, sizes)
     check_same_device(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
     check_no_inference(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
     check_count(_OP, "raw", raw.numel())
     check_number(_OP, "density_scale", density_scale)
     if not density_scale > 0:
         raise ValueError(f"{_OP}: density_scale must be positive, got {density_scale}")
+    check_number(_OP, "hidden", hidden)
+    if not 0 <= hidden < 1:
+        raise ValueError(f"{_OP}: hidden must lie in [0, 1), got {hidden}")
     run = backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)
     constant = (deltas.detach(), ray_offsets, target.detach())
     background = None if background is None else background.detach()
-    return RenderLoss(*run(raw, *constant, background=background, density_scale=float(density_scale)))
+    numbers = {"density_scale": float(density_scale), "hidden": float(hidden)}
+    return RenderLoss(*run(raw, *constant, background=background, **numbers))
+
+
+def check_targets(
+    op: str, target: Tensor, background: Tensor | None, dtypes: tuple[torch.dtype, ...], sizes: dict[str, int]
+) -> None:
+    """Checks what rays are compared with; ``sizes`` holds r."""
+    check_shape(op, "target", target, ("r", 3), sizes)
+    check_dtype(op, "target", target, dtypes)
+    if background is not None:
+        check_tensor(op, "background", background)
+        check_shape(op, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
+        check_dtype(op, "background", background, dtypes)

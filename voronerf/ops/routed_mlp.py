@@ -135,7 +135,7 @@ def routed_mlp(
     check_no_inference(_OP, **tensors)
     if centres is not None:
         points = positions[:, :3] if coords is None else coords
-        coords, centres, centre_weights = _one_dtype(points, centres, centre_weights)
+        coords, centres, centre_weights = of_one_dtype(points, centres, centre_weights)
     device, dtype = positions.device, weights[0].dtype
     run: Callable[..., tuple[Tensor, Tensor]]
     if backend == "auto" and _is_composed(device.type, device.index, dtype):
@@ -205,7 +205,7 @@ def _check_tables(
         raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
 
 
-def _one_dtype(coords: Tensor, centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+def of_one_dtype(coords: Tensor, centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
     """What is compared, in one type: float64 where any is, float32 otherwise."""
     dtype = torch.promote_types(torch.promote_types(coords.dtype, centres.dtype), torch.float32)
     if weights is not None:

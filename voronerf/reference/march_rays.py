@@ -53,6 +53,7 @@ def march_rays(
     samples: int,
     *,
     uniforms: Tensor | None = None,
+    seed: Tensor | None = None,
     disparity: bool = False,
     start: Tensor | None = None,
     most: int | None = None,
@@ -66,6 +67,8 @@ def march_rays(
     count = near.new_full((), samples)
     edges = _depth(near[:, None], far[:, None], stratum.to(near.dtype) / count, disparity)
     edges = torch.where(stratum < samples, edges, far[:, None])
+    if seed is not None:
+        uniforms = hashed_uniforms(seed, r, samples).to(near.dtype)
     inside = near.new_full((), 0.5) if uniforms is None else uniforms
     at = _depth(near[:, None], far[:, None], (stratum[:-1].to(near.dtype) + inside) / count, disparity)
     at = torch.minimum(torch.maximum(at, edges[:, :-1]), edges[:, 1:])
@@ -109,6 +112,21 @@ def march_rays(
     full = (got == wanted) & (wanted == (samples if most is None else most))
     stop = torch.where(got < wanted, waiting, torch.where(full, last + 1, samples))
     return March(offsets.to(torch.int32), ray_index, depths, deltas, positions, stop.to(torch.int32))
+
+
+def hashed_uniforms(seed: Tensor, r: int, samples: int) -> Tensor:
+    """Numbers in [0, 1), [r, samples], each a hash of its place and of seed, int32 [1]; exact in float32."""
+    ray, stratum = (torch.arange(count, device=seed.device) for count in (r, samples))
+    key = _mixed(ray + seed.long())
+    return (_mixed(key[:, None] ^ stratum * 0x9E3779B9) >> 8) / 2**24
+
+
+def _mixed(x: Tensor) -> Tensor:
+    """The last 32 bits of int64, mixed (lowbias32 of Chris Wellons)."""
+    x = x & 0xFFFFFFFF
+    x = ((x ^ (x >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
+    x = ((x ^ (x >> 15)) * 0x846CA68B) & 0xFFFFFFFF
+    return x ^ (x >> 16)
 
 
 def contracted(points: list[Tensor], contraction: Tensor | None) -> list[Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -45,11 +45,17 @@ def render_loss(
     *,
     background: Tensor | None = None,
     density_scale: float,
+    hidden: float = 0.0,
 ) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
-    colours, density = torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
     check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
+    given: dict[str, Any] = {"background": background, "density_scale": density_scale}
+    if hidden and raw.requires_grad:
+        found = render_loss(raw.detach(), deltas, ray_offsets, target, **given)
+        unseen = found.weights <= hidden * -torch.expm1(-found.density * deltas)
+        raw = torch.where(unseen[:, None], raw.detach(), raw)
+    colours, density = torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
     seen = composite(density, colours, deltas, deltas, ray_offsets=ray_offsets, background=background)
     error = (seen.colour - target).square().sum(-1)
     rest = (seen.colour, seen.weights, density, error)

@@ -5,19 +5,22 @@ r rays, m samples of all rays.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, cast
 
 import torch
 from torch import Tensor
 
+from voronerf import backends
 from voronerf.fields.radiance import activate_radiance
-from voronerf.ops.render_loss import render_loss
+from voronerf.ops.render_loss import RenderLoss, check_targets, render_loss
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, march_grid
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid
 from voronerf.rendering.volume import Rendered, weaken_near
 from voronerf.router import VoronoiRouter
+from voronerf.router.fused import routed_arguments
 
 
 class Comparison(NamedTuple):
@@ -106,20 +109,35 @@ def compare_marched(
         return None
     module: Any = field.module
     march = march_grid(rays, near, far, grid, renderer.samples, True, generator, renderer.spacing, backend)
-    raw = field.raw(march.positions, rays.directions, march.ray_index)
-    weaken_near(renderer.full_gradient, march.depths, raw)
-    found = render_loss(
-        raw,
-        march.deltas,
-        march.ray_offsets,
-        target,
-        background=background,
-        density_scale=float(module.density_scale),
-        backend=backend,
-    )
-    if raw.requires_grad:  # what next to no light reaches learns nothing, and takes no part in the backward pass
-        hidden = found.weights <= HIDDEN * -torch.expm1(-found.density * march.deltas)
-        raw.register_hook(lambda gradient: gradient.masked_fill(hidden[:, None], 0))
+    rest: dict[str, Any] = {
+        "background": background,
+        "density_scale": float(module.density_scale),
+        "hidden": HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
+    }
+    learn = _native_learning(renderer, march.positions)
+    given = march.positions, rays.directions, march.ray_index
+    routed = None if learn is None else routed_arguments(field, *given)
+    if learn is not None and routed is not None:
+        check_targets("compare", target, background, (torch.float32,), {"r": len(rays)})
+        found = learn(march, routed, target, **rest)
+    else:
+        raw = field.raw(*given)
+        weaken_near(renderer.full_gradient, march.depths, raw)
+        found = render_loss(raw, march.deltas, march.ray_offsets, target, **rest, backend=backend)
     return Comparison(
         found.loss, found.error, march.positions, found.weights, march.ray_index, found.density, march.deltas
     )
+
+
+def _native_learning(renderer: Marching, positions: Tensor) -> Callable[..., RenderLoss] | None:
+    """Networks, loss and gradients in one, for the CPU in float32; None where that is not to be had."""
+    device, module = positions.device, cast(VoronoiRouter, renderer.field).module
+    if device.type != "cpu" or torch.is_autocast_enabled("cpu") or renderer.full_gradient is not None:
+        return None
+    if not torch.is_grad_enabled() or backends.missing("native", device) is not None:
+        return None
+    if any(tensor.dtype != torch.float32 for tensor in (positions, *module.parameters())):
+        return None
+    from voronerf.native.learn_rays import learn_rays  # which is there where the compiled module is
+
+    return learn_rays

@@ -95,7 +95,7 @@ def render_marched(
             contracted space.
         samples: s, strata of a ray.
         background: [3] or [r, 3]; None is black.
-        jitter: random samples in the strata, the same ones as in `render_rays`, else their middles.
+        jitter: random samples in the strata, else their middles.
         generator: of the jitter.
         spacing: of the strata, "linear" or "disparity".
         full_gradient: distance from which the gradients of samples are whole, nearer ones have smaller; None for any.
@@ -154,11 +154,12 @@ def march_grid(
     backend: str,
 ) -> March:
     """The samples of `render_marched`, whose arguments these are."""
-    uniforms = None
+    seed = None
     if jitter:
         device = near.device if generator is None else generator.device
-        uniforms = torch.rand(len(rays), samples, device=device, dtype=near.dtype, generator=generator).to(near.device)
-    return grid.march(rays, near, far, samples, uniforms=uniforms, spacing=spacing, backend=backend)
+        seed = torch.randint(-(2**31), 2**31, (1,), device=device, dtype=torch.int32, generator=generator)
+        seed = seed.to(near.device)
+    return grid.march(rays, near, far, samples, seed=seed, spacing=spacing, backend=backend)
 
 
 @torch.no_grad()

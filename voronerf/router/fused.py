@@ -10,21 +10,25 @@ Letters: n samples, k cells.
 from __future__ import annotations
 
 import copy
+import functools
 import itertools
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, fx, nn
 from torch.fx.node import map_arg
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.ops import routed_mlp
+from voronerf.ops.routed_mlp import of_one_dtype, routed_mlp
 from voronerf.router.grouped import PerCell, for_all_cells
 from voronerf.router.grouping import Grouping, owned_parameters
 from voronerf.router.layout import Call, Results, map_tensors, map_tree
 from voronerf.router.trace import BEFORE, BEHIND, CELLS, LAYERS, Column, Linear, Trace, Unfusable
+
+if TYPE_CHECKING:
+    from voronerf.router.router import VoronoiRouter
 
 # Fields with a layer table --------------------------------------------------------------------------------------------
 
@@ -59,19 +63,23 @@ def described_by_table(field: nn.Module) -> bool:
     They do not if a class has its own ``forward`` without its own ``linears`` and ``activate``, or if hooks or
     parametrisations, such as weight normalisation, change inputs, outputs or weights of layers.
     """
+    return "forward" not in vars(field) and _class_described_by_table(type(field)) and _is_plain(field)
+
+
+@functools.cache
+def _class_described_by_table(kind: type[nn.Module]) -> bool:
     first = {}
     for name in ("forward", "linears", "activate"):
-        first[name] = next((i for i, base in enumerate(type(field).__mro__) if name in vars(base)), 0)
-    if first["forward"] < max(first["linears"], first["activate"]) or "forward" in vars(field):
+        first[name] = next((i for i, base in enumerate(kind.__mro__) if name in vars(base)), 0)
+    return first["forward"] >= max(first["linears"], first["activate"])
+
+
+def _is_plain(part: nn.Module) -> bool:
+    """Whether nothing is hooked into a module and its parts; the iterators of ``nn.Module`` take ten times as long."""
+    parts = part._modules
+    if part._forward_hooks or part._forward_pre_hooks or part._backward_hooks or part._backward_pre_hooks:
         return False
-    return not any(
-        part._forward_hooks
-        or part._forward_pre_hooks
-        or part._backward_hooks
-        or part._backward_pre_hooks
-        or "parametrizations" in part._modules
-        for part in field.modules()
-    )
+    return "parametrizations" not in parts and all(_is_plain(each) for each in parts.values() if each is not None)
 
 
 def run_table(
@@ -84,13 +92,35 @@ def run_table(
     where: dict[str, Any],
 ) -> Tensor:
     """What the networks of a field give before its ``activate``: [n, out]; ``where`` tells ``routed_mlp`` the cells."""
+    given = {"directions": directions, "direction_index": ray_index, "backend": backend}
+    return routed_mlp(positions, **parameters_of_table(field, k), **given, **where)[0]
+
+
+def parameters_of_table(field: LayeredField, k: int) -> dict[str, Any]:
+    """The layers of a field with its parameters for k cells, as ``routed_mlp`` takes them."""
     linears = field.linears()
     # A parameter that all cells share has no dimension of cells; the operation takes one for each.
     weights = [w if w.dim() == 3 else w.expand(k, -1, -1) for w in [layer.weight for layer in linears]]
     biases = [b if b is None or b.dim() == 2 else b.expand(k, -1) for b in [layer.bias for layer in linears]]
-    hashed = {} if field.layers.grid is None else {"features": field.features}  # type: ignore[attr-defined]
-    given = {"directions": directions, "direction_index": ray_index, "backend": backend, **hashed, **where}
-    return routed_mlp(positions, weights, biases, layers=field.layers, **given)[0]
+    features = None if field.layers.grid is None else field.features  # type: ignore[attr-defined]
+    return {"layers": field.layers, "weights": weights, "biases": biases, "features": features}
+
+
+def routed_arguments(
+    router: VoronoiRouter, positions: Tensor, directions: Tensor, ray_index: Tensor
+) -> dict[str, Any] | None:
+    """The arguments with which ``routed_mlp`` gives what ``router.raw`` does; None where that is not all it does."""
+    rule = router._coords_of_table(None, (positions,), {}) if router.by_table else positions
+    if rule is not None or router._shards is not None:
+        return None
+    given = {"positions": positions, **parameters_of_table(router.field, router.num_cells)}
+    if router.field.layers.uses_directions:
+        given.update(directions=directions, direction_index=ray_index)
+    where = router._where(positions, None)
+    if "centres" in where:
+        compared = of_one_dtype(positions, where["centres"], where["centre_weights"])
+        where.update(zip(("coords", "centres", "centre_weights"), compared))
+    return {**given, **where}
 
 
 def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
