@@ -25,6 +25,11 @@ void encode_rows(Isa isa, const HashEncoding& in, float* out, int64_t begin, int
   VN_FOR_ISA(isa, hash_encode_rows(in, out, width_of(in), begin, end))
 }
 
+void encode_level(Isa isa, const HashEncoding& in, int64_t level, float* out, int64_t stride, int64_t begin,
+                  int64_t end) {
+  VN_FOR_ISA(isa, hash_encode_level(in, level, out, stride, begin, end))
+}
+
 void level_rows(Isa isa, const HashEncoding& in, int64_t level, const float* gradient, int64_t stride, int64_t begin,
                 int64_t end, float* of_table) {
   VN_FOR_ISA(isa, hash_encode_level_backward(in, level, gradient, stride, begin, end, of_table))
@@ -54,6 +59,11 @@ void hash_encode_cpu(const HashInputs& in, const HashGrid& grid, float* out, Isa
   check(in);
   const HashEncoding given = hash_encoding(in, grid);
   for_points(in.n, threads, [&](int64_t begin, int64_t end) { encode_rows(isa, given, out, begin, end); });
+}
+
+void hash_level_cpu(const HashEncoding& in, int64_t level, float* out, int64_t stride, int64_t begin, int64_t end,
+                    Isa isa) {
+  encode_level(isa, in, level, out + level * in.features, stride, begin, end);
 }
 
 void hash_level_backward_cpu(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,

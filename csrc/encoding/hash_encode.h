@@ -42,6 +42,11 @@ void hash_encode_cpu(const HashInputs& in, const HashGrid& grid, float* out, Isa
 void hash_encode_backward_cpu(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                               float* of_positions, Isa isa, int threads);
 
+// Features of one level for points `begin` to `end` of a result whose rows are `stride` floats apart. A part of
+// hash_encode_cpu, on the calling thread.
+void hash_level_cpu(const HashEncoding& in, int64_t level, float* out, int64_t stride, int64_t begin, int64_t end,
+                    Isa isa);
+
 // Gradient of one level's entries, zero before: what points `begin` to `end` give, in their order, of a gradient whose
 // rows are `stride` floats apart. A part of hash_encode_backward_cpu, on the calling thread.
 void hash_level_backward_cpu(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,

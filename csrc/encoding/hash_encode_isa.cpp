@@ -81,6 +81,17 @@ void hash_encode_rows(const HashEncoding& in, float* out, int64_t stride, int64_
   });
 }
 
+void hash_encode_level(const HashEncoding& in, int64_t level, float* out, int64_t stride, int64_t begin, int64_t end) {
+  for_table(in, [&](auto features, auto type) {
+    HashCorners corners;
+    for_blocks(in, begin, end, [&](int64_t first, int64_t rows, const HashPlaces& places) {
+      corners_of<false>(in, in.levels[level], places, rows, corners);
+      hash_interpolate<features.value, typename decltype(type)::Value>(in, in.levels[level], corners, first, rows,
+                                                                       out + first * stride, stride);
+    });
+  });
+}
+
 void hash_encode_level_backward(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,
                                 int64_t begin, int64_t end, float* of_table) {
   for_width(in.features, [&](auto features) {

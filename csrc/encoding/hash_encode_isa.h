@@ -14,6 +14,10 @@ constexpr int64_t kHashBlock = 64;  // points whose corners are in cache at a ti
 VN_DECLARE_FOR_ISA(void hash_encode_rows(const HashEncoding& in, float* out, int64_t stride, int64_t begin,
                                          int64_t end))
 
+// The same of one level: its features are the first of a row.
+VN_DECLARE_FOR_ISA(void hash_encode_level(const HashEncoding& in, int64_t level, float* out, int64_t stride,
+                                          int64_t begin, int64_t end))
+
 // Adds what those points give to the entries of one level to of_table.
 VN_DECLARE_FOR_ISA(void hash_encode_level_backward(const HashEncoding& in, int64_t level, const float* gradient,
                                                    int64_t stride, int64_t begin, int64_t end, float* of_table))

@@ -36,20 +36,20 @@ VN_INLINE HashEncoding hash_of_cell(const HashEncoding& all, int64_t cell, const
 }
 
 // Raw rows x, `x_stride` floats apart and as long as `staged` in the plan, -> `value`; with bfloat16 operands also
-// `pairs`. `backward`: hashed positions are there already, and other values are kept beside the pairs.
+// `pairs`. `encoded`: hashed positions are there already, and other values are kept beside the pairs.
 VN_INLINE void encode_input(const MlpPlanInput& input, const HashEncoding& hash, const float* x, int64_t x_stride,
-                            const float* table, int64_t rows, float* value, float* pairs, bool backward) {
+                            const float* table, int64_t rows, float* value, float* pairs, bool encoded) {
   const int64_t stride = input.value.stride;
   const Columns columns = columns_of(input);
   switch (input.encoding.kind) {
     case MlpEncodingKind::frequency:
-      return encode(x, x_stride, table, rows, columns, value, stride, pairs, pairs == nullptr || backward);
+      return encode(x, x_stride, table, rows, columns, value, stride, pairs, pairs == nullptr || encoded);
     case MlpEncodingKind::integrated:
       encode(x, x_stride, table, rows, columns, value, stride);
       blur(x + columns.d, x_stride, table, rows, value, stride);
       break;
     case MlpEncodingKind::hash:
-      if (!backward) hash_encode_rows(hash, value, stride, 0, rows);
+      if (!encoded) hash_encode_rows(hash, value, stride, 0, rows);
       break;
     case MlpEncodingKind::spherical:
       harmonics_of_rows(x, rows, input.encoding.size, value, stride);

@@ -167,6 +167,29 @@ Taught taught_rows(const MlpTable& table, const MlpInputs& in, const float* grad
   return found;
 }
 
+// Hashed positions of all rows before the tiles, level by level. A step of training has written the whole table since
+// it was read last. Many rows read most of a level: it is fetched in order, which takes a fraction of what waiting for
+// each entry does, and stays in cache until its rows are done.
+void encode_by_level(const MlpInputs& in, const MlpPlan& plan, const HashEncoding& all, float* positions, Isa isa,
+                     int threads) {
+  constexpr int64_t kLine = 64, kRun = 1024, kRows = 1 << 14;  // rows of a task
+  const int64_t first = in.offsets[0], end = in.offsets[in.k], runs = ceil_div(end - first, kRows);
+  parallel_for(in.order == nullptr ? 0 : end - first, kRun, threads,
+               [&](int64_t i) { std::copy_n(in.positions + 3 * in.order[first + i], 3, positions + 3 * (first + i)); });
+  parallel_for(all.count * runs, 1, threads, [&](int64_t item) {
+    const int64_t level = item / runs, begin = first + item % runs * kRows, stop = std::min(end, begin + kRows);
+    const int64_t entry = all.features * (all.in.type == TableType::float32 ? 4 : 2);
+    const char* table = static_cast<const char*>(all.in.table) + all.levels[level].offset * entry;
+    const int64_t size = all.levels[level].entries * entry;
+    for (int64_t byte = 0; 8 * kLine * (stop - begin) > size && byte < size; byte += kLine) {
+      __builtin_prefetch(table + byte, 0, 2);
+    }
+    HashEncoding one = all;
+    one.in.positions = in.order == nullptr ? in.positions : positions;
+    hash_level_cpu(one, level, in.encoded, plan.positions.value.stride, begin, stop, isa);
+  });
+}
+
 // Gradient of the hash grid's tables: the levels of each, one at a time, since one fits a cache where all of them do
 // not, and since the rows are then added up in their sorted order by any number of threads.
 void scatter_hashed(const MlpInputs& in, const MlpPlan& plan, const HashEncoding& all, const float* positions,
@@ -205,7 +228,11 @@ void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa
   data.out = out;
   const HashEncoding hash = hash_of(table, in);
   if (hash.count > 0) data.hash = &hash;
-  const Workspace workspace(stride(plan) * threads);
+  const bool shared = hash.count > 0 && in.tables == 1 && in.encoded != nullptr;
+  const int64_t sorted = shared && in.order != nullptr ? in.n * table.positions : 0;
+  const Workspace workspace(stride(plan) * threads + sorted);
+  data.encoded = shared;
+  if (shared) encode_by_level(in, plan, hash, workspace.data() + stride(plan) * threads, isa, threads);
   run_tasks(tasks, plan, data, workspace.data(), isa, threads,
             [&](const RowTask& task, float* own) { forward(isa, plan, data, task, own); });
 }

@@ -96,6 +96,7 @@ struct MlpData {
   // Rows of hashed positions in sorted order, or null: as they are encoded, which the forward pass writes and the
   // backward pass reads; and for the gradient of the hash grid, that of the encoding, and the raw rows.
   float* hashed = nullptr;
+  bool encoded = false;  // the forward pass finds them there
   float* hashed_gradient = nullptr;
   float* sorted_positions = nullptr;
 };

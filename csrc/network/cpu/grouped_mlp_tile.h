@@ -82,7 +82,8 @@ struct Tile {
 #else
     float* const pairs = nullptr;
 #endif
-    encode_input(input, hash, staged, stride, workspace + input.table, rows, value(input), pairs, plan.gradients);
+    encode_input(input, hash, staged, stride, workspace + input.table, rows, value(input), pairs,
+                 plan.gradients || data.encoded);
   }
 
   // The values of all layers that reach an output; `heads` false leaves out those that only do.
