@@ -81,8 +81,8 @@ def check_shape(
 
 def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATS) -> None:
     """Raises TypeError unless the tensor's dtype is one of ``dtypes``."""
-    check_tensor(op, name, tensor)
-    if tensor.dtype not in dtypes:
+    if not isinstance(tensor, Tensor) or tensor.dtype not in dtypes:
+        check_tensor(op, name, tensor)
         names = [_short(dtype) for dtype in dtypes]
         rule = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
         raise TypeError(f"{op}: {name} must have dtype {rule}, got {_short(tensor.dtype)}")

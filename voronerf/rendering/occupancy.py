@@ -184,14 +184,16 @@ class OccupancyGrid:
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
-        stretch = self._stretch(positions)
+        if self.contraction is not None:
+            stretch = self.contraction.stretch(positions)
+            density, deltas = density * stretch, deltas / stretch
         observe_occupancy(
             self.density,
             self.occupied,
             self.box,
             positions,
-            density.float() * stretch,
-            deltas / stretch,
+            density.float(),
+            deltas.float(),
             weights.float(),
             decay=decay,
             threshold=self.threshold,
@@ -214,6 +216,7 @@ class OccupancyGrid:
         samples: int,
         *,
         uniforms: Tensor | None = None,
+        seed: Tensor | None = None,
         spacing: str = "linear",
         start: Tensor | None = None,
         most: int | None = None,
@@ -229,6 +232,7 @@ class OccupancyGrid:
             self.box,
             samples,
             uniforms=uniforms,
+            seed=seed,
             spacing=spacing,
             start=start,
             most=most,

@@ -297,7 +297,8 @@ class Trainer:
         if self.occupancy is not None and self.step % OCCUPANCY_EVERY == 0:
             self.router.eval()
             self._revisit(self.occupancy)
-        self.renderer.train()
+        if not self.router.training:
+            self.renderer.train()
         loss, positions, importance = self._compute()
         if self.config.average:
             update_averages(self.optimizer, self.config.average, self.step)
@@ -313,7 +314,7 @@ class Trainer:
         config = self.config
         batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
         half = HALVES.get(config.precision)
-        with torch.autocast(self.device.type, half, enabled=half is not None, cache_enabled=False):
+        with nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False):
             given: dict[str, Any] = {"background": batch.background, "generator": self.draws, "seen": batch.seen}
             found = self.renderer.compare(batch.rays, batch.near, batch.far, batch.target, **given)
         if self.occupancy is not None:
