@@ -1,46 +1,52 @@
 """Where the milliseconds of a training step go.
 
-    python benchmarks/step_profile.py --data DIR --downscale 4
-    python benchmarks/step_profile.py --data builtin --json profile.json
+    python benchmarks/step_profile.py --data DIR --downscale 4 --threads 1
+    python benchmarks/step_profile.py --data builtin --field nerf --json profile.json
 
-Trains a scene until it has cells, then times whole steps, and profiles as many: the profiler's time of every
-operator is added up by what the operator is for. What the operators do not account for is Python and the dispatcher.
-The profiler makes small operators look slower than they are, so both times of a step are shown.
+Trains a scene until it has cells and knows its empty space, then times whole steps, and in as many more every call of
+the compiled module. What these do not account for is PyTorch and Python. A third run under PyTorch's profiler lists
+operators; it makes them look slower than they are.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import statistics
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 import tyro
 from harness import metadata
 from torch.profiler import ProfilerActivity, profile
 
+from voronerf import native
 from voronerf.cli.main import EXPECTED
 from voronerf.data import load_scene
 from voronerf.files import write_text
 from voronerf.training.config import SamplingName, TrainConfig
 from voronerf.training.trainer import Trainer
 
-# What operators are for, by what their names hold; the first that fits. The time of a forward pass that is recorded for
-# autograd stands under a name such as GeneratedBackwardFor_voronerf_routed_mlp_native_default.
+# What the compiled functions of a step are for, by how their names begin; the first that fits.
 PARTS = {
-    "route": ("routed_mlp", "grouped_mlp", "grouped_linear"),
-    "cells": ("nearest_centre", "locate_cell", "cell_sort"),
-    "composite": ("composite", "render_loss"),
-    "batch": ("pixel_rays",),
-    "march and occupancy": ("march_rays", "update_occupancy"),
-    "encoding": ("hash_encode",),
-    "optimiser": ("_fused_adam", "_foreach"),
-    "other operators": ("",),
+    "batch": ("pixel_rays", "camera_rays"),
+    "march": ("march_rays",),
+    "cells": ("nearest_centre", "locate_cell", "cell_sort", "draw_cell"),
+    "backward": ("grouped_mlp_backward", "grouped_linear_backward", "hash_encode_backward"),
+    "forward": ("grouped_mlp", "grouped_linear", "hash_encode", "encode"),
+    "loss": ("render_loss", "composite", "resample"),
+    "occupancy": ("observe_occupancy", "update_occupancy"),
+    "Adam of tables": ("sparse_adam",),
+    "PyTorch and Python": ("",),
 }
+REST = "PyTorch and Python"
 
 
 @dataclass(frozen=True)
@@ -53,26 +59,28 @@ class Options:
     """Factor by which the images are made smaller on load."""
     cells: int = 16
     """Cells; 1 is one network."""
-    field: str = "nerf"
+    field: str = "hashgrid"
     """The networks, as for `voronerf train`."""
     sampling: SamplingName = "stratified"
     """Samples along a ray, likewise."""
     field_options: tuple[str, ...] = ()
     """Further options of the networks, each as NAME=VALUE."""
-    occupancy: bool = False
-    """Whether samples in empty space are left out; times are then also given for each sample that is kept."""
+    occupancy: bool = True
+    """Whether samples in empty space are left out, where that works; times are given for each sample that is kept."""
     width: int | None = None
     """Channels of the networks' hidden layers; default that of the field."""
-    rays: int = 1024
-    """Rays per step."""
+    rays: int = 512
+    """Rays per step, of the first steps."""
     samples: int | None = None
     """Samples per ray; default that of the sampling."""
     bfloat16: bool = False
     """Networks under autocast to bfloat16."""
-    warm: int = 20
-    """Steps before, the split in their middle; an occupancy grid needs some 150 to find what is empty."""
-    steps: int = 60
-    """Steps to time, and as many to profile."""
+    warm: int = 1000
+    """Steps before, the split after a fifth of them; an occupancy grid needs some 150 to find what is empty."""
+    steps: int = 100
+    """Steps to time, and as many again with a clock around each compiled function, and under the profiler."""
+    threads: int | None = None
+    """Threads; default PyTorch's number."""
     backend: str = "auto"
     """Backend of the operations."""
     top: int = 12
@@ -96,16 +104,17 @@ def main() -> None:
 
 def measure(options: Options) -> dict[str, Any]:
     """Metadata, and rows {part, ms, share} and {operator, ms, calls} of a step."""
-    warm, every = options.warm, 2 * options.steps
+    warm, every = options.warm, 3 * options.steps
+    torch.set_num_threads(options.threads or torch.get_num_threads())
     with tempfile.TemporaryDirectory() as folder:
         config = TrainConfig(
             data=options.data,
             downscale=options.downscale,
             out=Path(folder),
-            # The split comes after the first tenth of the warm-up; nothing is evaluated or saved on the way.
+            # The split comes after a fifth of the warm-up; nothing is evaluated or saved on the way.
             steps=warm + every + 1,
             cells=(options.cells,) if options.cells > 1 else (),
-            split_at=(warm / 2 / (warm + every + 1),) if options.cells > 1 else None,
+            split_at=(warm / 5 / (warm + every + 1),) if options.cells > 1 else None,
             evaluations=1,
             field=options.field,
             field_options=options.field_options,
@@ -128,13 +137,14 @@ def measure(options: Options) -> dict[str, Any]:
 
         for _ in range(warm):
             step()
-        kept: list[int] = []
+        samples = 0
         if trainer.occupancy is not None:
             march = trainer.occupancy.march
 
             def counted(*given: Any, **named: Any) -> Any:
+                nonlocal samples
                 found = march(*given, **named)
-                kept.append(len(found.positions))
+                samples += len(found.positions)
                 return found
 
             trainer.occupancy.march = counted  # type: ignore[method-assign]
@@ -145,7 +155,10 @@ def measure(options: Options) -> dict[str, Any]:
             step()
             times.append(1e3 * (time.perf_counter() - start))
         used = time.process_time() - used
-        samples = sum(kept) or options.steps * options.rays * int(trainer.config.samples or 0)
+        samples = samples or options.steps * options.rays * int(trainer.config.samples or 0)
+        with clocked() as clock:
+            for _ in range(options.steps):
+                step()
         with profile(activities=[ProfilerActivity.CPU]) as profiled:
             start = time.perf_counter()
             for _ in range(options.steps):
@@ -161,13 +174,11 @@ def measure(options: Options) -> dict[str, Any]:
     ]
     operators.sort(key=lambda row: -row["ms"])
     sums = dict.fromkeys(PARTS, 0.0)
-    for row in operators:
-        name = row["operator"]
-        sums[next(part for part, names in PARTS.items() if any(each in name for each in names))] += row["ms"]
+    for name, seconds in clock.items():
+        part = next(part for part, names in PARTS.items() if name.startswith(names))
+        sums[part] += 1e3 * seconds / options.steps
     median = statistics.median(times)
-    # Of the step as it is without the profiler: what is neither of the parts before it.
-    accounted = sum(sums.values())
-    sums["Python and dispatch"] = max(median - accounted, 0.0)
+    sums[REST] = max(median - sum(sums.values()), 0.0)
     return {
         "metadata": metadata(
             benchmark="step_profile",
@@ -189,10 +200,39 @@ def measure(options: Options) -> dict[str, Any]:
             profiled_step_ms=profiled_ms,
         ),
         "results": [
-            *({"part": part, "ms": ms, "share": ms / median} for part, ms in sums.items()),
+            *(
+                {"part": part, "ms": ms, "share": ms / median, "ns": 1e6 * ms * options.steps / samples}
+                for part, ms in sums.items()
+            ),
             *operators,
         ],
     }
+
+
+@contextlib.contextmanager
+def clocked() -> Iterator[Counter[str]]:
+    """The seconds that each compiled function has taken since, by its name."""
+    spent: Counter[str] = Counter()
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any) -> Any:
+            start = time.perf_counter()
+            result = function(*given)
+            spent[name] += time.perf_counter() - start
+            return result
+
+        return call
+
+    compiled = native.compiled
+    every = [key for key in vars(compiled) if key[0].islower() and callable(getattr(compiled, key))]
+    before = {name: getattr(compiled, name) for name in every}
+    for name, function in before.items():
+        setattr(compiled, name, timed(name, function))
+    try:
+        yield spent
+    finally:
+        for name, function in before.items():
+            setattr(compiled, name, function)
 
 
 def show(result: dict[str, Any], top: int) -> None:
@@ -208,7 +248,7 @@ def show(result: dict[str, Any], top: int) -> None:
     rows = result["results"]
     for row in rows:
         if "part" in row:
-            print(f"  {row['part']:22s} {row['ms']:8.3f} ms  {100 * row['share']:5.1f} %")
+            print(f"  {row['part']:22s} {row['ms']:8.3f} ms  {100 * row['share']:5.1f} %  {row['ns']:6.1f} ns a sample")
     for row in [row for row in rows if "operator" in row][:top]:
         print(f"    {row['operator']:44s} {row['ms']:8.3f} ms  {row['calls']:6.1f} calls")
 
