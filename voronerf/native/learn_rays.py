@@ -37,9 +37,8 @@ def learn_rays(
         hidden: Likewise.
     """
     where = routed_mlp.Where(**{name: routed[name] for name in routed_mlp.Where._fields if name in routed})
-    names = "positions", "weights", "biases", "layers"
-    rest = routed.get("directions"), routed.get("direction_index"), routed.get("features")
-    arguments, _ = routed_mlp.prepared(*(routed[name] for name in names), where, *rest)
+    network = {name: value for name, value in routed.items() if name not in routed_mlp.Where._fields}
+    arguments, _ = routed_mlp.prepared(**network, where=where)
     rays = march.deltas, march.ray_offsets, target, background, density_scale, hidden
     _, weights, biases, *_ = arguments
     return RenderLoss(*_Learn.apply(arguments, rays, *weights, *biases, arguments[6]))

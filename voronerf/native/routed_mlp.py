@@ -65,9 +65,9 @@ def prepared(
     biases: Sequence[Tensor | None],
     layers: MLP,
     where: Where,
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    features: Tensor | None,
+    directions: Tensor | None = None,
+    direction_index: Tensor | None = None,
+    features: Tensor | None = None,
 ) -> tuple[tuple[Any, ...], torch.dtype]:
     """The arguments of ``forward``, and the type of the result."""
     centres, child_offsets, child, depth, centre_weights, cells, coords = where

@@ -63,7 +63,8 @@ def described_by_table(field: nn.Module) -> bool:
     They do not if a class has its own ``forward`` without its own ``linears`` and ``activate``, or if hooks or
     parametrisations, such as weight normalisation, change inputs, outputs or weights of layers.
     """
-    return "forward" not in vars(field) and _class_described_by_table(type(field)) and _is_plain(field)
+    kind: Any = type(field)
+    return "forward" not in vars(field) and _class_described_by_table(kind) and _is_plain(field)
 
 
 @functools.cache
@@ -92,7 +93,7 @@ def run_table(
     where: dict[str, Any],
 ) -> Tensor:
     """What the networks of a field give before its ``activate``: [n, out]; ``where`` tells ``routed_mlp`` the cells."""
-    given = {"directions": directions, "direction_index": ray_index, "backend": backend}
+    given: dict[str, Any] = {"directions": directions, "direction_index": ray_index, "backend": backend}
     return routed_mlp(positions, **parameters_of_table(field, k), **given, **where)[0]
 
 
