@@ -54,6 +54,7 @@ LATER = {
     "kind": "auto",
     "normalise": True,
     "ray_growth": 1.0,
+    "lr_hold": 0.0,
     "gradient_scaling": True,
 }
 #: Of a run's settings, those that do not change what is learnt or how it is scored.

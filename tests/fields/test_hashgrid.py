@@ -76,6 +76,12 @@ def test_settings_come_from_the_scene():
     assert own.module.features.dim() == 3
 
 
+def test_the_finest_level_grows_slowly_with_large_images():
+    box = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    found = [HashGridField.scene_options(1 / pixels, box, False)["finest"] for pixels in (10, 40, 80, 100, 400)]
+    assert found == [32, 80, 160, 188, 376]
+
+
 def test_shared_parameters_count_once():
     shared, own = (TrainConfig(field="hashgrid", cells=(4,), cell_tables=own) for own in (False, True))
     field = HashGridField()

@@ -44,6 +44,7 @@ def test_json_of_something_else(text):
         ({"ray_growth": 17.0}, "--ray-growth must lie in 1..16, got 17.0"),
         ({"width": 1}, "--width must be at least 2, got 1"),
         ({"lr": 0.0}, "--lr must be positive, got 0.0"),
+        ({"lr_hold": 1.0}, r"--lr-hold must lie in \[0, 1\), got 1.0"),
         ({"lr_final": 2.0}, r"--lr-final must lie in \(0, 1\], got 2.0"),
         ({"warmup": 1.0}, r"--warmup must lie in \[0, 1\), got 1.0"),
         ({"average": 1.0}, r"--average must lie in \[0, 1\), got 1.0"),

@@ -24,6 +24,7 @@ from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.networks import count_parameters, octaves_for, resolve_config, solve_width
+from voronerf.training.rates import learning_rate
 from voronerf.training.run_directory import choose_directory, held, write_curve
 from voronerf.training.trainer import Trainer, TrainingError
 
@@ -255,6 +256,13 @@ def test_a_long_run_warms_up_in_a_hundred_steps(tmp_path, scene):
     for step, rate in ((0, 0.005), (50, 0.5 * 0.505), (100, 0.5), (2_000, 0.5)):
         trainer.step = step
         assert trainer.learning_rate() == pytest.approx(rate)
+
+
+def test_the_learning_rate_of_hash_grids_falls_in_the_second_half():
+    for field, rates in (("hashgrid", (1, 1, 0.1, 0.01)), ("nerf", (0.1**0.5, 0.1, 0.1**1.5, 0.01))):
+        config = TrainConfig(field=field, lr=0.5, lr_final=0.01)
+        found = [learning_rate(config, done, 1_000, 0) / 0.5 for done in (0.25, 0.5, 0.75, 1.0)]
+        assert found == pytest.approx(rates)
 
 
 def test_the_occupancy_grid_of_a_long_run_keeps_the_scene(tmp_path, scene):

@@ -12,6 +12,7 @@ have these attributes, all of which are optional:
                              entries without a gradient stay as they are, see ``voronerf.ops.sparse_adam``
     ray_growth               the most rays of a training step, as a multiple of ``--rays``, where space is empty:
                              more than 1, the default, for a field whose samples cost little beside the rest of a step
+    lr_hold                  fraction of a training for which the learning rate stays before it falls; default 0
     scene_options(pixel, box, contracted)
                              static method: options from the width of a pixel at the middle of the scene and the
                              corners of the space that the field sees, both in scene units, and whether all of space
@@ -88,6 +89,11 @@ class FieldType:
     def ray_growth(self) -> float:
         """The most rays of a training step, as a multiple of those of the first, where empty space is skipped."""
         return float(getattr(self.network, "ray_growth", 1.0))
+
+    @property
+    def lr_hold(self) -> float:
+        """Fraction of a training for which the learning rate stays before it falls."""
+        return float(getattr(self.network, "lr_hold", 0.0))
 
     def build(self, options: Mapping[str, Any]) -> nn.Module:
         """A field with these options and the defaults of the others.

@@ -179,6 +179,9 @@ class TrainConfig:
     space is not skipped then."""
     lr: float | None = None
     """Learning rate of Adam at the start; default: 0.02 up to width 64, in inverse proportion to the width beyond."""
+    lr_hold: float | None = None
+    """Fraction of the run for which the learning rate stays at --lr before it falls; default 0.5 for hashgrid, else
+    0."""
     lr_final: float = 0.05
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
     lr_split: float = 1.0
@@ -218,8 +221,9 @@ class TrainConfig:
         for name in ("width", "depth", "direction_octaves"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, self.field_type.options.get(name))
-        if self.ray_growth is None:
-            object.__setattr__(self, "ray_growth", self.field_type.ray_growth)
+        for name in ("ray_growth", "lr_hold"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, getattr(self.field_type, name))
         if self.lr is None and self.parameters is None:
             object.__setattr__(self, "lr", self.field_type.learning_rate(self.network_options))
         check_config(self, CHOICES)

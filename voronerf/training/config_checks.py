@@ -99,6 +99,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.eval_views >= 1, "eval_views", "be at least 1")
     need(config.final_views is None or config.final_views >= 1, "final_views", "be at least 1")
     need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
+    need(config.lr_hold is not None and 0 <= config.lr_hold < 1, "lr_hold", "lie in [0, 1)")
     need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
     need(0 < config.lr_split < float("inf"), "lr_split", "be a positive factor")
     need(0 <= config.average < 1, "average", "lie in [0, 1)")

@@ -27,7 +27,7 @@ FOG = INITIAL_DENSITY / 4
 #: cell: about thirty steps, until which the field has said nothing about most cells.
 OCCUPANCY_DECAY, OCCUPANCY_PATIENCE = 0.8, 8
 #: The share of all cells that are evaluated at random from time to time.
-OCCUPANCY_SHARE = 1 / 32
+OCCUPANCY_SHARE = 1 / 8
 #: Of a grid made for pictures alone: cells along each axis, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 

@@ -15,13 +15,14 @@ FILL = 0.25
 
 
 def learning_rate(config: TrainConfig, done: float, step: int, splits: int) -> float:
-    """Exponential decay from ``lr`` to ``lr * lr_final`` over the fraction 0..1 that is done, after a linear rise over
-    the warm-up, `WARMUP_STEPS` at most; ``lr_split`` of it for each split that was made."""
-    assert config.lr is not None
+    """``lr`` until ``lr_hold`` of the fraction 0..1 that is done, then exponential decay to ``lr * lr_final``, after a
+    linear rise over the warm-up, `WARMUP_STEPS` at most; ``lr_split`` of it for each split that was made."""
+    assert config.lr is not None and config.lr_hold is not None
     rise = 1.0
     if done < config.warmup and step < WARMUP_STEPS:
         rise = 0.01 + 0.99 * max(done / config.warmup, step / WARMUP_STEPS)
-    return config.lr * rise * math.exp(math.log(config.lr_final) * done) * config.lr_split**splits
+    fallen = max(0.0, done - config.lr_hold) / (1 - config.lr_hold)
+    return config.lr * rise * math.exp(math.log(config.lr_final) * fallen) * config.lr_split**splits
 
 
 def next_rays(config: TrainConfig, rays: int, samples: int) -> int:
