@@ -214,9 +214,7 @@ class Call:
     names: list[str]  # of positional arguments first
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
-    kinds: dict[str, str] = dataclasses.field(
-        default_factory=dict
-    )  # what each tensor has an entry for, once it is known
+    kinds: dict[str, str] = dataclasses.field(default_factory=dict)  # what each tensor has an entry for, by name
 
     @property
     def name(self) -> str:

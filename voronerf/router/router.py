@@ -24,10 +24,9 @@ from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.shard import ShardedCells, evaluate_over_ranks
 
-Assignment = Literal["nearest", "stochastic"]
-
 # Centres of a flat diagram beyond which it may look cells up by a grid of its own.
 _MANY = 256
+Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
 
@@ -133,12 +132,8 @@ class VoronoiRouter(ShardedCells):
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
-        self._own_coords = frozenset(
-            name for name in ("forward", *methods) if "coords" in (accepted_names([getattr(module, name)]) or ())
-        )
         self._choices = Choices()
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
-        self._argument_names = {name: argument_names(getattr(self.module, name)) for name in ("forward", *methods)}
         self._by_table = self._layered and described_by_table(self.module)
 
     @classmethod
@@ -197,18 +192,18 @@ class VoronoiRouter(ShardedCells):
                 nor per ray or could be both, or missing directions.
             TypeError: For a module that mixes samples.
         """
-        if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
-            self._by_table = described_by_table(self.module)
-        if self._by_table:
+        if self.by_table:
             return self._evaluate_table(self._coords_of_table(coords, args, kwargs), False, *args, **kwargs)
         if self._layered:
             args, kwargs = each_direction(args, kwargs)
-        return self._call_method("forward", *args, coords=coords, **kwargs)
+        return self._route("forward", *args, coords=coords, **kwargs)
 
     @property
     def by_table(self) -> bool:
         """Whether a layer table describes all that the module computes: then :meth:`raw` gives its outputs."""
-        return self._layered and described_by_table(self.module)
+        if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
+            self._by_table = described_by_table(self.module)
+        return self._by_table
 
     def raw(self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> Tensor:
         """What the networks of a field with a layer table give before its ``activate``: [n, out], never blended.
@@ -273,7 +268,7 @@ class VoronoiRouter(ShardedCells):
         """The routed methods, beside what a module has."""
         methods = self.__dict__.get("methods", ())
         if name in methods:
-            return functools.partial(self._call_method, name)
+            return functools.partial(self._route, name)
         try:
             return super().__getattr__(name)
         except AttributeError:
@@ -285,15 +280,13 @@ class VoronoiRouter(ShardedCells):
                 f"methods={[*methods, name]!r} to the router"
             ) from None
 
-    def _call_method(self, name: str, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
-        if name in self._own_coords and coords is not None:
-            kwargs, coords = {**kwargs, "coords": coords}, None
-        return self._route(name, args, kwargs, coords)
-
     @not_compiled
-    def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
+    def _route(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         """One call of a method of the module. ``torch.compile`` leaves it as it is and goes on behind it."""
-        known = self._argument_names[method]
+        called = getattr(self.module, method)
+        if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
+            kwargs, coords = {**kwargs, "coords": coords}, None
+        known = argument_names(called)
         names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
         rule = coords if coords is not None else self.coords
         if rule is None and self._layered:
