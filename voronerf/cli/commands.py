@@ -50,7 +50,7 @@ STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "S
 
 
 def say(line: str) -> None:
-    """Prints a line as it is, but for what a terminal would obey."""
+    """Prints a line as plain text, with control characters escaped."""
     console.print(printable(line), highlight=False, markup=False, emoji=False)
 
 

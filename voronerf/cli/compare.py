@@ -167,7 +167,7 @@ def rows_of(rows: list[list[str]]) -> str:
 
 
 def figure(value: Any, places: int) -> str:
-    """A number as a table shows it; a dash for what is none."""
+    """A number as a table shows it; a dash for anything else."""
     return f"{value:,.{places}f}" if is_finite(value) else "-"
 
 

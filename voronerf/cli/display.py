@@ -16,7 +16,7 @@ LONGEST_LINE = 900
 
 
 def printable(text: str) -> str:
-    """Text with escapes for what is no visible character, such as a sequence that a terminal would obey."""
+    """Text with its control characters escaped, since a terminal would obey them."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

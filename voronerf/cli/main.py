@@ -34,14 +34,14 @@ EXPECTED = (
     *(MemoryError, torch.OutOfMemoryError),
 )
 
-#: By which torch's plain RuntimeErrors tell that there is no memory left on a CPU, for tensors or for a thread, and
-#: SystemErrors of Python that there is none for an import.
+#: What messages say when a CPU has no memory left: RuntimeErrors of torch, for a tensor or a thread, and SystemErrors
+#: of Python, for an import.
 NO_MEMORY = (
     *("can't allocate memory", "Cannot allocate memory", "not enough memory", "bad_alloc", "can't start new thread"),
     *("error return without exception set", "returned NULL without setting an exception"),
 )
 
-#: Said before a training that nothing was said about.
+#: Printed before a training without any options.
 WHAT_TO_TRY = """This trains the built-in scene for 480 s, into runs/. Ctrl-C stops it. Other things to try:
   voronerf train --budget 60                the same for a minute
   voronerf train --data DIR --downscale 4   your scene: Blender, transforms.json, COLMAP or LLFF
@@ -154,7 +154,7 @@ def _train_command(args: list[str]) -> Callable[..., int]:
 
 
 def _show_thread_error(args: threading.ExceptHookArgs) -> None:
-    """A thread that finds no memory to begin says nothing: whoever waits for it does."""
+    """A thread that cannot start for lack of memory prints nothing: whoever waits for it reports the error."""
     if not isinstance(args.exc_value, (MemoryError, SystemError)):
         threading.__excepthook__(args)
 

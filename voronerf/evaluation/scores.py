@@ -70,7 +70,7 @@ def evaluate(
 ) -> list[ViewScore]:
     """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all), until ``stop`` is true.
 
-    PSNR leaves out what a mask leaves out; there the others compare the truth with itself.
+    PSNR leaves out the pixels that a mask leaves out. For SSIM and LPIPS these pixels have the colour of the truth.
 
     Examples:
         >>> from voronerf import NeRF

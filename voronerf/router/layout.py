@@ -254,7 +254,7 @@ class Call:
 
         def arrange(tensor: Tensor, kind: str) -> Tensor:
             rows = layout.flatten(tensor, kind)
-            if not layout.n:  # a module that is never called without rows gives its sizes on placeholders
+            if not layout.n:  # no module is called without rows: placeholders give the shapes of its results
                 empty = rows.new_full((n, *rows.shape[1:]), 0.5 if rows.is_floating_point() else 0)
                 rows = torch.cat([rows[:0], empty])  # joined, so that results depend on the argument as ever
             elif kind == RAY:

@@ -47,7 +47,6 @@ class Client:
         wants_sharp: a better one, when the camera rests.
         drawn_at: when the last sharp picture was done.
         cost: seconds that it took.
-        shows_nodes: whether something is drawn into the scene.
     """
 
     def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:

@@ -22,7 +22,7 @@ from voronerf.viewer.cameras import nearest_view
 LARGEST = 256
 #: A place counts as seen by a view if it is at most this much farther than what the view shows there.
 BEHIND = 0.03
-#: Where the nearest view sees nothing of a place.
+#: Colour of the places that the nearest view does not see.
 UNSEEN = (150, 160, 175)
 
 
@@ -79,7 +79,7 @@ class ViewErrors:
         return ViewError(number, camera, image.colour.clamp(0, 1) - truth, image)
 
     def picture(self, camera: Cameras, image: RenderedImage) -> Tensor:
-        """The errors of the nearest view, at the places that another camera sees; grey where the view sees them not.
+        """The errors of the nearest view, at the places that another camera sees; grey where that view does not.
 
         Args:
             camera: of the picture.
@@ -104,7 +104,7 @@ class ViewErrors:
         return picture
 
     def _depth(self, image: RenderedImage) -> Tensor:
-        """Distances [h, w]; where next to nothing is, that of the scene's end."""
+        """Distances [h, w]; the far bound of the scene where a pixel is at least half empty."""
         return torch.where(image.opacity > 0.5, image.depth, self.scene.far)
 
     def psnr(self, camera: Cameras, shows: Callable[[Tensor], Tensor]) -> tuple[str, float | None] | None:

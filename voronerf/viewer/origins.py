@@ -1,9 +1,9 @@
 """Keeps pages of other sites out: a browser lets each of its pages open a websocket to 127.0.0.1.
 
-viser asks nobody where they come from. Its server is that of websockets, which gives each request to a function of
-viser before it answers; the function here has it first. Its rules are those of Jupyter: a page must come from where it
-connects to, and what listens at a loopback address must have been asked for by a loopback name, since the owner of any
-other name can have it lead here after the page is loaded (DNS rebinding).
+viser does not check where a request comes from. Its server is that of the package websockets, which passes each request
+to a function of viser before it answers; the function here is called first. Its rules are those of Jupyter: a page must
+come from where it connects to, and what listens at a loopback address must be asked for by a loopback name, since
+the owner of any other name can have it lead here after the page is loaded (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from websockets.http11 import Request, Response
 
 @contextlib.contextmanager
 def only_own_pages(host: str) -> Iterator[None]:
-    """Has the server of viser that is made meanwhile, to listen at `host`, refuse what pages of other sites ask for."""
+    """A viser server that is made in this context, to listen at `host`, refuses requests of pages of other sites."""
     serve, made = server.serve, []
 
     def serve_own_pages(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> server.serve:

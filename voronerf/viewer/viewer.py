@@ -41,7 +41,7 @@ COARSE, BAND = 0.06, 0.1
 SMALLEST = 48
 #: Share of a training's time that goes into new pictures while nobody moves.
 REFRESH = 0.05
-#: Depth in scene units at which nothing is, the largest that viser takes.
+#: Depth of empty pixels in scene units, the largest that viser takes.
 NOWHERE = 160.0
 
 
