@@ -105,13 +105,11 @@ def load_scene(
         raise SceneError(f"{folder}: there is no such folder")
     if not folder.is_dir():
         raise SceneError(f"{folder}: is not a folder")
-    there = {
-        "blender": (folder / FORMATS["blender"]).is_file(),
-        "transforms": (folder / FORMATS["transforms"]).is_file(),
-        "colmap": find_model(folder) is not None,
-        "llff": (folder / FORMATS["llff"]).is_file(),
-    }
-    held = [name for name in FORMATS if there[name]]
+    held = [
+        name
+        for name, sign in FORMATS.items()
+        if (find_model(folder) is not None if name == "colmap" else (folder / sign).is_file())
+    ]
     if not held:
         raise SceneError(f"{folder}: is not a scene, it has none of {', '.join(FORMATS.values())}")
     if format != "auto" and format not in held:

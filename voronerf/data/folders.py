@@ -42,20 +42,15 @@ def choose_images(folder: Path, downscale: int | None, longest: float) -> ImageF
             sizes[int(match[1])] = path
     if not sizes:
         raise SceneError(f"{folder}: has neither a folder images nor images_2, images_4, ...")
+    chosen = downscale if downscale in sizes else min(sizes)
     if downscale is None:
-        return ImageFolder(sizes[min(sizes)], least_factor(longest / min(sizes)), _reduced(sizes[min(sizes)]))
-    if downscale in sizes:
-        return ImageFolder(sizes[downscale], 1, _reduced(sizes[downscale]))
-    largest = min(sizes)
-    if downscale == 1:
-        return ImageFolder(sizes[largest], 1, _reduced(sizes[largest]))
-    if downscale % largest:
-        raise SceneError(f"{sizes[largest]}: --downscale must be 1 or a multiple of {largest}, got {downscale}")
-    return ImageFolder(sizes[largest], downscale // largest, _reduced(sizes[largest]))
-
-
-def _reduced(folder: Path) -> tuple[str, ...]:
-    return () if folder.name == "images" else (f"{folder.name} is read, and not images",)
+        factor = least_factor(longest / chosen)
+    elif downscale == 1 or downscale % chosen == 0:
+        factor = max(downscale // chosen, 1)
+    else:
+        raise SceneError(f"{sizes[chosen]}: --downscale must be 1 or a multiple of {chosen}, got {downscale}")
+    notes = () if sizes[chosen].name == "images" else (f"{sizes[chosen].name} is read, and not images",)
+    return ImageFolder(sizes[chosen], factor, notes)
 
 
 def stay_inside(path: Path, folder: Path, allow_outside: bool) -> None:

@@ -153,10 +153,7 @@ def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Pat
     for spelt in dict.fromkeys((name, name.replace("\\", "/"))):
         for suffix in SUFFIXES:
             path = Path(f"{folder / spelt}{suffix}")
-            if not allow_outside and leads_outside(path, folder):
-                raise SceneError(
-                    f"{where}: file_path must lead to a file in the folder of the scene; --allow-outside reads others"
-                )
+            _check_inside(path, folder, allow_outside, f"{where}: file_path")
             if os.path.isfile(path):
                 return path
     return None
@@ -170,13 +167,15 @@ def _mask(path: Path, entries: dict[str, Any], allow_outside: bool, where: str) 
     if not isinstance(name, str) or "\0" in name:
         raise SceneError(f"{path}: {where}: mask_path must be a file name, got {name!r:.60}")
     mask = path.parent / name.replace("\\", "/")
-    if not allow_outside and leads_outside(mask, path.parent):
-        raise SceneError(
-            f"{path}: {where}: mask_path must lead to a file in the folder of the scene; --allow-outside reads others"
-        )
+    _check_inside(mask, path.parent, allow_outside, f"{path}: {where}: mask_path")
     if not mask.is_file():
         raise SceneError(f"{path}: {where}: its mask {mask} does not exist")
     return mask
+
+
+def _check_inside(path: Path, folder: Path, allow_outside: bool, what: str) -> None:
+    if not allow_outside and leads_outside(path, folder):
+        raise SceneError(f"{what} must lead to a file in the folder of the scene; --allow-outside reads others")
 
 
 def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor:

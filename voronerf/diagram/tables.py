@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 
-def check_table(name: str, table: Tensor, shape: tuple[int, ...]) -> None:
-    """Checks a table of centres [k, 3] or weights [k]; -1 in ``shape`` stands for any size.
+def check_table(name: str, table: Tensor, k: int | None = None) -> None:
+    """Checks a table of centres [any number, 3] or, where ``k`` is given, one of weights [k].
 
     Raises:
         ValueError: a wrong shape, or a value that is not finite.
@@ -16,10 +16,10 @@ def check_table(name: str, table: Tensor, shape: tuple[int, ...]) -> None:
     if not isinstance(table, Tensor) or not table.is_floating_point():
         got = table.dtype if isinstance(table, Tensor) else type(table).__name__
         raise TypeError(f"VoronoiDiagram: {name} must be a floating-point tensor, got {got}")
-    wanted = "[k, 3]" if len(shape) == 2 else f"[{shape[0]}]"
-    matches = table.dim() == len(shape) and all(s in (-1, t) for s, t in zip(shape, table.shape, strict=True))
-    if not matches:
-        raise ValueError(f"VoronoiDiagram: {name} must have shape {wanted}, got {list(table.shape)}")
+    if k is None and (table.dim() != 2 or table.shape[1] != 3):
+        raise ValueError(f"VoronoiDiagram: {name} must have shape [k, 3], got {list(table.shape)}")
+    if k is not None and table.shape != (k,):
+        raise ValueError(f"VoronoiDiagram: {name} must have shape [{k}], got {list(table.shape)}")
     if not bool(torch.isfinite(table).all()):
         raise ValueError(f"VoronoiDiagram: {name} must be finite, got NaN or infinity")
 
@@ -30,10 +30,10 @@ def check_tree(centres: Tensor, child_offsets: Tensor, child: Tensor, power: Ten
     def refuse(rule: str) -> ValueError:
         return ValueError(f"VoronoiDiagram: tables of a tree must {rule}")
 
-    check_table("centres", centres, (-1, 3))
+    check_table("centres", centres)
     m = centres.shape[0]
     if power is not None:
-        check_table("power", power, (m,))
+        check_table("power", power, m)
     if any(table.dtype != torch.int32 or table.dim() != 1 for table in (child_offsets, child)):
         raise refuse("hold child_offsets and child as int32 vectors")
     offsets, links = child_offsets.tolist(), child.tolist()

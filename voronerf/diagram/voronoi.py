@@ -82,12 +82,12 @@ class VoronoiDiagram(nn.Module):
             TypeError: not a floating-point tensor.
         """
         super().__init__()
-        check_table("centres", centres, (-1, 3))
+        check_table("centres", centres)
         k = centres.shape[0]
         if k == 0:
             raise ValueError("VoronoiDiagram: centres must hold at least one centre, got shape [0, 3]")
         if weights is not None:
-            check_table("weights", weights, (k,))
+            check_table("weights", weights, k)
         device = centres.device
         self._set_tables(
             centres.detach().to(torch.float32, copy=True).contiguous(),

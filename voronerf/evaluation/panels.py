@@ -52,7 +52,7 @@ def picture_of_colour(colour: Tensor) -> Tensor:
 
 def picture_of_error(colour: Tensor, truth: Tensor) -> Tensor:
     """Mean absolute error over the channels, black (0) to pale yellow (0.3 and above)."""
-    return _mapped((colour - truth).abs().mean(-1) / ERROR_SCALE, "inferno")
+    return mapped((colour - truth).abs().mean(-1) / ERROR_SCALE, "inferno")
 
 
 def picture_of_depth(depth: Tensor, opacity: Tensor) -> Tensor:
@@ -61,7 +61,7 @@ def picture_of_depth(depth: Tensor, opacity: Tensor) -> Tensor:
     solid = solid[:: 1 + solid.numel() // 2**20]  # torch takes no quantile of more than 2^24
     low, high = (solid.quantile(0.01), solid.quantile(0.99)) if solid.numel() else (depth.min(), depth.max())
     near_to_far = (depth - low) / (high - low).clamp_min(1e-6)
-    return _on_white(_mapped(1 - near_to_far, "viridis"), opacity)
+    return _on_white(mapped(1 - near_to_far, "viridis"), opacity)
 
 
 def picture_of_cells(cells: Tensor, opacity: Tensor, colour: Tensor | None = None) -> Tensor:
@@ -145,7 +145,8 @@ def save_panel(
     save_picture(path, contact_sheet(pictures))
 
 
-def _mapped(values: Tensor, name: str) -> Tensor:
+def mapped(values: Tensor, name: str) -> Tensor:
+    """Values [h, w], clipped to 0..1 and NaN as 0, in the colours of a map of matplotlib."""
     import matplotlib  # which the viewer's first picture need not wait for
 
     table = torch.from_numpy((matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).round().astype(np.uint8))

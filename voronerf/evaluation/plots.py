@@ -5,26 +5,14 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from voronerf.files import write_bytes
 
 
-def plot_curves(
-    path: Path,
-    curves: Mapping[str, Sequence[tuple[float, float]]],
-    *,
-    splits: Mapping[str, Sequence[float]] | None = None,
-    title: str = "",
-) -> None:
-    """Writes the picture of :func:`draw_curves`, whose arguments the others are.
-
-    Args:
-        path: Where the picture goes.
-        curves: As there, like the next two.
-        splits: For each label.
-        title: Above the axes.
-    """
-    write_bytes(path, draw_curves(curves, splits=splits, title=title))
+def plot_curves(path: Path, curves: Mapping[str, Sequence[tuple[float, float]]], **options: Any) -> None:
+    """Writes the picture of :func:`draw_curves` to a file; arguments are those of that function."""
+    write_bytes(path, draw_curves(curves, **options))
 
 
 def draw_curves(

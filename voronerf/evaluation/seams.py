@@ -17,44 +17,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import torch
-from torch import Tensor
 
 from voronerf.data import Scene
 from voronerf.diagram.blending import Mixture
 from voronerf.evaluation.scores import view_numbers
+from voronerf.rendering.renderer import RenderedImage
 from voronerf.router import VoronoiRouter
 
 #: The margin as a part of the diagonal of the scene's box: 0.04 of a Blender scene, a pixel and a half at 100 x 100.
 MARGIN = 0.01
 
 
-class Picture(Protocol):
-    """What is needed of a rendered image, such as `voronerf.rendering.RenderedImage`."""
-
-    @property
-    def colour(self) -> Tensor:
-        """[h, w, 3]."""
-        ...
-
-    @property
-    def opacity(self) -> Tensor:
-        """[h, w]."""
-        ...
-
-    @property
-    def heaviest(self) -> Tensor:
-        """[h, w, 3], position of each ray's heaviest sample."""
-        ...
-
-
 @torch.no_grad()
 def seam(
     router: VoronoiRouter,
     scene: Scene,
-    picture: Callable[[int], Picture],
+    picture: Callable[[int], RenderedImage],
     *,
     views: int | None = None,
     margin: float | None = None,

@@ -5,11 +5,13 @@ size x size points; densities are per scene unit.
 
 from __future__ import annotations
 
-import numpy as np
+import math
+
 import torch
 from torch import Tensor, nn
 
 from voronerf.data import Scene
+from voronerf.evaluation.panels import mapped
 from voronerf.rendering.contraction import Contraction, Perspective
 
 #: Half the side of a slice through a scene without a box, in scene units.
@@ -82,15 +84,9 @@ def slice_density(
     return density.float().cpu().reshape(points.shape[:-1])
 
 
-def picture_of_density(density: Tensor, densest: float = DENSEST) -> Tensor:
-    """Densities [h, w] as uint8 [h, w, 3]: 0 is black, `densest` and above pale yellow, on a logarithmic scale.
+def picture_of_density(density: Tensor) -> Tensor:
+    """Densities [h, w] as uint8 [h, w, 3]: 0 is black, `DENSEST` and above pale yellow, on a logarithmic scale.
 
-    The scale log(1 + density) / log(1 + densest) shows both walls and the faint fog before and behind them.
+    The scale log(1 + density) / log(1 + DENSEST) shows both walls and the faint fog before and behind them.
     """
-    import matplotlib
-
-    if not densest > 0:
-        raise ValueError(f"picture_of_density: densest must be positive, got {densest}")
-    shown = torch.log1p(density.float().nan_to_num(0).clamp(0, densest)) / float(np.log1p(densest))
-    table = torch.from_numpy((matplotlib.colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8))
-    return table[(shown.cpu() * 255).round().long()]
+    return mapped(torch.log1p(density.float().clamp(min=0)).cpu() / math.log1p(DENSEST), "magma")

@@ -72,15 +72,12 @@ def export_mesh(
     """
     path = Path(path)
     check_export(path, SUFFIXES)
-    mesh = surface_mesh(run, resolution, density, box, track)
+    mesh = _surface(run, resolution, density, box, track)
     write_geometry(path, mesh)
     return mesh
 
 
-def surface_mesh(
-    run: Run, resolution: int | None, density: float | None, box: Tensor | None, track: Track = in_silence
-) -> Any:
-    """The mesh that :func:`export_mesh` writes."""
+def _surface(run: Run, resolution: int | None, density: float | None, box: Tensor | None, track: Track) -> Any:
     import trimesh
     from scipy import ndimage
     from skimage.measure import marching_cubes

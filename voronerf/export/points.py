@@ -45,13 +45,12 @@ def export_points(run: Run, path: Path | str, *, count: int = 200_000, box: Tens
     """
     path = Path(path)
     check_export(path, SUFFIXES)
-    points = surface_points(run, count, box)
+    points = _surface(run, count, box)
     write_geometry(path, points, vertex_normal=True)
     return points
 
 
-def surface_points(run: Run, count: int, box: Tensor | None) -> Any:
-    """The points that :func:`export_points` writes."""
+def _surface(run: Run, count: int, box: Tensor | None) -> Any:
     import trimesh
     from scipy.spatial import cKDTree
 
@@ -62,7 +61,7 @@ def surface_points(run: Run, count: int, box: Tensor | None) -> Any:
     side = int((8 * count / min(VIEWS, len(cameras)) * max(cameras.width / cameras.height, 1)) ** 0.5) + 1
     low, high = box_of(run, box)
     points, colours, towards = [], [], []
-    for view in training_views(run, side=side):
+    for view in training_views(run, side):
         shown = view.distance.isfinite() & ((view.surface >= low) & (view.surface <= high)).all(-1)
         points.append(view.surface[shown])
         colours.append(view.colour[shown])

@@ -128,7 +128,7 @@ def in_silence(parts: Sequence[Any], name: str) -> Iterable[Any]:
     return parts
 
 
-def density_at(run: Run, nodes: Nodes, track: Track = in_silence) -> Tensor:
+def density_at(run: Run, nodes: Nodes, track: Track) -> Tensor:
     """The densities of a run at nodes, float32 of their shape; seen from above, as densities depend on no direction."""
     density = torch.empty(nodes.shape)
     down = torch.tensor([[0.0, 0.0, -1.0]])
@@ -155,11 +155,11 @@ class View:
     surface: Tensor
 
 
-def training_views(run: Run, count: int = VIEWS, side: int = VIEW_SIDE, track: Track = in_silence) -> Iterator[View]:
-    """Renders evenly spread training views, at their size over the whole number that leaves `side` pixels or more."""
+def training_views(run: Run, side: int = VIEW_SIDE, track: Track = in_silence) -> Iterator[View]:
+    """Renders up to `VIEWS` evenly spread training views, reduced by the largest number that leaves `side` pixels."""
     cameras = run.scene.train.cameras
     cameras = cameras.downscaled(max(max(cameras.width, cameras.height) // side, 1))
-    numbers = torch.linspace(0, len(cameras) - 1, min(count, len(cameras))).round().long().tolist()
+    numbers = torch.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().long().tolist()
     for number in track(numbers, "views"):
         image = run.render(cameras, number)
         camera, surface, contraction = cameras[[number]], image.heaviest.cpu(), run.renderer.contraction
