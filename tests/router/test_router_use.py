@@ -80,6 +80,15 @@ def test_methods_share_an_assignment(generator: torch.Generator, monkeypatch: py
     assert len(drawn) == 3
 
 
+def test_a_module_may_call_its_arguments_as_the_router_calls_its_own(generator: torch.Generator) -> None:
+    class Named(nn.Linear):
+        def forward(self, x: Tensor, name: str, method: str) -> Tensor:
+            return super().forward(x) * len(name + method)
+
+    router, x = VoronoiRouter(Named(3, 2), uniform(generator, 4, 3), coords="first3"), uniform(generator, 20, 3)
+    torch.testing.assert_close(router(x, name="a", method="b"), 2 * router(x, "a", ""))
+
+
 # Optimisers -----------------------------------------------------------------------------------------------------------
 
 OPTIMIZERS: dict[str, Callable[[Any], torch.optim.Optimizer]] = {

@@ -25,10 +25,8 @@ _ELEMENTWISE = """
     add sub subtract rsub mul multiply div divide true_divide remainder fmod pow maximum minimum atan2 hypot lerp where
     addcmul addcdiv clamp clamp_min clamp_max gt ge lt le eq ne masked_fill logaddexp
     __add__ __radd__ __iadd__ __sub__ __rsub__ __isub__ __mul__ __rmul__ __imul__ __truediv__ __rtruediv__ __itruediv__
-    __div__ __rdiv__ __idiv__ __mod__ __pow__ __rpow__ __lt__ __le__ __gt__ __ge__ __eq__ __ne__
+    __mod__ __pow__ __rpow__ __lt__ __le__ __gt__ __ge__ __eq__ __ne__
 """
-
-
 _INTEGERS = (torch.int32, torch.int64)
 _FEW = 1 << 12  # most values a cell that are read from planes in one look-up
 
