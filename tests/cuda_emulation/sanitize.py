@@ -152,7 +152,7 @@ def rendered(module, offsets, background):
     r, per_ray = len(offsets) - 1, background is not None and background.ndim == 2
     inputs = every((floats(180, 4), floats(180), offsets, floats(r, 3), background))
     results = [unwritten(1), unwritten(r, 3), unwritten(180), unwritten(180), unwritten(r), unwritten(180, 4)]
-    given = module.RenderLossInputs(*inputs, per_ray, 10.0, r, 180)
+    given = module.RenderLossInputs(*inputs, per_ray, 10.0, 0.0, r, 180)
     module.render_loss(given, module.RenderLossOutputs(*every(results)), module.Cuda(0, 0))
     return results
 
