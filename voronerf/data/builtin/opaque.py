@@ -54,11 +54,17 @@ def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views
         >>> scene.train.cameras.width, len(scene.train), len(scene.test)
         (8, 100, 25)
     """
-    train, test = builtin_cameras("builtin_scene", size, train_views, test_views)
-    box = bounds()
-    train_split = render_views(train, "train", see, box=box, supersamples=SUPERSAMPLES)
-    test_split = render_views(test, "test", see, box=box, supersamples=SUPERSAMPLES)
-    return Scene("builtin", train_split, test_split, NEAR, FAR, torch.from_numpy(box), "linear", "white")
+    cameras = builtin_cameras("builtin_scene", size, train_views, test_views)
+    return render_scene("builtin", cameras, see, bounds(), SUPERSAMPLES)
+
+
+def render_scene(name: str, cameras: tuple[Cameras, Cameras], see: See, box: Array, supersamples: int) -> Scene:
+    """The scene of training and test cameras as `builtin_cameras` gives them; the rest as of `render_views`."""
+    train, test = (
+        render_views(views, part, see, box=box, supersamples=supersamples)
+        for part, views in zip(("train", "test"), cameras)
+    )
+    return Scene(name, train, test, NEAR, FAR, torch.from_numpy(box), "linear", "white")
 
 
 def builtin_cameras(caller: str, size: int, train_views: int, test_views: int) -> tuple[Cameras, Cameras]:

@@ -18,15 +18,13 @@ import torch
 
 from voronerf import backends
 from voronerf.data.builtin.opaque import (
-    FAR,
-    NEAR,
     SUPERSAMPLES,
     TEST_VIEWS,
     TRAIN_VIEWS,
     Hits,
     bounds,
     builtin_cameras,
-    render_views,
+    render_scene,
     see,
 )
 from voronerf.data.builtin.opaque_solids import FLOOR, bricks, checker, diagonals, globe, mosaic, plain, spiral
@@ -64,12 +62,9 @@ def rich_scene(
         >>> scene.train.images.shape[1:3]
         torch.Size([4, 4])
     """
-    train, test = builtin_cameras("rich_scene", size, train_views, test_views)
-    box, hits = bounds(SOLIDS), caster(SOLIDS, backend)
-    look = functools.partial(see, solids=SOLIDS, hits=hits)
-    train_split = render_views(train, "train", look, box=box, supersamples=SUPERSAMPLES)
-    test_split = render_views(test, "test", look, box=box, supersamples=SUPERSAMPLES)
-    return Scene("builtin-rich", train_split, test_split, NEAR, FAR, torch.from_numpy(box), "linear", "white")
+    cameras = builtin_cameras("rich_scene", size, train_views, test_views)
+    look = functools.partial(see, solids=SOLIDS, hits=caster(SOLIDS, backend))
+    return render_scene("builtin-rich", cameras, look, bounds(SOLIDS), SUPERSAMPLES)
 
 
 def caster(solids: Sequence[Solid], backend: str = "auto") -> Hits:

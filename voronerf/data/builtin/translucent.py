@@ -14,10 +14,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from voronerf.data.builtin.opaque import FAR, NEAR, TEST_VIEWS, TRAIN_VIEWS, builtin_cameras, render_views
+from voronerf.data.builtin.opaque import TEST_VIEWS, TRAIN_VIEWS, builtin_cameras, render_scene
 from voronerf.data.builtin.solids import Array
 from voronerf.data.scene import Scene
 
@@ -56,11 +55,6 @@ class Medium:
         """A box that holds the medium, [2, 3]."""
         centre, radii = np.array(self.centre), np.array(self.radii)
         return np.stack((np.maximum(centre - radii, self.low), np.minimum(centre + radii, self.high)))
-
-    def contains(self, points: Doubles) -> NDArray[np.bool_]:
-        """Whether points [n, 3] lie in it."""
-        ball = (((points - self.centre) / self.radii) ** 2).sum(axis=-1) < 1
-        return ball & (points > self.low).all(axis=-1) & (points < self.high).all(axis=-1)
 
     def span(self, origins: Array, directions: Array) -> tuple[Array, Array]:
         """Where rays are inside: (enter [r], leave [r]), both 0 where they never are or the medium lies behind them."""
@@ -155,11 +149,8 @@ def translucent_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_v
         >>> scene.train.images.shape[1:3]
         torch.Size([4, 4])
     """
-    train, test = builtin_cameras("translucent_scene", size, train_views, test_views)
-    box = bounds()
-    train_split = render_views(train, "train", integrate, box=box, supersamples=SUPERSAMPLES)
-    test_split = render_views(test, "test", integrate, box=box, supersamples=SUPERSAMPLES)
-    return Scene("builtin-translucent", train_split, test_split, NEAR, FAR, torch.from_numpy(box), "linear", "white")
+    cameras = builtin_cameras("translucent_scene", size, train_views, test_views)
+    return render_scene("builtin-translucent", cameras, integrate, bounds(), SUPERSAMPLES)
 
 
 def bounds(media: tuple[Medium, ...] = MEDIA) -> Array:
