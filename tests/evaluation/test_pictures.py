@@ -11,6 +11,7 @@ from PIL import Image
 
 from voronerf.evaluation import panels
 from voronerf.evaluation.video import check_video, write_video
+from voronerf.rendering.renderer import RenderedImage
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 16, 256, 5000])
@@ -58,7 +59,7 @@ def test_panel_file(tmp_path):
     path = tmp_path / "new" / "panel.png"
     cells = torch.zeros(7, 9, dtype=torch.int32)
     opacity = torch.ones(7, 9)
-    panels.save_panel(path, truth=colour, colour=colour, opacity=opacity, depth=opacity, cells=cells)
+    panels.save_panel(path, colour, RenderedImage(colour, opacity, opacity, colour), cells)
     width, height = Image.open(path).size
     zoom = -(-panels.PICTURE_HEIGHT // 7)
     assert (width, height) == (5 * (9 * zoom + 6) + 6, 7 * zoom + 6 + 18 + 6)

@@ -19,7 +19,7 @@ from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.scores import render_view, view_numbers
 from voronerf.files import write_bytes
-from voronerf.rendering.renderer import Renderer
+from voronerf.rendering.renderer import RenderedImage, Renderer
 
 # Steps of hue, saturation and value; their multiples modulo 1 fill the range evenly for any count (Roberts 2018).
 HUE_STEP, SATURATION_STEP, VALUE_STEP = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
@@ -116,31 +116,21 @@ def save_picture(path: Path, picture: Tensor) -> None:
     write_bytes(path, data.getvalue())
 
 
-def save_panel(
-    path: Path,
-    *,
-    truth: Tensor,
-    colour: Tensor,
-    opacity: Tensor,
-    depth: Tensor,
-    cells: Tensor,
-) -> None:
+def save_panel(path: Path, truth: Tensor, image: RenderedImage, cells: Tensor) -> None:
     """Writes truth, render, error, depth and cells of one view side by side, as PNG.
 
     Args:
         path: the file.
         truth: [h, w, 3] in 0..1.
-        colour: [h, w, 3], rendered.
-        opacity: [h, w].
-        depth: [h, w].
+        image: the rendered view, on the CPU.
         cells: integer [h, w].
     """
     pictures = {
         "truth": picture_of_colour(truth),
-        "render": picture_of_colour(colour),
-        "error": picture_of_error(colour, truth),
-        "depth": picture_of_depth(depth, opacity),
-        "cells": picture_of_cells(cells, opacity, colour),
+        "render": picture_of_colour(image.colour),
+        "error": picture_of_error(image.colour, truth),
+        "depth": picture_of_depth(image.depth, image.opacity),
+        "cells": picture_of_cells(cells, image.opacity, image.colour),
     }
     save_picture(path, contact_sheet(pictures))
 
@@ -173,15 +163,8 @@ def write_panels(
             continue
         # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
         cells = diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)
-        cells = cells.reshape(image.opacity.shape)
+        cells = cells.reshape(image.opacity.shape).cpu()
         path = folder / f"{scene.test.names[view]}.png"
-        save_panel(
-            path,
-            truth=scene.test.truth(view, background),
-            colour=image.colour.cpu(),
-            opacity=image.opacity.cpu(),
-            depth=image.depth.cpu(),
-            cells=cells.cpu(),
-        )
+        save_panel(path, scene.test.truth(view, background), RenderedImage(*(part.cpu() for part in image)), cells)
         paths.append(path)
     return paths
