@@ -100,7 +100,7 @@ def test_exports_of_a_run(run, tmp_path, capsys, fails):
     succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--video", files[2], options)
     assert all(file.stat().st_size for file in files)
     assert "3 of 3 cells" in capsys.readouterr().out
-    fails("the training views show no surface in the box", "export", run, "--points", tmp_path / "points.ply")
+    fails("no surface in the box", "export", run, "--box 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")
     fails("export needs --points FILE.ply, --mesh", "export", run)
     fails("the file must end in .glb", "export", run, "--cells cells.stl")
     fails("--box must be x y z of a corner and of", "export", run, "--box 0 0 0 1 1 0 --mesh", files[0])

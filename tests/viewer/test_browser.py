@@ -70,7 +70,7 @@ def test_chromium_shows_the_scene_and_its_cells(run, served, browser) -> None:
         """Whether the canvas is not yet like a picture, in the mean over channels and pixels."""
         return np.abs(seen() - picture).mean() > 4
 
-    image = (run.render(client.camera(512)).colour.clamp(0, 1) * 255).round().byte()
+    image = (run.render(client.camera(128)).colour.clamp(0, 1) * 255).round().byte()
     whole = Image.fromarray(image.numpy()).resize((width, height), Image.Resampling.BILINEAR)
     colour = np.array(whole, dtype=float)[middle]
     assert colour.std() > 20

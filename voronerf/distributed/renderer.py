@@ -19,7 +19,7 @@ from voronerf.distributed.group import Group
 from voronerf.distributed.sharing import Sharing, voxels_of_ranks
 from voronerf.distributed.sums import Samples, along_rays, compose, own_samples, sum_runs
 from voronerf.rendering.cameras import Rays
-from voronerf.rendering.marching import Seen
+from voronerf.rendering.marching import Seen, draw_seed
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid, density_of
 from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.rendering.sampling import NEARBY, stratified_depths
@@ -107,19 +107,14 @@ class RankRenderer(Renderer):
             index = torch.arange(first, last, device=near.device, dtype=torch.int32).repeat_interleave(self.samples)
             found = positions.reshape(-1, 3), index, depths.reshape(-1), deltas.reshape(-1)
         else:
-            uniforms = None
-            if jitter:
-                drawn_on = near.device if generator is None else generator.device
-                shape = len(rays), self.samples
-                uniforms = torch.rand(shape, device=drawn_on, dtype=near.dtype, generator=generator).to(near.device)[
-                    kept
-                ]
+            # A ray's jitter follows from the sum of seed and number.
+            seed = draw_seed(near.device, generator) + first if jitter else None
             march = grid.march(
                 rays[kept],
                 near[kept],
                 far[kept],
                 strata,
-                uniforms=uniforms,
+                seed=seed,
                 spacing=self.spacing,
                 backend=self.backend,
             )

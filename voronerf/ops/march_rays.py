@@ -71,7 +71,8 @@ def march_rays(
         box: [2, 3], lowest and highest corner, the second above the first.
         samples: strata of a ray, s, 1 to 65,535.
         uniforms: [r, s] in 0 to 1, the place of each sample in its stratum; None for the middles.
-        seed: int32 [1], in place of ``uniforms``: they are hashes of seed, ray and stratum, the same for every backend.
+        seed: int32 [1], in place of ``uniforms``: they are hashes of stratum and seed + number of the ray, the same for
+            every backend.
         spacing: of the strata, "linear" or "disparity" (equal steps of 1 / distance).
         start: int32 [r], the first stratum to consider, >= 0; None for 0.
         most: largest number of samples of a ray, at least 1; None for all.

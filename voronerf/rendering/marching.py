@@ -142,6 +142,12 @@ def render_marched(
     )
 
 
+def draw_seed(device: torch.device, generator: torch.Generator | None) -> Tensor:
+    """A seed of jitter for ``march_rays``, int32 [1]; the device is that of the rays."""
+    drawn_on = device if generator is None else generator.device
+    return torch.randint(-(2**31), 2**31, (1,), device=drawn_on, dtype=torch.int32, generator=generator).to(device)
+
+
 def march_grid(
     rays: Rays,
     near: Tensor,
@@ -154,11 +160,7 @@ def march_grid(
     backend: str,
 ) -> March:
     """The samples of `render_marched`, whose arguments these are."""
-    seed = None
-    if jitter:
-        device = near.device if generator is None else generator.device
-        seed = torch.randint(-(2**31), 2**31, (1,), device=device, dtype=torch.int32, generator=generator)
-        seed = seed.to(near.device)
+    seed = draw_seed(near.device, generator) if jitter else None
     return grid.march(rays, near, far, samples, seed=seed, spacing=spacing, backend=backend)
 
 
