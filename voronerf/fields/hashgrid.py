@@ -60,7 +60,7 @@ class HashGridField(RadianceField):
     router_options: ClassVar[dict[str, Any]] = {"share": ["features"]}
     sparse_parameters = ("features",)
     ray_growth = 8.0
-    lr_hold = 0.5
+    lr_hold = 0.25
 
     def __init__(
         self,

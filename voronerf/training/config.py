@@ -180,7 +180,7 @@ class TrainConfig:
     lr: float | None = None
     """Learning rate of Adam at the start; default: 0.02 up to width 64, in inverse proportion to the width beyond."""
     lr_hold: float | None = None
-    """Fraction of the run for which the learning rate stays at --lr before it falls; default 0.5 for hashgrid, else
+    """Fraction of the run for which the learning rate stays at --lr before it falls; default 0.25 for hashgrid, else
     0."""
     lr_final: float = 0.05
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
