@@ -86,10 +86,7 @@ def test_the_table_of_balance_is_that_of_its_files() -> None:
     assert "".join(lines) in (ROOT / "docs" / "results.md").read_text()
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    ["throughput.json", "throughput.json --targets", "foreign_fields.json --foreign", "foreign_shared.json --foreign"],
-)
+@pytest.mark.parametrize("arguments", ["throughput.json", "throughput.json --targets", "foreign_fields.json --foreign"])
 def test_tables_of_performance_are_those_of_the_program(arguments: str) -> None:
     name, *options = arguments.split()
     made = script(ROOT / "benchmarks" / "table.py", RESULTS / name, *options)
