@@ -163,7 +163,7 @@ print(faults() - before, int(out.count_nonzero()))
 
 
 def test_what_a_step_frees_is_kept() -> None:
-    """In a fresh process: the second of two equal steps finds the memory of the first."""
+    """In a fresh process: a step finds the memory of an equal one before it."""
     if platform.libc_ver()[0] != "glibc":
         pytest.skip("glibc alone can be asked")
     program = """
@@ -172,10 +172,12 @@ from voronerf.native import compiled
 compiled.keep_freed_memory()
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 step = lambda: [torch.ones(1 << 22) for _ in range(16)]
-step()
-before = faults()
-step()
-print(faults() - before)
+found = []
+for _ in range(6):
+    before = faults()
+    step()
+    found.append(faults() - before)
+print(min(found[1:]))
 """
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert int(found) < 45000  # of 65,536 pages; the system may reclaim some
+    assert int(found) < 2000  # of 65,536 pages; the least of five, since the system may reclaim some
