@@ -177,7 +177,7 @@ for _ in range(6):
     before = faults()
     step()
     found.append(faults() - before)
-print(min(found[1:]))
+print(sorted(found[1:])[2])
 """
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert int(found) < 2000  # of 65,536 pages; the least of five, since the system may reclaim some
+    assert int(found) < 2000  # of 65,536 pages; the median of five, since the system may reclaim some
