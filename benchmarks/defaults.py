@@ -30,8 +30,8 @@ from voronerf.training.config import ConfigError
 #: What is compared, as the sides of `time_to_quality.py`; the first are the defaults.
 SIDES = (
     "default:",
-    "512 rays: --rays 512",
-    "2,048 rays: --rays 2048",
+    "256 rays: --rays 256",
+    "1,024 rays: --rays 1024",
     "96 samples: --samples 96",
     "8 cells: --cells 8",
     "64 cells: --cells 64",
@@ -39,9 +39,9 @@ SIDES = (
     "width 64: --width 64",
     "2^14 entries: --field-options log2_entries=14",
     "2^16 entries: --field-options log2_entries=16",
-    "rate 0.005: --lr 0.005",
-    "rate 0.02: --lr 0.02",
-    "centroidal: --centres centroidal",
+    "rate 0.01: --lr 0.01",
+    "rate 0.03: --lr 0.03",
+    "balanced: --centres balanced",
 )
 
 
@@ -49,7 +49,7 @@ SIDES = (
 class Options:
     """Where to search, and for how long."""
 
-    scenes: tuple[str, ...] = ("builtin", "rich")
+    scenes: tuple[str, ...] = ("builtin", "builtin-rich")
     """Scene folders or built-in scenes."""
     downscale: tuple[int, ...] = ()
     """Factor by which the images of each scene are made smaller; default: 1 for all."""

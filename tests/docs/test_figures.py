@@ -54,7 +54,7 @@ def holds(entry: list[float], text: str) -> bool:
     return all(map(shown, FIGURE.findall(text)))
 
 
-@pytest.mark.parametrize(("name", "text"), marked())
+@pytest.mark.parametrize(("name", "text"), list(marked()))
 def test_figures_are_those_of_the_file(name: str, text: str) -> None:
     """Of a table, each row or each column is of one result, the first column and the head apart."""
     found = entries(name)
@@ -86,10 +86,17 @@ def test_the_table_of_balance_is_that_of_its_files() -> None:
     assert "".join(lines) in (ROOT / "docs" / "results.md").read_text()
 
 
-@pytest.mark.parametrize("arguments", ["throughput.json", "throughput.json --targets", "foreign_fields.json --foreign"])
-def test_tables_of_performance_are_those_of_the_program(arguments: str) -> None:
+@pytest.mark.parametrize(
+    ("page", "arguments"),
+    [
+        ("performance", "throughput.json"),
+        ("performance", "throughput.json --targets"),
+        ("foreign-fields", "foreign_fields.json --foreign"),
+    ],
+)
+def test_tables_of_operations_are_those_of_the_program(page: str, arguments: str) -> None:
     name, *options = arguments.split()
     made = script(ROOT / "benchmarks" / "table.py", RESULTS / name, *options)
-    page = (ROOT / "docs" / "performance.md").read_text()
+    text = (ROOT / "docs" / f"{page}.md").read_text()
     for table in made.strip().split("\n\n"):
-        assert f"{table}\n\n" in page
+        assert f"{table}\n\n" in text
