@@ -212,7 +212,8 @@ def main(options: Options) -> None:
     if options.json is not None:
         write_text(options.json, json.dumps(outcome, indent=1) + "\n")
     if options.plot is not None:
-        labels = {f"{r['side']} ({r['seed']})": r for r in outcome["results"]}
+        several = len({r["seed"] for r in outcome["results"]}) > 1
+        labels = {f"{r['side']}, seed {r['seed']}" if several else r["side"]: r for r in outcome["results"]}
         curves = {label: [(m["seconds"], m["psnr"]) for m in r["curve"]] for label, r in labels.items()}
         splits = {label: [s["started_at_second"] for s in r["stages"][1:]] for label, r in labels.items()}
         plot_curves(options.plot, curves, splits=splits, title=f"{outcome['metadata']['data']}, equal training time")
