@@ -56,7 +56,7 @@ def split_cells(trainer: Trainer) -> bool:
     trainer.stages.append(Stage(cells, trainer.seconds, trainer.step, before, after, len(balances)))
     when = f"at {trainer.seconds:.0f} s, step {trainer.step}"
     if balances:
-        trainer.say(f"{cells} cells {when}, std(W / max W) {before:.3f} -> {after:.4f}")
+        trainer.say(f"{cells} cells {when}, imbalance of their importance {before:.3f} -> {after:.4f}")
     else:
         need = max(k, config.min_cell_samples)
         trainer.say(f"no cell split {when}: none holds {need} of the {points.shape[0]} samples kept")
