@@ -115,6 +115,16 @@ class HashInputs(NamedTuple):
 
 Isa: tuple[str, ...]  # portable avx2 avx512
 
+class KnownSamples(NamedTuple):
+    positions: Tensor | None  # const float32*
+    ray_index: Tensor | None  # const int32*
+    depths: Tensor | None  # const float32*
+    deltas: Tensor | None  # const float32*
+    cells: Tensor | None  # const int32*
+    own: Tensor | None  # const int32*
+    n: int  # int64
+    bent: bool
+
 class LinearGradients(NamedTuple):
     out: Tensor | None  # const any*
     x: Tensor | None  # any*
@@ -222,6 +232,14 @@ class ObservedSamples(NamedTuple):
     threshold: float  # float32
     hidden: float  # float32
 
+class OwnSamples(NamedTuple):
+    positions: Tensor | None  # float32*
+    ray_index: Tensor | None  # int32*
+    depths: Tensor | None  # float32*
+    deltas: Tensor | None  # float32*
+    cells: Tensor | None  # int32*
+    offsets: Tensor | None  # int32*
+
 Peak: tuple[str, ...]  # float32 bfloat16 copy
 
 class PixelRaysInputs(NamedTuple):
@@ -269,6 +287,16 @@ class RenderLossOutputs(NamedTuple):
     error: Tensor | None  # float32*
     gradient: Tensor | None  # float32*
 
+class RunsOfRays(NamedTuple):
+    sums: Tensor | None  # const float32*
+    target: Tensor | None  # const float32*
+    background: Tensor | None  # const float32*
+    background_per_ray: bool
+    q: int  # int64
+    first: int  # int64
+    r: int  # int64
+    rays: int  # int64
+
 class SparseAdam(NamedTuple):
     step_size: float  # float32
     correction: float  # float32
@@ -277,6 +305,9 @@ class SparseAdam(NamedTuple):
     epsilon: float  # float32
 
 TableType: tuple[str, ...]  # float32 bfloat16 float16
+
+# const float32*, int64, int64, float32*, Cpu
+def add_touched(_0: Tensor | None, _1: int, _2: int, _3: Tensor | None, _4: Cpu) -> None: ...
 
 # any*, int64
 def advise_huge_pages(_0: Tensor | None, _1: int) -> None: ...
@@ -312,6 +343,9 @@ def centre_grid_entries(_0: CentreGridTables) -> int: ...
 
 # CentreGridTables
 def centre_grid_lists(_0: CentreGridTables) -> int: ...
+
+# RunsOfRays, float32*, Cpu
+def compose_runs(_0: RunsOfRays, _1: Tensor | None, _2: Cpu) -> float: ...
 
 # CompositeInputs, CompositeOutputs, Cpu
 @overload
@@ -447,6 +481,12 @@ def observe_occupancy(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None,
 @overload
 def observe_occupancy(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cuda) -> None: ...
 
+# KnownSamples, OwnSamples, Cpu
+def own_samples(_0: KnownSamples, _1: OwnSamples, _2: Cpu) -> int: ...
+
+# const float32*, int64, float32*, Cpu
+def pack_touched(_0: Tensor | None, _1: int, _2: Tensor | None, _3: Cpu) -> int: ...
+
 # PixelRaysInputs, PixelRaysOutputs, Cpu
 @overload
 def pixel_rays(_0: PixelRaysInputs, _1: PixelRaysOutputs, _2: Cpu) -> bool: ...
@@ -467,6 +507,12 @@ def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor
 # const float32*, const float32*, const float32*, float32*, float64*, int64, int64, int64, Cuda
 @overload
 def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: int, _8: Cuda) -> None: ...
+
+# RenderLossInputs, const float32*, float32*, float32*, float32*, Cpu
+def run_gradients(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
+
+# RenderLossInputs, const float32*, const int32*, float32*, float32*, Cpu
+def run_sums(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
 
 # SparseAdam, const float32*, float32*, float32*, float32*, int64, Cpu
 @overload

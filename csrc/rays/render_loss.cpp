@@ -17,6 +17,23 @@ void rays_of(Isa isa, const RenderLossInputs& in, const RenderLossOutputs& out, 
   VN_FOR_ISA(isa, render_loss_rays(in, out, begin, end))
 }
 
+void sums_of(Isa isa, const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
+             float* sums, int64_t begin, int64_t end) {
+  VN_FOR_ISA(isa, run_sums_block(in, depths, ray_index, density, sums, begin, end))
+}
+
+void gradients_of(Isa isa, const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
+                  float* importance, int64_t begin, int64_t end) {
+  VN_FOR_ISA(isa, run_gradients_block(in, answers, gradient, weights, importance, begin, end))
+}
+
+// block(begin, end) for blocks of rays, shared out to threads.
+template <typename Block>
+void each_block(int64_t rays, int threads, const Block& block) {
+  parallel_for((rays + kRenderLossRays - 1) / kRenderLossRays, 1, threads,
+               [&](int64_t i) { block(i * kRenderLossRays, std::min(rays, (i + 1) * kRenderLossRays)); });
+}
+
 void strays_of(Isa isa, const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {
   VN_FOR_ISA(isa, render_loss_strays(in, out, begin, end))
 }
@@ -35,13 +52,23 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
   }
   strays_of(isa, in, out, 0, in.offsets[0]);
   strays_of(isa, in, out, in.offsets[in.r], in.m);
-  const int64_t blocks = (in.r + kRenderLossRays - 1) / kRenderLossRays;
-  parallel_for(blocks, 1, threads, [&](int64_t block) {
-    rays_of(isa, in, out, block * kRenderLossRays, std::min(in.r, (block + 1) * kRenderLossRays));
-  });
+  each_block(in.r, threads, [&](int64_t begin, int64_t end) { rays_of(isa, in, out, begin, end); });
   double sum = 0.0;
   for (int64_t i = 0; i < in.r; ++i) sum += static_cast<double>(out.error[i]);
   *out.loss = static_cast<float>(sum / (3.0 * static_cast<double>(in.r)));
+}
+
+void run_sums_cpu(const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
+                  float* sums, Isa isa, int threads) {
+  each_block(in.r, threads,
+             [&](int64_t begin, int64_t end) { sums_of(isa, in, depths, ray_index, density, sums, begin, end); });
+}
+
+void run_gradients_cpu(const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
+                       float* importance, Isa isa, int threads) {
+  each_block(in.r, threads, [&](int64_t begin, int64_t end) {
+    gradients_of(isa, in, answers, gradient, weights, importance, begin, end);
+  });
 }
 
 }  // namespace voronerf

@@ -35,4 +35,14 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
 // Offsets that fall or exceed m are not refused: samples outside are not touched.
 void render_loss_cuda(const RenderLossInputs& in, const RenderLossOutputs& out, void* stream);
 
+// The same in two halves, for runs, which are pieces of rays: offsets are theirs, r counts them, and there is neither
+// target nor background. The first gives the partial sums [r,6]: colour as if nothing were in front, optical depth,
+// depth of the first sample, ray. What is known of whole rays answers each sum with [r,6]: the gradient of the loss to
+// the ray's colour, what the light behind the run adds to it, the optical depth in front, the error of the ray.
+// `importance` is that error times the weights.
+void run_sums_cpu(const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
+                  float* sums, Isa isa, int threads);
+void run_gradients_cpu(const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
+                       float* importance, Isa isa, int threads);
+
 }  // namespace voronerf

@@ -16,6 +16,7 @@ namespace VN_ISA_NAMESPACE {
 namespace {
 
 constexpr int64_t kChunk = 128;
+constexpr int64_t kRunSums = 6;   // numbers of a partial sum, and of an answer
 constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
 
 // Samples [first, first + count), in the order of their rays, filled up to whole vectors by samples of no extent.
@@ -95,7 +96,7 @@ VN_INLINE void each_ray(const RenderLossInputs& in, int64_t from, int64_t to, in
 VN_INLINE void forward(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
                        int64_t first, int64_t count, bool together, Chunk& chunk, Sums& sums) {
   activate(in, first, count, chunk);
-  put(out.density + first, chunk.density, count);
+  if (out.density != nullptr) put(out.density + first, chunk.density, count);
   each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
     double front = sums.front[ray];
     for (int64_t i = begin; i < end; ++i) {
@@ -138,6 +139,14 @@ VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out,
     }
     out.error[ray] = error;
     sums.behind[ray - from] = behind;
+  }
+}
+
+// What runs are told of their rays.
+VN_INLINE void hear(const float* answers, int64_t from, int64_t to, Sums& sums) {
+  for (int64_t run = from; run < to; ++run) {
+    for (int k = 0; k < 3; ++k) sums.slopes[k][run - from] = answers[kRunSums * run + k];
+    sums.behind[run - from] = static_cast<double>(answers[kRunSums * run + 3]);
   }
 }
 
@@ -188,19 +197,40 @@ VN_INLINE void backward(const RenderLossInputs& in, const RenderLossOutputs& out
   }
 }
 
-// Rays whose samples fill a chunk at most, or one longer ray.
-VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
-                           Chunk& chunk, Sums& sums) {
-  const int64_t begin = in.offsets[from], end = in.offsets[to];
-  const bool together = end - begin <= kChunk;
-  for (int64_t ray = 0; ray < to - from; ++ray) {
+// `run(from, to)` for rays whose samples fill a chunk at most, or one longer ray.
+template <typename Run>
+VN_INLINE void each_chunk(const RenderLossInputs& in, int64_t begin, int64_t end, const Run& run) {
+  for (int64_t from = begin, to; from < end; from = to) {
+    to = from + 1;
+    while (to < end && in.offsets[to + 1] - in.offsets[from] <= kChunk) ++to;
+    run(from, to);
+  }
+}
+
+VN_INLINE void reset(int64_t rays, Sums& sums) {
+  for (int64_t ray = 0; ray < rays; ++ray) {
     sums.front[ray] = 0.0;
     for (int k = 0; k < 3; ++k) sums.light[k][ray] = 0.0;
+  }
+}
+
+// Rays of `each_chunk`, or runs, where there are answers.
+VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& out, const float* answers, int64_t from,
+                           int64_t to, Chunk& chunk, Sums& sums) {
+  const int64_t begin = in.offsets[from], end = in.offsets[to];
+  const bool together = end - begin <= kChunk;
+  reset(to - from, sums);
+  for (int64_t run = from; answers != nullptr && run < to; ++run) {
+    sums.front[run - from] = static_cast<double>(answers[kRunSums * run + 4]);
   }
   for (int64_t first = begin; first < end; first += kChunk) {
     forward(in, out, from, to, first, end - first < kChunk ? end - first : kChunk, together, chunk, sums);
   }
-  compare(in, out, from, to, sums);
+  if (answers != nullptr) {
+    hear(answers, from, to, sums);
+  } else {
+    compare(in, out, from, to, sums);
+  }
   for (int64_t last = end; last > begin;) {
     const int64_t count = (last - begin - 1) % kChunk + 1;
     last -= count;
@@ -213,10 +243,40 @@ VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& 
 void render_loss_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {
   Chunk chunk;
   Sums sums;
-  for (int64_t from = begin, to; from < end; from = to) {
-    to = from + 1;
-    while (to < end && in.offsets[to + 1] - in.offsets[from] <= kChunk) ++to;
-    render_rays(in, out, from, to, chunk, sums);
+  each_chunk(in, begin, end, [&](int64_t from, int64_t to) { render_rays(in, out, nullptr, from, to, chunk, sums); });
+}
+
+void run_sums_block(const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
+                    float* sums, int64_t begin, int64_t end) {
+  Chunk chunk;
+  Sums summed;
+  const RenderLossOutputs out{nullptr, nullptr, nullptr, density, nullptr, nullptr};
+  each_chunk(in, begin, end, [&](int64_t from, int64_t to) {
+    reset(to - from, summed);
+    for (int64_t first = in.offsets[from]; first < in.offsets[to]; first += kChunk) {
+      const int64_t left = in.offsets[to] - first;
+      forward(in, out, from, to, first, left < kChunk ? left : kChunk, true, chunk, summed);
+    }
+    for (int64_t run = from; run < to; ++run) {
+      float* const sum = sums + kRunSums * run;
+      for (int k = 0; k < 3; ++k) sum[k] = static_cast<float>(summed.light[k][run - from]);
+      sum[3] = static_cast<float>(summed.front[run - from]);
+      sum[4] = depths[in.offsets[run]];
+      sum[5] = static_cast<float>(ray_index[in.offsets[run]]);
+    }
+  });
+}
+
+void run_gradients_block(const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
+                         float* importance, int64_t begin, int64_t end) {
+  Chunk chunk;
+  Sums sums;
+  const RenderLossOutputs out{nullptr, nullptr, weights, nullptr, nullptr, gradient};
+  each_chunk(in, begin, end, [&](int64_t from, int64_t to) { render_rays(in, out, answers, from, to, chunk, sums); });
+  for (int64_t run = begin; run < end; ++run) {
+    for (int64_t i = in.offsets[run]; i < in.offsets[run + 1]; ++i) {
+      importance[i] = weights[i] * answers[kRunSums * run + 5];
+    }
   }
 }
 

@@ -10,6 +10,10 @@ constexpr int64_t kRenderLossRays = 64;  // of a call, at most
 
 VN_DECLARE_FOR_ISA(void render_loss_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin,
                                          int64_t end))
+VN_DECLARE_FOR_ISA(void run_sums_block(const RenderLossInputs& in, const float* depths, const int32_t* ray_index,
+                                       float* density, float* sums, int64_t begin, int64_t end))
+VN_DECLARE_FOR_ISA(void run_gradients_block(const RenderLossInputs& in, const float* answers, float* gradient,
+                                            float* weights, float* importance, int64_t begin, int64_t end))
 // Samples of no ray: only their density is of interest.
 VN_DECLARE_FOR_ISA(void render_loss_strays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin,
                                            int64_t end))

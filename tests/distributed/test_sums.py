@@ -7,6 +7,8 @@ from helpers import refuses, seeded
 from voronerf import OccupancyGrid, VoronoiDiagram, composite
 from voronerf.distributed.sharing import Sharing, assign_cells, voxels_of_ranks
 from voronerf.distributed.sums import along_rays, compose, own_samples, sum_runs
+from voronerf.ops import render_loss
+from voronerf.ops.march_rays import March
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
@@ -37,8 +39,8 @@ def test_partial_sums_are_one_composite(ranks):
     order = along_rays(ray, start)
     sums = [torch.cat([getattr(runs, name) for runs in found])[order] for name in ("colour", "optical")]
     seen = compose(*(part.detach() for part in sums), ray[order], rays)
-    gradients = seen.gradients(sums[0].detach(), ray[order], slopes, background)
-    torch.autograd.backward(sums, (gradients[:, :3], gradients[:, 3]))
+    behind = seen.behind(sums[0].detach(), ray[order], slopes, background)
+    torch.autograd.backward(sums, (seen.front[:, None] * slopes[ray[order]], -behind))
 
     colour = seen.colour + seen.through[:, None] * background
     assert torch.allclose(colour, expected.colour, rtol=1e-12, atol=1e-14)
@@ -46,6 +48,41 @@ def test_partial_sums_are_one_composite(ranks):
     finite = density.isfinite()
     assert torch.allclose(parts[0].grad[finite], whole[0].grad[finite], rtol=1e-10, atol=1e-13)
     assert torch.allclose(parts[1].grad, whole[1].grad, rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.parametrize("ranks", [1, 3])
+def test_compiled_partial_sums_are_one_loss(ranks):
+    """Loss, gradients, weights and importance of `render_loss`, whatever rank has which sample; long and empty rays."""
+    ray_runs = pytest.importorskip("voronerf.native.ray_runs", reason="the extension is not built")
+    generator, counts = seeded(), torch.tensor([5, 0, 1, 300, 40, 0, 7])
+    n, rays = int(counts.sum()), len(counts)
+    index = torch.repeat_interleave(counts).int()
+    offsets = torch.cat((torch.zeros(1, dtype=torch.int64), counts.cumsum(0))).int()
+    raw = torch.randn(n, 4, generator=generator)
+    raw[2, 3] = 1e9  # opaque
+    depths, deltas = torch.arange(n) * 0.01 + 1, torch.full((n,), 0.01)
+    target, background = torch.rand(2, rays, 3, generator=generator)
+    cells = torch.randint(ranks, (n,), generator=generator).int()
+    rest = {"density_scale": 2.0, "hidden": 1e-3}
+    leaf = raw.clone().requires_grad_()
+    expected = render_loss(leaf, deltas, offsets, target, background=background, **rest)
+    expected.loss.backward()
+    whole = March(offsets, index, depths, deltas, torch.rand(n, 3, generator=generator), index)
+
+    own = [torch.where(torch.arange(ranks) == rank, 0, -1).int() for rank in range(ranks)]
+    kept = [(cells == rank).nonzero()[:, 0] for rank in range(ranks)]
+    samples = [ray_runs.own_samples(whole, cells, numbers, bent=False) for numbers in own]
+    assert all(mine.positions.equal(whole.positions[rows]) for mine, rows in zip(samples, kept, strict=True))
+    sums = [ray_runs.run_sums(raw[rows], mine, 2.0)[0] for mine, rows in zip(samples, kept, strict=True)]
+    answers, loss = ray_runs.compose_runs(torch.cat(sums), target, background, first=0, rays=rays)
+    assert torch.allclose(loss, expected.loss, rtol=1e-6)
+    for mine, rows, told in zip(samples, kept, answers.split(list(map(len, sums))), strict=True):
+        gradient, weights, importance = ray_runs.run_gradients(raw[rows], mine, told, **rest)
+        assert torch.allclose(gradient, leaf.grad[rows], rtol=1e-4, atol=1e-8)
+        assert torch.allclose(weights, expected.weights[rows], rtol=1e-5, atol=1e-8)
+        assert torch.allclose(importance, (expected.weights * expected.error[index])[rows], rtol=1e-5, atol=1e-8)
+    with pytest.raises(ValueError, match="compose_runs: rays must be 1 to 7, got 0"):
+        ray_runs.compose_runs(sums[0], target, background, first=1, rays=rays)
 
 
 def test_a_gap_that_another_rank_may_fill_ends_a_run():

@@ -7,25 +7,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
+
+from voronerf import backends
+
+_WORD = 32  # entries that share a number of bits
 
 
 def pack_entries(gradient: Tensor) -> Tensor:
     """What another rank must be told of a gradient float32 [n].
 
-    It has the numbers of the entries that are not zero, as bits of int32, and behind them their values. Where that
-    would be as long, it is the gradient itself.
+    It has a bit for each entry that says whether it is not zero, as bits of float32, and behind them the values of
+    these. Where that would be as long, it is the gradient itself.
     """
-    touched = gradient != 0
-    if gradient.device.type == "cpu":  # torch takes three times as long
-        numbers = torch.from_numpy(np.flatnonzero(touched.numpy()))
+    if _natively(gradient):
+        from voronerf.native.touched_entries import pack_touched  # which is there where the compiled module is
+
+        message = pack_touched(gradient)
     else:
-        numbers = touched.nonzero()[:, 0]
-    if 2 * len(numbers) >= len(gradient):
-        return gradient
-    return torch.cat((numbers.int().view(torch.float32), gradient.index_select(0, numbers)))
+        touched = gradient != 0
+        bits = torch.nn.functional.pad(touched, (0, -len(gradient) % _WORD)).view(-1, _WORD).long()
+        words = (bits << torch.arange(_WORD, device=gradient.device)).sum(1).to(torch.int32)
+        message = torch.cat((words.view(torch.float32), gradient[touched]))
+    return message if len(message) < len(gradient) else gradient
 
 
 def add_entries(parts: Sequence[Tensor], n: int) -> Tensor:
@@ -44,7 +49,16 @@ def add_entries(parts: Sequence[Tensor], n: int) -> Tensor:
     for part in parts:
         if len(part) == n:
             total += part
+        elif _natively(part):
+            from voronerf.native.touched_entries import add_touched
+
+            add_touched(part, total)
         else:
-            numbers, values = part.view(2, -1)
-            total.index_add_(0, numbers.view(torch.int32), values)
+            words, values = part.tensor_split((-(-n // _WORD),))
+            bits = words.view(torch.int32)[:, None] >> torch.arange(_WORD, device=part.device, dtype=torch.int32)
+            total[(bits & 1).bool().view(-1)[:n]] += values
     return total
+
+
+def _natively(tensor: Tensor) -> bool:
+    return tensor.device.type == "cpu" and backends.missing("native", tensor.device) is None

@@ -67,8 +67,7 @@ class Group:
     def __init__(self, device: torch.device) -> None:
         self.rank, self.size, self.device = own_rank(), world_size(), device
         self.sent: Counter[str] = Counter()
-        self._room: dict[str, int] = {}  # rows of a message of each kind
-        self._rooms = [0] * self.size, [0] * self.size  # rows of an exchange, to and from each rank
+        self._rooms: dict[str, tuple[list[int], list[int]]] = {}  # rows of a message of each kind, to and from ranks
         backend = "nccl" if device.type == "cuda" else "gloo"
         if device.type == "cuda":
             torch.cuda.set_device(device)  # where torch puts what it sends of Python objects
@@ -126,79 +125,55 @@ class Group:
         return wait
 
     def share(self, kind: str, rows: Tensor) -> list[Tensor]:
-        """The rows of every rank, as many as each has.
-
-        One message does it: it has room for some more rows than the fullest of its kind before it, and says how many
-        there are. What does not fit follows in another.
-
-        Args:
-            kind: What they are.
-            rows: float32 [n, c].
-        """
-        n, room = len(rows), self._room.get(kind, 0)
-        message = rows.new_empty(1 + room, rows.shape[1])
-        message[:1].view(torch.int32)[:] = n
-        message[1 : 1 + n] = rows[:room]
-        found = self._gather(kind, message)
-        counts = found.view(torch.int32)[:, 0, 0].tolist()
-        parts, most = found[:, 1:], max(counts)
-        if most > room:
-            rest = rows.new_empty(most - room, rows.shape[1])
-            rest[: max(n - room, 0)] = rows[room:]
-            parts = torch.cat((parts, self._gather(kind, rest)), 1)
-        self._room[kind] = most + most // 4 + 1
-        return [part[:count] for part, count in zip(parts, counts, strict=True)]
+        """The rows of every rank, as many as each has; see :meth:`exchange`."""
+        return self.exchange(kind, [rows] * self.size)
 
     def exchange(self, kind: str, parts: Sequence[Tensor]) -> list[Tensor]:
         """Sends each rank its part, and gets one of each; how many rows these have need not be known.
 
-        As in :meth:`share`, a message has room for some more rows than the one before it to the same rank.
+        A message has room for some more rows than the one of its kind before it to the same rank, and says how many
+        there are. What does not fit follows in another.
 
         Args:
-            kind: What they are; all exchanges are of one kind.
+            kind: What they are.
             parts: float32 [n, c] for each rank; the own one stays.
         """
-        there, came = self._rooms
-        messages = [part.new_empty(1 + room, part.shape[1]) for part, room in zip(parts, there, strict=True)]
-        for message, part in zip(messages, parts, strict=True):
-            message[:1].view(torch.int32)[:] = len(part)
-            message[1 : 1 + len(part)] = part[: len(message) - 1]
+        there, came = self._rooms.get(kind, ([0] * self.size, [0] * self.size))
+        messages = [
+            part if rank == self.rank else _message(part, room)
+            for rank, (part, room) in enumerate(zip(parts, there, strict=True))
+        ]
         found = self.swap(kind, messages, [1 + room for room in came])
-        counts = torch.stack([message[0] for message in found]).view(torch.int32)[:, 0].tolist()
-        rests = [part.new_empty(max(n - room, 0), part.shape[1]) for part, n, room in zip(parts, counts, came)]
-        others = [rank for rank in range(self.size) if rank != self.rank]
-        left = [(rank, parts[rank][there[rank] :].contiguous()) for rank in others if len(parts[rank]) > there[rank]]
-        with self._waiting():
-            sends = [dist.P2POp(dist.isend, rest, rank) for rank, rest in left]
-            sends += [dist.P2POp(dist.irecv, rests[rank], rank) for rank in others if len(rests[rank])]
-            for work in dist.batch_isend_irecv(sends) if sends else []:
-                work.wait()
-        self.sent[kind] += sum(rest.numel() * rest.element_size() for _, rest in left)
-        result = [torch.cat((part[1 : 1 + n], rest)) for part, n, rest in zip(found, counts, rests, strict=True)]
+        counts = [
+            len(message) if rank == self.rank else int(message[0, :1].view(torch.int32))
+            for rank, message in enumerate(found)
+        ]
+        rests = [part[room:] for part, room in zip(parts, there, strict=True)]
+        more = self.swap(kind, rests, [max(n - room, 0) for n, room in zip(counts, came, strict=True)])
+        self._rooms[kind] = [len(part) * 9 // 8 + 8 for part in parts], [n * 9 // 8 + 8 for n in counts]
+        result = [
+            torch.cat((message[1:], rest)) if len(rest) else message[1 : 1 + n]
+            for message, rest, n in zip(found, more, counts, strict=True)
+        ]
         result[self.rank] = parts[self.rank]
-        self._rooms = [n + n // 4 + 1 for n in map(len, parts)], [n + n // 4 + 1 for n in counts]
         return result
 
     def swap(self, kind: str, parts: Sequence[Tensor], came: Sequence[int]) -> list[Tensor]:
         """Sends each rank its part [n, c], and gets ``came`` rows of each; the own part stays."""
-        own = self.rank
-        others = [part[:0] if rank == own else part for rank, part in enumerate(parts)]
-        there, came = list(map(len, others)), [0 if rank == own else n for rank, n in enumerate(came)]
-        message = torch.cat(others)
-        found = message.new_empty(sum(came), message.shape[1])
-        with self._waiting():
-            dist.all_to_all_single(found, message, came, there)
-        self.sent[kind] += message.numel() * message.element_size()
-        result = list(found.split(came))
-        result[own] = parts[own]
-        return result
-
-    def _gather(self, kind: str, message: Tensor) -> Tensor:
-        every = message.repeat(self.size, 1, 1)
-        found = torch.empty_like(every)
-        with self._waiting():
-            dist.all_to_all_single(found, every)  # gloo gathers in twice the time
-        self.sent[kind] += (self.size - 1) * message.numel() * message.element_size()
+        found = list(parts)
+        messages = []
+        for rank, (part, n) in enumerate(zip(parts, came, strict=True)):
+            if rank == self.rank:
+                continue
+            found[rank] = part.new_empty(n, part.shape[1])
+            if n:
+                messages.append(dist.P2POp(dist.irecv, found[rank], rank))
+            if len(part):
+                messages.append(dist.P2POp(dist.isend, part, rank))
+                self.sent[kind] += part.numel() * part.element_size()
+        with self._waiting():  # gloo takes half as long for these as for its collectives
+            for work in dist.batch_isend_irecv(messages) if messages else []:
+                work.wait()
         return found
 
     def from_first(self, value: Any) -> Any:
@@ -207,6 +182,14 @@ class Group:
         with self._waiting():
             dist.broadcast_object_list(box, src=0)
         return box[0]
+
+
+def _message(rows: Tensor, room: int) -> Tensor:
+    """The number of rows [n, c], and as many of them as there is room for, [1 + room, c]."""
+    message = rows.new_empty(1 + room, rows.shape[1])
+    message[0, :1].view(torch.int32).fill_(len(rows))
+    message[1 : 1 + len(rows)] = rows[:room]
+    return message
 
 
 _current: Group | None = None

@@ -2,7 +2,7 @@
 
 Before the first split all ranks have the same network, and each evaluates its slice of the rays. Afterwards each
 evaluates its own cells on all rays. Each rank puts a slice of the rays together: it gets a partial sum of each run from
-those that evaluated it, 24 bytes, and answers with its gradients (Li et al. 2024, NeRF-XL).
+those that evaluated it, 24 bytes, and answers with what its gradients follow from (Li et al. 2024, NeRF-XL).
 
 r rays, m own samples, q runs.
 """
@@ -10,20 +10,25 @@ r rays, m own samples, q runs.
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
+from voronerf import backends
 from voronerf.distributed.group import Group
 from voronerf.distributed.sharing import Sharing, voxels_of_ranks
 from voronerf.distributed.sums import Samples, along_rays, compose, own_samples, sum_runs
+from voronerf.ops.march_rays import March
 from voronerf.rendering.cameras import Rays
+from voronerf.rendering.comparison import compare_samples, compares_outputs
 from voronerf.rendering.marching import Seen, draw_seed
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid, density_of
 from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.rendering.sampling import NEARBY, stratified_depths
 from voronerf.rendering.volume import weaken_near
+from voronerf.router import VoronoiRouter
+from voronerf.router.fused import routed_arguments
 
 #: Rays of a picture at a time: no ray ends at the first surface, since other ranks do not know it in time.
 PICTURE_CHUNK = 16_384
@@ -59,6 +64,7 @@ class RankRenderer(Renderer):
 
     group: Group
     sharing: Sharing | None = None
+    _numbers: Tensor  # int32 [k], of each cell among own ones, or -1
     _reached: Tensor  # bool [v], the voxels of the grid that own cells reach
     _several: Tensor  # bool [v], those that cells of two or more ranks reach
 
@@ -69,6 +75,8 @@ class RankRenderer(Renderer):
     def own_cells(self, sharing: Sharing) -> None:
         """Renders only the cells of this rank from now on; the grid forgets what they do not reach."""
         self.sharing = sharing
+        own = sharing.owner == self.group.rank
+        self._numbers = torch.where(own, own.cumsum(0) - 1, -1).to(torch.int32)
         if self.occupancy is not None:
             reached = voxels_of_ranks(sharing, self.occupancy, self.group.size)
             self._reached, self._several = reached[self.group.rank], reached.sum(0) > 1
@@ -109,15 +117,8 @@ class RankRenderer(Renderer):
         else:
             # A ray's jitter follows from the sum of seed and number.
             seed = draw_seed(near.device, generator) + first if jitter else None
-            march = grid.march(
-                rays[kept],
-                near[kept],
-                far[kept],
-                strata,
-                seed=seed,
-                spacing=self.spacing,
-                backend=self.backend,
-            )
+            given: dict[str, Any] = {"seed": seed, "spacing": self.spacing, "backend": self.backend}
+            march = grid.march(rays[kept], near[kept], far[kept], strata, **given)
             found = march.positions, march.ray_index + first, march.depths, march.deltas
         hidden = self.sharing is not None and grid is not None
         return own_samples(*found, *self._owns(found[0]), hidden=hidden, bent=self.contraction is not None)
@@ -148,6 +149,15 @@ class RankRenderer(Renderer):
             generator: Of the samples, in the same state on all ranks.
             seen: [s], the distances of points at which the last s rays end, or None.
         """
+        own = slice(*self._slices(len(rays))[self.group.rank :][:2])
+        background = None if background is None else background.expand_as(target)
+        if self.occupancy is not None and seen is None and compares_outputs(self):
+            if self.sharing is None:
+                march = self._march(self.occupancy, rays[own], near[own], far[own], generator, own.start)
+                return self._learn_slice(rays, march, target, background, own)
+            if near.device.type == "cpu" and self.full_gradient is None and not backends.missing("native", near.device):
+                march = self._march(self.occupancy, rays, near, far, generator, 0)
+                return self._learn_natively(rays, march, target, background, own)
         samples = self.samples_of(rays, near, far, jitter=True, generator=generator)
         colour, density = self.field(samples.positions, rays.directions, samples.ray_index)
         colour, density = colour.to(near.dtype), density.to(near.dtype)
@@ -159,24 +169,77 @@ class RankRenderer(Renderer):
             colour = torch.cat((colour, _lies_at(points, samples)[:, None]), 1)
         runs = sum_runs(samples, colour, density, self.backend)
         sums = torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1).detach()
-        bounds = self._slices(len(rays))
-        cuts = torch.searchsorted(runs.ray, torch.tensor(bounds, device=near.device)).tolist()
-        sizes = [end - begin for begin, end in itertools.pairwise(cuts)]
-        parts = self.group.exchange("sums", sums.split(sizes))
-        own = slice(*bounds[self.group.rank :][:2])
-        shown = None if background is None else background.expand_as(target)[own]
+        parts, sizes = self._tell_sums(sums, len(rays))
+        shown = None if background is None else background[own]
         given = torch.cat(parts), own.start, target[own], shown, None if points is None else points[own]
         answers, loss = self._answer(*given, rays=len(rays), seen=0 if seen is None else len(seen))
         answers = torch.cat(self.group.swap("sums", answers.split(list(map(len, parts))), sizes))
-        run = torch.repeat_interleave(samples.run_offsets.diff())
-        weights = runs.weights * answers[run, c + 1]
+        run, front = torch.repeat_interleave(samples.run_offsets.diff()), torch.exp(-answers[:, c + 1])
+        weights = runs.weights * front[run]
         if self.occupancy is not None:
             hidden = weights <= HIDDEN * -torch.expm1(-density.detach() * samples.deltas)
             colour.register_hook(lambda gradient: gradient.masked_fill(hidden[:, None], 0))
             density.register_hook(lambda gradient: gradient.masked_fill(hidden, 0))
-        torch.autograd.backward((runs.colour, runs.optical), (answers[:, :c], answers[:, c]))
+        torch.autograd.backward((runs.colour, runs.optical), (front[:, None] * answers[:, :c], -answers[:, c]))
         importance = weights * answers[run, c + 2]
         return Learnt(loss, samples.positions, density.detach(), samples.deltas, weights, importance)
+
+    def _march(
+        self,
+        grid: OccupancyGrid,
+        rays: Rays,
+        near: Tensor,
+        far: Tensor,
+        generator: torch.Generator | None,
+        first: int,
+    ) -> March:
+        """The samples of rays from a first one on, with the jitter of all: a ray's follows from seed plus number."""
+        seed = draw_seed(near.device, generator) + first
+        return grid.march(rays, near, far, self.samples, seed=seed, spacing=self.spacing, backend=self.backend)
+
+    def _learn_slice(self, rays: Rays, march: March, target: Tensor, background: Tensor | None, own: slice) -> Learnt:
+        """:meth:`learn` where all ranks have the same network: no ray is split."""
+        found = compare_samples(self, rays[own], march, target[own], None if background is None else background[own])
+        loss = found.loss * (len(found.error) / len(rays))
+        loss.backward()
+        assert found.density is not None
+        weights, importance = found.weights, found.importance()
+        return Learnt(loss.detach(), march.positions, found.density, march.deltas, weights, importance)
+
+    def _learn_natively(
+        self, rays: Rays, march: March, target: Tensor, background: Tensor | None, own: slice
+    ) -> Learnt:
+        """:meth:`learn` from the outputs of the networks, where these mean a colour and a density."""
+        from voronerf.native import ray_runs  # which is there where the compiled module is
+
+        assert self.sharing is not None
+        field = cast(VoronoiRouter, self.field)
+        scale = float(cast(Any, field.module).density_scale)
+        cells = self.sharing.diagram.locate(march.positions, backend=self.backend)
+        samples = ray_runs.own_samples(march, cells, self._numbers, bent=self.contraction is not None)
+        routed = routed_arguments(field, samples.positions, rays.directions, samples.ray_index)
+        assert routed is not None
+        networks = ray_runs.Networks(routed, samples.cells)
+        sums, density = ray_runs.run_sums(networks.out, samples, scale)
+        parts, sizes = self._tell_sums(sums, len(rays))
+        behind = None if background is None else background[own]
+        every = torch.cat(parts)
+        answers, loss = ray_runs.compose_runs(every, target[own], behind, first=own.start, rays=len(rays))
+        answers = torch.cat(self.group.swap("sums", answers.split(list(map(len, parts))), sizes))
+        gradient, weights, importance = ray_runs.run_gradients(networks.out, samples, answers, scale, HIDDEN)
+        networks.backward(gradient)
+        return Learnt(loss, samples.positions, density, samples.deltas, weights, importance)
+
+    def _tell_sums(self, sums: Tensor, rays: int) -> tuple[list[Tensor], list[int]]:
+        """Sends sums [q, c], by ascending rays, to the ranks that put these together.
+
+        Returns:
+            The sums that come from each rank, and how many went there.
+        """
+        bounds = torch.tensor(self._slices(rays), dtype=sums.dtype, device=sums.device)
+        cuts = torch.searchsorted(sums[:, -1].contiguous(), bounds).tolist()
+        sizes = [end - begin for begin, end in itertools.pairwise(cuts)]
+        return self.group.exchange("sums", sums.split(sizes)), sizes
 
     def _answer(
         self,
@@ -201,8 +264,8 @@ class RankRenderer(Renderer):
             seen: Those of them that end at points.
 
         Returns:
-            For each run [q, c + 3] the gradients of its colours and its optical depth, the light that arrives at it,
-            and the error of its ray; and the part [] that these rays have in the loss.
+            For each run [q, c + 3] the gradients of its ray's colours, what light behind it adds to the loss, the
+            optical depth in front of it, and the error of its ray; and the part [] that these rays have in the loss.
         """
         c = sums.shape[1] - 3
         order = along_rays(sums[:, c + 2].long(), sums[:, c + 1])
@@ -221,40 +284,40 @@ class RankRenderer(Renderer):
             slopes[:, 3] = torch.where(ends & (light >= 1e-3) & (light <= 1), -share / light, 0)
             loss = loss - share * torch.log(light[ends].clamp(1e-3, 1)).sum()
         answers = torch.empty_like(sums)
-        answers[order, : c + 1] = whole.gradients(part, ray, slopes, behind)
-        answers[order, c + 1], answers[order, c + 2] = whole.front, error[ray]
+        answers[order, :c], answers[order, c] = slopes[ray], whole.behind(part, ray, slopes, behind)
+        answers[order, c + 1], answers[order, c + 2] = whole.before, error[ray]
         return answers, loss
 
     # --- the grid --------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def observations(self, grid: OccupancyGrid, found: Learnt) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """What samples say of the voxels that they are in.
-
-        Returns:
-            Positions [m, 3] and densities [m] of own samples, and of those in voxels that other ranks reach too voxel
-            and density, [c, 2], which these should know.
-        """
-        density = found.density.float().nan_to_num(nan=float("inf"), posinf=float("inf"))
-        visible = found.weights > HIDDEN * -torch.expm1(-density * found.deltas)
-        density = torch.where(visible, density, 0)
-        positions, cells = found.positions, grid.cells(found.positions)
+    def observations(self, grid: OccupancyGrid, found: Learnt) -> Tensor:
+        """What other ranks should know of own samples: voxel and density [c, 2] in voxels that several ranks reach."""
+        cells, density, deltas, weights = (
+            grid.cells(found.positions),
+            found.density.float(),
+            found.deltas,
+            found.weights,
+        )
+        positions = found.positions
+        if self.sharing is not None:
+            rows = self._several[cells].nonzero()[:, 0]
+            every = cells, density, deltas, weights, positions
+            cells, density, deltas, weights, positions = (values[rows] for values in every)
+        density = density.nan_to_num(nan=float("inf"), posinf=float("inf"))
+        density = torch.where(weights > HIDDEN * -torch.expm1(-density * deltas), density, 0)
         if grid.contraction is not None:  # the grid will stretch them as at the middle of their voxel
             middle = grid.contraction.stretch(grid.points(cells.long()))
             density = density * grid.contraction.stretch(positions) / middle
-            positions = grid.points(cells.long())
-        told = torch.stack((cells.view(torch.float32), density), 1)
-        return (positions, density), told if self.sharing is None else told[self._several[cells]]
+        return torch.stack((cells.view(torch.float32), density), 1)
 
-    def observe(
-        self, grid: OccupancyGrid, own: tuple[Tensor, Tensor], others: Tensor, *, decay: float, backend: str
-    ) -> None:
+    def observe(self, grid: OccupancyGrid, found: Learnt, others: Tensor, *, decay: float, backend: str) -> None:
         """Teaches the grid what all ranks found in the voxels that own cells reach.
 
         Args:
             grid: Of this rank.
-            own: The first part of this rank's :meth:`observations`.
-            others: [c, 2], the second of all other ranks.
+            found: By this rank.
+            others: [c, 2], the :meth:`observations` of all other ranks.
             decay: As of a grid.
             backend: As of a grid.
         """
@@ -262,10 +325,11 @@ class RankRenderer(Renderer):
         if self.sharing is not None:
             ours = self._reached[cells]
             cells, others = cells[ours], others[ours]
-        positions = torch.cat((own[0], grid.points(cells.long())))
-        density = torch.cat((own[1], others[:, 1]))
-        ones = torch.ones_like(density)  # what counts has been decided
-        grid.observe(positions, density, ones, ones, decay=decay, backend=backend)
+        told, ones = others[:, 1], torch.ones_like(others[:, 1])  # whether it is visible has been decided
+        positions = torch.cat((found.positions, grid.points(cells.long())))
+        density, deltas = torch.cat((found.density.float(), told)), torch.cat((found.deltas, ones))
+        weights = torch.cat((found.weights, ones))
+        grid.observe(positions, density, deltas, weights, decay=decay, backend=backend)
 
     def revisited(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """The field of all ranks, for the grid: each evaluates the positions that it owns."""

@@ -109,35 +109,35 @@ class Composed(NamedTuple):
     Attributes:
         colour: [r, c], without a background.
         through: [r], the light that passes all of them.
-        front: [q], the light that arrives at each run.
+        before: [q], the optical depth in front of each run.
         place: int64 [q], where each run is in a table with a row for each ray.
         width: The columns of the table.
     """
 
     colour: Tensor
     through: Tensor
-    front: Tensor
+    before: Tensor
     place: Tensor
     width: int
 
-    def gradients(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
-        """The gradients of the runs' colours and optical depths, from those of the colours of the rays.
+    @property
+    def front(self) -> Tensor:
+        """[q], the light that arrives at each run."""
+        return torch.exp(-self.before)
+
+    def behind(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
+        """What the light from behind each run [q] adds to the loss, which more optical depth takes away.
 
         Args:
             colour: [q, c], as of :func:`compose`.
             ray: int64 [q], likewise.
             slopes: [r, c], the gradient of each ray's colour over its background.
             background: [r, c].
-
-        Returns:
-            [q, c + 1], colours first. More depth takes light from all that is behind: later runs, and the background.
         """
-        direct = self.front[:, None] * slopes[ray]
-        table = direct.new_zeros(len(slopes), self.width)
-        table.view(-1)[self.place] = (direct * colour).sum(1)
+        table = slopes.new_zeros(len(slopes), self.width)
+        table.view(-1)[self.place] = self.front * (slopes[ray] * colour).sum(1)
         table = torch.cat((table[:, 1:], (self.through * (slopes * background).sum(1))[:, None]), 1)
-        behind = table.flip(1).cumsum(1).flip(1).view(-1)[self.place]
-        return torch.cat((direct, -behind[:, None]), 1)
+        return table.flip(1).cumsum(1).flip(1).view(-1)[self.place]
 
 
 def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed:
@@ -156,9 +156,9 @@ def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed
     table = optical.new_zeros(rays, width)
     table.view(-1)[place] = optical
     # The sum is shifted: less its last term it would be inf - inf for an opaque run.
-    front = torch.exp(-torch.nn.functional.pad(table[:, :-1], (1, 0)).cumsum(1)).view(-1)[place]
-    whole = colour.new_zeros(rays, colour.shape[1]).index_add(0, ray, front[:, None] * colour)
-    return Composed(whole, torch.exp(-table.sum(1)), front, place, width)
+    before = torch.nn.functional.pad(table[:, :-1], (1, 0)).cumsum(1).view(-1)[place]
+    whole = colour.new_zeros(rays, colour.shape[1]).index_add(0, ray, torch.exp(-before)[:, None] * colour)
+    return Composed(whole, torch.exp(-table.sum(1)), before, place, width)
 
 
 def along_rays(ray: Tensor, start: Tensor) -> Tensor:

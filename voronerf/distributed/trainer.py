@@ -159,11 +159,11 @@ class RankTrainer(Trainer):
         if collects:
             heaviest, importance = select_heaviest(found.positions, found.importance, len(kept))
             kept[: len(heaviest), :3], kept[: len(heaviest), 3] = heaviest, importance
-        own, seen = (None, kept.new_empty(0, 2)) if grid is None else self.renderer.observations(grid, found)
+        seen = kept.new_empty(0, 2) if grid is None else self.renderer.observations(grid, found)
         total, loss, kept, others = self._tell(found, kept, seen)
-        if grid is not None and own is not None:
+        if grid is not None:
             backend = "auto" if config.backend == "warp" else config.backend
-            self.renderer.observe(grid, own, others, decay=OCCUPANCY_DECAY, backend=backend)
+            self.renderer.observe(grid, found, others, decay=OCCUPANCY_DECAY, backend=backend)
         self.guard.judge(total, self.optimizer)
         summed()
         self.optimizer.step()

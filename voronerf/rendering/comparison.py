@@ -13,6 +13,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.fields.radiance import activate_radiance
+from voronerf.ops.march_rays import March
 from voronerf.ops.render_loss import RenderLoss, check_targets, render_loss
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
@@ -100,15 +101,27 @@ def compare_marched(
     None where that is not to be had: without a grid, for fields that do not declare what their outputs mean
     (`activate_radiance`), and for a backend that has no `render_loss`.
     """
-    field, grid, backend = renderer.field, renderer.occupancy, renderer.backend
-    if grid is None or backend not in ("auto", "native"):
+    grid = renderer.occupancy
+    if grid is None or not compares_outputs(renderer):
         return None
-    if not isinstance(field, VoronoiRouter) or getattr(type(field.module), "activate", None) is not activate_radiance:
-        return None
-    if not field.by_table:
-        return None
+    march = march_grid(rays, near, far, grid, renderer.samples, True, generator, renderer.spacing, renderer.backend)
+    return compare_samples(renderer, rays, march, target, background)
+
+
+def compares_outputs(renderer: Marching) -> bool:
+    """Whether colours are to be had from the outputs of the networks: their field says what these mean."""
+    field = renderer.field
+    if renderer.backend not in ("auto", "native") or not isinstance(field, VoronoiRouter):
+        return False
+    return getattr(type(field.module), "activate", None) is activate_radiance and field.by_table
+
+
+def compare_samples(
+    renderer: Marching, rays: Rays, march: March, target: Tensor, background: Tensor | None
+) -> Comparison:
+    """`compare_marched` of samples, for a renderer that `compares_outputs`."""
+    field = cast(VoronoiRouter, renderer.field)
     module: Any = field.module
-    march = march_grid(rays, near, far, grid, renderer.samples, True, generator, renderer.spacing, backend)
     rest: dict[str, Any] = {
         "background": background,
         "density_scale": float(module.density_scale),
@@ -123,7 +136,7 @@ def compare_marched(
     else:
         raw = field.raw(*given)
         weaken_near(renderer.full_gradient, march.depths, raw)
-        found = render_loss(raw, march.deltas, march.ray_offsets, target, **rest, backend=backend)
+        found = render_loss(raw, march.deltas, march.ray_offsets, target, **rest, backend=renderer.backend)
     return Comparison(
         found.loss, found.error, march.positions, found.weights, march.ray_index, found.density, march.deltas
     )

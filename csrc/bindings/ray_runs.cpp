@@ -1,0 +1,16 @@
+#include "rays/ray_runs.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_STRUCT(KnownSamples, positions, ray_index, depths, deltas, cells, own, n, bent);
+VN_STRUCT(OwnSamples, positions, ray_index, depths, deltas, cells, offsets);
+VN_STRUCT(RunsOfRays, sums, target, background, background_per_ray, q, first, r, rays);
+
+VN_BINDINGS(module) {
+  module.cpu("own_samples", VN_CPU(own_samples_cpu));
+  module.cpu("compose_runs", VN_CPU(compose_runs_cpu));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,88 @@
+// One pass each, on one thread: a step has some thousands of samples and some hundreds of runs.
+#include "rays/ray_runs.h"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace voronerf {
+
+int64_t own_samples_cpu(const KnownSamples& in, const OwnSamples& out, int) {
+  int64_t count = 0, runs = 0, before = -2;
+  for (int64_t i = 0; i < in.n; ++i) {
+    const int32_t cell = in.own[in.cells[i]];
+    if (cell < 0) continue;
+    const int32_t ray = in.ray_index[i];
+    bool begins = i - before != 1 || ray != out.ray_index[count - 1];
+    if (!begins) {
+      // Less than the stratum between would be long: none lies there.
+      const bool near = in.depths[i] - out.depths[count - 1] < std::min(in.deltas[i], out.deltas[count - 1]);
+      begins = !near && (in.bent || cell != out.cells[count - 1]);
+    }
+    if (begins) out.offsets[runs++] = static_cast<int32_t>(count);
+    for (int k = 0; k < 3; ++k) out.positions[3 * count + k] = in.positions[3 * i + k];
+    out.ray_index[count] = ray;
+    out.depths[count] = in.depths[i];
+    out.deltas[count] = in.deltas[i];
+    out.cells[count++] = cell;
+    before = i;
+  }
+  out.offsets[runs] = static_cast<int32_t>(count);
+  return runs;
+}
+
+float compose_runs_cpu(const RunsOfRays& in, float* answers, int) {
+  std::vector<int64_t> ends(in.r + 1), order(in.q);
+  const auto ray_of = [&](int64_t run) { return static_cast<int64_t>(in.sums[6 * run + 5]) - in.first; };
+  for (int64_t run = 0; run < in.q; ++run) {
+    const int64_t ray = ray_of(run);
+    if (ray < 0 || ray >= in.r) {
+      throw std::invalid_argument("compose_runs: rays must be " + std::to_string(in.first) + " to " +
+                                  std::to_string(in.first + in.r - 1) + ", got " + std::to_string(ray + in.first));
+    }
+    ++ends[ray];
+  }
+  for (int64_t ray = 0, sum = 0; ray <= in.r; ++ray) sum += std::exchange(ends[ray], sum);
+  for (int64_t run = 0; run < in.q; ++run) order[ends[ray_of(run)]++] = run;  // now each is the end of its ray
+  const float share = 2.0f / (3.0f * static_cast<float>(in.rays));
+  double loss = 0.0;
+  for (int64_t ray = 0, begin = 0; ray < in.r; begin = ends[ray++]) {
+    const auto start = [&](int64_t run) { return in.sums[6 * run + 4]; };
+    std::stable_sort(order.begin() + begin, order.begin() + ends[ray],
+                     [&](int64_t a, int64_t b) { return start(a) < start(b); });
+    const float* background = in.background;
+    if (background != nullptr && in.background_per_ray) background += 3 * ray;
+    double front = 0.0, light[3] = {}, slopes[3], behind = 0.0;
+    for (int64_t i = begin; i < ends[ray]; ++i) {
+      const float* sum = in.sums + 6 * order[i];
+      float* answer = answers + 6 * order[i];
+      answer[4] = static_cast<float>(front);
+      for (int k = 0; k < 3; ++k) light[k] += std::exp(-front) * static_cast<double>(sum[k]);
+      front += static_cast<double>(sum[3]);
+    }
+    float error = 0.0f;
+    for (int k = 0; k < 3; ++k) {
+      const double left = background == nullptr ? 0.0 : std::exp(-front) * static_cast<double>(background[k]);
+      const float off = static_cast<float>(light[k] + left) - in.target[3 * ray + k];
+      slopes[k] = static_cast<double>(off * share);
+      behind += slopes[k] * left;
+      error += off * off;
+    }
+    loss += static_cast<double>(error);
+    for (int64_t i = ends[ray]; i-- > begin;) {
+      const float* sum = in.sums + 6 * order[i];
+      float* answer = answers + 6 * order[i];
+      for (int k = 0; k < 3; ++k) answer[k] = static_cast<float>(slopes[k]);
+      answer[3] = static_cast<float>(behind);
+      answer[5] = error;
+      const double arrives = std::exp(-static_cast<double>(answer[4]));
+      for (int k = 0; k < 3; ++k) behind += slopes[k] * arrives * static_cast<double>(sum[k]);
+    }
+  }
+  return static_cast<float>(loss / (3.0 * static_cast<double>(in.rays)));
+}
+
+}  // namespace voronerf
