@@ -17,7 +17,6 @@ def _sparse_adam_kernel(
     mean: wp.array(dtype=wp.float32),
     square: wp.array(dtype=wp.float32),
     rate: wp.float32,
-    correction: wp.float32,
     first: wp.float32,
     second: wp.float32,
     epsilon: wp.float32,
@@ -30,7 +29,7 @@ def _sparse_adam_kernel(
     v = second * square[i] + (1.0 - second) * (g * g)
     mean[i] = m
     square[i] = v
-    parameter[i] = parameter[i] - rate * (m / (wp.sqrt(v) / correction + epsilon))
+    parameter[i] = parameter[i] - rate * (m / (wp.sqrt(v) + epsilon))
 
 
 def sparse_adam(
@@ -39,11 +38,10 @@ def sparse_adam(
     mean: Tensor,
     square: Tensor,
     rate: float,
-    correction: float,
     first: float,
     second: float,
     epsilon: float,
 ) -> None:
-    """The formula of ``voronerf.ops.sparse_adam``; ``rate`` and ``correction`` are corrected for the moments' start."""
+    """The formula of ``voronerf.ops.sparse_adam``; ``rate`` and ``epsilon`` are corrected for the moments' start."""
     arrays = [array(tensor.view(-1), parameter) for tensor in (parameter, gradient, mean, square)]
-    launch(_sparse_adam_kernel, parameter.numel(), [*arrays, rate, correction, first, second, epsilon], parameter)
+    launch(_sparse_adam_kernel, parameter.numel(), [*arrays, rate, first, second, epsilon], parameter)

@@ -79,6 +79,15 @@ class Cuda(NamedTuple):
     device: int  # int32
     stream: int  # uint64
 
+class DrawPixelsInputs(NamedTuple):
+    seed: Tensor | None  # const int32*
+    ends: Tensor | None  # const int64*
+    shift: Tensor | None  # const int64*
+    first: Tensor | None  # const int32*
+    bits: int  # int64
+    below: int  # int64
+    b: int  # int64
+
 class Encoding(NamedTuple):
     x: Tensor | None  # const float32*
     variances: Tensor | None  # const float32*
@@ -299,12 +308,15 @@ class RunsOfRays(NamedTuple):
 
 class SparseAdam(NamedTuple):
     step_size: float  # float32
-    correction: float  # float32
     decay: float  # float32
     decay_sq: float  # float32
     epsilon: float  # float32
+    every: bool
 
 TableType: tuple[str, ...]  # float32 bfloat16 float16
+
+# SparseAdam[], const float32**, float32**, float32**, float32**, int64[], Cpu
+def adam(_0: Sequence[SparseAdam], _1: Sequence[Tensor | None] | None, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[int], _6: Cpu) -> None: ...
 
 # const float32*, int64, int64, float32*, Cpu
 def add_touched(_0: Tensor | None, _1: int, _2: int, _3: Tensor | None, _4: Cpu) -> None: ...
@@ -373,6 +385,9 @@ def draw_cell_places(_0: int, _1: Cpu) -> int: ...
 
 # int64, Cpu
 def draw_cell_sums(_0: int, _1: Cpu) -> int: ...
+
+# DrawPixelsInputs, int64*, float32*, Cpu
+def draw_pixels(_0: DrawPixelsInputs, _1: Tensor | None, _2: Tensor | None, _3: Cpu) -> None: ...
 
 # Encoding, float32*, float32*, Cpu
 @overload

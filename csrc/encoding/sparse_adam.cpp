@@ -26,4 +26,21 @@ void sparse_adam_cpu(const SparseAdam& rule, const float* gradient, float* param
   });
 }
 
+void adam_cpu(const std::vector<SparseAdam>& rules, const float* const* gradients, float* const* parameters,
+              float* const* means, float* const* squares, const std::vector<int64_t>& sizes, Isa isa, int threads) {
+  struct Block {
+    size_t tensor;
+    int64_t begin;
+  };
+  std::vector<Block> blocks;
+  for (size_t i = 0; i < sizes.size(); ++i) {
+    for (int64_t begin = 0; begin < sizes[i]; begin += kBlock) blocks.push_back({i, begin});
+  }
+  parallel_for(static_cast<int64_t>(blocks.size()), 1, threads, [&](int64_t number) {
+    const auto [i, begin] = blocks[number];
+    run_block(isa, rules[i], gradients[i], parameters[i], means[i], squares[i], begin,
+              std::min(sizes[i], begin + kBlock));
+  });
+}
+
 }  // namespace voronerf

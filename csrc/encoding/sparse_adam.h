@@ -1,17 +1,19 @@
-// Adam on the entries that have a gradient. n entries; the formula is in voronerf/ops/sparse_adam.py.
+// Adam on lists of tensors, and on the entries of tables that have a gradient. The formula is in
+// voronerf/ops/sparse_adam.py.
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 #include "common/isa.h"
 
 namespace voronerf {
 
 struct SparseAdam {
-  float step_size;        // the learning rate, corrected for the first moment's start at zero
-  float correction;       // the root of the second moment's correction
+  float step_size;        // the learning rate, corrected for the moments' start at zero
   float decay, decay_sq;  // of the moments
-  float epsilon;
+  float epsilon;          // corrected likewise
+  bool every;             // entries without a gradient move on by their moments, which decay, as torch's do
 };
 
 // gradient: [n] -> parameter, mean, square: [n], updated in place where the gradient is not zero.
@@ -19,5 +21,9 @@ void sparse_adam_cpu(const SparseAdam& rule, const float* gradient, float* param
                      int64_t n, Isa isa, int threads);
 void sparse_adam_cuda(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
                       int64_t n, void* stream);
+
+// The same of several parameters, by the rule of each.
+void adam_cpu(const std::vector<SparseAdam>& rules, const float* const* gradients, float* const* parameters,
+              float* const* means, float* const* squares, const std::vector<int64_t>& sizes, Isa isa, int threads);
 
 }  // namespace voronerf

@@ -54,10 +54,10 @@ VN_INLINE void store(float* to, F32 a) {
 // kLanes entries.
 VN_INLINE void update(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square) {
   const F32 g = load(gradient), p = load(parameter), m = load(mean), v = load(square);
-  const auto present = g != F32{};
+  const auto present = (g != F32{}) | (rule.every ? -1 : 0);
   const F32 new_m = rule.decay * m + (1.0f - rule.decay) * g;
   const F32 new_v = rule.decay_sq * v + (1.0f - rule.decay_sq) * (g * g);
-  const F32 moved = p - rule.step_size * (new_m / (square_root(new_v) / rule.correction + rule.epsilon));
+  const F32 moved = p - rule.step_size * (new_m / (square_root(new_v) + rule.epsilon));
   store(mean, present ? new_m : m);
   store(square, present ? new_v : v);
   store(parameter, present ? moved : p);
@@ -74,7 +74,7 @@ void sparse_adam_block(const SparseAdam& rule, const float* gradient, float* par
     int count = 0;
     for (int64_t i = 0; i < lines; ++i) {
       found[count] = static_cast<int32_t>(i * kLine);
-      count += any(gradient + line + i * kLine);
+      count += rule.every || any(gradient + line + i * kLine);
     }
     for (int i = 0; i < count; ++i) {
       if (i + kAhead < count) {

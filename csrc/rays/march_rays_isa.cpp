@@ -6,6 +6,7 @@
 // same cell on every path.
 #include "rays/march_rays_isa.h"
 
+#include "common/hashed.h"
 #include "common/simd.h"
 
 namespace voronerf {
@@ -36,19 +37,8 @@ VN_INLINE float sample_at(const Ray& ray, int64_t i, float inside, float first, 
   return above > last ? last : above;
 }
 
-// Chris Wellons' lowbias32.
-VN_INLINE uint32_t mixed(uint32_t x) {
-  x = (x ^ x >> 16) * 0x7feb352du;
-  x = (x ^ x >> 15) * 0x846ca68bu;
-  return x ^ x >> 16;
-}
-
-// The key of a ray, and a number in [0, 1) of one of its strata.
 VN_INLINE uint32_t key_of(const MarchInputs& in, int64_t i) {
-  return in.seed == nullptr ? 0 : mixed(static_cast<uint32_t>(*in.seed) + static_cast<uint32_t>(i));
-}
-VN_INLINE float hashed(uint32_t key, uint32_t stratum) {
-  return static_cast<float>(static_cast<int32_t>(mixed(key ^ stratum * 0x9e3779b9u) >> 8)) * 0x1p-24f;
+  return in.seed == nullptr ? 0 : hash_key(*in.seed, i);
 }
 
 enum class Space { kWorld, kSphere, kPerspective };

@@ -1,5 +1,6 @@
 """The optimiser of tables: few entries have a gradient, moments are inherited and saved."""
 
+import functools
 from typing import ClassVar
 
 import pytest
@@ -36,21 +37,22 @@ def embedded():
 
 def test_dense_groups_are_torchs():
     results = []
-    for make in (Adam, torch.optim.Adam):
+    for make in (Adam, functools.partial(torch.optim.Adam, fused=True)):
         torch.manual_seed(0)
         parameters = [torch.nn.Parameter(torch.randn(5, 3)), torch.nn.Parameter(torch.randn(7))]
-        optimizer = make(parameters, lr=0.1, fused=True)
+        optimizer = make(parameters, lr=0.1, betas=(0.9, 0.99))
         for _ in range(3):
             optimizer.zero_grad()
             sum((p.square() * torch.randn_like(p)).sum() for p in parameters).backward()
             optimizer.step()
         results.append([*parameters, *(t for p in parameters for t in optimizer.state[p].values())])
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_tables_move_where_they_have_a_gradient_and_keep_it():
     table, other = torch.nn.Parameter(torch.ones(6, 2)), torch.nn.Parameter(torch.ones(2))
-    optimizer = Adam([{"params": [other]}, {"params": [table], "sparse": True}], lr=0.5, fused=True)
+    optimizer = Adam([{"params": [other]}, {"params": [table], "sparse": True}], lr=0.5)
     for row in (1, 4):
         optimizer.zero_grad()
         (table[row].sum() + other.sum()).backward()
@@ -67,7 +69,7 @@ def test_a_scaled_gradient_is_unscaled_and_an_overflow_skipped():
     results = []
     for enabled in (False, True):
         table = torch.nn.Parameter(torch.ones(40, 2))
-        optimizer = Adam([{"params": [table], "sparse": True}], lr=0.5, fused=True, eps=1e-3)
+        optimizer = Adam([{"params": [table], "sparse": True}], lr=0.5, eps=1e-3)
         scaler = torch.amp.GradScaler("cpu", enabled=enabled)
         for factor in (1.0, 2.0) if not enabled else (1.0, torch.inf, 2.0):
             optimizer.zero_grad()

@@ -32,7 +32,7 @@ class AdamConfig(OptimizerConfig):
         params = list(params)
         sparse = self.sparse and params[0].device.type == "cpu"
         groups = [{"params": params, "sparse": sparse}]
-        return Adam(groups, lr=self.lr, betas=self.betas, eps=self.eps, fused=True)
+        return Adam(groups, lr=self.lr, betas=self.betas, eps=self.eps)
 
 
 @dataclasses.dataclass

@@ -87,5 +87,12 @@ def sparse_adam(
         raise ValueError(f"{_OP}: epsilon must be positive, got {epsilon}")
     run = backends.resolve(_OP, backend=backend, device=parameter.device, dtype=torch.float32)
     first, second = betas
-    rate, correction = learning_rate / (1 - first**step), (1 - second**step) ** 0.5
-    run(parameter, gradient.contiguous(), mean, square, rate, correction, first, second, epsilon)
+    rate, epsilon = corrected(step, learning_rate, betas, epsilon)
+    run(parameter, gradient.contiguous(), mean, square, rate, first, second, epsilon)
+
+
+def corrected(step: int, learning_rate: float, betas: tuple[float, float], epsilon: float) -> tuple[float, float]:
+    """Rate and epsilon with which the moments need no correction for their start at zero."""
+    first, second = betas
+    root = (1 - second**step) ** 0.5
+    return learning_rate * root / (1 - first**step), epsilon * root

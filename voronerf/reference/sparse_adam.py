@@ -12,14 +12,13 @@ def sparse_adam(
     mean: Tensor,
     square: Tensor,
     rate: float,
-    correction: float,
     first: float,
     second: float,
     epsilon: float,
 ) -> None:
-    """The formula of ``voronerf.ops.sparse_adam``; ``rate`` and ``correction`` are corrected for the moments' start."""
+    """The formula of ``voronerf.ops.sparse_adam``; ``rate`` and ``epsilon`` are corrected for the moments' start."""
     present = gradient != 0
     mean.copy_(torch.where(present, first * mean + (1 - first) * gradient, mean))
     square.copy_(torch.where(present, second * square + (1 - second) * gradient.square(), square))
-    moved = parameter - rate * mean / (square.sqrt() / correction + epsilon)
+    moved = parameter - rate * mean / (square.sqrt() + epsilon)
     parameter.copy_(torch.where(present, moved, parameter))

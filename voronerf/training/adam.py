@@ -2,20 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from voronerf.ops.sparse_adam import sparse_adam
+from voronerf import backends
+from voronerf.ops.sparse_adam import corrected, sparse_adam
 
 
 class Adam(torch.optim.Adam):
     """``torch.optim.Adam``, with groups of parameters whose entries without a gradient stay as they are.
 
     A group says ``sparse=True``; see :func:`voronerf.ops.sparse_adam`. Its state has the same names as that of the
-    other groups, which are torch's.
+    other groups, which are torch's. On the CPU all float32 parameters are updated in one pass of the compiled module,
+    since torch's own step takes longer to prepare than to compute for networks of this size.
+
+    Args:
+        params: As of ``torch.optim.Adam``, like the rest.
+        lr: The learning rate.
+        betas: Decay of the averages of gradients and of their squares.
+        eps: Added to the root of the second moment.
+        capturable: Whether a CUDA graph can record a step.
     """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        *,
+        lr: float | Tensor,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+        capturable: bool = False,
+    ) -> None:
+        super().__init__(params, lr=lr, betas=betas, eps=eps, capturable=capturable, fused=True)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -24,33 +45,63 @@ class Adam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        groups = [group for group in self.param_groups if group.get("sparse", False)]
-        tables = [(p, p.grad, group) for group in groups for p in group["params"] if p.grad is not None]
+        entries = [(p, p.grad, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        together = all(_computed_natively(parameter) for parameter, _, _ in entries)
+        own = [entry for entry in entries if together or entry[2].get("sparse", False)]
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
-        if tables and (overflow is None or not overflow.item()):
-            for parameter, gradient, group in tables:
-                self._step_table(parameter, gradient if scale is None else gradient / scale, group)
-        for parameter, _, _ in tables:
-            parameter.grad = None  # torch's step passes them over
-        super().step()
-        for parameter, gradient, _ in tables:
-            parameter.grad = gradient
+        if own and (overflow is None or not overflow.item()):
+            if scale is not None:
+                own = [(parameter, gradient / scale, group) for parameter, gradient, group in own]
+            if together:
+                self._step_together(own)
+            else:
+                for parameter, gradient, group in own:
+                    self._step_table(parameter, gradient, group)
+        if not together:
+            for parameter, _, _ in own:
+                parameter.grad = None  # torch's step passes them over
+            super().step()
+            for parameter, gradient, _ in own:
+                parameter.grad = gradient
         return loss
 
-    def _step_table(self, parameter: torch.Tensor, gradient: torch.Tensor, group: dict[str, Any]) -> None:
-        state = self.state[parameter]
-        if not state:
-            state["step"] = torch.tensor(0.0)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        state["step"] = state["step"].cpu() + 1  # a fused optimiser loads it to the parameter's device
+    def _step_together(self, entries: list[tuple[Tensor, Tensor, dict[str, Any]]]) -> None:
+        from voronerf.native.sparse_adam import adam  # which is there where the compiled module is
+
+        rules, states = [], []
+        for parameter, _, group in entries:
+            state, step = self._next(parameter)
+            rate, epsilon = corrected(step, float(group["lr"]), group["betas"], group["eps"])
+            rules.append((rate, *group["betas"], epsilon, not group.get("sparse", False)))
+            states.append(state)
+        moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
+        adam(rules, [gradient for _, gradient, _ in entries], [parameter for parameter, _, _ in entries], *moments)
+
+    def _step_table(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
+        state, step = self._next(parameter)
         sparse_adam(
             parameter,
             gradient,
             state["exp_avg"],
             state["exp_avg_sq"],
-            step=int(state["step"]),
+            step=step,
             learning_rate=group["lr"],
             betas=group["betas"],
             epsilon=group["eps"],
         )
+
+    def _next(self, parameter: Tensor) -> tuple[dict[str, Tensor], int]:
+        """The state of a parameter, and the number of the step that comes, which is counted."""
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.tensor(0.0)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        state["step"] = state["step"].cpu()  # a fused optimiser loads it to the parameter's device
+        state["step"] += 1
+        return state, int(state["step"])
+
+
+def _computed_natively(parameter: Tensor) -> bool:
+    native = parameter.device.type == "cpu" and backends.missing("native", parameter.device) is None
+    return native and parameter.dtype == torch.float32 and parameter.is_contiguous()

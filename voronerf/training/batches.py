@@ -10,11 +10,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from voronerf import backends
 from voronerf.data import Scene
 from voronerf.data.scene import Sightings
 from voronerf.data.store import Pages
 from voronerf.ops.pixel_rays import pixel_rays
+from voronerf.reference.draw_pixels import Runs, draw_pixels
 from voronerf.rendering.cameras import Rays
+from voronerf.rendering.marching import draw_seed
 from voronerf.rendering.rays import intersect_box
 
 #: Share of the rays that are drawn from the sightings of points, where these are learnt from.
@@ -66,11 +69,16 @@ class RayBatches:
         self.background = scene.background_colour(self.place)
         self.box = None if scene.box is None else scene.box.to(self.place)
         self.useful = self._useful_pixels()
+        self._draw_pixels = draw_pixels
+        if self.place.type == "cpu" and backends.missing("native", self.place) is None:
+            from voronerf.native.draw_pixels import draw_pixels as native  # which is there where the module is
+
+            self._draw_pixels = native
         self.sightings = None
         if sightings and scene.train.sightings is not None:
             self.sightings = Sightings(*(tensor.to(self.place) for tensor in scene.train.sightings))
 
-    def _useful_pixels(self) -> _Runs | None:
+    def _useful_pixels(self) -> Runs | None:
         """The pixels to draw from; None when that is all of them."""
         cameras, masks = self.cameras, self.scene.train.masks
         if self.box is None and masks is None and cameras.sizes is None:
@@ -89,8 +97,8 @@ class RayBatches:
             row, column = (edges == 1).nonzero(as_tuple=True)
             last = (edges == -1).nonzero(as_tuple=True)[1]
             found.append(torch.stack(((image * cameras.height + row) * cameras.width + column, last - column)))
-        useful = _Runs(*torch.cat(found, dim=1))
-        return useful if 0 < len(useful) < self._pixels else None
+        start, length = torch.cat(found, dim=1)
+        return Runs.of(start, length) if 0 < int(length.sum()) < self._pixels else None
 
     @property
     def _pixels(self) -> int:
@@ -98,7 +106,7 @@ class RayBatches:
 
     def __len__(self) -> int:
         """Number of rays to draw from."""
-        return self._pixels if self.useful is None else len(self.useful)
+        return self._pixels if self.useful is None else self.useful.count
 
     def draw(self, count: int, generator: torch.Generator, *, random_background: bool = True) -> Batch:
         """A batch of ``count`` rays, drawn with replacement.
@@ -107,19 +115,16 @@ class RayBatches:
         over a colour that is drawn for each ray, or over that of the scene.
         """
         several = 0 if self.sightings is None else int(SEEN * count)
-        index = self._numbers(len(self), count - several, generator)
-        if self.useful is not None:
-            index = self.useful.numbers(index)
+        index, uniforms = self._draw_pixels(draw_seed(self.place, generator), count, len(self), self.useful)
         seen = None
         if several and self.sightings is not None:
-            chosen = self._numbers(len(self.sightings.pixels), several, generator)
-            index = torch.cat((index, self.sightings.pixels[chosen]))
+            seed = draw_seed(self.place, generator)
+            chosen, _ = self._draw_pixels(seed, several, len(self.sightings.pixels), None)
+            index[count - several :] = self.sightings.pixels[chosen]
             seen = self.sightings.distances[chosen].to(self.device)
         if self.pages is not None:
             self.pages.fetch(index)
-        background = self.background
-        if random_background and self.images.shape[-1] == 4:
-            background = torch.rand(count, 3, generator=generator, device=generator.device).to(self.place)
+        background = uniforms if random_background and self.images.shape[-1] == 4 else self.background
         cameras = self.cameras
         found = pixel_rays(
             cameras.poses,
@@ -140,27 +145,3 @@ class RayBatches:
         radii = None if radii is None else radii.to(self.device)
         background = None if background is None else background.to(self.device)
         return Batch(Rays(origins, directions, radii), near, far, colour, background, seen)
-
-    def _numbers(self, below: int, count: int, generator: torch.Generator) -> Tensor:
-        return torch.randint(below, (count,), generator=generator, device=generator.device).to(self.place)
-
-
-class _Runs:
-    """Numbers in rising runs: few entries for pixels of which most of a row counts.
-
-    Args:
-        first: int64 [n], the first number of each run.
-        length: int64 [n], how many it has.
-    """
-
-    def __init__(self, first: Tensor, length: Tensor) -> None:
-        self.ends = length.cumsum(0)
-        self.shift = first - (self.ends - length)
-        self.count = int(self.ends[-1]) if len(first) else 0
-
-    def __len__(self) -> int:
-        return self.count
-
-    def numbers(self, place: Tensor) -> Tensor:
-        """The numbers at places [b] of all runs one after another."""
-        return place + self.shift[torch.searchsorted(self.ends, place, right=True)]

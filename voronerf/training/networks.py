@@ -306,7 +306,7 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) ->
     options: dict[str, Any] = {"lr": config.lr}
     if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=dense[0].device), "capturable": True}
-    return Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True, **options)
+    return Adam(groups, betas=(0.9, 0.99), eps=1e-15, **options)
 
 
 def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:

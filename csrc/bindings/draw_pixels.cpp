@@ -1,0 +1,13 @@
+#include "rays/draw_pixels.h"
+
+#include "bindings/bind.h"
+
+namespace voronerf {
+
+VN_STRUCT(DrawPixelsInputs, seed, ends, shift, first, bits, below, b);
+
+VN_BINDINGS(module) {
+  module.cpu("draw_pixels", VN_CPU(draw_pixels_cpu));
+}
+
+}  // namespace voronerf

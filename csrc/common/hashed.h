@@ -1,0 +1,25 @@
+// Random numbers as hashes of what they are for: the same for any number of threads, in any order.
+#pragma once
+
+#include <cstdint>
+
+#include "common/hd.h"
+
+namespace voronerf {
+
+// Chris Wellons' lowbias32.
+VN_HD uint32_t mixed(uint32_t x) {
+  x = (x ^ x >> 16) * 0x7feb352du;
+  x = (x ^ x >> 15) * 0x846ca68bu;
+  return x ^ x >> 16;
+}
+
+// The key of a ray, and the numbers of that ray in [0, 1), one for each place.
+VN_HD uint32_t hash_key(int32_t seed, int64_t ray) {
+  return mixed(static_cast<uint32_t>(seed) + static_cast<uint32_t>(ray));
+}
+VN_HD float hashed(uint32_t key, uint32_t place) {
+  return static_cast<float>(static_cast<int32_t>(mixed(key ^ place * 0x9e3779b9u) >> 8)) * 0x1p-24f;
+}
+
+}  // namespace voronerf

@@ -1,0 +1,47 @@
+// Blocks of pixels over threads; each is a hash of its number alone. The run of a place is looked for from the first
+// that can hold it, a few before.
+#include "rays/draw_pixels.h"
+
+#include <algorithm>
+
+#include "common/hashed.h"
+#include "common/parallel.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int64_t kPixels = 256;  // of a task
+
+// 48 bits of hashes as a place below a number.
+int64_t draw_place(uint32_t key, int64_t below) {
+  const double fraction = static_cast<double>(hashed(key, 0)) + static_cast<double>(hashed(key, 1)) * 0x1p-24;
+  return static_cast<int64_t>(fraction * static_cast<double>(below));
+}
+
+}  // namespace
+
+void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, int threads) {
+  parallel_for((in.b + kPixels - 1) / kPixels, 1, threads, [&](int64_t block) {
+    const int64_t begin = block * kPixels, end = std::min(in.b, begin + kPixels);
+    for (int64_t i = begin; i < end; ++i) {
+      const uint32_t key = hash_key(*in.seed, i);
+      pixels[i] = draw_place(key, in.below);
+      for (int channel = 0; channel < 3; ++channel) uniforms[3 * i + channel] = hashed(key, 2 + channel);
+    }
+    if (in.ends == nullptr) return;
+    int64_t run[kPixels];
+    for (int64_t i = begin; i < end; ++i) {
+      run[i - begin] = in.first[pixels[i] >> in.bits];
+      __builtin_prefetch(in.ends + run[i - begin]);
+      __builtin_prefetch(in.shift + run[i - begin]);
+    }
+    for (int64_t i = begin; i < end; ++i) {
+      int64_t at = run[i - begin];
+      while (in.ends[at] <= pixels[i]) ++at;
+      pixels[i] += in.shift[at];
+    }
+  });
+}
+
+}  // namespace voronerf

@@ -1,0 +1,22 @@
+// The pixels of a training step, drawn from runs of pixels: n runs, b pixels. What it computes is said in
+// voronerf/reference/draw_pixels.py.
+#pragma once
+
+#include <cstdint>
+
+namespace voronerf {
+
+struct DrawPixelsInputs {
+  const int32_t* seed;   // [1]
+  const int64_t* ends;   // [n], how many pixels the runs up to each have; or null, for all of 0 to below - 1
+  const int64_t* shift;  // [n], added to a place in a run
+  const int32_t* first;  // the first run that ends behind place 0, 2^bits, 2 * 2^bits, ...
+  int64_t bits;
+  int64_t below;  // places of all runs
+  int64_t b;
+};
+
+// pixels: [b]. uniforms: [b,3], in [0, 1).
+void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, int threads);
+
+}  // namespace voronerf

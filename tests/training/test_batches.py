@@ -1,0 +1,44 @@
+"""Which pixels a batch is drawn from."""
+
+import pytest
+import torch
+
+from voronerf.reference.draw_pixels import Runs, draw_pixels
+
+SEED = torch.tensor([-7], dtype=torch.int32)
+# The first pixels and the lengths of runs: one pixel, many runs of the same length, and some that are much longer.
+RUNS = {
+    "one": ([5], [1]),
+    "even": (range(0, 3000, 10), [7] * 300),
+    "uneven": ([2, 10, 50, 70, 5000, 2**40], [1, 1, 3, 500, 1, 1]),
+}
+
+
+def runs_of(start, length):
+    return Runs.of(torch.tensor(start), torch.tensor(length))
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_every_pixel_of_the_runs_is_drawn_as_often(name):
+    runs = runs_of(*map(list, RUNS[name]))
+    there = torch.cat([torch.arange(first, first + count) for first, count in zip(*RUNS[name])])
+    pixels, uniforms = draw_pixels(SEED, 100 * len(there), len(there), runs)
+    drawn, counts = pixels.unique(return_counts=True)
+    assert torch.equal(drawn, there) and bool(((counts - 100).abs() < 50).all())  # five standard deviations
+    assert uniforms.shape == (100 * len(there), 3) and bool(((uniforms >= 0) & (uniforms < 1)).all())
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("name", [None, *RUNS])
+@pytest.mark.parametrize("count", [0, 1, 257, 5000])
+def test_native_draws_are_those_of_the_reference(name, count):
+    from voronerf.native.draw_pixels import draw_pixels as drawn
+
+    runs = None if name is None else runs_of(*map(list, RUNS[name]))
+    below = 10**9 if runs is None else runs.count
+    before = torch.get_num_threads()
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        for found, expected in zip(drawn(SEED, count, below, runs), draw_pixels(SEED, count, below, runs), strict=True):
+            assert torch.equal(found, expected)
+    torch.set_num_threads(before)
