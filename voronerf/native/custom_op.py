@@ -18,6 +18,7 @@ _LISTENERS = [
     getattr(torch._C, name, lambda: True)
     for name in ("_len_torch_function_stack", "_len_torch_dispatch_stack", "_are_functorch_transforms_active")
 ]
+_PLAIN = (Tensor, torch.nn.Parameter)
 _PROFILES = getattr(torch.autograd, "_profiler_enabled", lambda: True)
 
 # Results of at least this many bytes are put on huge pages; for smaller ones the allocator usually has warm memory.
@@ -82,16 +83,23 @@ class Op:
         """What the op gives."""
         if torch.compiler.is_compiling() or _PROFILES() or any(listens() for listens in _LISTENERS):
             return self._op(*arguments)
-        differentiated, grad = False, torch.is_grad_enabled()
-        flat, lengths = _flattened(arguments)
-        for tensor in flat:
-            if isinstance(tensor, Tensor):
-                if type(tensor) not in (Tensor, torch.nn.Parameter) or tensor.device.type not in self._devices:
-                    return self._op(*arguments)
-                differentiated = differentiated or (grad and tensor.requires_grad)
-        if not differentiated:
+        tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
+        for argument in arguments:
+            if isinstance(argument, (list, tuple)):
+                tensors += [entry for entry in argument if isinstance(entry, Tensor)]
+        for tensor in tensors:
+            if type(tensor) not in _PLAIN or tensor.device.type not in self._devices:
+                return self._op(*arguments)
+        if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
             return self._run(*arguments)
-        return self._op(*arguments) if self._function is None else self._function.apply(*flat, lengths)
+        if self._function is None:
+            return self._op(*arguments)
+        flat, lengths = _flattened(arguments)
+        return self._function.apply(*flat, lengths)
+
+    def inside(self, *arguments: Any) -> Any:
+        """What the op gives, for a node of autograd that has looked at its arguments itself."""
+        return self._run(*arguments)
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
         """The op's backward, as of ``torch.library.custom_op``."""

@@ -50,15 +50,15 @@ class _Learn(torch.autograd.Function):
         ctx: Any, arguments: tuple[Any, ...], rays: tuple[Any, ...], *parameters: Tensor | None
     ) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
-        out, _, order, offsets, encoded = routed_mlp.forward(*arguments)
-        *found, gradient = render_loss.forward(out, *rays)
+        out, _, order, offsets, encoded = routed_mlp.forward.inside(*arguments)
+        *found, gradient = render_loss.forward.inside(out, *rays)
         ctx.mark_non_differentiable(*found[1:])
         *needs, to_features = ctx.needs_input_grad[2:]
         if any(needs) or to_features:
             network, order = arguments[:7], order if order.numel() else None
             positions, *rest = network
             wanted = [any(needs), False, False, to_features]
-            results = grouped_mlp.backward(gradient, positions, offsets, *rest, order, encoded, wanted)
+            results = grouped_mlp.backward.inside(gradient, positions, offsets, *rest, order, encoded, wanted)
             *of_parameters, _, _, of_features = results
             ctx.gradients = [*of_parameters, of_features]
         return tuple(found)

@@ -5,7 +5,6 @@ r rays, m samples of all rays.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, cast
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 from voronerf import backends
 from voronerf.fields.radiance import activate_radiance
 from voronerf.ops.march_rays import March
-from voronerf.ops.render_loss import RenderLoss, check_targets, render_loss
+from voronerf.ops.render_loss import check_targets, render_loss
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.marching import Marched, march_grid
@@ -127,12 +126,13 @@ def compare_samples(
         "density_scale": float(module.density_scale),
         "hidden": HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
     }
-    learn = _native_learning(renderer, march.positions)
     given = march.positions, rays.directions, march.ray_index
-    routed = None if learn is None else routed_arguments(field, *given)
-    if learn is not None and routed is not None:
+    routed = routed_arguments(field, *given) if _learns_natively(renderer, march.positions) else None
+    if routed is not None and _in_float32(routed):
+        from voronerf.native.learn_rays import learn_rays  # which is there where the compiled module is
+
         check_targets("compare", target, background, (torch.float32,), {"r": len(rays)})
-        found = learn(march, routed, target, **rest)
+        found = learn_rays(march, routed, target, **rest)
     else:
         raw = field.raw(*given)
         weaken_near(renderer.full_gradient, march.depths, raw)
@@ -142,15 +142,14 @@ def compare_samples(
     )
 
 
-def _native_learning(renderer: Marching, positions: Tensor) -> Callable[..., RenderLoss] | None:
-    """Networks, loss and gradients in one, for the CPU in float32; None where that is not to be had."""
-    device, module = positions.device, cast(VoronoiRouter, renderer.field).module
+def _learns_natively(renderer: Marching, positions: Tensor) -> bool:
+    """Whether networks, loss and gradients are to be had in one, if all of them are in float32: on the CPU."""
+    device = positions.device
     if device.type != "cpu" or torch.is_autocast_enabled("cpu") or renderer.full_gradient is not None:
-        return None
-    if not torch.is_grad_enabled() or backends.missing("native", device) is not None:
-        return None
-    if any(tensor.dtype != torch.float32 for tensor in (positions, *module.parameters())):
-        return None
-    from voronerf.native.learn_rays import learn_rays  # which is there where the compiled module is
+        return False
+    return torch.is_grad_enabled() and backends.missing("native", device) is None
 
-    return learn_rays
+
+def _in_float32(routed: dict[str, Any]) -> bool:
+    tensors = (routed["positions"], *routed["weights"], *routed["biases"], routed["features"])
+    return all(tensor is None or tensor.dtype == torch.float32 for tensor in tensors)
