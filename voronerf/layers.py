@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from voronerf.grids import HashGrid
 
@@ -190,6 +190,19 @@ class MLP:
         return [
             (layer.width, self.input_width(index, positions_d, directions_d)) for index, layer in enumerate(self.layers)
         ]
+
+
+@functools.lru_cache(maxsize=64)
+def for_last_output(table: MLP) -> tuple[MLP, tuple[int, ...]]:
+    """A table whose only output is the last of another's, and which layers of that it has."""
+    needed = {table.outputs[-1]}
+    for index in range(len(table.layers) - 1, -1, -1):
+        needed.update(s for s in table.layers[index].inputs if isinstance(s, int) and index in needed)
+    kept = tuple(sorted(needed))
+    numbers: dict[int | str, int] = {old: new for new, old in enumerate(kept)}
+    layers = [table.layers[index] for index in kept]
+    layers = [replace(layer, inputs=tuple(numbers.get(s, s) for s in layer.inputs)) for layer in layers]
+    return replace(table, layers=tuple(layers), outputs=(numbers[table.outputs[-1]],)), kept
 
 
 def encoded_width(features: int, octaves: int | None) -> int:

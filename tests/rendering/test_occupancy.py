@@ -80,6 +80,21 @@ def test_cells_that_are_looked_at_fade_and_the_others_stay():
     assert bool((density[1::2] == 8).all())
 
 
+@pytest.mark.parametrize(
+    "field", [HashGridField(width=8, log2_entries=10), NeRF(width=8, depth=2), NeRF(width=8, view_directions=False)]
+)
+def test_the_density_of_a_router_is_found_without_its_colour(field):
+    for parameter in field.parameters():
+        torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(1))
+    router = VoronoiRouter(field, torch.rand(5, 3), share=[n for n, _ in field.named_parameters() if n == "features"])
+    box = torch.tensor([[0.0, 0, 0], [1.0, 1, 1]])
+    grids = [OccupancyGrid(box, 6, threshold=1e-6) for _ in range(2)]
+    for grid, asked in zip(grids, (router, lambda *given: router(*given))):
+        grid.update(asked, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(grids[0].density, grids[1].density)
+    assert len(grids[0].density.unique()) > 10
+
+
 def test_points_lie_in_their_cells():
     grid = OccupancyGrid(torch.tensor([[0.0, 10.0, -4.0], [2.0, 13.0, 0.0]]), (2, 3, 4), threshold=1)
     every = torch.arange(24)

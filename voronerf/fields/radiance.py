@@ -35,7 +35,12 @@ def activate_radiance(self: Any, raw: Tensor) -> tuple[Tensor, Tensor]:
     # `split`, because its gradient is one concatenation, and that of two slices two padded arrays and their sum.
     # `contiguous`, because torch vectorises activations for contiguous values only. Together a third of the time.
     colour, density = (part.contiguous() for part in raw.split([3, 1], dim=-1))
-    return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
+    return torch.sigmoid(colour), activate_density(self, density.squeeze(-1))
+
+
+def activate_density(self: Any, raw: Tensor) -> Tensor:
+    """The density of `activate_radiance` [n], of the last of the network's outputs [n]."""
+    return F.softplus(raw) * self.density_scale
 
 
 def reset_layers(layers: Sequence[nn.Linear], heads: Sequence[nn.Linear], density_scale: float) -> None:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from voronerf.checks import MAX_COUNT
+from voronerf.fields.radiance import activate_density, activate_radiance
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.update_occupancy import update_occupancy
@@ -22,6 +23,8 @@ from voronerf.reference.observe_occupancy import cells_of
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
+from voronerf.router import VoronoiRouter
+from voronerf.router.fused import last_output
 
 CHUNK = 1 << 17  # points that a field evaluates at a time
 HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
@@ -281,6 +284,15 @@ class OccupancyGrid:
 
 def density_of(field: Field, points: Tensor) -> Tensor:
     """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN becomes infinity."""
-    direction = points.new_tensor(((0.0, 0.0, 1.0),))
-    _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
+    raw = last_output(field, points) if isinstance(field, VoronoiRouter) and _gives_radiance(field) else None
+    if raw is not None:
+        sigma = activate_density(field.module, raw[:, 0].float())
+    else:
+        direction = points.new_tensor(((0.0, 0.0, 1.0),))
+        _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
     return sigma.detach().float().nan_to_num(nan=float("inf"), posinf=float("inf"))
+
+
+def _gives_radiance(field: VoronoiRouter) -> bool:
+    """Whether the last of the outputs of a field's networks is its density."""
+    return getattr(type(field.module), "activate", None) is activate_radiance and field.by_table and field.blend == 0

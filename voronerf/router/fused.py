@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, fx, nn
 from torch.fx.node import map_arg
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer, for_last_output
 from voronerf.ops.routed_mlp import of_one_dtype, routed_mlp
 from voronerf.router.grouped import PerCell, for_all_cells
 from voronerf.router.grouping import Grouping, owned_parameters
@@ -122,6 +122,20 @@ def routed_arguments(
         compared = of_one_dtype(positions, where["centres"], where["centre_weights"])
         where.update(zip(("coords", "centres", "centre_weights"), compared))
     return {**given, **where}
+
+
+def last_output(router: VoronoiRouter, positions: Tensor) -> Tensor | None:
+    """The last of the outputs of ``router.raw``, [n, width], without the layers that it does not need.
+
+    None where it needs the view direction, or ``router.raw`` does more than the networks.
+    """
+    table, kept = for_last_output(router.field.layers)
+    rule = router._coords_of_table(None, (positions,), {})
+    if table.uses_directions or rule is not None or router._shards is not None:
+        return None
+    given = parameters_of_table(router.field, router.num_cells)
+    given.update({name: [given[name][i] for i in kept] for name in ("weights", "biases")}, layers=table)
+    return routed_mlp(positions, **given, backend=router.backend, **router._where(positions, None))[0]
 
 
 def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
