@@ -36,14 +36,14 @@ from voronerf.training.trainer import Trainer
 
 # What the compiled functions of a step are for, by how their names begin; the first that fits.
 PARTS = {
-    "batch": ("pixel_rays", "camera_rays"),
+    "batch": ("draw_pixels", "pixel_rays", "camera_rays"),
     "march": ("march_rays",),
     "cells": ("nearest_centre", "locate_cell", "cell_sort", "draw_cell"),
     "backward": ("grouped_mlp_backward", "grouped_linear_backward", "hash_encode_backward"),
     "forward": ("grouped_mlp", "grouped_linear", "hash_encode", "encode"),
     "loss": ("render_loss", "composite", "resample"),
     "occupancy": ("observe_occupancy", "update_occupancy"),
-    "Adam of tables": ("sparse_adam",),
+    "Adam": ("sparse_adam", "adam"),
     "PyTorch and Python": ("",),
 }
 REST = "PyTorch and Python"

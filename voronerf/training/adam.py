@@ -37,6 +37,7 @@ class Adam(torch.optim.Adam):
         capturable: bool = False,
     ) -> None:
         super().__init__(params, lr=lr, betas=betas, eps=eps, capturable=capturable, fused=True)
+        self._native = backends.missing("native", torch.device("cpu")) is None
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -46,7 +47,7 @@ class Adam(torch.optim.Adam):
             with torch.enable_grad():
                 loss = closure()
         entries = [(p, p.grad, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        together = all(_computed_natively(parameter) for parameter, _, _ in entries)
+        together = self._native and all(_is_plain(parameter) for parameter, _, _ in entries)
         own = [entry for entry in entries if together or entry[2].get("sparse", False)]
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
@@ -97,11 +98,10 @@ class Adam(torch.optim.Adam):
         if not state:
             state["step"] = torch.tensor(0.0)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        state["step"] = state["step"].cpu()  # a fused optimiser loads it to the parameter's device
-        state["step"] += 1
-        return state, int(state["step"])
+        step = state["step"] = state["step"].cpu()  # a fused optimiser loads it to the parameter's device
+        step += 1
+        return state, int(step)
 
 
-def _computed_natively(parameter: Tensor) -> bool:
-    native = parameter.device.type == "cpu" and backends.missing("native", parameter.device) is None
-    return native and parameter.dtype == torch.float32 and parameter.is_contiguous()
+def _is_plain(parameter: Tensor) -> bool:
+    return parameter.is_cpu and parameter.dtype == torch.float32 and parameter.is_contiguous()
