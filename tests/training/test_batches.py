@@ -35,7 +35,7 @@ def test_native_draws_are_those_of_the_reference(name, count):
     from voronerf.native.draw_pixels import draw_pixels as drawn
 
     runs = None if name is None else runs_of(*map(list, RUNS[name]))
-    below = 10**9 if runs is None else runs.count
+    below = 10**9 if runs is None else runs.total
     before = torch.get_num_threads()
     for threads in (1, 3):
         torch.set_num_threads(threads)

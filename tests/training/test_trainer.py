@@ -160,7 +160,7 @@ def after_the_split(folder, scene, **settings):
 
 
 def test_centres_are_balanced_or_not(tmp_path, scene):
-    kinds = {"balanced": {}, "random": {"centres": "random"}, "uniform": {"centres": "uniform"}}
+    kinds = {"balanced": {"centres": "balanced"}, "random": {"centres": "random"}, "uniform": {"centres": "uniform"}}
     trainers = {name: after_the_split(tmp_path / name, scene, **settings) for name, settings in kinds.items()}
     stages = {name: trainer.stages[-1] for name, trainer in trainers.items()}
     for name, stage in stages.items():

@@ -18,24 +18,24 @@ class Runs(NamedTuple):
         shift: int64 [n], what is added to a place in all runs, one after another, to get the pixel.
         first: int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on, up to all pixels.
         bits: of `first`: about as many places as a run has.
-        count: of the pixels of all runs.
+        total: the pixels of all runs.
     """
 
     ends: Tensor
     shift: Tensor
     first: Tensor
     bits: int
-    count: int
+    total: int
 
     @staticmethod
     def of(start: Tensor, length: Tensor) -> Runs:
         """Runs from their first pixels, int64 [n], and how many each has, int64 [n], >= 1; n >= 1."""
         ends = length.cumsum(0)
-        count = int(ends[-1])
-        bits = max(count // len(ends), 1).bit_length()
-        places = torch.arange(0, count, 1 << bits, device=ends.device)
+        total = int(ends[-1])
+        bits = max(total // len(ends), 1).bit_length()
+        places = torch.arange(0, total, 1 << bits, device=ends.device)
         first = torch.searchsorted(ends, places, right=True).int()
-        return Runs(ends, start - (ends - length), first, bits, count)
+        return Runs(ends, start - (ends - length), first, bits, total)
 
 
 def draw_pixels(seed: Tensor, count: int, below: int, runs: Runs | None) -> tuple[Tensor, Tensor]:

@@ -284,15 +284,15 @@ class OccupancyGrid:
 
 def density_of(field: Field, points: Tensor) -> Tensor:
     """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN becomes infinity."""
-    raw = last_output(field, points) if isinstance(field, VoronoiRouter) and _gives_radiance(field) else None
-    if raw is not None:
-        sigma = activate_density(field.module, raw[:, 0].float())
-    else:
+    sigma = _density_alone(field, points) if isinstance(field, VoronoiRouter) else None
+    if sigma is None:
         direction = points.new_tensor(((0.0, 0.0, 1.0),))
         _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
     return sigma.detach().float().nan_to_num(nan=float("inf"), posinf=float("inf"))
 
 
-def _gives_radiance(field: VoronoiRouter) -> bool:
-    """Whether the last of the outputs of a field's networks is its density."""
-    return getattr(type(field.module), "activate", None) is activate_radiance and field.by_table and field.blend == 0
+def _density_alone(field: VoronoiRouter, points: Tensor) -> Tensor | None:
+    """The density without the networks' colour, where they give it as the last of their outputs; else None."""
+    radiance = getattr(type(field.module), "activate", None) is activate_radiance
+    raw = last_output(field, points) if radiance and field.by_table and field.blend == 0 else None
+    return None if raw is None else activate_density(field.module, raw[:, 0].float())

@@ -106,7 +106,7 @@ class RayBatches:
 
     def __len__(self) -> int:
         """Number of rays to draw from."""
-        return self._pixels if self.useful is None else self.useful.count
+        return self._pixels if self.useful is None else self.useful.total
 
     def draw(self, count: int, generator: torch.Generator, *, random_background: bool = True) -> Batch:
         """A batch of ``count`` rays, drawn with replacement.
