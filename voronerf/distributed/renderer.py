@@ -59,14 +59,16 @@ class RankRenderer(Renderer):
 
     Attributes:
         group: The ranks.
-        sharing: Which of them owns which cells; None while all have the same network.
+        sharing: Which of them owns which cells; None while all have the same network, like the next two.
+        reached: bool [v], the voxels of the grid that own cells reach.
+        several: bool [v], those that cells of two or more ranks reach.
     """
 
     group: Group
     sharing: Sharing | None = None
+    reached: Tensor | None = None
+    several: Tensor | None = None
     _numbers: Tensor  # int32 [k], of each cell among own ones, or -1
-    _reached: Tensor  # bool [v], the voxels of the grid that own cells reach
-    _several: Tensor  # bool [v], those that cells of two or more ranks reach
 
     def join(self, group: Group) -> None:
         """Renders with the ranks of a group."""
@@ -79,8 +81,12 @@ class RankRenderer(Renderer):
         self._numbers = torch.where(own, own.cumsum(0) - 1, -1).to(torch.int32)
         if self.occupancy is not None:
             reached = voxels_of_ranks(sharing, self.occupancy, self.group.size)
-            self._reached, self._several = reached[self.group.rank], reached.sum(0) > 1
+            self.reached, self.several = reached[self.group.rank], reached.sum(0) > 1
             self.forget_others(self.occupancy)
+
+    @property
+    def _natively(self) -> bool:
+        return self.device.type == "cpu" and backends.missing("native", self.device) is None
 
     # --- samples ---------------------------------------------------------------------------------------------------
 
@@ -155,7 +161,7 @@ class RankRenderer(Renderer):
             if self.sharing is None:
                 march = self._march(self.occupancy, rays[own], near[own], far[own], generator, own.start)
                 return self._learn_slice(rays, march, target, background, own)
-            if near.device.type == "cpu" and self.full_gradient is None and not backends.missing("native", near.device):
+            if self._natively and self.full_gradient is None:
                 march = self._march(self.occupancy, rays, near, far, generator, 0)
                 return self._learn_natively(rays, march, target, background, own)
         samples = self.samples_of(rays, near, far, jitter=True, generator=generator)
@@ -290,47 +296,6 @@ class RankRenderer(Renderer):
 
     # --- the grid --------------------------------------------------------------------------------------------------
 
-    @torch.no_grad()
-    def observations(self, grid: OccupancyGrid, found: Learnt) -> Tensor:
-        """What other ranks should know of own samples: voxel and density [c, 2] in voxels that several ranks reach."""
-        cells, density, deltas, weights = (
-            grid.cells(found.positions),
-            found.density.float(),
-            found.deltas,
-            found.weights,
-        )
-        positions = found.positions
-        if self.sharing is not None:
-            rows = self._several[cells].nonzero()[:, 0]
-            every = cells, density, deltas, weights, positions
-            cells, density, deltas, weights, positions = (values[rows] for values in every)
-        density = density.nan_to_num(nan=float("inf"), posinf=float("inf"))
-        density = torch.where(weights > HIDDEN * -torch.expm1(-density * deltas), density, 0)
-        if grid.contraction is not None:  # the grid will stretch them as at the middle of their voxel
-            middle = grid.contraction.stretch(grid.points(cells.long()))
-            density = density * grid.contraction.stretch(positions) / middle
-        return torch.stack((cells.view(torch.float32), density), 1)
-
-    def observe(self, grid: OccupancyGrid, found: Learnt, others: Tensor, *, decay: float, backend: str) -> None:
-        """Teaches the grid what all ranks found in the voxels that own cells reach.
-
-        Args:
-            grid: Of this rank.
-            found: By this rank.
-            others: [c, 2], the :meth:`observations` of all other ranks.
-            decay: As of a grid.
-            backend: As of a grid.
-        """
-        cells = others[:, 0].contiguous().view(torch.int32)
-        if self.sharing is not None:
-            ours = self._reached[cells]
-            cells, others = cells[ours], others[ours]
-        told, ones = others[:, 1], torch.ones_like(others[:, 1])  # whether it is visible has been decided
-        positions = torch.cat((found.positions, grid.points(cells.long())))
-        density, deltas = torch.cat((found.density.float(), told)), torch.cat((found.deltas, ones))
-        weights = torch.cat((found.weights, ones))
-        grid.observe(positions, density, deltas, weights, decay=decay, backend=backend)
-
     def revisited(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """The field of all ranks, for the grid: each evaluates the positions that it owns."""
         _, own = self._owns(positions)
@@ -344,9 +309,9 @@ class RankRenderer(Renderer):
 
     def forget_others(self, grid: OccupancyGrid) -> None:
         """Empties the voxels that own cells do not reach; they have no samples then."""
-        if self.sharing is not None:
-            grid.density.view(-1)[~self._reached] = 0
-            grid.occupied.view(-1)[~self._reached] = False
+        if self.reached is not None:
+            grid.density.view(-1)[~self.reached] = 0
+            grid.occupied.view(-1)[~self.reached] = False
 
     # --- pictures --------------------------------------------------------------------------------------------------
 

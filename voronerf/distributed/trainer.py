@@ -15,6 +15,7 @@ from voronerf.diagram.subdivision import Split
 from voronerf.distributed.checkpoint import RankWriter, ownership
 from voronerf.distributed.gradients import add_entries, pack_entries
 from voronerf.distributed.group import Group
+from voronerf.distributed.observing import observations, observe
 from voronerf.distributed.renderer import Learnt, RankRenderer
 from voronerf.distributed.sharing import Sharing, assign_cells
 from voronerf.ops.select_heaviest import select_heaviest
@@ -159,11 +160,11 @@ class RankTrainer(Trainer):
         if collects:
             heaviest, importance = select_heaviest(found.positions, found.importance, len(kept))
             kept[: len(heaviest), :3], kept[: len(heaviest), 3] = heaviest, importance
-        seen = kept.new_empty(0, 2) if grid is None else self.renderer.observations(grid, found)
+        seen = kept.new_empty(0, 2) if grid is None else observations(grid, found, self.renderer.several)
         total, loss, kept, others = self._tell(found, kept, seen)
         if grid is not None:
             backend = "auto" if config.backend == "warp" else config.backend
-            self.renderer.observe(grid, found, others, decay=OCCUPANCY_DECAY, backend=backend)
+            observe(grid, found, others, self.renderer.reached, decay=OCCUPANCY_DECAY, backend=backend)
         self.guard.judge(total, self.optimizer)
         summed()
         self.optimizer.step()
@@ -190,7 +191,7 @@ class RankTrainer(Trainer):
         Args:
             found: By this rank.
             kept: [n, 4], the heaviest samples, as many on all ranks.
-            seen: [c, 2], see :meth:`RankRenderer.observations`.
+            seen: [c, 2], see :func:`voronerf.distributed.observing.observations`.
 
         Returns:
             The sum of the loss and of all gradients that the guard reads; the loss; what all ranks have kept; and what
@@ -277,7 +278,7 @@ class RankTrainer(Trainer):
         self._find_shared()
 
     def _resume(self, checkpoint: Checkpoint) -> None:
-        self.sharing = self.renderer.sharing = None
+        self.sharing = self.renderer.sharing = self.renderer.reached = self.renderer.several = None
         super()._resume(checkpoint)
         self._find_shared()
         whole = self.router.diagram

@@ -7,6 +7,9 @@ from torch import Tensor
 
 from voronerf import native
 
+#: Positions, sigma, deltas and weights.
+Samples = tuple[Tensor, Tensor, Tensor, Tensor]
+
 
 def observe_occupancy(
     density: Tensor,
@@ -21,9 +24,67 @@ def observe_occupancy(
     hidden: float,
 ) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    x, y, z = density.shape
+    given = _samples(density, box, positions, sigma, deltas, weights, decay, threshold, hidden)
     m = positions.shape[0]
-    given = native.compiled.ObservedSamples(
+    machine = native.machine(density)
+    cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
+    native.compiled.observe_occupancy(given, density, occupied.view(torch.uint8), cells, before, machine)
+
+
+def observe_told(
+    density: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    told: Tensor,
+    reached: Tensor | None,
+    samples: Samples,
+    *,
+    decay: float,
+    threshold: float,
+    hidden: float,
+) -> None:
+    """The same with samples of other ranks, for ``voronerf.distributed``, on the CPU.
+
+    Args:
+        density: As above, like the next two.
+        occupied: Likewise.
+        box: Likewise.
+        told: [c, 2], what :func:`tell_observed` gave on other ranks.
+        reached: bool, one for each cell: the others are left alone. None for all.
+        samples: Of this rank.
+        decay: As above, like the next two.
+        threshold: Likewise.
+        hidden: Likewise.
+    """
+    given = _samples(density, box, *samples, decay, threshold, hidden)
+    rows = len(samples[0]) + len(told)
+    cells, before = density.new_empty(rows, dtype=torch.int32), density.new_empty(rows)
+    reached = torch.ones_like(occupied) if reached is None else reached
+    grid = density, occupied.view(torch.uint8), cells, before, native.cpu()
+    native.compiled.observe_told(given, told, len(told), reached.view(torch.uint8), *grid)
+
+
+def tell_observed(density: Tensor, box: Tensor, several: Tensor | None, samples: Samples, *, hidden: float) -> Tensor:
+    """Cell, as bits, and density [c, 2] of samples in cells that several ranks reach, a bool for each; None for all."""
+    told = density.new_empty(len(samples[0]), 2)
+    given = _samples(density, box, *samples, 1.0, 1.0, hidden)
+    several = None if several is None else several.view(torch.uint8)
+    return told[: native.compiled.tell_observed(given, several, told, native.cpu())]
+
+
+def _samples(
+    density: Tensor,
+    box: Tensor,
+    positions: Tensor,
+    sigma: Tensor,
+    deltas: Tensor,
+    weights: Tensor,
+    decay: float,
+    threshold: float,
+    hidden: float,
+) -> native.compiled.ObservedSamples:
+    x, y, z = density.shape
+    return native.compiled.ObservedSamples(
         positions=positions,
         sigma=sigma,
         deltas=deltas,
@@ -32,11 +93,8 @@ def observe_occupancy(
         x=x,
         y=y,
         z=z,
-        m=m,
+        m=positions.shape[0],
         decay=decay,
         threshold=threshold,
         hidden=hidden,
     )
-    machine = native.machine(density)
-    cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
-    native.compiled.observe_occupancy(given, density, occupied.view(torch.uint8), cells, before, machine)
