@@ -1,6 +1,5 @@
-#include "encoding/sparse_adam.h"
-
 #include "bindings/bind.h"
+#include "encoding/adam.h"
 
 namespace voronerf {
 

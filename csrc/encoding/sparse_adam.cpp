@@ -1,9 +1,8 @@
 // Blocks of entries over threads. An entry depends on itself alone, so results do not depend on the threads.
-#include "encoding/sparse_adam.h"
-
 #include <algorithm>
 
 #include "common/parallel.h"
+#include "encoding/adam.h"
 #include "encoding/sparse_adam_isa.h"
 
 namespace voronerf {

@@ -1,9 +1,7 @@
-// Adam on lists of tensors, and on the entries of tables that have a gradient. The formula is in
-// voronerf/ops/sparse_adam.py.
+// Adam on the entries that have a gradient. n entries; the formula is in voronerf/ops/sparse_adam.py.
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
 #include "common/isa.h"
 
@@ -21,9 +19,5 @@ void sparse_adam_cpu(const SparseAdam& rule, const float* gradient, float* param
                      int64_t n, Isa isa, int threads);
 void sparse_adam_cuda(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
                       int64_t n, void* stream);
-
-// The same of several parameters, by the rule of each.
-void adam_cpu(const std::vector<SparseAdam>& rules, const float* const* gradients, float* const* parameters,
-              float* const* means, float* const* squares, const std::vector<int64_t>& sizes, Isa isa, int threads);
 
 }  // namespace voronerf
