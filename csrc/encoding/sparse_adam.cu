@@ -15,7 +15,7 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= n) return;
   const float g = gradient[i];
-  if (g == 0.0f && !rule.every) return;
+  if (g == 0.0f) return;
   const float m = rule.decay * mean[i] + (1.0f - rule.decay) * g;
   const float v = rule.decay_sq * square[i] + (1.0f - rule.decay_sq) * (g * g);
   mean[i] = m;

@@ -11,7 +11,7 @@ struct SparseAdam {
   float step_size;        // the learning rate, corrected for the moments' start at zero
   float decay, decay_sq;  // of the moments
   float epsilon;          // corrected likewise
-  bool every;             // entries without a gradient move on by their moments, which decay, as torch's do
+  bool every;             // on the CPU: entries without a gradient move on by their moments, which decay, as torch's do
 };
 
 // gradient: [n] -> parameter, mean, square: [n], updated in place where the gradient is not zero.
