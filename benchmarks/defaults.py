@@ -11,6 +11,7 @@ counts is the mean gain in PSNR over the defaults, over all scenes, at half of t
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import statistics
 import sys
@@ -55,6 +56,8 @@ class Options:
     """Factor by which the images of each scene are made smaller; default: 1 for all."""
     sides: tuple[str, ...] = SIDES
     """What is compared, each as "NAME: OPTIONS" with options of `voronerf train`; gains are over the first."""
+    variants: tuple[str, ...] = ()
+    """Options for all sides, each as "NAME: OPTIONS"; with each of them every scene has a column of its own."""
     budget: float = 30.0
     """Training seconds of each side."""
     clock: Literal["wall", "cpu"] = "cpu"
@@ -85,12 +88,14 @@ def measure(options: Options) -> dict[str, Any]:
             raise ConfigError(f"--json must name a file of the same settings, got {options.json}")
         results = stored["results"]
     outcome = {"metadata": metadata(benchmark="defaults", **settings), "results": results}
-    for scene, downscale in zip(options.scenes, factors, strict=True):
-        key = {"scene": Path(scene).name, "downscale": downscale}
-        if any(key.items() <= row.items() for row in results):
+    scenes = zip(options.scenes, factors, strict=True)
+    for (scene, downscale), variant in itertools.product(scenes, options.variants or ("",)):
+        key = {"scene": Path(scene).name, "downscale": downscale} | ({"variant": variant} if variant else {})
+        common = variant.partition(":")[2]
+        if any(column(key) == column(row) for row in results):
             continue
         given = {name: value for name, value in dataclasses.asdict(options).items() if name in (*names, "sides")}
-        comparison = time_to_quality.Options(data=scene, downscale=downscale, evaluations=2, **given)
+        comparison = time_to_quality.Options(data=scene, downscale=downscale, common=common, evaluations=2, **given)
         with tempfile.TemporaryDirectory() as folder:
             found = time_to_quality.compare(comparison, Path(folder))
         for row in found["results"]:
@@ -101,24 +106,34 @@ def measure(options: Options) -> dict[str, Any]:
     return outcome
 
 
+def column(row: dict[str, Any]) -> str:
+    """What a row's column of the table is called."""
+    scene = row["scene"] if row["downscale"] == 1 else f"{row['scene']} / {row['downscale']}"
+    return f"{scene}, {row['variant'].partition(':')[0]}" if "variant" in row else str(scene)
+
+
 def table(outcome: dict[str, Any]) -> str:
-    """Mean gain over the first side on each scene, at half of the time and at the end, as Markdown."""
-    runs: dict[tuple[str, int], dict[str, list[list[float]]]] = {}
+    """Mean gain over the first side on each scene, at half of the time and at the end, as Markdown.
+
+    Of several seeds also the least and the largest gain at the end.
+    """
+    runs: dict[str, dict[str, list[list[float]]]] = {}
     for row in outcome["results"]:
-        runs.setdefault((row["scene"], row["downscale"]), {}).setdefault(row["side"], []).append(row["psnr"])
+        runs.setdefault(column(row), {}).setdefault(row["side"], []).append(row["psnr"])
     sides = [side.partition(":")[0].strip() for side in outcome["metadata"]["sides"]]
-    heads = [scene if factor == 1 else f"{scene} / {factor}" for scene, factor in runs]
-    lines = [f"| {' | '.join(['', *heads, 'mean'])} |", "|---" * (len(runs) + 2) + "|"]
+    lines = [f"| {' | '.join(['', *runs, 'mean'])} |", "|---" * (len(runs) + 2) + "|"]
     for side in sides:
         cells, gains = [], []
         for found in runs.values():
-            own, first = ([statistics.mean(at) for at in zip(*found[name])] for name in (side, sides[0]))
-            gains.append([a - b for a, b in zip(own, first)])
-            cells.append(
-                ", ".join(
-                    f"{x:.2f}" if side == sides[0] else f"{x:+.2f}" for x in (own if side == sides[0] else gains[-1])
-                )
-            )
+            first = found[sides[0]]
+            gain = [[a - b for a, b in zip(*pair)] for pair in zip(found[side], first)]
+            gains.append([statistics.mean(at) for at in zip(*gain)])
+            if side == sides[0]:
+                cells.append(", ".join(f"{statistics.mean(at):.2f}" for at in zip(*first)))
+                continue
+            text = ", ".join(f"{x:+.2f}" for x in gains[-1])
+            ends = [of_seed[-1] for of_seed in gain]
+            cells.append(f"{text} ({min(ends):+.2f} to {max(ends):+.2f})" if len(ends) > 1 else text)
         mean = ", ".join(f"{statistics.mean(at):+.2f}" for at in zip(*gains))
         lines.append(f"| {' | '.join([side, *cells, '' if side == sides[0] else mean])} |")
     return "\n".join(lines)

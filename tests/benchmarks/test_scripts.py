@@ -94,23 +94,24 @@ def test_centres_makes_only_the_rows_that_are_missing(tmp_path):
     assert f"| builtin, nerf, 3x2 cells | {texts[1]} | {texts[0]} |" in said  # centroidal-transport, regular
 
 
-def test_defaults_make_only_the_scenes_that_are_missing(tmp_path):
+def test_defaults_make_only_the_columns_that_are_missing(tmp_path):
     path = tmp_path / "defaults.json"
     sides = ("default: --rays 32 --samples 8", "more: --rays 64 --samples 8")
     options = ("--budget", "0.2", "--eval-views", "1", "--json", path, "--sides", *sides)
-    script(BENCHMARKS / "defaults.py", *options, "--scenes", "builtin", "--downscale", "10")
+    options += ("--scenes", "builtin", "--downscale", "10", "--variants", "narrow: --width 16")
+    script(BENCHMARKS / "defaults.py", *options)
     first = read_json(path)["results"]
     assert [(row["scene"], row["downscale"], row["side"], len(row["psnr"])) for row in first] == [
         ("builtin", 10, "default", 2),
         ("builtin", 10, "more", 2),
     ]
-    scenes = ("--scenes", "builtin", "builtin-translucent", "--downscale", "10", "10")
-    said = script(BENCHMARKS / "defaults.py", *options, *scenes)
+    said = script(BENCHMARKS / "defaults.py", *options, "wide: --width 64")
     rows = read_json(path)["results"]
-    assert rows[:2] == first and [row["scene"] for row in rows[2:]] == ["builtin-translucent"] * 2
+    assert rows[:2] == first and [row["variant"] for row in rows[2:]] == ["wide: --width 64"] * 2
     gains = [[b - a for a, b in zip(*(row["psnr"] for row in pair))] for pair in (rows[:2], rows[2:])]
     means = [sum(at) / 2 for at in zip(*gains)]
     expected = [", ".join(f"{x:+.2f}" for x in pair) for pair in (*gains, means)]
+    assert "|  | builtin / 10, narrow | builtin / 10, wide | mean |" in said
     assert f"| more | {' | '.join(expected)} |" in said
 
 
@@ -207,6 +208,7 @@ def test_tables_of_centres_and_defaults_are_those_of_the_programs():
     for page, table, names in (
         ("centres", lambda found: centres.table(found["results"]), ("centres_lego_ship", "centres_builtin_rich")),
         ("defaults", defaults.table, ("defaults_second", "defaults_rays")),
+        ("centres", defaults.table, ("cells",)),
     ):
         text = (BENCHMARKS.parent / "docs" / f"{page}.md").read_text()
         for name in names:
