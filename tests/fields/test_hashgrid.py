@@ -76,10 +76,11 @@ def test_settings_come_from_the_scene():
     assert own.module.features.dim() == 3
 
 
-def test_the_finest_level_grows_slowly_with_large_images():
+def test_the_grid_grows_with_the_images():
     box = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    found = [HashGridField.scene_options(1 / pixels, box, False)["finest"] for pixels in (10, 40, 80, 100, 400)]
-    assert found == [32, 80, 160, 188, 376]
+    found = [HashGridField.scene_options(1 / pixels, box, False) for pixels in (10, 40, 80, 100, 353)]
+    assert [own["finest"] for own in found] == [32, 80, 160, 200, 706]
+    assert [own["log2_entries"] for own in found] == [14, 14, 15, 15, 18]
 
 
 def test_shared_parameters_count_once():

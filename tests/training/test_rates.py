@@ -4,7 +4,7 @@ import pytest
 from tiny_runs import small, stopping
 
 from voronerf.training.config import TrainConfig
-from voronerf.training.rates import learning_rate
+from voronerf.training.rates import learning_rate, next_rays
 from voronerf.training.trainer import Trainer
 
 
@@ -76,3 +76,9 @@ def test_a_step_takes_more_rays_where_space_is_empty(tmp_path, scene):
         trainer.train_step()
         rays.append(trainer.rays)
     assert rays[0] == 64 and 64 <= rays[1] < rays[2] <= 256 and rays[3] == 256
+
+
+def test_steps_on_large_images_keep_more_samples():
+    for samples, share in ((32, 0.25), (64, 0.25), (128, 0.5)):
+        config = TrainConfig(rays=100, samples=samples)
+        assert next_rays(config, 100, int(100 * samples * share / 2)) == 200

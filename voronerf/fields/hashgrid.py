@@ -116,18 +116,14 @@ class HashGridField(RadianceField):
     def scene_options(pixel: float, box: Box, contracted: bool) -> dict[str, Any]:
         """The grid covers the space, and has finer cells and more entries for larger images.
 
-        Half a pixel is the width of the finest cells. Where an object has more than 90 pixels the resolution grows with
-        the square root alone, to 353 cells for the 353 pixels of Lego at 400 x 400: finer ones learn more slowly.
-
-        A surface meets as many cells as the square of the resolution; the entries grow with the pixels themselves,
-        since larger tables take longer to read and to learn: 2^15 for an object of 100 pixels, 2^17 for 400. In a
-        contracted scene, seen from within, larger tables were worse.
+        Half a pixel is the width of the finest cells. A surface meets as many cells as the square of the resolution;
+        the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an object of 88
+        pixels, 2^18 for 353. In a contracted scene, seen from within, larger tables were worse.
         """
         pixels = max(high - low for low, high in zip(*box)) / pixel
         found: dict[str, Any] = {"box": box, "finest": max(round(2 * pixels), 32)}
         if not contracted:
-            found["finest"] = min(found["finest"], round(18.8 * math.sqrt(pixels)))
-            found["log2_entries"] = min(max(round(math.log2(pixels) + 8.5), 14), 19)
+            found["log2_entries"] = min(max(round(1.5 * math.log2(pixels) + 5.3), 14), 19)
         return found
 
     def reset_parameters(self) -> None:

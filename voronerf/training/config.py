@@ -137,7 +137,8 @@ class TrainConfig:
     """Rays per training step; where empty space is skipped, of the first steps."""
     ray_growth: float | None = None
     """Where empty space is skipped, few samples of a ray are left. A step then takes more rays, up to this multiple of
-    --rays, so that it has a quarter of the samples of the first steps; 1 is off. Default 8 for hashgrid, else 1."""
+    --rays, so that it has a quarter of the samples of the first steps, or half with 128 samples a ray, and so on; 1 is
+    off. Default 8 for hashgrid, else 1."""
     sampling: SamplingName = "stratified"
     """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
     (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""

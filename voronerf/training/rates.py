@@ -10,8 +10,9 @@ from voronerf.training.config import TrainConfig
 #: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
 #: which forgets in some thirty steps, would empty itself for good.
 WARMUP_STEPS = 100
-#: The share of a step's samples that are to be left once empty space is known, if more rays can bring them.
-FILL = 0.25
+#: The share of a step's samples that are to be left once empty space is known, if more rays can bring them, and the
+#: samples of a ray beyond which it grows with them: large images need larger tables, which larger steps keep cheap.
+FILL, FILL_SAMPLES = 0.25, 64
 
 
 def learning_rate(config: TrainConfig, done: float, step: int, splits: int) -> float:
@@ -28,7 +29,8 @@ def learning_rate(config: TrainConfig, done: float, step: int, splits: int) -> f
 def next_rays(config: TrainConfig, rays: int, samples: int) -> int:
     """Rays of the next step, after one whose ``rays`` had so many samples in occupied space; see ``ray_growth``."""
     assert config.samples is not None and config.ray_growth is not None
-    wanted = rays * FILL * config.rays * config.samples / max(samples, 1)
+    share = FILL * max(config.samples / FILL_SAMPLES, 1.0)
+    wanted = rays * share * config.rays * config.samples / max(samples, 1)
     return int(min(max(wanted, config.rays), config.rays * config.ray_growth))
 
 
