@@ -41,7 +41,7 @@ def city() -> None:
         axis.set(xscale="log", xlabel="blocks on a side of the city", title=field, xlim=(0.9, 9))
         axis.set_xticks([1, 2, 4, 8], ["1", "2", "4", "8"])
         axis.minorticks_off()
-        axis.legend(fontsize=8, loc="upper left")
+        axis.legend(fontsize=8, loc="lower right")
     axes[0].set(ylabel="PSNR over one network, dB")
     figure.savefig(IMAGES / "city_gain.png", dpi=110)
 
