@@ -24,7 +24,7 @@ def observe_occupancy(
     hidden: float,
 ) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    given = _samples(density, box, positions, sigma, deltas, weights, decay, threshold, hidden)
+    given = _samples(density, box, (positions, sigma, deltas, weights), decay, threshold, hidden)
     m = positions.shape[0]
     machine = native.machine(density)
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
@@ -56,7 +56,7 @@ def observe_told(
         threshold: Likewise.
         hidden: Likewise.
     """
-    given = _samples(density, box, *samples, decay, threshold, hidden)
+    given = _samples(density, box, samples, decay, threshold, hidden)
     rows = len(samples[0]) + len(told)
     cells, before = density.new_empty(rows, dtype=torch.int32), density.new_empty(rows)
     reached = torch.ones_like(occupied) if reached is None else reached
@@ -67,22 +67,15 @@ def observe_told(
 def tell_observed(density: Tensor, box: Tensor, several: Tensor | None, samples: Samples, *, hidden: float) -> Tensor:
     """Cell, as bits, and density [c, 2] of samples in cells that several ranks reach, a bool for each; None for all."""
     told = density.new_empty(len(samples[0]), 2)
-    given = _samples(density, box, *samples, 1.0, 1.0, hidden)
+    given = _samples(density, box, samples, 1.0, 1.0, hidden)
     several = None if several is None else several.view(torch.uint8)
     return told[: native.compiled.tell_observed(given, several, told, native.cpu())]
 
 
 def _samples(
-    density: Tensor,
-    box: Tensor,
-    positions: Tensor,
-    sigma: Tensor,
-    deltas: Tensor,
-    weights: Tensor,
-    decay: float,
-    threshold: float,
-    hidden: float,
+    density: Tensor, box: Tensor, samples: Samples, decay: float, threshold: float, hidden: float
 ) -> native.compiled.ObservedSamples:
+    positions, sigma, deltas, weights = samples
     x, y, z = density.shape
     return native.compiled.ObservedSamples(
         positions=positions,
