@@ -10,8 +10,8 @@ from helpers import same
 
 import voronerf
 from voronerf import VoronoiDiagram
-from voronerf.native.cell_sort import WAYS
-from voronerf.native.cell_sort import sort as sort_cells
+from voronerf.ops.cell_sort.native import WAYS
+from voronerf.ops.cell_sort.native import sort as sort_cells
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)
