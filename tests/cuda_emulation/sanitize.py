@@ -28,6 +28,9 @@ class Memory:
     def is_contiguous(self):
         return True
 
+    def is_neg(self):
+        return False
+
     def data_ptr(self):
         return self.array.ctypes.data
 

@@ -408,8 +408,8 @@ def _map(stages: Stages, name: str) -> Model | None:
             stages.progress(f"{name} mapping", 0, 0)
             thread.join(0.5)
         with _told("mapping"):
-            for error in errors:
-                raise error
+            for failure in errors:
+                raise failure
         os.replace(part, folder)
     found = [path for path in folder.iterdir() if (path / "images.bin").is_file()]
     if not found:
