@@ -65,7 +65,7 @@ def guarded(host: str) -> Iterator[None]:
 
             async def recv() -> Any:
                 while True:
-                    data = await receive()
+                    data: Any = await receive()
                     message = msgspec.msgpack.decode(data)
                     if message["type"] in KINDS and set(message.get("updates", ("value",))) == {"value"}:
                         return data
