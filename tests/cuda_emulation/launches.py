@@ -1,0 +1,66 @@
+"""What a piece of work would ask of a GPU, counted without one: launches of kernels and reads of the host.
+
+Kernels of this project are counted by the emulation, torch's by its operations: one that computes is one launch.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest import mock
+
+import torch
+from emulated import emulated
+from torch.utils._python_dispatch import TorchDispatchMode
+
+aten = torch.ops.aten
+READING = {
+    *(aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default, aten.equal.default),
+    *(aten.is_nonzero.default, aten._unique2.default, aten.repeat_interleave.Tensor),
+}
+"""Operations after which the host knows something of the device's: a number, or a size."""
+FREE = {"empty", "empty_like", "new_empty", "empty_strided", "new_empty_strided", "_unsafe_view", "lift_fresh"}
+"""Operations that only allocate, or only name what is there."""
+
+
+class Asked(TorchDispatchMode):
+    """Counts torch's operations while it lasts.
+
+    Attributes:
+        operations: how often each operation that computes was called, by name.
+        reads: how often each that the host waits for.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations: Counter[str] = Counter()
+        self.reads: Counter[str] = Counter()
+        self.kernels = 0
+
+    @property
+    def launches(self) -> int:
+        """Kernels of this project and of torch."""
+        return self.kernels + self.operations.total()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        name = function.overloadpacket.__name__
+        by_bool = function is aten.index.Tensor and any(
+            index is not None and index.dtype == torch.bool for index in args[1]
+        )
+        # torch.tensor of a number: a copy from memory of the host, which waits for it.
+        if function in READING or by_bool or function is aten.lift_fresh.default:
+            self.reads[name] += 1
+        elif not function.is_view and name not in FREE and name != "detach":
+            self.operations[name] += 1
+        return function(*args, **(kwargs or {}))
+
+
+@contextmanager
+def asked() -> Iterator[Asked]:
+    """Counts what is asked of the emulated GPU; custom ops run as without a mode, so that what is in them counts."""
+    with emulated() as module, mock.patch("voronerf.native.custom_op._LISTENERS", []):
+        before, counted = module.launches(), Asked()
+        with counted:
+            yield counted
+        counted.kernels = module.launches() - before
