@@ -74,6 +74,7 @@ PYBIND11_MODULE(voronerf_emulation, module) {
     plan["bytes"] = found.bytes;
     return plan;
   });
+  module.def("launches", &vn_emulation::launches);
   module.def("seed", [](uint64_t seed) { vn_emulation::settings().seed = seed; });
   module.def("device", [](int capability, int compiled, int shared_bytes) {
     vn_emulation::settings().capability = capability;
