@@ -10,6 +10,9 @@
 
 namespace py = pybind11;
 
+namespace vn_emulation {
+int64_t launches();
+}
 void bind_groups(py::module_& module);
 void bind_index_maps(py::module_& module);
 void bind_plans(py::module_& module);
