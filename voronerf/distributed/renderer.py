@@ -28,7 +28,6 @@ from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.rendering.sampling import NEARBY, stratified_depths
 from voronerf.rendering.volume import weaken_near
 from voronerf.router import VoronoiRouter
-from voronerf.router.fused import routed_arguments
 
 #: Rays of a picture at a time: no ray ends at the first surface, since other ranks do not know it in time.
 PICTURE_CHUNK = 16_384
@@ -216,14 +215,14 @@ class RankRenderer(Renderer):
         self, rays: Rays, march: March, target: Tensor, background: Tensor | None, own: slice
     ) -> Learnt:
         """:meth:`learn` from the outputs of the networks, where these mean a colour and a density."""
-        from voronerf.native import ray_runs  # which is there where the compiled module is
+        from voronerf.ops.ray_runs import native as ray_runs
 
         assert self.sharing is not None
         field = cast(VoronoiRouter, self.field)
         scale = float(cast(Any, field.module).density_scale)
         cells = self.sharing.diagram.locate(march.positions, backend=self.backend)
         samples = ray_runs.own_samples(march, cells, self._numbers, bent=self.contraction is not None)
-        routed = routed_arguments(field, samples.positions, rays.directions, samples.ray_index)
+        routed = field.table_arguments(samples.positions, rays.directions, samples.ray_index)
         assert routed is not None
         networks = ray_runs.Networks(routed, samples.cells)
         sums, density = ray_runs.run_sums(networks.out, samples, scale)

@@ -1,0 +1,101 @@
+"""What rendered samples teach an occupancy grid. x, y, z cells along each axis, m samples."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
+from voronerf.checks import (
+    check_count,
+    check_dtype,
+    check_number,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+    check_writable,
+)
+
+_OP = backends.declare(
+    "observe_occupancy",
+    native=Implementation(EVERYWHERE, (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
+
+
+def observe_occupancy(
+    density: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    positions: Tensor,
+    sigma: Tensor,
+    deltas: Tensor,
+    weights: Tensor,
+    *,
+    decay: float,
+    threshold: float,
+    hidden: float,
+    backend: str = "auto",
+) -> None:
+    """Updates the cells of an occupancy grid that rendered samples lie in, in place.
+
+    A cell with samples gets the largest of their densities and ``decay`` times its old density (Mueller et al. 2022,
+    appendix C). A sample that receives less than the share ``hidden`` of the light counts as density 0:
+    ``weights <= hidden * (1 - exp(-sigma * deltas))``. The other cells keep theirs. Not differentiable.
+
+    Args:
+        density: float32 [x, y, z], >= 0, contiguous.
+        occupied: bool [x, y, z], contiguous: density >= threshold.
+        box: float32 [2, 3], lowest and highest corner.
+        positions: float32 [m, 3]; a position outside the box counts for the nearest cell at its border.
+        sigma: float32 [m], densities of the samples; NaN counts as infinite.
+        deltas: float32 [m], lengths of their strata.
+        weights: float32 [m], their contributions to their rays.
+        decay: 0 to 1.
+        threshold: density from which a cell counts as occupied.
+        hidden: share of the light, 0 to 1.
+        backend: "auto", "reference", "native" or "warp".
+
+    Raises:
+        ValueError: shapes, devices, a grid that is not contiguous, a decay out of range, an unknown backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import observe_occupancy
+        >>> density, occupied = torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1, dtype=torch.bool)
+        >>> box = torch.tensor([[0.0, 0, 0], [3.0, 1, 1]])
+        >>> positions = torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]])  # in the first two cells
+        >>> samples = positions, torch.tensor([0.0, 9.0]), torch.ones(2), torch.tensor([0.0, 1.0])
+        >>> observe_occupancy(density, occupied, box, *samples, decay=0.5, threshold=3.0, hidden=1e-3)
+        >>> density.flatten(), occupied.flatten()
+        (tensor([2., 9., 4.]), tensor([False,  True,  True]))
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "density", density, ("x", "y", "z"), sizes)
+    check_shape(_OP, "occupied", occupied, ("x", "y", "z"), sizes)
+    check_shape(_OP, "box", box, (2, 3))
+    check_shape(_OP, "positions", positions, ("m", 3), sizes)
+    floats = {"density": density, "box": box, "positions": positions}
+    for name, value in (("sigma", sigma), ("deltas", deltas), ("weights", weights)):
+        check_shape(_OP, name, value, ("m",), sizes)
+        floats[name] = value
+    check_dtype(_OP, "density", density, (torch.float32,))
+    check_dtype(_OP, "occupied", occupied, (torch.bool,))
+    check_same_dtype(_OP, **floats)
+    check_same_device(_OP, **floats, occupied=occupied)
+    check_count(_OP, "density", density.numel())
+    check_count(_OP, "positions", sizes["m"])
+    for name, grid in (("density", density), ("occupied", occupied)):
+        check_writable(_OP, name, grid)
+    if density.numel() < 1:
+        raise ValueError(f"{_OP}: density must have at least one cell, got {list(density.shape)}")
+    for name, number in (("decay", decay), ("threshold", threshold), ("hidden", hidden)):
+        check_number(_OP, name, number)
+    if not 0 <= decay <= 1:
+        raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
+    run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)
+    samples = (tensor.detach() for tensor in (box, positions, sigma, deltas, weights))
+    run(density.detach(), occupied, *samples, float(decay), float(threshold), float(hidden))
