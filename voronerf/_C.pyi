@@ -138,7 +138,7 @@ class HashInputs(NamedTuple):
     tables: int  # int64
     entries: int  # int64
 
-Isa: tuple[str, ...]  # portable avx2 avx512
+Isa: tuple[str, ...]  # portable neon avx2 avx512 avx512_bf16
 
 class KnownSamples(NamedTuple):
     positions: Tensor | None  # const float32*
@@ -349,6 +349,9 @@ def balance_centres(_0: BalanceInputs, _1: Tensor | None, _2: Tensor | None, _3:
 
 # int64
 def balance_centres_workspace(_0: int) -> int: ...
+
+# 
+def bfloat16_gain() -> float: ...
 
 # const int32*, int32*, int32*, int32*, int64, int64, Cpu
 @overload
