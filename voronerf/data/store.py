@@ -96,7 +96,7 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
 
 
 def check_mapped() -> None:
-    """Raises SceneError where a file that is mapped has become shorter: to read what is missing would end the process."""
+    """Raises SceneError where a mapped file has become shorter: who reads what is missing is ended by SIGBUS."""
     for mapped in _mapped:
         if mapped.size() < len(mapped):
             raise SceneError(
