@@ -15,7 +15,6 @@ Environment:
 from __future__ import annotations
 
 import os
-import platform
 import shlex
 import shutil
 import subprocess
@@ -28,11 +27,14 @@ from setuptools.command.build_ext import build_ext
 
 ROOT = Path(__file__).resolve().parent
 SOURCES = ROOT / "csrc"
-X86_ISAS = {
-    "portable": ["-DVN_ISA=0"],
-    "avx2": ["-DVN_ISA=1", "-mavx2", "-mfma"],
-    "avx512": ["-DVN_ISA=2", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma"],
+ISAS = {
+    "x86_64": {
+        "avx2": ["-DVN_ISA=1", "-mavx2", "-mfma"],
+        "avx512": ["-DVN_ISA=2", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma"],
+    },
+    "aarch64": {"neon": ["-DVN_ISA=3"]},
 }
+"""Of an architecture, beside the portable path."""
 LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
 # Short, for the sake of build time: 8.x runs the code of 80, and what comes after 9.0 compiles the PTX of 90.
 DEFAULT_ARCHITECTURES = "75;80;90"
@@ -141,9 +143,10 @@ def ninja() -> list[str]:
 
 
 def isas() -> dict[str, list[str]]:
-    """Instruction sets of this architecture and their flags."""
-    x86 = platform.machine().lower() in ("x86_64", "amd64") and "aarch64" not in " ".join(compiler())
-    return X86_ISAS if x86 else {"portable": X86_ISAS["portable"]}
+    """Instruction sets of the compiler's architecture and their flags."""
+    target = subprocess.run([*compiler(), "-dumpmachine"], check=True, capture_output=True, text=True).stdout
+    architecture = target.split("-")[0].replace("arm64", "aarch64")
+    return {"portable": ["-DVN_ISA=0"], **ISAS.get(architecture, {})}
 
 
 def build_info(cuda: Cuda) -> str:

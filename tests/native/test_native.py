@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,10 +12,10 @@ from helpers import on_any_number_of_threads, refuses
 from torch import Tensor
 
 from voronerf import backends, cell_sort, locate_cell, nearest_centre
-from voronerf.reference.cell_sort import cell_sort as reference_sort
-from voronerf.reference.locate_cell import locate_cell as reference_locate
-from voronerf.reference.nearest_centre import distances
-from voronerf.reference.nearest_centre import nearest_centre as reference_nearest
+from voronerf.ops.cell_sort.reference import cell_sort as reference_sort
+from voronerf.ops.locate_cell.reference import locate_cell as reference_locate
+from voronerf.ops.nearest_centre.reference import distances
+from voronerf.ops.nearest_centre.reference import nearest_centre as reference_nearest
 
 pytestmark = pytest.mark.native
 
@@ -279,16 +278,39 @@ def test_devices_of_a_cuda_build(architectures: list[str], runs: list[int], fail
 
 
 def test_peak_of_each_kind(isa: str) -> None:
-    fp32 = _native.measure_peak("float32", threads=1)
-    assert fp32 > 1e9 and _native.measure_peak("copy", isa=isa, threads=2) > 1e8
-    if isa != "avx512":
+    assert _native.measure_peak("float32", isa=isa, threads=1) > 1e8
+    assert _native.measure_peak("copy", isa=isa, threads=2) > 1e8
+    if isa == "avx512_bf16":
+        assert _native.measure_peak("bfloat16", isa=isa, threads=1) > 1e8
+    else:
         with pytest.raises(ValueError, match=r"^measure_peak: kind must be one that the instruction set has, got bfl"):
             _native.measure_peak("bfloat16", isa=isa)
-    elif "avx512_bf16" in Path("/proc/cpuinfo").read_text():
-        assert _native.measure_peak("bfloat16", threads=1) > 1.2 * fp32
+
+
+def test_bfloat16_is_multiplied_in_what_is_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("VORONERF_ISA", raising=False)
+    monkeypatch.setattr(_native, "SUPPORTED_ISAS", ("portable", "avx512", "avx512_bf16"))
+    for gain, chosen, text in [
+        (0.49, "avx512", "in float32: bfloat16 makes 0.49 x the operations of float32"),
+        (2.0, "avx512_bf16", "in bfloat16: bfloat16 makes 2 x the operations of float32"),
+    ]:
+        monkeypatch.setattr(_native, "_bfloat16_gain", gain)
+        assert _native._choose_isa() == chosen
+        with _native.using_isa(chosen):
+            assert _native.describe()["bfloat16 products"] == text
+    monkeypatch.setenv("VORONERF_ISA", "avx512")  # forced
+    assert _native._choose_isa() == "avx512"
+    monkeypatch.setattr(_native, "_bfloat16_gain", 0.0)
+    assert _native.describe()["bfloat16 products"] == "in float32: this processor, or this build, has none"
+
+
+def test_the_gain_of_bfloat16_is_the_same_each_time() -> None:
+    gains = [_native.compiled.bfloat16_gain() for _ in range(5)]
+    assert len({gain >= _native.LEAST_GAIN for gain in gains}) == 1, gains
+    assert (gains[0] > 0) == ("avx512_bf16" in _native.SUPPORTED_ISAS)
 
 
 def test_peak_errors() -> None:
     refuses("measure_peak: kind must be one of float32, bfloat16, copy, got 'fp32'", _native.measure_peak, "fp32")
-    with pytest.raises(ValueError, match=r"^measure_peak: isa must be one of portable, avx2, avx512, got 'sse'"):
+    with pytest.raises(ValueError, match=r"^measure_peak: isa must be one of portable, neon, .*avx512_bf16, got 'sse'"):
         _native.measure_peak("copy", isa="sse")

@@ -10,7 +10,7 @@ from tolerances import assert_as_exact
 
 from voronerf import HashGrid
 from voronerf.ops import hash_encode
-from voronerf.reference.hash_encode import hash_encode as reference
+from voronerf.ops.hash_encode.reference import hash_encode as reference
 
 pytestmark = pytest.mark.op("hash_encode")
 
@@ -228,7 +228,7 @@ def derivatives(encode, grid, x, table, cells, dtype):
 
 
 FEATURES = ["both", "one feature", "four features", "eight features"]
-KINDS = {"name": FEATURES, "dtype": [torch.float32, *HALVES], "isa": ["portable", "avx2", "avx512"]}
+KINDS = {"name": FEATURES, "dtype": [torch.float32, *HALVES], "isa": ["portable", "neon", "avx2", "avx512"]}
 
 
 @pytest.mark.native

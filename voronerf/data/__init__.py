@@ -1,4 +1,4 @@
-"""Scenes: loaders of Blender synthetic scenes and of photographs, and four scenes computed from formulas."""
+"""Scenes: loaders of Blender synthetic scenes and of photographs, and scenes computed from formulas."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from voronerf.data.blender import load_blender
-from voronerf.data.builtin import builtin_scene, city_scene, rich_scene, translucent_scene
+from voronerf.data.builtin import builtin_scene, city_scene, rich_scene
 from voronerf.data.builtin.city import city_of
 from voronerf.data.capture import load_capture
 from voronerf.data.colmap import find_model, load_colmap
@@ -22,17 +22,16 @@ __all__ = [
     "city_scene",
     "load_scene",
     "rich_scene",
-    "translucent_scene",
 ]
 
 BUILTIN_SIZE = 100
-BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene, "builtin-translucent": translucent_scene}
+BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene}
 CITY = "builtin-city"  # of one block, or with their number: builtin-city:4x4
 #: In the order in which a folder is tried, with what shows each.
 FORMATS = {
     "blender": "transforms_train.json",
-    "transforms": "transforms.json",
     "colmap": "a COLMAP model in sparse/0",
+    "transforms": "transforms.json",
     "llff": FILE,
 }
 
@@ -55,7 +54,7 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", "builtin-rich", "builtin-translucent", "builtin-city" of one block or "builtin-city:4x4" of
+        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of
             16, or a folder with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp,
             nerfstudio), a COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
@@ -105,11 +104,13 @@ def load_scene(
         raise SceneError(f"{folder}: there is no such folder")
     if not folder.is_dir():
         raise SceneError(f"{folder}: is not a folder")
+    model = find_model(folder)
     held = [
-        name
-        for name, sign in FORMATS.items()
-        if (find_model(folder) is not None if name == "colmap" else (folder / sign).is_file())
+        name for name, sign in FORMATS.items() if (model is not None if name == "colmap" else (folder / sign).is_file())
     ]
+    if model == folder / "colmap/sparse/0" and "transforms" in held:
+        held.remove("colmap")  # nerfstudio's, whose transforms.json was made of it and says more
+        held.append("colmap")
     if not held:
         raise SceneError(f"{folder}: is not a scene, it has none of {', '.join(FORMATS.values())}")
     if format != "auto" and format not in held:

@@ -1,6 +1,6 @@
 """The compiled module: finds torch's OpenMP for it, loads it, chooses an instruction set, and says how it was built.
 
-The files beside this one are its ops, one each. Importing this package raises ``BackendUnavailable`` where the
+Importing this package raises ``BackendUnavailable`` where the
 extension is missing or was built for other sources than these.
 
 OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch
@@ -72,11 +72,19 @@ compiled.name_dtypes(DTYPES)
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
+LEAST_GAIN = 1.25
+"""Of bfloat16 products over float32 ones, for networks to use them: rounding and pairing operands costs some."""
+_bfloat16_gain = compiled.bfloat16_gain()
 
 
 def _choose_isa() -> str:
-    """Best instruction set of this processor, or the one of VORONERF_ISA."""
-    wanted = os.environ.get("VORONERF_ISA") or SUPPORTED_ISAS[-1]
+    """Best instruction set of this processor, or the one of VORONERF_ISA.
+
+    One whose bfloat16 products are slower than float32 ones is not the best. The gain is far from `LEAST_GAIN` on all
+    known processors, so that every process on a machine chooses the same.
+    """
+    best = [isa for isa in SUPPORTED_ISAS if isa != "avx512_bf16" or _bfloat16_gain >= LEAST_GAIN]
+    wanted = os.environ.get("VORONERF_ISA") or best[-1]
     if wanted not in SUPPORTED_ISAS:
         here = ", ".join(SUPPORTED_ISAS)
         # Not BackendUnavailable, which backend="auto" would skip silently.
@@ -161,11 +169,20 @@ def describe() -> dict[str, Any]:
     """How the module was built and what it uses."""
     return {
         "instruction set": _isa,
+        "bfloat16 products": _bfloat16_products(),
         "compiler": compiled.compiler,
         "openmp": compiled.openmp,
         "cuda": compiled.cuda_outcome,
         "cuda architectures": compiled.cuda_architectures.split(";") if compiled.cuda else [],
     }
+
+
+def _bfloat16_products() -> str:
+    """What bfloat16 is multiplied in on the CPU, and why."""
+    if _bfloat16_gain == 0:
+        return "in float32: this processor, or this build, has none"
+    used = "in bfloat16" if _isa == "avx512_bf16" else "in float32"
+    return f"{used}: bfloat16 makes {_bfloat16_gain:.2g} x the operations of float32"
 
 
 def measure_peak(kind: str, *, isa: str | None = None, threads: int | None = None) -> float:

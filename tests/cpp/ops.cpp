@@ -1,0 +1,473 @@
+// Every CPU kernel but the whole networks', over random and edge sizes, with every instruction set of the machine.
+//
+// Numbers are compared with the reference in Python (tests/); here every array has exactly its size, so that sanitizers
+// guard its ends, outputs start poisoned, every eighth case has NaN and infinity among its inputs, one and three
+// threads must agree bit for bit, and all instruction sets with the portable path.
+#include <algorithm>
+#include <cstdio>
+#include <cstdlib>
+
+#include "cases.h"
+#include "encoding/encode.h"
+#include "encoding/sparse_adam.h"
+#include "encoding/spherical_harmonics.h"
+#include "encoding/touched_entries.h"
+#include "geometry/cell_sort.h"
+#include "geometry/centre_grid.h"
+#include "geometry/draw_cell.h"
+#include "geometry/locate_cell.h"
+#include "geometry/nearest_centre.h"
+#include "network/grouped_linear.h"
+#include "rays/composite.h"
+#include "rays/march_rays.h"
+#include "rays/render_loss.h"
+#include "rays/resample.h"
+
+namespace {
+
+using voronerf::Isa;
+
+template <typename T>
+void search(Isa isa) {
+  const int64_t counts[] = {1, 2, 16, 17, 255, 256, 257, 300 + below(300)};
+  const int64_t n = some_rows(), k = counts[below(8)];
+  const Array<T> points = below(2) == 0 ? uniform<T>(3 * n) : lattice<T>(3 * n);
+  const bool was_wild = wild;
+  wild = false;  // centres and weights are finite
+  const Array<T> centres = below(2) == 0 ? uniform<T>(3 * k) : lattice<T>(3 * k);
+  const Array<T> weights = below(2) == 0 ? Array<T>() : uniform<T>(k);
+  wild = was_wild;
+  Array<int32_t> found(n, -7), again(n, -7), by_grid(n, -7);
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), or_null(weights), found.data(), n, k, isa, 1);
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), or_null(weights), again.data(), n, k, isa, 3);
+  same(found, again, "nearest_centre");
+  within(found, k, "nearest_centre");
+  like_portable(found, "nearest_centre");
+
+  const Array<double> exact(centres.begin(), centres.end()), power(weights.begin(), weights.end());
+  const auto tables = voronerf::centre_grid_build(exact.data(), or_null(power), k, isa, 1);
+  const auto others = voronerf::centre_grid_build(exact.data(), or_null(power), k, isa, 3);
+  same(tables->entries, others->entries, "centre_grid");
+  same(tables->lists, others->lists, "centre_grid");
+  Array<float> table;
+  for (int64_t i = 0; i < k; ++i) {
+    for (int a = 0; a < 3; ++a) table.push_back(static_cast<float>(centres[3 * i + a]));
+    table.push_back(weights.empty() ? 0.0f : static_cast<float>(weights[i]));
+  }
+  const voronerf::CentreGrid grid{tables->frame, tables->entries.data(), tables->lists.data(), table.data(),
+                                  tables->bits};
+  for (const int threads : {1, 3}) {
+    voronerf::nearest_centre_grid_cpu(points.data(), centres.data(), or_null(weights), grid, by_grid.data(), n, k, isa,
+                                      threads);
+    if (by_grid != found) fail("nearest_centre_grid: not what all centres give");
+  }
+}
+
+// Of double precision there is no drawing.
+void draw(const Array<double>&, const Array<double>&, const Array<double>&, const Array<int32_t>&,
+          const Array<int32_t>&, int32_t, Isa) {}
+
+void draw(const Array<float>& points, const Array<float>& centres, const Array<float>& weights,
+          const Array<int32_t>& offsets, const Array<int32_t>& child, int32_t leaves, Isa isa) {
+  const int64_t n = static_cast<int64_t>(points.size()) / 3, m = offsets.back();
+  const Array<float> uniforms = uniform<float>(2 * n);
+  const double temperatures[] = {1e-300, 1e-3, 0.3, 1e30};
+  const double temperature = temperatures[below(4)];
+  Array<int32_t> results[2];
+  for (int i = 0; i < 2; ++i) {
+    const int threads = 1 + 2 * i;
+    results[i].assign(n, -7);
+    Array<int32_t> places(voronerf::draw_cell_places(m, threads));
+    Array<float> sums = poisoned(voronerf::draw_cell_sums(m, threads));
+    if (!voronerf::draw_cell_cpu(points.data(), centres.data(), or_null(weights), offsets.data(), child.data(),
+                                 uniforms.data(), results[i].data(), places.data(), sums.data(), n, m, 2, temperature,
+                                 isa, threads)) {
+      fail("draw_cell: did not arrive");
+    }
+  }
+  same(results[0], results[1], "draw_cell");
+  within(results[0], leaves, "draw_cell");
+  like_portable(Array<float>(results[0].begin(), results[0].end()), "draw_cell",
+                0.05);  // a draw on the edge may differ
+}
+
+template <typename T>
+void locate(Isa isa) {
+  // A root whose every other centre is refined, by diagrams of different sizes.
+  const int64_t n = some_rows(), root = 1 + below(20);
+  Array<int32_t> offsets = {0, static_cast<int32_t>(root)}, child(root);
+  int32_t leaves = 0;
+  for (int64_t i = 0; i < root; ++i) {
+    if (i % 2 == 0) {
+      child[i] = -1 - leaves++;
+      continue;
+    }
+    child[i] = static_cast<int32_t>(offsets.size() - 1);
+    const int32_t size = static_cast<int32_t>(1 + below(17));
+    for (int32_t j = 0; j < size; ++j) child.push_back(-1 - leaves++);
+    offsets.push_back(offsets.back() + size);
+  }
+  const int64_t m = offsets.back();
+  const Array<T> points = uniform<T>(3 * n), centres = lattice<T>(3 * m);
+  const Array<T> weights = below(2) == 0 ? Array<T>() : lattice<T>(m);
+  if (voronerf::locate_cell_fault(offsets.data(), child.data(), static_cast<int64_t>(offsets.size()) - 1, m)) {
+    fail("locate_cell: a sound tree refused");
+  }
+  Array<int32_t> results[2];
+  for (int i = 0; i < 2; ++i) {
+    const int threads = 1 + 2 * i;
+    results[i].assign(n, -7);
+    Array<int32_t> workspace(voronerf::locate_cell_workspace(m, threads));
+    if (!voronerf::locate_cell_cpu(points.data(), centres.data(), or_null(weights), offsets.data(), child.data(),
+                                   results[i].data(), workspace.data(), n, m, 2, isa, threads)) {
+      fail("locate_cell: did not arrive");
+    }
+  }
+  same(results[0], results[1], "locate_cell");
+  within(results[0], leaves, "locate_cell");
+  like_portable(results[0], "locate_cell");
+  draw(points, centres, weights, offsets, child, leaves, isa);
+}
+
+void sort() {
+  const int64_t counts[] = {1, 2, 255, 256, 5000};
+  const int64_t n = below(3) == 0 ? 70000 + below(9) : some_rows(), k = counts[below(5)];
+  Array<int32_t> cells(n);
+  for (int32_t& cell : cells) cell = static_cast<int32_t>(below(2) == 0 ? k - 1 : below(k));
+  const bool broken = n > 0 && below(4) == 0;
+  if (broken) cells[below(n)] = below(2) == 0 ? -1 : static_cast<int32_t>(k);
+  Array<int32_t> order[2], offsets[2];
+  for (int i = 0; i < 2; ++i) {
+    order[i].assign(n, -7);
+    offsets[i].assign(k + 1, -7);
+    Array<int32_t> workspace(voronerf::cell_sort_workspace(n, k));
+    const bool valid =
+        voronerf::cell_sort_cpu(cells.data(), order[i].data(), offsets[i].data(), workspace.data(), n, k, 1 + 2 * i);
+    if (valid == broken) fail("cell_sort: cells out of range not told from those in range");
+  }
+  if (broken) return;
+  same(order[0], order[1], "cell_sort");
+  same(offsets[0], offsets[1], "cell_sort");
+  for (int64_t i = 1; i < n; ++i) {
+    const int32_t a = order[0][i - 1], b = order[0][i];
+    if (cells[a] > cells[b] || (cells[a] == cells[b] && a >= b)) fail("cell_sort: not in order");
+  }
+}
+
+void composite(Isa isa) {
+  const int64_t r = below(100), s = below(40), c = 1 + below(5);
+  const bool packed = below(2) == 0, background = below(2) == 0, per_ray = below(2) == 0;
+  Array<int32_t> offsets;
+  int64_t m = r * s;
+  if (packed) {
+    m = below(3);
+    for (int64_t i = 0; i <= r; ++i) {
+      offsets.push_back(static_cast<int32_t>(m));
+      if (i < r) m += below(3) == 0 ? 0 : below(70);
+    }
+    m += below(3);  // samples of no ray
+  }
+  const Array<float> sigma = uniform<float>(m), rgb = uniform<float>(m * c), depths = uniform<float>(m);
+  const Array<float> deltas = uniform<float>(m), behind = uniform<float>(background ? (per_ray ? r * c : c) : 0);
+  const voronerf::CompositeInputs in{sigma.data(),
+                                     rgb.data(),
+                                     depths.data(),
+                                     deltas.data(),
+                                     or_null(offsets),
+                                     background ? behind.data() : nullptr,
+                                     per_ray,
+                                     r,
+                                     s,
+                                     m,
+                                     c};
+  const Array<float> to_colour = uniform<float>(r * c), to_opacity = uniform<float>(r), to_depth = uniform<float>(r);
+  const Array<float> to_weights = uniform<float>(m);
+  const int64_t asked = below(16);
+  Array<float> results[2][10];
+  for (int i = 0; i < 2; ++i) {
+    Array<float>* out = results[i];
+    const int64_t sizes[] = {r * c, r, r, m, m, m * c, m, m, static_cast<int64_t>(behind.size()), r};
+    for (int j = 0; j < 10; ++j) out[j] = poisoned(sizes[j]);
+    voronerf::composite_cpu(in, {out[0].data(), out[1].data(), out[2].data(), out[3].data()}, isa, 1 + 2 * i);
+    const voronerf::CompositeGradients gradients{asked & 1 ? to_colour.data() : nullptr,
+                                                 asked & 2 ? to_opacity.data() : nullptr,
+                                                 asked & 4 ? to_depth.data() : nullptr,
+                                                 asked & 8 ? to_weights.data() : nullptr,
+                                                 out[4].data(),
+                                                 out[5].data(),
+                                                 out[6].data(),
+                                                 asked & 1 ? out[7].data() : nullptr,
+                                                 background ? out[8].data() : nullptr,
+                                                 out[9].data()};
+    voronerf::composite_backward_cpu(in, gradients, isa, 1 + 2 * i);
+  }
+  for (int j = 0; j < 9; ++j) {
+    same(results[0][j], results[1][j], "composite");
+    if (wild || (j == 7 && (asked & 1) == 0)) continue;
+    like_portable(results[0][j], "composite");
+    for (const float value : results[0][j]) {
+      if (!std::isfinite(value)) fail("composite: result " + std::to_string(j) + " is not finite");
+    }
+  }
+}
+
+void encode(Isa isa) {
+  const bool integrated = below(3) == 0, include = !integrated && below(2) == 0;
+  const int64_t n = below(3) == 0 ? below(3) : below(200), d = integrated ? 3 : below(9), octaves = below(12);
+  const int64_t width = d * (2 * octaves + (include ? 1 : 0));
+  const Array<float> x = uniform<float>(n * d);
+  Array<float> variances = uniform<float>(integrated ? n * d : 0);
+  for (float& variance : variances) variance = std::fabs(variance);
+  const Array<float> gradient = uniform<float>(n * width);
+  const voronerf::Encoding in{x.data(), integrated ? variances.data() : nullptr, n, d, octaves, include, width};
+  Array<float> results[2][3];
+  for (int i = 0; i < 2; ++i) {
+    const int threads = 1 + 2 * i;
+    results[i][0] = poisoned(n * width);
+    results[i][1] = poisoned(n * d);
+    results[i][2] = poisoned(variances.size());
+    Array<float> workspace = poisoned(voronerf::encode_workspace(d, octaves, threads));
+    voronerf::encode_cpu(in, results[i][0].data(), workspace.data(), isa, threads);
+    workspace = poisoned(voronerf::encode_workspace(d, octaves, threads));
+    voronerf::encode_backward_cpu(in, gradient.data(), results[i][1].data(),
+                                  integrated ? results[i][2].data() : nullptr, workspace.data(), isa, threads);
+  }
+  for (int j = 0; j < 3; ++j) {
+    same(results[0][j], results[1][j], "encode");
+    like_portable(results[0][j], "encode");
+    for (const float value : results[0][j]) {
+      if (!wild && !std::isfinite(value)) {
+        fail("encode: result " + std::to_string(j) + " is not finite for d = " + std::to_string(d) +
+             ", octaves = " + std::to_string(octaves) + (include ? ", input included" : ""));
+      }
+    }
+  }
+}
+
+void harmonics(Isa isa) {
+  const int64_t n = below(3) == 0 ? below(3) : below(3000), degree = 1 + below(4), width = degree * degree;
+  const Array<float> directions = uniform<float>(3 * n), gradient = uniform<float>(n * width);
+  Array<float> results[2][2];
+  for (int i = 0; i < 2; ++i) {
+    results[i][0] = poisoned(n * width);
+    results[i][1] = poisoned(3 * n);
+    voronerf::spherical_harmonics_cpu(directions.data(), results[i][0].data(), n, degree, isa, 1 + 2 * i);
+    voronerf::spherical_harmonics_backward_cpu(directions.data(), gradient.data(), results[i][1].data(), n, degree, isa,
+                                               1 + 2 * i);
+  }
+  for (int j = 0; j < 2; ++j) {
+    same(results[0][j], results[1][j], "spherical_harmonics");
+    like_portable(results[0][j], "spherical_harmonics");
+    for (const float value : results[0][j]) {
+      if (!wild && !std::isfinite(value)) fail("spherical_harmonics: a result is not finite");
+    }
+  }
+}
+
+// bfloat16 is bits here: halves of the floats that are there anyway.
+template <typename T>
+Array<T> stored(int64_t size) {
+  const Array<float> values = uniform<float>(size);
+  Array<T> result(size);
+  for (int64_t i = 0; i < size; ++i) {
+    std::memcpy(&result[i], reinterpret_cast<const char*>(&values[i]) + sizeof(float) - sizeof(T), sizeof(T));
+  }
+  return result;
+}
+
+template <typename T>
+void linear(Isa isa) {
+  const int64_t widths[] = {1, 2, 3, 4, 15, 16, 17, 32, 33, 48, 63, 64, 65, 90, 129};
+  const int64_t k = 1 + below(5), i = widths[below(15)], o = widths[below(15)];
+  Array<int32_t> offsets{static_cast<int32_t>(below(3))};
+  for (int64_t c = 0; c < k; ++c) {
+    const int64_t rows = below(3) == 0 ? 0 : below(4) == 0 ? 500 + below(600) : below(200);
+    offsets.push_back(offsets.back() + static_cast<int32_t>(rows));
+  }
+  const int64_t n = offsets.back() + below(3);
+  const Array<T> x = stored<T>(n * i), weight = stored<T>(k * o * i), bias = stored<T>(below(2) * k * o),
+                 gradient = stored<T>(n * o);
+  const voronerf::LinearInputs in{x.data(),
+                                  offsets.data(),
+                                  weight.data(),
+                                  or_null(bias),
+                                  n,
+                                  k,
+                                  i,
+                                  o,
+                                  static_cast<voronerf::Activation>(below(5)),
+                                  sizeof(T) == 2};
+  const bool to_x = below(4) > 0, to_weight = below(4) > 0;
+  Array<T> results[2][4];
+  for (int j = 0; j < 2; ++j) {
+    Array<T>* const own = results[j];
+    const int64_t sizes[] = {n * o, to_x ? n * i : 0, to_weight ? k * o * i : 0,
+                             to_weight ? static_cast<int64_t>(bias.size()) : 0};
+    for (int part = 0; part < 4; ++part) {
+      own[part].assign(sizes[part], T());
+      own[part].shrink_to_fit();
+      if (sizes[part] > 0) std::memset(own[part].data(), 0xff, sizes[part] * sizeof(T));  // NaN
+    }
+    voronerf::grouped_linear_cpu(in, own[0].data(), isa, 1 + 2 * j);
+    voronerf::grouped_linear_backward_cpu(
+        in,
+        {gradient.data(), to_x ? own[1].data() : nullptr, to_weight ? own[2].data() : nullptr,
+         to_weight && !bias.empty() ? own[3].data() : nullptr},
+        isa, 1 + 2 * j);
+  }
+  for (int part = 0; part < 4; ++part) {
+    same(results[0][part], results[1][part], "grouped_linear");
+    Array<float> values = poisoned(results[0][part].size());
+    for (size_t i = 0; i < values.size(); ++i) {
+      uint32_t bits = 0;
+      std::memcpy(reinterpret_cast<char*>(&bits) + sizeof(float) - sizeof(T), &results[0][part][i], sizeof(T));
+      std::memcpy(&values[i], &bits, sizeof(float));
+      if (!wild && !std::isfinite(values[i])) fail("grouped_linear: a result is not finite");
+    }
+    like_portable(values, "grouped_linear", sizeof(T) == 2 ? 2e-2 : 1e-5);
+  }
+}
+
+void march(Isa isa) {
+  const int64_t r = below(4) == 0 ? 300 : below(9), s = 1 + below(70), x = 1 + below(9), y = 1 + below(9),
+                z = 1 + below(9);
+  const Array<float> origins = uniform<float>(3 * r), directions = uniform<float>(3 * r);
+  const Array<float> near(r, 0.1f), far(r, 3.0f), uniforms = uniform<float>(below(2) * r * s);
+  const float box[] = {-1.0f, -1.0f, -1.0f, 1.0f, 1.0f, 1.0f}, sphere[] = {0.0f, 0.0f, 0.0f, 0.5f};
+  const int32_t seed = static_cast<int32_t>(below(1000));
+  Array<uint8_t> occupied(x * y * z);
+  for (uint8_t& cell : occupied) cell = static_cast<uint8_t>(below(2));
+  const bool hashed = uniforms.empty() && below(2) == 0, disparity = below(2) == 0, contracted = below(2) == 0;
+  const voronerf::MarchInputs in{origins.data(),
+                                 directions.data(),
+                                 near.data(),
+                                 far.data(),
+                                 occupied.data(),
+                                 box,
+                                 or_null(uniforms),
+                                 hashed ? &seed : nullptr,
+                                 nullptr,
+                                 r,
+                                 s,
+                                 x,
+                                 y,
+                                 z,
+                                 disparity,
+                                 1 + below(s),
+                                 {contracted ? sphere : nullptr, nullptr}};
+  Array<float> depths[2];
+  for (int i = 0; i < 2; ++i) {
+    const int threads = 1 + 2 * i;
+    Array<uint32_t> mask(r * voronerf::march_words(s));
+    Array<int32_t> offsets(r + 1, -7);
+    voronerf::march_rays_count_cpu(in, mask.data(), offsets.data(), r * s, isa, threads);
+    const int64_t rows = offsets[r];
+    Array<int32_t> ray(rows), stop(r);
+    Array<float> deltas = poisoned(rows), positions = poisoned(3 * rows);
+    depths[i] = poisoned(rows);
+    voronerf::march_rays_fill_cpu(in, mask.data(), offsets.data(), rows, ray.data(), depths[i].data(), deltas.data(),
+                                  positions.data(), stop.data(), isa, threads);
+    within(ray, std::max<int64_t>(r, 1), "march_rays");
+    if (i > 0) continue;
+    // A sample on the side of a cell may be in the next one.
+    const double found = static_cast<double>(rows);
+    like_portable(Array<double>{found}, "march_rays", 1e-2);
+  }
+  same(depths[0], depths[1], "march_rays");
+}
+
+void loss(Isa isa) {
+  const int64_t r = below(100);
+  Array<int32_t> offsets{0};
+  for (int64_t i = 0; i < r; ++i) {
+    offsets.push_back(offsets.back() + static_cast<int32_t>(below(3) == 0 ? 0 : below(70)));
+  }
+  const int64_t m = offsets.back();
+  const bool per_ray = below(2) == 0;
+  const Array<float> raw = uniform<float>(4 * m), target = uniform<float>(3 * r);
+  const Array<float> background = uniform<float>(below(2) * (per_ray ? 3 * r : 3));
+  Array<float> deltas = uniform<float>(m);
+  for (float& delta : deltas) delta = std::fabs(delta);
+  const voronerf::RenderLossInputs in{
+      raw.data(), deltas.data(), offsets.data(), target.data(), or_null(background), per_ray, 10.0f, 1e-4f, r, m};
+  const int64_t sizes[] = {1, 3 * r, m, m, r, 4 * m};
+  Array<float> results[2][6];
+  for (int i = 0; i < 2; ++i) {
+    for (int j = 0; j < 6; ++j) results[i][j] = poisoned(sizes[j]);
+    Array<float>* out = results[i];
+    voronerf::render_loss_cpu(
+        in, {out[0].data(), out[1].data(), out[2].data(), out[3].data(), out[4].data(), out[5].data()}, isa, 1 + 2 * i);
+  }
+  for (int j = 0; j < 6; ++j) {
+    same(results[0][j], results[1][j], "render_loss");
+    if (r > 0) like_portable(results[0][j], "render_loss", 1e-4);
+  }
+}
+
+void adam(Isa isa) {
+  const int64_t n = some_rows();
+  const bool every = below(2) == 0;
+  Array<float> gradient = uniform<float>(n);
+  for (float& value : gradient) {
+    if (below(4) > 0) value = 0.0f;
+  }
+  const Array<float> start[] = {uniform<float>(n), uniform<float>(n), uniform<float>(n)};
+  for (int i = 0; i < 2; ++i) {
+    Array<float> parameter = start[0], mean = start[1], square = start[2];
+    for (float& value : square) value = std::fabs(value);
+    voronerf::sparse_adam_cpu({1e-2f, 0.9f, 0.99f, 1e-8f, every}, gradient.data(), parameter.data(), mean.data(),
+                              square.data(), n, isa, 1 + 2 * i);
+    like_portable(parameter, "sparse_adam");
+    like_portable(mean, "sparse_adam");
+  }
+  Array<float> message(n + n / 32 + 33), total = start[0];
+  const int64_t length = voronerf::pack_touched_cpu(gradient.data(), n, message.data(), isa, 3);
+  message.resize(length);
+  message.shrink_to_fit();
+  voronerf::add_touched_cpu(message.data(), length, n, total.data(), isa, 3);
+  like_portable(total, "add_touched");
+}
+
+void resample() {
+  const int64_t r = below(4) == 0 ? 300 : below(9), s = 1 + below(70), count = 1 + below(70);
+  const Array<float> weights = uniform<float>(r * s), uniforms = uniform<float>(below(2) * r * count);
+  Array<float> edges = uniform<float>(r * (s + 1));
+  Array<float> depths[2];
+  for (int i = 0; i < 2; ++i) {
+    depths[i] = poisoned(r * count);
+    voronerf::resample_cpu(weights.data(), edges.data(), or_null(uniforms), depths[i].data(), r, s, count, 1 + 2 * i);
+  }
+  same(depths[0], depths[1], "resample");
+  for (const float depth : depths[0]) {
+    if (!wild && !std::isfinite(depth)) fail("resample: a depth is not finite");
+  }
+}
+
+}  // namespace
+
+int main(int count, char** arguments) {
+  const int cases = count > 1 ? std::atoi(arguments[1]) : 60;
+  for (int i = 0; i < cases; ++i) {
+    wild = i % 8 == 7;
+    for (const Isa isa : {Isa::portable, Isa::neon, Isa::avx2, Isa::avx512, Isa::avx512_bf16}) {
+      if (!voronerf::isa_supported(isa)) continue;
+      start_case(i, isa == Isa::portable);
+      search<float>(isa);
+      if (i % 4 == 0) search<double>(isa);
+      locate<float>(isa);
+      if (i % 4 == 0) locate<double>(isa);
+      composite(isa);
+      encode(isa);
+      harmonics(isa);
+      linear<float>(isa);
+      linear<uint16_t>(isa);
+      march(isa);
+      loss(isa);
+      adam(isa);
+    }
+    sort();
+    resample();
+  }
+  std::printf("%d cases\n", cases);
+  return 0;
+}
