@@ -15,6 +15,7 @@ Environment:
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -36,8 +37,9 @@ ISAS = {
 }
 """Of an architecture, beside the portable path."""
 LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
-# Short, for the sake of build time: 8.x runs the code of 80, and what comes after 9.0 compiles the PTX of 90.
-DEFAULT_ARCHITECTURES = "75;80;90"
+# One of each major version, which runs on its minor ones. Without 100 and 120 a Blackwell GPU would compile the PTX of
+# 90 for minutes when a kernel is first used.
+DEFAULT_ARCHITECTURES = "75;80;90;100;120"
 BINDINGS = 2
 """Compilations that share the files of csrc/bindings."""
 
@@ -163,8 +165,18 @@ def build_info(cuda: Cuda) -> str:
         "VN_CUDA_BUILT": str(int(cuda.nvcc is not None)),
         "VN_CUDA_OUTCOME": f'"{cuda.outcome}"',
         "VN_CUDA_ARCHITECTURES": f'"{";".join(cuda.architectures)}"',
+        "VN_CUDA_MAJOR": str(0 if cuda.nvcc is None else toolkit_major(cuda.nvcc)),
     }
     return "#pragma once\n" + "".join(f"#define {name} {value}\n" for name, value in values.items())
+
+
+def toolkit_major(nvcc: Path) -> int:
+    """Major version of the CUDA toolkit, such as 13."""
+    said = subprocess.run([nvcc, "--version"], check=True, capture_output=True, text=True).stdout
+    found = re.search(r"release (\d+)", said)
+    if found is None:
+        raise SystemExit(f"voronerf: {nvcc} --version names no release")
+    return int(found[1])
 
 
 def bindings() -> dict[str, str]:

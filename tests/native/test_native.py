@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -314,3 +315,18 @@ def test_peak_errors() -> None:
     refuses("measure_peak: kind must be one of float32, bfloat16, copy, got 'fp32'", _native.measure_peak, "fp32")
     with pytest.raises(ValueError, match=r"^measure_peak: isa must be one of portable, neon, .*avx512_bf16, got 'sse'"):
         _native.measure_peak("copy", isa="sse")
+
+
+def test_a_driver_older_than_the_toolkit_is_refused(monkeypatch):
+    """Calls of a runtime that the driver does not know would all fail, after "auto" had chosen them."""
+    built = SimpleNamespace(cuda=True, cuda_major=13, cuda_architectures="90")
+    monkeypatch.setattr(_native, "compiled", built)
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda device: (9, 0))
+    for driver, reason in (
+        (14, None),
+        (13, None),
+        (12, "built with CUDA 13, the driver has CUDA 12; update the driver"),
+    ):
+        monkeypatch.setattr(_native, "_driver_major", lambda driver=driver: driver)
+        said = _native.missing(torch.device("cuda"))
+        assert said is None if reason is None else said.startswith(reason)

@@ -140,6 +140,12 @@ def missing(device: torch.device) -> str | None:
         return None
     if not compiled.cuda:
         return f"{compiled.cuda_outcome}; install the CUDA toolkit and rebuild with VORONERF_CUDA=1 `pip install -e .`"
+    driver = _driver_major()
+    if driver < compiled.cuda_major:
+        return (
+            f"built with CUDA {compiled.cuda_major}, the driver has CUDA {driver}; update the driver, "
+            f"or rebuild with a toolkit of CUDA {driver}"
+        )
     major, minor = torch.cuda.get_device_capability(device)
     if _runs_on(compiled.cuda_architectures.split(";"), 10 * major + minor):
         return None
@@ -147,6 +153,17 @@ def missing(device: torch.device) -> str | None:
         f"built with CUDA for {compiled.cuda_architectures}, the device is {major}{minor}; "
         f"rebuild with VORONERF_CUDA_ARCHITECTURES={major}{minor} `pip install -e .`"
     )
+
+
+@functools.cache
+def _driver_major() -> int:
+    """Major version of CUDA that the driver has; its minor version may be older than that of the toolkit."""
+    version = ctypes.c_int()
+    library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    status = library.cuDriverGetVersion(ctypes.byref(version))
+    if status != 0:
+        raise RuntimeError(f"cuDriverGetVersion failed with error {status}")
+    return version.value // 1000
 
 
 def _runs_on(architectures: list[str], capability: int) -> bool:
