@@ -105,14 +105,12 @@ def declare(
 
 
 def ops() -> tuple[str, ...]:
-    """Names of the ops, in the order of ``voronerf.ops``."""
-    importlib.import_module("voronerf.ops")  # which declares them
+    """Names of the ops, which declare themselves where ``voronerf`` is imported."""
     return tuple(dict.fromkeys(op for op, _ in _TABLE))
 
 
 def implemented(op: str) -> tuple[str, ...]:
     """Backends that have an implementation of an op, whether or not it can run here."""
-    ops()  # puts them into the table
     return tuple(backend for backend in BACKENDS if (op, backend) in _TABLE)
 
 

@@ -13,7 +13,6 @@
 #include "geometry/cell_sort.h"
 #include "geometry/centre_grid.h"
 #include "rays/composite.h"
-#include "geometry/draw_cell.h"
 #include "encoding/encode.h"
 #include "encoding/spherical_harmonics.h"
 #include "network/grouped_linear.h"
@@ -60,32 +59,6 @@ void search(Isa isa) {
   }
 }
 
-// Of double precision there is no drawing.
-void draw(const Array<double>&, const Array<double>&, const Array<double>&, const Array<int32_t>&,
-          const Array<int32_t>&, int32_t, Isa) {}
-
-void draw(const Array<float>& points, const Array<float>& centres, const Array<float>& weights,
-          const Array<int32_t>& offsets, const Array<int32_t>& child, int32_t leaves, Isa isa) {
-  const int64_t n = static_cast<int64_t>(points.size()) / 3, m = offsets.back();
-  const Array<float> uniforms = uniform<float>(2 * n);
-  const double temperatures[] = {1e-300, 1e-3, 0.3, 1e30};
-  const double temperature = temperatures[below(4)];
-  Array<int32_t> results[2];
-  for (int i = 0; i < 2; ++i) {
-    const int threads = 1 + 2 * i;
-    results[i].assign(n, -7);
-    Array<int32_t> places(voronerf::draw_cell_places(m, threads));
-    Array<float> sums = poisoned(voronerf::draw_cell_sums(m, threads));
-    if (!voronerf::draw_cell_cpu(points.data(), centres.data(), or_null(weights), offsets.data(), child.data(),
-                                 uniforms.data(), results[i].data(), places.data(), sums.data(), n, m, 2, temperature,
-                                 isa, threads)) {
-      fail("draw_cell: did not arrive");
-    }
-  }
-  same(results[0], results[1], "draw_cell");
-  within(results[0], leaves, "draw_cell");
-}
-
 template <typename T>
 void locate(Isa isa) {
   // A root whose every other centre is refined, by diagrams of different sizes.
@@ -120,7 +93,6 @@ void locate(Isa isa) {
   }
   same(results[0], results[1], "locate_cell");
   within(results[0], leaves, "locate_cell");
-  draw(points, centres, weights, offsets, child, leaves, isa);
 }
 
 void sort() {

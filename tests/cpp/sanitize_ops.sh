@@ -6,8 +6,8 @@ cd "$(dirname "$0")/../.."
 build=$(mktemp -d)
 trap 'rm -rf "$build"' EXIT
 common=(-std=c++17 -O1 -g -ffp-contract=off -Wall -Wextra -Icsrc)
-plain=(nearest_centre centre_grid locate_cell draw_cell cell_sort composite encode spherical_harmonics resample grouped_linear row_tasks isa)
-per_isa=(nearest_centre_isa centre_grid_isa draw_cell_isa composite_isa encode_isa
+plain=(nearest_centre centre_grid locate_cell cell_sort composite encode spherical_harmonics resample grouped_linear row_tasks isa)
+per_isa=(nearest_centre_isa centre_grid_isa composite_isa encode_isa
   spherical_harmonics_isa grouped_linear_isa grouped_linear_half_isa)
 isas=("portable -DVN_ISA=0")
 if [ "$(uname -m)" = x86_64 ]; then
