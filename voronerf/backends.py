@@ -104,9 +104,9 @@ def declare(
     return op
 
 
-def ops() -> tuple[str, ...]:
-    """Names of the ops, which declare themselves where ``voronerf`` is imported."""
-    return tuple(dict.fromkeys(op for op, _ in _TABLE))
+def ops(backend: str = "reference", device: str = "cpu") -> tuple[str, ...]:
+    """Names of the ops that a backend implements for a device, which declare themselves where voronerf is imported."""
+    return tuple(op for (op, name), found in _TABLE.items() if name == backend and device in (found.devices or ORDER))
 
 
 def implemented(op: str) -> tuple[str, ...]:

@@ -30,17 +30,10 @@ from ops import (
 
 import voronerf
 from voronerf import native
+from voronerf.ops import cases as of_ops
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 CPU = torch.device("cpu")
-OPS = {
-    *("nearest_centre", "locate_cell", "cell_sort", "grouped_linear", "grouped_mlp", "frequency_encode"),
-    *("integrated_encode", "spherical_harmonics", "hash_encode", "composite", "resample", "routed_mlp"),
-    "render_loss",
-}
-NOT_DIFFERENTIABLE = {"march_rays", "update_occupancy", "camera_rays", "balance_centres"}
-NOT_DIFFERENTIABLE |= {"pixel_rays", "observe_occupancy", "sparse_adam"}
-OPS |= NOT_DIFFERENTIABLE
 COLUMNS = [
     *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "threads"),
     *("median_ms", "iqr_ms", "throughput", "unit", "percent_of_peak", "alternatives", "speedup_over_best", "max_error"),
@@ -119,11 +112,11 @@ def test_instruction_set_is_forced_and_put_back():
 def test_every_operation_has_rows_in_both_modes():
     for arguments in ([], ["--quick"]):
         cases = throughput.chosen_cases(throughput.parse(arguments))
-        assert {case.op for case in cases} == OPS
+        assert {case.op for case in cases} == set(of_ops.cases())
         keys = [case.key for case in cases]
         assert len(set(keys)) == len(keys)
     both = {(case.op, case.direction) for case in throughput.chosen_cases(throughput.parse([]))}
-    differentiable = OPS - NOT_DIFFERENTIABLE - {"nearest_centre", "locate_cell", "cell_sort", "resample"}
+    differentiable = {op for op, case in of_ops.cases().items() if case.differentiable}
     assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 

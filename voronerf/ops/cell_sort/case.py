@@ -10,4 +10,11 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {"cells": draw.integers(0, k, n), "k": k}
 
 
-CASE = Case(_make, refused={"k must be an integer, got str": {"k": "x"}, "k must be at least 1, got 0": {"k": 0}})
+CASE = Case(
+    _make,
+    refused={
+        "k must be an integer, got str": {"k": "x"},
+        "k must be at least 1, got 0": {"k": 0},
+        "k must be at most 2147483647, got 2147483648": {"k": 2**31},
+    },
+)

@@ -50,7 +50,8 @@ def draw_cell(
         leaf int32 [n].
 
     Raises:
-        ValueError: shapes, devices, temperature, depth or an unknown backend.
+        ValueError: shapes, devices, temperature, depth or an unknown backend; on the CPU also tables that are not a
+            tree.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 
@@ -102,7 +103,22 @@ def draw_cell(
         weights = weights.detach().to(dtype)
     points, centres, uniforms = (tensor.detach().to(dtype) for tensor in (points, centres, uniforms))
     run = backends.resolve(_OP, backend=backend, device=points.device, dtype=dtype)
+    host = points.device.type == "cpu" and not torch.compiler.is_compiling()
+    if host:
+        _check_tree(child_offsets, child)
     leaf: Tensor = run(
         points, centres, child_offsets, child, uniforms, temperature=float(temperature), depth=depth, weights=weights
     )
+    if host and bool((leaf < 0).any()):
+        raise ValueError(f"{_OP}: depth must be the number of levels of the tree, got {depth}, which is too few")
     return leaf
+
+
+def _check_tree(child_offsets: Tensor, child: Tensor) -> None:
+    if int(child_offsets[0]) != 0 or int(child_offsets[-1]) != len(child):
+        ends = child_offsets[[0, -1]].tolist()
+        raise ValueError(f"{_OP}: child_offsets must go from 0 to the number of centres, got {ends}")
+    if bool((child_offsets.diff() < 1).any()):
+        raise ValueError(f"{_OP}: child_offsets must increase, got a diagram without centres")
+    if bool((child >= len(child_offsets) - 1).any()):
+        raise ValueError(f"{_OP}: child must name a diagram, got {int(child.max())}")

@@ -16,4 +16,10 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {**call, "index": draw.integers(0, c * h * w, n, dtype=torch.int64)}
 
 
-CASE = Case(_make, refused={"far must be a number, got NoneType": {"far": None}})
+CASE = Case(
+    _make,
+    refused={
+        "far must be a number, got NoneType": {"far": None},
+        "far must be at most 3.4e+38 or infinite, got 1e+39": {"far": 1e39},
+    },
+)
