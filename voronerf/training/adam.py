@@ -141,7 +141,9 @@ class Adam(torch.optim.Adam):
                     state["step"] = torch.zeros((), device=device)
                     state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
                 state["step"] = state["step"].to(device)  # a checkpoint of a CPU has it there
-                rules.append(Rule(rate.to(device), state["step"], *group["betas"], group["eps"], not group.get("sparse", False)))
+                first, second = group["betas"]
+                every = not group.get("sparse", False)
+                rules.append(Rule(rate.to(device), state["step"], first, second, group["eps"], every))
                 tensors.append((parameter.grad, parameter, state["exp_avg"], state["exp_avg_sq"]))
         found = getattr(self, "found_inf", None)
         judged = None if found is None else Judged(found)
