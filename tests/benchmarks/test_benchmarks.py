@@ -325,8 +325,24 @@ def test_throughput_runs_and_table_reads_its_result(tmp_path, capsys):
         assert row["alternatives"]["torch cumsum + searchsorted"] > 0 and row["max_error"] < 1e-2
         if row["backend"] == "native":
             assert f"`resample` {row['case']}" in table.markdown([row])[-1]
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps({**outcome, "metadata": {**metadata, "machine": "Another"}}))
+    capsys.readouterr()
+    table.main([str(path), str(other), "--rows", "^resample"])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"| | dtype | | {harness.processor()} | Another |"
+    assert all(line.count(" ms, ") == 2 for line in lines[2:]) and len(lines) > 2
     with pytest.raises(SystemExit, match=r"must be a result of throughput\.py"):
         table.load(BENCHMARKS / "results" / "time_to_quality_lego.json")
+
+
+def test_processors_have_names():
+    text = "vendor_id\t: {}\ncpu family\t: {}\nmodel\t\t: {}\nmodel name\t: A name\n"
+    assert harness.processor(text.format("AuthenticAMD", 26, 2)) == "A name (Zen 5)"
+    assert harness.processor(text.format("AuthenticAMD", 25, 17)) == "A name (Zen 4)"
+    assert harness.processor(text.format("GenuineIntel", 6, 207)) == "A name (Emerald Rapids)"
+    assert harness.processor(text.format("GenuineIntel", 6, 1)) == "A name (family 6, model 1)"
+    assert harness.processor("model name: Arm\n") == "Arm"
 
 
 def _row(case, ms, alternatives, **columns):

@@ -134,3 +134,18 @@ def test_adam_is_that_of_the_formula(count):
 def test_adam_leaves_out_a_step_that_is_not_finite(spoilt):
     adam_on_both(45, spoilt=spoilt)
     adam_on_both(45, spoilt=spoilt, limit=torch.inf if spoilt == "loss" else 1e3)
+
+
+def test_atomic_sums_are_refused_where_deterministic_algorithms_are_asked_for():
+    grid = voronerf.HashGrid(levels=2, features=2, log2_entries=10, finest=20)
+    table = torch.rand(grid.table_shape, requires_grad=True)
+    total = voronerf.hash_encode(torch.rand(9, 3), table, grid, backend="native").sum()
+    try:
+        torch.use_deterministic_algorithms(True)
+        with pytest.raises(RuntimeError, match=r"^hash_encode: the gradient of a hash grid's table has no determ"):
+            total.backward(retain_graph=True)
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        with pytest.warns(UserWarning, match=r"^hash_encode: the gradient"):
+            total.backward()
+    finally:
+        torch.use_deterministic_algorithms(False)
