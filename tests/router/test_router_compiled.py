@@ -99,9 +99,7 @@ def test_what_is_in_the_way_of_one_graph_is_said(options: Any) -> None:
     if options:
         model(x)
     torch._dynamo.reset()
-    with pytest.raises(
-        Exception, match="a graph without breaks takes a router with fuse"
-    ):
+    with pytest.raises(Exception, match="a graph without breaks takes a router with fuse"):
         torch.compile(model, fullgraph=True, backend="eager")(x)
     torch._dynamo.reset()
     torch.testing.assert_close(torch.compile(model, backend="eager")(x), model(x))  # with breaks
