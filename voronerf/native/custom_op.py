@@ -62,7 +62,7 @@ def custom_op(
         schema = torch.library.infer_schema(run, mutates_args=())
         op = torch.library.custom_op(f"voronerf::{name}", run, mutates_args=(), device_types=devices, schema=schema)
         op.register_fake(fake or (lambda *arguments: next(steps(*arguments))))
-        return Op(op, run, devices, direct=typing.get_origin(results) is not list)
+        return Op(op, run, devices, listed=typing.get_origin(results) is list)
 
     return declare
 
@@ -75,8 +75,8 @@ class Op:
     profilers are given the custom op.
     """
 
-    def __init__(self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], direct: bool) -> None:
-        self._op, self._run, self._devices, self._direct = op, run, devices, direct
+    def __init__(self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], listed: bool) -> None:
+        self._op, self._run, self._devices, self._listed = op, run, devices, listed
         self._function: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
@@ -95,7 +95,8 @@ class Op:
         if self._function is None:
             return self._op(*arguments)
         flat, lengths = _flattened(arguments)
-        return self._function.apply(*flat, lengths)
+        results = self._function.apply(*flat, lengths)
+        return list(results) if self._listed else results
 
     def inside(self, *arguments: Any) -> Any:
         """What the op gives, for a node of autograd that has looked at its arguments itself."""
@@ -104,18 +105,15 @@ class Op:
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
         """The op's backward, as of ``torch.library.custom_op``."""
         self._op.register_autograd(backward, setup_context=setup_context)
-        if not self._direct:  # autograd.Function knows no lists of results
-            return
-
         def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
             *given, lengths = flat
             arguments = _nested(given, lengths)
             result = self._run(*arguments)
             setup_context(ctx, arguments, result)
-            return result
+            return tuple(result) if self._listed else result  # autograd.Function knows no lists
 
         def gradients(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
-            found = backward(ctx, *of_results)
+            found = backward(ctx, of_results) if self._listed else backward(ctx, *of_results)
             return (*_flattened(found if isinstance(found, tuple) else (found,))[0], None)
 
         parts = {"forward": staticmethod(forward), "backward": staticmethod(gradients)}

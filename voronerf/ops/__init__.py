@@ -17,6 +17,7 @@ from voronerf.ops.draw_cell import draw_cell
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
+from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.hash_encode import hash_encode
 from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.locate_cell import locate_cell
@@ -51,6 +52,7 @@ __all__ = [
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",
+    "grouped_program",
     "hash_encode",
     "integrated_encode",
     "locate_cell",
