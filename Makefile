@@ -29,13 +29,12 @@ test: $(VENV)/.built
 # A few minutes; for figures to keep, run the scripts with --json and the settings they document.
 bench: $(VENV)/.built
 	@$(BIN)/python benchmarks/throughput.py --quick --targets
-	@$(BIN)/python benchmarks/balance.py --cells 4 16 64 --seeds 2
 	@$(BIN)/python benchmarks/time_to_quality.py --data builtin --budget 30 --eval-views 5
 
-# Every table and figure of the paper in small, on Lego and Ship where they are, into runs/paper-small and docs/paper.md.
+# Every table and figure of the paper in small, on Lego and Ship where they are, into runs/paper-small; its report.md has all of them.
 # What is there already is not made again.
 paper: $(VENV)/.built
-	@$(BIN)/python benchmarks/paper.py all $(PAPER_ARGS)
+	@$(BIN)/python benchmarks/paper.py $(PAPER_ARGS)
 
 check: $(VENV)/.built
 	@$(BIN)/ruff check

@@ -19,6 +19,22 @@ def name_dtypes(names: dict[str, torch.dtype]) -> None: ...
 
 Activation: tuple[str, ...]  # none relu softplus sigmoid sine
 
+class AdamGuard(NamedTuple):
+    loss: Tensor | None  # const float32*
+    limit: float  # float32
+    found: Tensor | None  # float32*
+    skipped: Tensor | None  # float32*
+    in_a_row: Tensor | None  # float32*
+    scale: Tensor | None  # const float32*
+
+class AdamRule(NamedTuple):
+    rate: Tensor | None  # const float32*
+    step: Tensor | None  # float32*
+    decay: float  # float64
+    decay_sq: float  # float64
+    epsilon: float  # float64
+    every: bool
+
 class BalanceInputs(NamedTuple):
     samples: Tensor | None  # const float32*
     masses: Tensor | None  # const float64*
@@ -329,7 +345,11 @@ class SparseAdam(NamedTuple):
 TableType: tuple[str, ...]  # float32 bfloat16 float16
 
 # SparseAdam[], const float32**, float32**, float32**, float32**, int64[], Cpu
+@overload
 def adam(_0: Sequence[SparseAdam], _1: Sequence[Tensor | None] | None, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[int], _6: Cpu) -> None: ...
+# AdamRule[], AdamGuard, const float32**, float32**, float32**, float32**, int64[], float32*, Cuda
+@overload
+def adam(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Tensor | None, _8: Cuda) -> None: ...
 
 # const float32*, int64, int64, float32*, Cpu
 def add_touched(_0: Tensor | None, _1: int, _2: int, _3: Tensor | None, _4: Cpu) -> None: ...
@@ -400,7 +420,11 @@ def draw_cell_places(_0: int, _1: Cpu) -> int: ...
 def draw_cell_sums(_0: int, _1: Cpu) -> int: ...
 
 # DrawPixelsInputs, int64*, float32*, Cpu
+@overload
 def draw_pixels(_0: DrawPixelsInputs, _1: Tensor | None, _2: Tensor | None, _3: Cpu) -> None: ...
+# DrawPixelsInputs, int64*, float32*, Cuda
+@overload
+def draw_pixels(_0: DrawPixelsInputs, _1: Tensor | None, _2: Tensor | None, _3: Cuda) -> None: ...
 
 # Encoding, float32*, float32*, Cpu
 @overload
@@ -484,10 +508,18 @@ def locate_cell_fault(_0: Tensor | None, _1: Tensor | None, _2: int, _3: int) ->
 def locate_cell_workspace(_0: int, _1: Cpu) -> int: ...
 
 # MarchInputs, int32*, int32*, int64, Cpu
+@overload
 def march_rays_count(_0: MarchInputs, _1: Tensor | None, _2: Tensor | None, _3: int, _4: Cpu) -> None: ...
+# MarchInputs, int32*, int32*, int64, Cuda
+@overload
+def march_rays_count(_0: MarchInputs, _1: Tensor | None, _2: Tensor | None, _3: int, _4: Cuda) -> None: ...
 
 # MarchInputs, const int32*, const int32*, int64, int32*, float32*, float32*, float32*, int32*, Cpu
+@overload
 def march_rays_fill(_0: MarchInputs, _1: Tensor | None, _2: Tensor | None, _3: int, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: Tensor | None, _8: Tensor | None, _9: Cpu) -> None: ...
+# MarchInputs, const int32*, const int32*, int64, int32*, float32*, float32*, float32*, int32*, Cuda
+@overload
+def march_rays_fill(_0: MarchInputs, _1: Tensor | None, _2: Tensor | None, _3: int, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: Tensor | None, _8: Tensor | None, _9: Cuda) -> None: ...
 
 # Peak, Cpu
 def measure_peak(_0: str, _1: Cpu) -> float: ...
@@ -573,4 +605,8 @@ def spherical_harmonics_backward(_0: Tensor | None, _1: Tensor | None, _2: Tenso
 def tell_observed(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None, _3: Cpu) -> int: ...
 
 # const float32*, const int32*, const float32*, float32*, uint8*, int64, int64, float32, float32, Cpu
+@overload
 def update_occupancy(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: float, _8: float, _9: Cpu) -> bool: ...
+# const float32*, const int32*, const float32*, float32*, uint8*, int64, int64, float32, float32, Cuda
+@overload
+def update_occupancy(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: float, _8: float, _9: Cuda) -> None: ...

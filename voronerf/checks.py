@@ -114,6 +114,17 @@ def check_same_device(op: str, **tensors: Tensor | None) -> None:
             raise ValueError(f"{op}: {name} must be on the device of {first[0]}, {first[1]}, got {tensor.device}")
 
 
+def check_writable(op: str, name: str, tensor: Tensor) -> None:
+    """Raises ValueError unless memory holds a tensor's values in order and as they are, so that an op can write there.
+
+    The negative bit, of ``x.conj().imag``, says that memory holds them negated.
+    """
+    if not tensor.is_contiguous():
+        raise ValueError(f"{op}: {name} must be contiguous, got strides {tensor.stride()}")
+    if tensor.is_neg():
+        raise ValueError(f"{op}: {name} must be a tensor of its own (clone), got a negative view")
+
+
 def check_no_inference(op: str, **tensors: Tensor | None) -> None:
     """Raises TypeError where gradients are recorded and a named tensor was made in ``torch.inference_mode``, which
     autograd cannot keep."""

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from balance import load_samples, separate_objects
-from harness import metadata
 from torch import Tensor
 
-from paper.claims import NOT_MEASURED, Claim
-from paper.published import BALANCE
-from paper.runs import Run, Variant, default_scenes, make_run
-from paper.settings import Settings
+from paper.claims import Claim
+from paper.runs import Run, Settings, Variant, default_scenes, make_run
 from voronerf.diagram.balance import balance
-from voronerf.files import write_text
 
 CELLS, DIAGRAMS = 16, 100
-KEPT, MADE = "kept by a training", "separate objects"
-OBJECTS, COUNT, TAIL = 9, 10_000, 1.0
+#: std(W / max W) before and after balancing as published, the median of 100 diagrams.
+PUBLISHED = (0.246, 0.0018)
+OBJECTS, COUNT = 9, 10_000
+Samples = tuple[Tensor, Tensor]  # points [m, 3] and importance [m]
 
 
 def runs(settings: Settings) -> list[Run]:
@@ -32,95 +29,59 @@ def runs(settings: Settings) -> list[Run]:
     return [make_run(variant, scene, seed, settings) for scene in scenes for seed in range(settings.seeds)]
 
 
-def samples_path(run: Run) -> Path:
-    """The samples that a training kept for its first split; results from a record have none."""
-    return run.folder / "samples" / "level-1.npz"
+def separate_objects(seed: int) -> Samples:
+    """Samples near the surfaces of balls of different sizes and shares, scattered in a box of side 6, some touching."""
+    generator = torch.Generator().manual_seed(seed)
+    places = torch.rand(OBJECTS, 3, generator=generator) * 6 - 3
+    radii = torch.rand(OBJECTS, generator=generator) * 0.5 + 0.15
+    member = torch.multinomial(torch.rand(OBJECTS, generator=generator) + 0.2, COUNT, True, generator=generator)
+    normals = torch.nn.functional.normalize(torch.randn(COUNT, 3, generator=generator), dim=1)
+    distance = radii[member, None] * (1 + 0.02 * torch.randn(COUNT, 1, generator=generator))
+    importance = torch.randn(COUNT, generator=generator).exp() * (1 + 3 * normals[:, 0].clamp(min=0))
+    return places[member] + normals * distance, importance
 
 
-def without_samples(settings: Settings) -> list[str]:
-    """The trainings without kept samples."""
-    absent = [run for run in runs(settings) if not samples_path(run).is_file()]
-    return [f"samples of {Path(run.scene).name}, seed {run.seed}" for run in absent]
+def load_samples(path: Path) -> Samples:
+    """The samples that a training kept for its split."""
+    with np.load(path) as file:
+        return torch.from_numpy(file["points"]), torch.from_numpy(file["importance"])
 
 
-def sample_sets(settings: Settings) -> dict[str, Callable[[int], tuple[Tensor, Tensor]]]:
-    """For each source the samples of its diagram number i: points [m, 3] and importance [m]."""
-    paths: dict[str, list[Path]] = {}
-    for run in runs(settings):
-        path = samples_path(run)
-        if path.is_file():
-            paths.setdefault(f"{KEPT}, {Path(run.scene).name}", []).append(path)
-    found: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {}
-    for name, files in paths.items():
-        loaded = [load_samples(path) for path in files]
-        found[name] = lambda i, loaded=loaded: loaded[i % len(loaded)]
-    found[MADE] = lambda i: separate_objects(i, COUNT, OBJECTS, TAIL)
-    return found
-
-
-def measure(settings: Settings, say: Callable[[str], None] = print, *, diagrams: int = DIAGRAMS) -> dict[str, Any]:
-    """Balances the diagrams of every source; returns {metadata, results, claims}."""
-    results = []
-    for name, samples in sample_sets(settings).items():
-        pairs = list(_balanced(samples, diagrams, settings.backend))
-        before, after = ([pair[i] for pair in pairs] for i in (0, 1))
-        row = {
-            "variant": name,
-            "before": statistics.median(before),
-            "after": statistics.median(after),
-            "before_all": before,
-            "after_all": after,
-        }
-        results.append(row)
-        say(f"{name:34} std(W / max W) {row['before']:.4f} -> {row['after']:.4f}, median of {len(pairs)}")
-    outcome = {
-        "metadata": metadata(
-            benchmark="paper",
-            experiment="balance",
-            kind="figure",
-            scenes=[Path(name).name for name in settings.scene or default_scenes()],
-            diagrams=diagrams,
-            cells=CELLS,
-            seeds=len({run.seed for run in runs(settings) if samples_path(run).is_file()}) or settings.seeds,
-            budget_seconds=settings.budget,
-            missing=without_samples(settings),
-        ),
-        "results": results,
-        "claims": [claim.to_dict() for claim in claims(results)],
+def measure(
+    trained: Sequence[Run], backend: str, say: Callable[[str], None] = print, *, diagrams: int = DIAGRAMS
+) -> tuple[list[dict[str, Any]], list[Claim]]:
+    """Balances the diagrams of every source of samples, trainings and separate objects; returns (rows, claims)."""
+    kept: dict[str, list[Samples]] = {}
+    for run in trained:
+        samples = load_samples(run.folder / "samples" / "level-1.npz")
+        kept.setdefault(f"kept by a training, {Path(run.scene).name}", []).append(samples)
+    sources: dict[str, Callable[[int], Samples]] = {
+        name: lambda number, sets=sets: sets[number % len(sets)] for name, sets in kept.items()
     }
-    write_text(settings.out / "balance.json", json.dumps(outcome, indent=1) + "\n")
-    return outcome
+    sources["separate objects"] = separate_objects
+    rows, claims = [], []
+    for name, drawn in sources.items():
+        results = [
+            balance(*drawn(n), CELLS, generator=torch.Generator().manual_seed(n), backend=backend)
+            for n in range(diagrams)
+        ]
+        before, after = [r.imbalance_before for r in results], [r.imbalance_after for r in results]
+        first, last = statistics.median(before), statistics.median(after)
+        rows.append({"variant": name, "before": first, "after": last, "before_all": before, "after_all": after})
+        text = f"std(W / max W) of {CELLS} cells, median of {diagrams} diagrams, {name}"
+        here = f"{first:.3f} -> {last:.4f}"
+        claims.append(Claim(text, f"{PUBLISHED[0]} -> {PUBLISHED[1]}", here, balance_verdict(first, last)))
+        say(f"{text}: {here}")
+    return rows, claims
 
 
-def _balanced(
-    samples: Callable[[int], tuple[Tensor, Tensor]], diagrams: int, backend: str
-) -> Iterator[tuple[float, float]]:
-    for number in range(diagrams):
-        points, importance = samples(number)
-        generator = torch.Generator().manual_seed(number)
-        result = balance(points, importance, CELLS, generator=generator, backend=backend)
-        yield result.imbalance_before, result.imbalance_after
-
-
-def claims(results: Sequence[dict[str, Any]]) -> list[Claim]:
-    """Whether cells are as even as published, for every source of samples."""
-    found = []
-    for row in results:
-        here = f"{row['before']:.3f} -> {row['after']:.4f}"
-        text = f"std(W / max W) of {CELLS} cells, median of {len(row['after_all'])} diagrams, {row['variant']}"
-        found.append(Claim(text, f"{BALANCE[0]} -> {BALANCE[1]}", here, balance_verdict(row["before"], row["after"])))
-    return found
-
-
-def balance_verdict(before: float | None, after: float | None) -> str:
+def balance_verdict(before: float, after: float) -> str:
     """Whether balancing reaches the published figure, at least its factor, or neither."""
-    if before is None or after is None:
-        return NOT_MEASURED
     if after >= before:
         return "does not hold"
-    if after <= BALANCE[1]:
+    if after <= PUBLISHED[1]:
         return "holds"
-    factor, published = before / after, BALANCE[0] / BALANCE[1]
+    factor, published = before / after, PUBLISHED[0] / PUBLISHED[1]
     if factor >= published:
         return f"the factor holds: {factor:.0f}, published {published:.0f}"
     return f"evener by a factor of {factor:.0f}, published {published:.0f}"

@@ -5,30 +5,21 @@ from __future__ import annotations
 import itertools
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
-
-from paper.records import comparable
+from typing import Any, NamedTuple
 
 Row = dict[str, Any]
 
 
 class Rows:
-    """Results by scene and variant, a value a seed.
+    """Results by scene and variant, a value a seed."""
 
-    Args:
-        rows: the results.
-        scenes: those that were asked for, of which some may have no results yet.
-    """
-
-    def __init__(self, rows: Sequence[Row], scenes: Sequence[str] = ()) -> None:
+    def __init__(self, rows: Sequence[Row]) -> None:
         self.rows = list(rows)
-        self.asked = list(scenes)
 
     @property
     def scenes(self) -> list[str]:
-        """The scenes that were asked for, and those of the results in their order."""
-        return list(dict.fromkeys((*self.asked, *(row["scene"] for row in self.rows))))
+        """The scenes in the order of the results."""
+        return list(dict.fromkeys(row["scene"] for row in self.rows))
 
     @property
     def variants(self) -> list[str]:
@@ -45,17 +36,14 @@ class Rows:
         return [row[metric] for row in self.of(variant, scene) if row.get(metric) is not None]
 
     def mean(self, variant: str, scene: str | None = None, metric: str = "psnr") -> float | None:
-        """Its mean, None where there is none."""
+        """Its mean; None without values."""
         values = self.values(variant, scene, metric)
         return statistics.fmean(values) if values else None
 
     def gains(
         self, better: str, worse: str, scene: str | None = None, value: Callable[[Row], float | None] | None = None
     ) -> list[float]:
-        """Difference between two variants, for each scene and seed that both have; PSNR by default.
-
-        Trainings of different machines are not a pair: the same seconds are not the same number of steps there.
-        """
+        """Difference between two variants, for each scene and seed that both have; PSNR by default."""
         return list(self.paired(better, worse, scene, value).values())
 
     def paired(
@@ -64,26 +52,17 @@ class Rows:
         """The same by scene and seed."""
         get = value or (lambda row: row.get("psnr"))
         first, second = ({(row["scene"], row["seed"]): row for row in self.of(name, scene)} for name in (better, worse))
-        pairs = {
-            key: (get(row), get(second[key]))
-            for key, row in first.items()
-            if key in second and comparable(row, second[key])
-        }
+        pairs = {key: (get(row), get(second[key])) for key, row in first.items() if key in second}
         return {key: a - b for key, (a, b) in pairs.items() if a is not None and b is not None}
 
 
-@dataclass(frozen=True)
-class Claim:
+class Claim(NamedTuple):
     """A claim, the published figure, the figure here, and whether they agree."""
 
     claim: str
     published: str
     here: str
     verdict: str
-
-    def to_dict(self) -> dict[str, str]:
-        """Ready for JSON."""
-        return asdict(self)
 
 
 NOT_MEASURED = "not measured"
@@ -151,7 +130,7 @@ def fewer_seams(rows: Rows, scene: str, usual: str, other: str, looks: Sequence[
     others = {row["seed"]: row for row in rows.of(other, scene)}
     means = []
     for row in rows.of(usual, scene):
-        if row["seed"] not in others or not comparable(row, others[row["seed"]]):
+        if row["seed"] not in others:
             continue
         pairs = [(at_look(row, name, "seam"), at_look(others[row["seed"]], name, "seam")) for name in looks]
         shared = [(a, b) for a, b in pairs if a is not None and b is not None]

@@ -1,21 +1,20 @@
-"""The paper's experiments that are trainings: which variants each compares, and what it claims.
+"""The paper's experiments that are trainings: which variants each compares, what it claims, what was published.
 
 Both sides of every comparison have the same rays, samples, schedule and kernels; the learning rate follows from the
-width alone, by one rule for all (see ``voronerf train --lr``).
+width alone, by one rule for all (see ``voronerf train --lr``). Published figures are those of Elsner et al. 2023,
+"Adaptive Voronoi NeRFs": 400 x 400 images, 24 h on an RTX 2080 Ti.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from paper.cells import cell_count_claims, cell_count_variants, early_late_claims, early_late_variants, levels_name
 from paper.claims import Claim, Rows, at_look, equal_claim, fewer_seams, gain_claim, growing_claim, order_claim
-from paper.published import CELLS, HIERARCHICAL, KILONERF, STRATIFIED, Scores
-from paper.runs import Run, Variant, default_scenes, make_run
-from paper.settings import Settings
-from voronerf.training.config import ConfigError, TrainConfig
+from paper.runs import AS_PUBLISHED, Run, Settings, Variant, default_scenes, make_run, open_scene
+from voronerf.training.config import TrainConfig
+from voronerf.training.networks import count_parameters, resolve_config
 
 FIELDS = {"nerf": "NeRF", "mipnerf": "mip-NeRF"}
 SAMPLINGS = ("stratified", "hierarchical")
@@ -24,15 +23,41 @@ BALANCED, RANDOM, UNIFORM = "balanced centres", "random centres", "uniform centr
 LOOSE = "uniform centres, twice the box"
 INHERIT, FRESH = "inherited", "random parameters"
 NEAREST, STOCHASTIC = "nearest cell", "stochastic assignment"
-KILO_START, KILO_LATE, KILO_CELLS = (
-    "512 uniform cells after 16 steps",
-    "512 uniform cells, inherited",
-    "16 x 16 Voronoi cells",
-)
 KILO_FIRST_STEPS = 16
+KILO_START, KILO_LATE = f"512 uniform cells after {KILO_FIRST_STEPS} steps", "512 uniform cells, inherited"
+KILO_CELLS = "16 x 16 Voronoi cells"
 NEVER, TOO_EARLY, USUAL, LATE = "never split", "split at 2 %", "split at 20 %", "split at 50 %"
 EARLY = ("after", "at-25", "at-50")
 SOLID, TRANSLUCENT = "builtin", "builtin-translucent"
+SPLIT_TIMES, TYPICAL = (0.05, 0.1, 0.2, 0.4, 0.6), 0.2
+COUNTS = (4, 8, 12, 16, 32)
+
+
+class Scores(NamedTuple):
+    """PSNR in dB, SSIM, LPIPS."""
+
+    psnr: float
+    ssim: float
+    lpips: float
+
+
+CONDITIONS = "published: 400 x 400, 24 h, RTX 2080 Ti"
+#: Published, (field, sampling, scene) -> one network of width 256, 12 Voronoi cells of width 64.
+PUBLISHED: dict[tuple[str, str, str], tuple[Scores, Scores]] = {
+    ("nerf", "hierarchical", "lego"): (Scores(27.355, 0.9451, 0.0910), Scores(27.652, 0.9483, 0.0831)),
+    ("mipnerf", "hierarchical", "lego"): (Scores(30.538, 0.9712, 0.0507), Scores(31.234, 0.9752, 0.0417)),
+    ("nerf", "hierarchical", "ship"): (Scores(26.717, 0.8967, 0.2016), Scores(27.373, 0.9068, 0.1820)),
+    ("mipnerf", "hierarchical", "ship"): (Scores(28.226, 0.9164, 0.1658), Scores(29.007, 0.9250, 0.1439)),
+    ("nerf", "hierarchical", "drums"): (Scores(23.077, 0.9145, 0.1320), Scores(23.490, 0.9230, 0.1128)),
+    ("mipnerf", "hierarchical", "drums"): (Scores(24.474, 0.9354, 0.1054), Scores(24.760, 0.9409, 0.0869)),
+    ("nerf", "stratified", "lego"): (Scores(25.450, 0.912, 0.144), Scores(25.603, 0.917, 0.134)),
+    ("mipnerf", "stratified", "lego"): (Scores(27.401, 0.945, 0.111), Scores(27.979, 0.949, 0.105)),
+}
+PUBLISHED_CELLS = 12
+#: Published: the same networks for the same time, Lego: KiloNeRF's 512 uniform cells, 16 x 16 Voronoi cells.
+KILONERF = (Scores(27.080, 0.938, 0.098), Scores(27.765, 0.952, 0.078))
+
+Claims = Callable[[Rows, Settings], list[Claim]]
 
 
 @dataclass(frozen=True)
@@ -44,36 +69,30 @@ class Experiment:
         about: what it compares, for the reader of its table.
         variants: for some settings and a scene.
         claims: what the paper says, judged by the results.
-        scenes: those of the settings, or its own where the user named none.
+        scenes: those to train if the settings name none.
         published: the published scores of a variant on a scene, or None.
-        metrics: columns.
     """
 
     kind: str
     about: str
     variants: Callable[[Settings, str], list[Variant]]
-    claims: Callable[[Rows, Settings], list[Claim]] = lambda rows, settings: []
+    claims: Claims = lambda rows, settings: []
     scenes: Callable[[], tuple[str, ...]] = default_scenes
     published: Callable[[str, str], Scores | None] = lambda variant, scene: None
 
     def runs(self, settings: Settings) -> list[Run]:
-        """Its trainings.
-
-        Raises:
-            ConfigError: When --options has what the variants differ in.
-        """
-        for scene in settings.scene or self.scenes():
-            compared = {name for variant in self.variants(settings, scene) for name in variant.changes}
-            if compared & settings.further.keys():
-                names = ", ".join(sorted(compared & settings.further.keys()))
-                raise ConfigError(f"--options must not name what the experiment compares, got {names}")
+        """Its trainings."""
         return [
-            make_run(variant, scene, seed, settings, rate)
+            make_run(variant, scene, seed, settings)
             for scene in settings.scene or self.scenes()
             for variant in self.variants(settings, scene)
-            for rate in settings.rates
             for seed in range(settings.seeds)
         ]
+
+
+def per_scene(judge: Callable[[Rows, Settings, str], list[Claim]]) -> Claims:
+    """Claims that are made of each scene alone."""
+    return lambda rows, settings: [claim for scene in rows.scenes for claim in judge(rows, settings, scene)]
 
 
 def cells_name(count: int) -> str:
@@ -86,7 +105,12 @@ def uniform_name(count: int) -> str:
     return f"{count} uniform cells, width 64"
 
 
-def one_or_cells(settings: Settings) -> list[Variant]:
+def levels_name(cells: tuple[int, ...]) -> str:
+    """The cells of each level: "12 cells", "4 x 4 cells"."""
+    return f"{' x '.join(map(str, cells))} cells" if cells else "one network"
+
+
+def one_or_cells(settings: Settings, scene: str = "") -> list[Variant]:
     """One network of width 256, one of width 64, the cells."""
     return [
         Variant(WIDE, {"cells": (), "width": 256}),
@@ -95,18 +119,12 @@ def one_or_cells(settings: Settings) -> list[Variant]:
     ]
 
 
-def rendered(field: str, sampling: str, settings: Settings) -> dict[str, Any]:
-    """The settings of a field and a sampling; two passes share the samples of one."""
-    changes: dict[str, Any] = {} if field == "nerf" else {"field": field}
-    if sampling == "hierarchical":
-        half = settings.samples // 2
-        changes |= {"sampling": sampling, "samples": half, "fine_samples": settings.samples - half}
-    return changes
-
-
 def row_name(field: str, sampling: str, network: str) -> str:
     """The name of a row of the tables by field and sampling."""
     return f"{FIELDS[field]}, {sampling}: {network}"
+
+
+# --- the tables by field and sampling -------------------------------------------------------------------------------
 
 
 def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant]]:
@@ -115,76 +133,69 @@ def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant
         for field in FIELDS:
             for sampling in samplings:
                 networks = one_or_cells(settings)
+                extra: dict[str, Any] = {"field": field}
                 if sampling == "stratified":
                     changes = {"cells": (settings.cells,), "width": 64, "centres": "uniform"}
                     networks.append(Variant(uniform_name(settings.cells), changes))
-                extra = rendered(field, sampling, settings)
+                else:  # two passes share the samples of one
+                    half = settings.samples // 2
+                    extra |= {"sampling": sampling, "samples": half, "fine_samples": settings.samples - half}
                 found += [Variant(row_name(field, sampling, v.name), {**v.changes, **extra}) for v in networks]
         return found
 
     return variants
 
 
-def _published(variant: str, scene: str) -> Scores | None:
-    found: dict[str, Scores] = {}
-    for field in FIELDS:
-        tables = {"hierarchical": HIERARCHICAL.get((field, scene))}
-        tables["stratified"] = STRATIFIED[field] if scene == "lego" else None
-        for sampling, scores in tables.items():
-            for network, score in zip((WIDE, cells_name(CELLS)), scores or ()):
-                found[row_name(field, sampling, network)] = score
-    return found.get(variant)
-
-
-def _published_gain(better: str, worse: str, scene: str) -> str:
-    high, low = _published(better, scene), _published(worse, scene)
-    return f"{high.psnr - low.psnr:+.2f} dB" if high and low else "-"
-
-
-def _kilo_published(variant: str, scene: str) -> Scores | None:
-    if scene != "lego":
-        return None
-    return KILONERF[0] if variant == KILO_START else KILONERF[1] if variant == KILO_CELLS else None
-
-
-def _crossed_claims(samplings: Sequence[str]) -> Callable[[Rows, Settings], list[Claim]]:
-    def claims(rows: Rows, settings: Settings) -> list[Claim]:
+def _crossed_claims(samplings: Sequence[str]) -> Claims:
+    def judge(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
         found = []
-        for scene in rows.scenes:
-            for field in FIELDS:
-                for sampling in samplings:
-
-                    def named(network: str, field: str = field, sampling: str = sampling) -> str:
-                        return row_name(field, sampling, network)
-
-                    cells, what = named(cells_name(settings.cells)), f"{scene}, {FIELDS[field]}, {sampling}: cells beat"
-                    text = _published_gain(cells, named(WIDE), scene)
-                    wide, narrow = rows.gains(cells, named(WIDE), scene), rows.gains(cells, named(NARROW), scene)
-                    found.append(gain_claim(f"{what} one network of width 256, by 2 dB", text, wide, 2.0))
-                    found.append(gain_claim(f"{what} one network of width 64, by 0.5 dB", "-", narrow, 0.5))
-                    if sampling == "stratified":
-                        uniform = named(uniform_name(settings.cells))
-                        found.append(gain_claim(f"{what} uniform cells", "-", rows.gains(cells, uniform, scene)))
+        for field in FIELDS:
+            for sampling in samplings:
+                cells, wide, narrow, uniform = (
+                    row_name(field, sampling, network)
+                    for network in (cells_name(settings.cells), WIDE, NARROW, uniform_name(settings.cells))
+                )
+                what = f"{scene}, {FIELDS[field]}, {sampling}: cells beat"
+                high, low = _published(cells, scene), _published(wide, scene)
+                gain = f"{high.psnr - low.psnr:+.2f} dB" if high and low else "-"
+                found += [
+                    gain_claim(f"{what} one network of width 256, by 2 dB", gain, rows.gains(cells, wide, scene), 2.0),
+                    gain_claim(
+                        f"{what} one network of width 64, by 0.5 dB", "-", rows.gains(cells, narrow, scene), 0.5
+                    ),
+                ]
+                if sampling == "stratified":
+                    found.append(gain_claim(f"{what} uniform cells", "-", rows.gains(cells, uniform, scene)))
         return found
 
-    return claims
+    return per_scene(judge)
+
+
+def _published(variant: str, scene: str) -> Scores | None:
+    for (field, sampling, where), scores in PUBLISHED.items():
+        for network, score in zip((WIDE, cells_name(PUBLISHED_CELLS)), scores):
+            if (where, row_name(field, sampling, network)) == (scene, variant):
+                return score
+    return None
+
+
+# --- KiloNeRF -------------------------------------------------------------------------------------------------------
 
 
 def _kilo_variants(settings: Settings, scene: str) -> list[Variant]:
     # More samples a batch, so that 512 of them are there after a few steps; the same for all.
     common = {"field": "kilonerf", "reservoir_batches": 100}
     uniform = {**common, "cells": (512,), "centres": "uniform"}
-    first = {"split_at_steps": (KILO_FIRST_STEPS,)}
     # The inherited grid is split when the Voronoi cells are for the first time.
-    config = TrainConfig(field="kilonerf", cells=(16, 16))
+    first_split = TrainConfig(field="kilonerf", cells=(16, 16)).splits[:1]
     return [
-        Variant(KILO_START, {**uniform, **first}),
-        Variant(KILO_LATE, {**uniform, "split_at": config.splits[:1]}),
+        Variant(KILO_START, {**uniform, "split_at_steps": (KILO_FIRST_STEPS,)}),
+        Variant(KILO_LATE, {**uniform, "split_at": first_split}),
         Variant(KILO_CELLS, {**common, "cells": (16, 16)}),
     ]
 
 
-def _kilo_claims(rows: Rows, settings: Settings) -> list[Claim]:
+def _kilo_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
     text = f"{KILONERF[1].psnr - KILONERF[0].psnr:+.3f} dB"
     return [
         gain_claim(
@@ -193,95 +204,110 @@ def _kilo_claims(rows: Rows, settings: Settings) -> list[Claim]:
             rows.gains(KILO_CELLS, other, scene),
             0.5,
         )
-        for scene in rows.scenes
         for other in (KILO_START, KILO_LATE)
     ]
 
 
-def _convergence_claims(rows: Rows, settings: Settings) -> list[Claim]:
+def _kilo_published(variant: str, scene: str) -> Scores | None:
+    return {KILO_START: KILONERF[0], KILO_CELLS: KILONERF[1]}.get(variant) if scene == "lego" else None
+
+
+# --- figures --------------------------------------------------------------------------------------------------------
+
+
+def _changed(*variants: tuple[str, dict[str, Any]]) -> Callable[[Settings, str], list[Variant]]:
+    """Variants of the cells of the settings, each with changes of its own."""
+    return lambda settings, scene: [Variant(name, {"cells": (settings.cells,), **more}) for name, more in variants]
+
+
+def _convergence_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
     cells = cells_name(settings.cells)
+    wide, narrow = rows.gains(cells, WIDE, scene), rows.gains(cells, NARROW, scene)
     return [
-        claim
-        for scene in rows.scenes
-        for claim in (
-            gain_claim(
-                f"{scene}: cells beat one network of width 256, by 2 dB", "-", rows.gains(cells, WIDE, scene), 2
-            ),
-            gain_claim(
-                f"{scene}: cells beat one network of width 64, by 0.5 dB", "-", rows.gains(cells, NARROW, scene), 0.5
-            ),
-            growing_claim(f"{scene}: the lead over width 64 grows with the time", "-", rows, cells, NARROW, scene),
+        gain_claim(f"{scene}: cells beat one network of width 256, by 2 dB", "-", wide, 2),
+        gain_claim(f"{scene}: cells beat one network of width 64, by 0.5 dB", "-", narrow, 0.5),
+        growing_claim(f"{scene}: the lead over width 64 grows with the time", "-", rows, cells, NARROW, scene),
+    ]
+
+
+def _initialisation_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
+    text = f"{scene}: inheritance beats random parameters on held-out views"
+    return [gain_claim(text, "order", rows.gains(INHERIT, FRESH, scene))]
+
+
+def _ghosting_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
+    return [
+        gain_claim(
+            f"{scene}: {when} inherited networks show a held-out view better",
+            "order",
+            rows.gains(INHERIT, FRESH, scene, lambda row, name=name: at_look(row, name, "psnr")),
         )
+        for name, when in (("after", "soon after the split"), ("end", "at the end"))
     ]
 
 
-def _initialisation_variants(settings: Settings, scene: str) -> list[Variant]:
-    cells = {"cells": (settings.cells,)}
-    return [Variant(INHERIT, cells), Variant(FRESH, {**cells, "init": "random"})]
-
-
-def _initialisation_claims(rows: Rows, settings: Settings) -> list[Claim]:
-    found = []
-    for scene in rows.scenes:
-        gains = rows.gains(INHERIT, FRESH, scene)
-        found.append(gain_claim(f"{scene}: inheritance beats random parameters on held-out views", "order", gains))
-    return found
-
-
-def _ghosting_claims(rows: Rows, settings: Settings) -> list[Claim]:
-    found = []
-    for scene in rows.scenes:
-        for name, when in (("after", "soon after the split"), ("end", "at the end")):
-            gains = rows.gains(INHERIT, FRESH, scene, lambda row, name=name: at_look(row, name, "psnr"))
-            found.append(gain_claim(f"{scene}: {when} inherited networks show a held-out view better", "order", gains))
-    return found
-
-
-def _split_kind_variants(settings: Settings, scene: str) -> list[Variant]:
-    cells = {"cells": (settings.cells,)}
+def _split_kind_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
+    order = f"{scene}: balanced centres beat random, random beat uniform"
+    loose = f"{scene}: balanced centres beat a grid over twice the box"
     return [
-        Variant(BALANCED, cells),
-        Variant(RANDOM, {**cells, "centres": "random"}),
-        Variant(UNIFORM, {**cells, "centres": "uniform"}),
-        Variant(LOOSE, {**cells, "centres": "uniform", "uniform_scale": 2.0}),
+        order_claim(order, "order", rows, (BALANCED, RANDOM, UNIFORM), scene),
+        gain_claim(loose, "-", rows.gains(BALANCED, LOOSE, scene)),
     ]
 
 
-def _split_kind_claims(rows: Rows, settings: Settings) -> list[Claim]:
-    found = []
-    for scene in rows.scenes:
-        claim = f"{scene}: balanced centres beat random, random beat uniform"
-        found.append(order_claim(claim, "order", rows, (BALANCED, RANDOM, UNIFORM), scene))
-        claim = f"{scene}: balanced centres beat a grid over twice the box"
-        found.append(gain_claim(claim, "-", rows.gains(BALANCED, LOOSE, scene)))
-    return found
+def _split_name(at: float) -> str:
+    return f"split at {100 * at:.0f} %"
 
 
-def _seam_variants(settings: Settings, scene: str) -> list[Variant]:
-    cells = {"cells": (settings.cells,)}
-    return [Variant(NEAREST, cells), Variant(STOCHASTIC, {**cells, "assignment": "stochastic"})]
+def _early_late_variants(settings: Settings, scene: str) -> list[Variant]:
+    usual = TrainConfig(cells=(settings.cells,)).splits
+    times = [(_split_name(at), {} if (at,) == usual else {"split_at": (at,)}) for at in SPLIT_TIMES]
+    return _changed(*times)(settings, scene)
 
 
-def _seam_claims(rows: Rows, settings: Settings) -> list[Claim]:
-    found = []
-    for scene in rows.scenes:
-        early, late = (fewer_seams(rows, scene, NEAREST, STOCHASTIC, looks) for looks in (EARLY, ("end",)))
-        quality = rows.gains(STOCHASTIC, NEAREST, scene)
-        found += [
-            gain_claim(f"{scene}: stochastic assignment: fewer seams in the first half", "order", early, unit="%"),
-            equal_claim(f"{scene}: as many seams at the end", "no difference", late, 10.0, "%"),
-            equal_claim(f"{scene}: the same quality at the end", "no difference", quality, 0.2),
-        ]
-    return found
-
-
-def _limit_variants(settings: Settings, scene: str) -> list[Variant]:
-    cells = {"cells": (settings.cells,)}
+def _early_late_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
+    early, usual, late = map(_split_name, (SPLIT_TIMES[0], TYPICAL, SPLIT_TIMES[-1]))
     return [
-        Variant(NEVER, {"cells": ()}),
-        Variant(TOO_EARLY, {**cells, "split_at": (0.02,)}),
-        Variant(USUAL, cells),
-        Variant(LATE, {**cells, "split_at": (0.5,)}),
+        gain_claim(f"{scene}: a {what} costs: {usual} beats {other}", "-", rows.gains(usual, other, scene))
+        for what, other in (("too early split", early), ("too late split", late))
+    ]
+
+
+def _cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
+    """Different numbers of cells, of one width, and of one number of parameters in total."""
+    levels: list[tuple[int, ...]] = [(), *((count,) for count in COUNTS), (4, 4)]
+    reference = TrainConfig(**{"data": scene, **AS_PUBLISHED, "cells": (PUBLISHED_CELLS,)})
+    total = count_parameters(resolve_config(reference, open_scene(scene, settings)))
+    own = [Variant(levels_name(cells), {"cells": cells}) for cells in levels]
+    # 12 cells are what the others are matched with: one training is both
+    matched = [{"cells": cells} | ({} if cells == (PUBLISHED_CELLS,) else {"parameters": total}) for cells in levels]
+    return own + [Variant(f"{levels_name(cells)}, matched", changes) for cells, changes in zip(levels, matched)]
+
+
+def _cell_count_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
+    names = [levels_name((count,)) for count in COUNTS]
+    most, fewest, alone = names[-1], names[0], levels_name(())
+    found = [
+        gain_claim(
+            f"{scene}: more cells are better at the same width: {most} beat {fewest}",
+            "-",
+            rows.gains(most, fewest, scene),
+        ),
+        order_claim(f"{scene}: each step to more cells is, from {fewest} to {most}", "-", rows, names[::-1], scene),
+    ]
+    for better, worse in ((levels_name((PUBLISHED_CELLS,)), alone), (most, fewest)):
+        what = f"{scene}: with as many parameters in total {better} beat {worse}"
+        found.append(gain_claim(what, "-", rows.gains(f"{better}, matched", f"{worse}, matched", scene)))
+    return found
+
+
+def _seam_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
+    early, late = (fewer_seams(rows, scene, NEAREST, STOCHASTIC, looks) for looks in (EARLY, ("end",)))
+    quality = rows.gains(STOCHASTIC, NEAREST, scene)
+    return [
+        gain_claim(f"{scene}: stochastic assignment: fewer seams in the first half", "order", early, unit="%"),
+        equal_claim(f"{scene}: as many seams at the end", "no difference", late, 10.0, "%"),
+        equal_claim(f"{scene}: the same quality at the end", "no difference", quality, 0.2),
     ]
 
 
@@ -307,11 +333,15 @@ def _limit_claims(rows: Rows, settings: Settings) -> list[Claim]:
     return found
 
 
-def _title_variants(settings: Settings, scene: str) -> list[Variant]:
-    return [Variant(levels_name(cells), {"cells": cells}) for cells in ((settings.cells,), (4, 4))]
-
+_INITIALISED = _changed((INHERIT, {}), (FRESH, {"init": "random"}))
 
 EXPERIMENTS: dict[str, Experiment] = {
+    "convergence": Experiment(
+        "figure",
+        "Test PSNR over training time: one wide network, one narrow network, cells of narrow networks.",
+        one_or_cells,
+        per_scene(_convergence_claims),
+    ),
     "sampling": Experiment(
         "table",
         "NeRF and mip-NeRF, each with stratified and with hierarchical sampling: one network against cells.",
@@ -333,59 +363,62 @@ EXPERIMENTS: dict[str, Experiment] = {
         "Networks of KiloNeRF's size for the same time: a uniform grid of cells against nested Voronoi cells. "
         "The grid is there after 16 steps, KiloNeRF's from the start, or it inherits when the Voronoi cells do.",
         _kilo_variants,
-        _kilo_claims,
+        per_scene(_kilo_claims),
         published=_kilo_published,
-    ),
-    "convergence": Experiment(
-        "figure",
-        "Test PSNR over training time: one wide network, one narrow network, cells of narrow networks.",
-        lambda settings, scene: one_or_cells(settings),
-        _convergence_claims,
     ),
     "initialisation": Experiment(
         "figure",
         "New cells start as copies of their parent, or from random parameters.",
-        _initialisation_variants,
-        _initialisation_claims,
+        _INITIALISED,
+        per_scene(_initialisation_claims),
+    ),
+    "ghosting": Experiment(
+        "figure",
+        "A held-out view soon after the split and at the end: inherited networks and random ones.",
+        _INITIALISED,
+        per_scene(_ghosting_claims),
+    ),
+    "density": Experiment(
+        "figure", "Density on a horizontal slice: the coarse network, soon after the split, at the end.", _INITIALISED
     ),
     "split-kinds": Experiment(
         "figure",
         "Centres balanced by importance, drawn from the samples, or on a grid: over the samples, or one that "
         "is twice as large along each axis, as if their place were not known.",
-        _split_kind_variants,
-        _split_kind_claims,
+        _changed(
+            (BALANCED, {}),
+            (RANDOM, {"centres": "random"}),
+            (UNIFORM, {"centres": "uniform"}),
+            (LOOSE, {"centres": "uniform", "uniform_scale": 2.0}),
+        ),
+        per_scene(_split_kind_claims),
     ),
     "early-late": Experiment(
-        "figure", "The time of the split, as a share of the run.", early_late_variants, early_late_claims
+        "figure", "The time of the split, as a share of the run.", _early_late_variants, per_scene(_early_late_claims)
     ),
     "cell-count": Experiment(
         "figure",
         "The number of cells, with networks of one width, and with the parameters of 12 such networks in total.",
-        cell_count_variants,
-        cell_count_claims,
+        _cell_count_variants,
+        per_scene(_cell_count_claims),
     ),
-    "ghosting": Experiment(
-        "figure",
-        "A held-out view soon after the split and at the end: inherited networks and random ones.",
-        _initialisation_variants,
-        _ghosting_claims,
-    ),
-    "density": Experiment(
-        "figure",
-        "Density on a horizontal slice: the coarse network, soon after the split, at the end.",
-        _initialisation_variants,
-    ),
-    "title": Experiment("figure", "Each pixel in the colour of its cell.", _title_variants),
     "seams": Experiment(
         "figure",
         "Samples go to the nearest cell, or while training to one drawn from the distances: seams over time.",
-        _seam_variants,
-        _seam_claims,
+        _changed((NEAREST, {}), (STOCHASTIC, {"assignment": "stochastic"})),
+        per_scene(_seam_claims),
+    ),
+    "title": Experiment(
+        "figure",
+        "Each pixel in the colour of its cell.",
+        lambda settings, scene: [
+            Variant(levels_name(cells), {"cells": cells}) for cells in ((settings.cells,), (4, 4))
+        ],
     ),
     "limits": Experiment(
         "figure",
         "A scene of fog and glass beside a solid one: no split, one before anything is known, the usual, a late one.",
-        _limit_variants,
+        _changed((NEVER, {"cells": ()}), (TOO_EARLY, {"split_at": (0.02,)}), (USUAL, {}), (LATE, {"split_at": (0.5,)})),
         _limit_claims,
         scenes=lambda: (TRANSLUCENT, SOLID),
     ),

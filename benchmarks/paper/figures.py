@@ -180,10 +180,8 @@ def _density(look: dict[str, Any]) -> Tensor:
     return picture_of_density(torch.from_numpy(look["density"]).float())
 
 
-def sheet(
-    path: Path, rows: Sequence[Row], folder: Path, columns: Sequence[tuple[str, str, Callable[[dict[str, Any]], Any]]]
-) -> Path | None:
-    """Pictures of the first seed: a line for every scene and variant, columns of (caption, look, picture of a look)."""
+def sheet(path: Path, rows: Sequence[Row], folder: Path, columns: Sequence[Column]) -> Path | None:
+    """Pictures of the first seed: a line for every scene and variant."""
     lines = []
     for row in rows:
         if row["seed"] != 0:
@@ -191,9 +189,8 @@ def sheet(
         pictures = {}
         for caption, name, draw in columns:
             look = paper_looks.load(folder / "runs" / row["run"], name)
-            picture = None if look is None else draw(look)
-            if picture is not None:
-                pictures[f"{caption.format(variant=row['variant'], scene=row['scene'])}"] = picture
+            if look is not None:
+                pictures[caption.format(variant=row["variant"], scene=row["scene"])] = draw(look)
         if len(pictures) == len(columns):
             lines.append(contact_sheet(pictures))
     if not lines:
@@ -208,51 +205,30 @@ def stacked(pictures: Sequence[Tensor]) -> Tensor:
     return torch.cat([torch.nn.functional.pad(p, (0, 0, 0, width - p.shape[1]), value=255) for p in pictures])
 
 
-def ghosting(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:
-    """Held-out views before the split, soon after it and at the end."""
-    truth = lambda look: torch.from_numpy(look["truth"])  # noqa: E731
-    columns = [
-        ("{scene}", "end", truth),
+def _truth(look: dict[str, Any]) -> Tensor:
+    return torch.from_numpy(look["truth"])
+
+
+Column = tuple[str, str, Callable[[dict[str, Any]], Tensor]]  # caption, look, the picture of a look
+_TITLE: list[Column] = [("{scene}", "end", _truth), ("{variant}", "end", _view), ("cells", "end", _cells)]
+SHEETS: dict[str, list[Column]] = {
+    "ghosting": [
+        ("{scene}", "end", _truth),
         ("before the split", "before", _view),
         ("{variant}, soon after", "after", _view),
         ("error, soon after", "after", _error),
         ("{variant}, end", "end", _view),
         ("error, end", "end", _error),
-    ]
-    return sheet(path, rows, folder, columns)
-
-
-def density(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:
-    """Slices of the density."""
-    columns = [
+    ],
+    "density": [
         ("{scene}, coarse", "before", _density),
         ("{variant}, soon after", "after", _density),
         ("{variant}, end", "end", _density),
-    ]
-    return sheet(path, rows, folder, columns)
-
-
-def title(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:
-    """A held-out view and its cells."""
-    columns = [
-        ("{scene}", "end", lambda look: torch.from_numpy(look["truth"])),
-        ("{variant}", "end", _view),
-        ("cells", "end", _cells),
-    ]
-    return sheet(path, rows, folder, columns)
-
-
-def limits(path: Path, rows: Sequence[Row], folder: Path) -> Path | None:
-    """View, error and cells of every variant at the end."""
-    columns = [
-        ("{scene}", "end", lambda look: torch.from_numpy(look["truth"])),
-        ("{variant}", "end", _view),
-        ("error", "end", _error),
-        ("cells", "end", _cells),
-    ]
-    return sheet(path, rows, folder, columns)
-
-
+    ],
+    "title": _TITLE,
+    "split-kinds": _TITLE,
+    "limits": [*_TITLE[:2], ("error", "end", _error), _TITLE[2]],
+}
 PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
     "sampling": bars,
     "architecture": bars,
@@ -267,13 +243,6 @@ PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
     "nested-2d": curves,
     "balance": balance,
 }
-PICTURES: dict[str, Callable[[Path, Sequence[Row], Path], Path | None]] = {
-    "ghosting": ghosting,
-    "density": density,
-    "title": title,
-    "limits": limits,
-    "split-kinds": title,
-}
 
 
 def draw(name: str, rows: Sequence[Row], folder: Path) -> list[Path]:
@@ -281,8 +250,8 @@ def draw(name: str, rows: Sequence[Row], folder: Path) -> list[Path]:
     found: list[Path | None] = []
     if name in PLOTS and rows:
         found.append(PLOTS[name](folder / f"{name}.png", rows))
-    if name in PICTURES and rows:
-        found.append(PICTURES[name](folder / f"{name}-pictures.png", rows, folder))
+    if name in SHEETS and rows:
+        found.append(sheet(folder / f"{name}-pictures.png", rows, folder, SHEETS[name]))
     if name == "nested-2d":
         found.append(folder / "nested-2d-pictures.png")
     return [path for path in found if path is not None and path.is_file()]

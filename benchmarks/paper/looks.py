@@ -47,27 +47,13 @@ def held_out_view(scene: Scene) -> int:
 
 
 def reached(trainer: Trainer, second: float) -> None:
-    """Writes the look of a trainer at one of its stops, unless that was done before an interruption."""
+    """Writes the looks of a trainer that are due at a number of training seconds."""
     names = [name for name, at in stops(trainer) if at == second]
-    if all((trainer.out / "looks" / f"{name}.npz").is_file() for name in names):
-        return
     if "after" in names and trainer.level == 0:
         # Steps may be longer than the time between the two stops; this one makes the split.
         trainer.advance(math.nextafter(trainer.seconds, math.inf))
     for name in names:
         look(trainer, second, name)
-
-
-def forget_later(trainer: Trainer) -> None:
-    """Deletes a resumed run's looks at steps after its checkpoint, which will be made again."""
-    for entry in numbers(trainer.out):
-        if entry["seconds"] > trainer.seconds:
-            (trainer.out / "looks" / f"{entry['look']}.npz").unlink()
-
-
-def missed(trainer: Trainer) -> list[str]:
-    """The looks that a finished run lacks, because their time had passed when it was resumed."""
-    return [name for name, _ in stops(trainer) if not (trainer.out / "looks" / f"{name}.npz").is_file()]
 
 
 @torch.no_grad()
@@ -116,7 +102,7 @@ def seams(trainer: Trainer) -> dict[str, float]:
 
 
 def load(folder: Path, name: str) -> dict[str, Any] | None:
-    """The arrays of a run's look, None where it was not made."""
+    """The arrays of a run's look; None if it was not made."""
     path = folder / "looks" / f"{name}.npz"
     if not path.is_file():
         return None

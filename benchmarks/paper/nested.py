@@ -7,7 +7,6 @@ The cells are the library's own, whose points have three coordinates: pixel (x, 
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import time
 from collections.abc import Callable
@@ -16,19 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import metadata
 from torch import Tensor, nn
 from turns import take_turns
 
-from paper.claims import Rows, gain_claim
+from paper.claims import Claim, Rows, gain_claim
 from paper.figures import stacked
 from paper.looks import held_out_view
-from paper.runs import default_scenes, open_scene
-from paper.settings import Settings
+from paper.runs import Settings, default_scenes, open_scene
 from voronerf import NeRF, SampleReservoir, VoronoiDiagram, VoronoiRouter, frequency_encode, split_diagram
 from voronerf.evaluation.panels import contact_sheet, palette, picture_of_colour, picture_of_error, save_picture
-from voronerf.files import write_text
-from voronerf.training.config import ConfigError
 
 CHILDREN, LEVELS = 4, 3
 SPLITS = (0.15, 0.35, 0.55)  # of the budget, a level each
@@ -191,24 +186,26 @@ def octaves_of(image: Tensor) -> int:
     return max(1, math.ceil(math.log2(math.pi * max(image.shape[:2]) / 2)))
 
 
-def nested(settings: Settings, say: Callable[[str], None] = print) -> dict[str, Any]:
-    """Fits a held-out view of each scene by the three contenders, draws the cells; returns {metadata, results}."""
-    results, pictures, sizes = [], [], []
-    for name in settings.scene or default_scenes():
-        rows, picture, size = fitted_view(name, settings, say)
-        results += rows
+def nested(settings: Settings, say: Callable[[str], None] = print) -> tuple[list[dict[str, Any]], list[Claim]]:
+    """Fits a held-out view of each scene by the three contenders and draws the cells; returns (rows, claims)."""
+    rows, pictures = [], []
+    scenes = settings.scene or default_scenes()
+    for name in scenes:
+        found, picture = fitted_view(name, settings, say)
+        rows += found
         pictures.append(picture)
-        sizes.append(size)
     save_picture(settings.out / "nested-2d-pictures.png", stacked(pictures))
-    outcome = outcome_of(results, settings, size=sizes[0])
-    write_text(settings.out / "nested-2d.json", json.dumps(outcome, indent=1) + "\n")
-    return outcome
+    table = Rows(rows)
+    claims = [
+        gain_claim(f"a picture of {scene}: nested cells beat {other}", "-", table.gains(NESTED, other, scene))
+        for scene in table.scenes
+        for other in (ONE, MATCHED)
+    ]
+    return rows, claims
 
 
-def fitted_view(
-    name: str, settings: Settings, say: Callable[[str], None]
-) -> tuple[list[dict[str, Any]], Tensor, list[int]]:
-    """The fits of one scene's view: a row a contender and seed, the sheet of pictures of seed 0, the view's size."""
+def fitted_view(name: str, settings: Settings, say: Callable[[str], None]) -> tuple[list[dict[str, Any]], Tensor]:
+    """The fits of one scene's view: a row a contender and seed, and the sheet of pictures of seed 0."""
     # one picture is little to learn: it is taken four times as large as the scene's
     scene = open_scene(name, replace(settings, downscale=max(1, settings.downscale // 4)))
     image = scene.test.truth(held_out_view(scene), torch.ones(3))
@@ -242,60 +239,11 @@ def fitted_view(
             "steps": fit.step,
             "seconds": fit.seconds,
             "curve": [{"seconds": second, "psnr": psnr} for second, psnr in fit.curve],
-            "levels": [
-                {"cells": level.cells, "imbalance": level.imbalance and list(level.imbalance)} for level in fit.levels
-            ],
+            "levels": [{"cells": level.cells, "imbalance": level.imbalance} for level in fit.levels],
         }
         results.append(row)
         say(f"{variant:34} seed {seed}  {row['cells']:4d} cells  {row['steps']:6d} steps  psnr {row['psnr']:.2f}")
-    return results, drawn(image, {variant: fits[variant, 0] for variant in widths}), list(image.shape[:2])
-
-
-def outcome_of(results: list[dict[str, Any]], settings: Settings, **more: Any) -> dict[str, Any]:
-    """{metadata, results, claims} of fits; of none, that they are missing."""
-    rows = Rows(results)
-    claims = [
-        gain_claim(f"a picture of {scene}: nested cells beat {other}", "-", rows.gains(NESTED, other, scene))
-        for scene in described(settings)["scenes"]
-        for other in (ONE, MATCHED)
-    ]
-    missing = [] if results else ["the fit of a picture"]
-    return {
-        "metadata": metadata(**described(settings), **more, missing=missing),
-        "results": results,
-        "claims": [claim.to_dict() for claim in claims],
-    }
-
-
-def refuse_trainings(settings: Settings) -> None:
-    """Raises ConfigError for settings that only trainings of scenes follow."""
-    usual = Settings()
-    for name in ("options", "rates", "variants", "only_seeds", "record"):
-        if getattr(settings, name) != getattr(usual, name):
-            option = f"--{name.replace('_', '-')}"
-            raise ConfigError(f"{option} must be left out for nested-2d, a fit, got {getattr(settings, name)!r}")
-
-
-def described(settings: Settings) -> dict[str, Any]:
-    """What the experiment's result depends on, for its metadata."""
-    return {
-        "benchmark": "paper",
-        "experiment": "nested-2d",
-        "kind": "figure",
-        "scenes": [Path(name).name for name in settings.scene or default_scenes()],
-        "downscale": settings.downscale,
-        "budget_seconds": settings.budget,
-        "seeds": settings.seeds,
-        "backend": settings.backend,
-        "splits": list(SPLITS),
-        "children": CHILDREN,
-        "levels": LEVELS,
-        "width": WIDTH,
-        "depth": DEPTH,
-        "batch": BATCH,
-        "rate": RATE,
-        "rate_final": RATE_FINAL,
-    }
+    return results, drawn(image, {variant: fits[variant, 0] for variant in widths})
 
 
 def drawn(image: Tensor, fits: dict[str, ImageFit]) -> Tensor:

@@ -8,6 +8,7 @@ VN_STRUCT(DrawPixelsInputs, seed, ends, shift, first, bits, below, b);
 
 VN_BINDINGS(module) {
   module.cpu("draw_pixels", VN_CPU(draw_pixels_cpu));
+  module.cuda("draw_pixels", VN_CUDA(draw_pixels_cuda));
 }
 
 }  // namespace voronerf

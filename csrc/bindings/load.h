@@ -1,8 +1,7 @@
 // What Python passes as what C++ takes: one Loader for each kind of parameter.
 //
-//   T*            a tensor of that dtype (or None, which is null); a const one is made contiguous for the call. A
-//   tensor
-//                 without elements is there all the same: its address is not null.
+//   T*            a tensor of that dtype (or None, which is null); a const one is made contiguous for the call, and has
+//                 its negative bit resolved. A tensor without elements is there all the same: its address is not null.
 //   T* const*     a sequence of such tensors, or None
 //   enumeration   the name of a value (VN_NAMES)
 //   struct        a named tuple with its members (VN_STRUCT), of a class that the module makes
@@ -20,6 +19,7 @@
 #include <string>
 #include <tuple>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 namespace voronerf {
@@ -161,8 +161,8 @@ struct Loader<E, std::enable_if_t<std::is_enum_v<E>>> {
   }
 };
 
-// Tensors: anything with a dtype, contiguous(), is_contiguous() and data_ptr(); what the dtypes are, Python says once
-// (name_dtypes).
+// Tensors: anything with a dtype, contiguous(), is_contiguous(), is_neg(), resolve_neg() and data_ptr(); what the
+// dtypes are, Python says once (name_dtypes).
 
 inline std::map<std::string, PyObject*>& dtypes() {
   static std::map<std::string, PyObject*> known;
@@ -195,6 +195,8 @@ struct Loader<T*, std::enable_if_t<!std::is_pointer_v<T>>> {
     if (given == Py_None) return true;
     static PyObject *const dtype_word = PyUnicode_InternFromString("dtype"),
                            *const address_word = PyUnicode_InternFromString("data_ptr"),
+                           *const negative_word = PyUnicode_InternFromString("is_neg"),
+                           *const resolve_word = PyUnicode_InternFromString("resolve_neg"),
                            *const contiguous_word =
                                PyUnicode_InternFromString(std::is_const_v<T> ? "contiguous" : "is_contiguous");
     if constexpr (!std::is_void_v<T>) {
@@ -211,6 +213,14 @@ struct Loader<T*, std::enable_if_t<!std::is_pointer_v<T>>> {
       Py_DECREF(answer);  // True or False
       if (answer != Py_True) return false;
       Py_INCREF(kept = given);
+    }
+    PyObject* const negative = PyObject_CallMethodNoArgs(kept, negative_word);
+    if (negative == nullptr) return PyErr_Clear(), false;
+    Py_DECREF(negative);        // True or False
+    if (negative == Py_True) {  // memory holds the values negated, as of x.conj().imag
+      PyObject* const resolved = std::is_const_v<T> ? PyObject_CallMethodNoArgs(kept, resolve_word) : nullptr;
+      if (resolved == nullptr) return PyErr_Clear(), false;
+      Py_DECREF(std::exchange(kept, resolved));
     }
     PyObject* const number = PyObject_CallMethodNoArgs(kept, address_word);
     if (number == nullptr) return PyErr_Clear(), false;

@@ -12,4 +12,27 @@ namespace voronerf {
 void adam_cpu(const std::vector<SparseAdam>& rules, const float* const* gradients, float* const* parameters,
               float* const* means, float* const* squares, const std::vector<int64_t>& sizes, Isa isa, int threads);
 
+// The rule of a parameter whose numbers are on the device, where no host reads them.
+struct AdamRule {
+  const float* rate;  // [1], the learning rate
+  float* step;        // [1], steps done; goes up by one unless the step is left out
+  double decay, decay_sq, epsilon;
+  bool every;  // as of SparseAdam
+};
+
+// When a step is left out: where `found` is not 0. With a loss, it is set first: to whether the loss or a gradient of a
+// parameter with `every` is not below `limit`, NaN included.
+struct AdamGuard {
+  const float* loss;  // [1], or null
+  float limit;
+  float* found;               // [1], or null for never
+  float *skipped, *in_a_row;  // [1], how many steps were left out, and of the last ones; null without a loss
+  const float* scale;         // [1], of which the gradients are multiples, or null
+};
+
+// The same on CUDA in two launches. corrected: [2, number of parameters], working memory.
+void adam_cuda(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
+               float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
+               float* corrected, void* stream);
+
 }  // namespace voronerf

@@ -4,7 +4,6 @@
 
 #include <algorithm>
 
-#include "common/hashed.h"
 #include "common/parallel.h"
 
 namespace voronerf {
@@ -12,12 +11,6 @@ namespace voronerf {
 namespace {
 
 constexpr int64_t kPixels = 256;  // of a task
-
-// 48 bits of hashes as a place below a number.
-int64_t draw_place(uint32_t key, int64_t below) {
-  const double fraction = static_cast<double>(hashed(key, 0)) + static_cast<double>(hashed(key, 1)) * 0x1p-24;
-  return static_cast<int64_t>(fraction * static_cast<double>(below));
-}
 
 }  // namespace
 

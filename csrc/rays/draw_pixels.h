@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "common/hashed.h"
+
 namespace voronerf {
 
 struct DrawPixelsInputs {
@@ -16,7 +18,14 @@ struct DrawPixelsInputs {
   int64_t b;
 };
 
+// 48 bits of hashes as a place below a number.
+VN_HD int64_t draw_place(uint32_t key, int64_t below) {
+  const double fraction = static_cast<double>(hashed(key, 0)) + static_cast<double>(hashed(key, 1)) * 0x1p-24;
+  return static_cast<int64_t>(fraction * static_cast<double>(below));
+}
+
 // pixels: [b]. uniforms: [b,3], in [0, 1).
 void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, int threads);
+void draw_pixels_cuda(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, void* stream);
 
 }  // namespace voronerf

@@ -7,6 +7,7 @@
 
 #include <cstdint>
 
+#include "common/hd.h"
 #include "common/isa.h"
 
 namespace voronerf {
@@ -35,17 +36,21 @@ struct MarchInputs {
 // Strata of a word of the mask.
 constexpr int64_t kMarchWord = 32;
 
-static inline int64_t march_words(int64_t s) {
+VN_HD int64_t march_words(int64_t s) {
   return (s + kMarchWord - 1) / kMarchWord;
 }
 
 // mask: [r, march_words(s)], bit i of word w for stratum 32 w + i. offsets: [r+1], none above capacity.
 void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, Isa isa,
                           int threads);
+void march_rays_count_cuda(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, void* stream);
 
 // rows: length of ray_index, depths, deltas and positions [rows,3], at least offsets[r]; what is beyond that becomes 0.
 void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,
                          int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
                          int threads);
+void march_rays_fill_cuda(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,
+                          int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop,
+                          void* stream);
 
 }  // namespace voronerf

@@ -20,6 +20,12 @@ inline float atomicAdd(float* to, float value) {
 inline int atomicMax(int* to, int value) {
   return vn_change_atomically(to, [&](int before) { return std::max(before, value); });
 }
+inline unsigned atomicMin(unsigned* to, unsigned value) {
+  return vn_change_atomically(to, [&](unsigned before) { return std::min(before, value); });
+}
+inline float atomicExch(float* to, float value) {
+  return vn_change_atomically(to, [&](float) { return value; });
+}
 inline unsigned atomicOr(unsigned* to, unsigned value) {
   return vn_change_atomically(to, [&](unsigned before) { return before | value; });
 }

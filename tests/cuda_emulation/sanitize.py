@@ -28,6 +28,9 @@ class Memory:
     def is_contiguous(self):
         return True
 
+    def is_neg(self):
+        return False
+
     def data_ptr(self):
         return self.array.ctypes.data
 
@@ -145,6 +148,41 @@ def step(module):
     rule, gradient = module.SparseAdam(0.01, 0.9, 0.99, 1e-8, False), floats(700)
     gradient[::3] = 0
     module.sparse_adam(rule, *every((gradient, floats(700), floats(700), floats(700))), 700, gpu)
+    rules = [module.AdamRule(at(floats(1)), at(floats(1)), 0.9, 0.99, 1e-8, dense) for dense in (True, False)] * 21
+    tensors = [[floats(n) for n in (1100, 33) * 21] for _ in range(4)]
+    guard = module.AdamGuard(*every((floats(1),)), 9.0, *every([floats(1) for _ in range(4)]))
+    module.adam(rules, guard, *map(every, tensors), [1100, 33] * 21, at(unwritten(84)), gpu)
+    marched(module, 7, 70)
+    ends, first = np.cumsum(RANDOM.integers(1, 9, 40)), RANDOM.integers(0, 1, 99).astype(np.int32)
+    drawn, uniforms = np.full(300, -7777), unwritten(300, 3)
+    given = module.DrawPixelsInputs(*every((integers(5), ends, ends - 9, first)), 3, int(ends[-1]), 300)
+    module.draw_pixels(given, *every((drawn, uniforms)), gpu)
+    written(uniforms)
+    rows, result = RANDOM.integers(-1, 61, 700).astype(np.int32), unwritten(60)
+    given = every((floats(60), rows, floats(700), result, occupied))
+    module.update_occupancy(*given, 60, 700, 0.9, 0.5, gpu)
+    written(result)
+    assert (occupied == (result >= 0.5)).all()
+
+
+def marched(module, r, s):
+    """Rays through a grid of which half of the cells are taken, cut at 90 samples in 100 rows."""
+    gpu, box, words = module.Cuda(0, 0), np.array([[0, 0, 0], [1, 1, 1]], np.float32), -(-s // 32)
+    for sphere, start, capacity in ((None, None, 90), (floats(4) + 1, RANDOM.integers(0, s, r).astype(np.int32), 9999)):
+        rays = every((floats(r, 3), floats(r, 3) - 0.5, floats(r) / 9, floats(r) + 1))
+        taken, drawn = RANDOM.integers(0, 2, (3, 4, 5), dtype=np.uint8), (None, integers(3))
+        if start is None:
+            drawn = floats(r, s), None
+        space = module.MarchSpace(at(sphere), None)
+        given = module.MarchInputs(*rays, *every((taken, box, *drawn, start)), r, s, 3, 4, 5, False, s // 2, space)
+        mask, offsets = unwritten(r, words, dtype=np.int32), unwritten(r + 1, dtype=np.int32)
+        module.march_rays_count(given, *every((mask, offsets)), capacity, gpu)
+        rows = max(int(offsets[-1]), 100)
+        assert (np.diff(offsets) >= 0).all() and offsets[-1] <= capacity
+        results = [unwritten(rows, dtype=np.int32), unwritten(rows), unwritten(rows), unwritten(rows, 3)]
+        results.append(unwritten(r, dtype=np.int32))
+        module.march_rays_fill(given, *every((mask, offsets)), rows, *every(results), gpu)
+        written(offsets, *results)
 
 
 def rendered(module, offsets, background):

@@ -15,7 +15,8 @@ HERE = Path(__file__).resolve().parent
 OPERATIONS = (
     *("nearest_centre", "locate_cell", "draw_cell", "cell_sort", "composite", "frequency_encode", "integrated_encode"),
     *("hash_encode", "spherical_harmonics", "resample", "grouped_linear", "grouped_mlp", "routed_mlp"),
-    *("sparse_adam", "observe_occupancy", "pixel_rays", "render_loss"),
+    *("sparse_adam", "observe_occupancy", "pixel_rays", "render_loss", "march_rays"),
+    "update_occupancy",
 )
 """Those that have CUDA kernels."""
 BUGS = [

@@ -10,8 +10,10 @@ from helpers import same
 
 import voronerf
 from voronerf import VoronoiDiagram
+from voronerf.native import draw_pixels, sparse_adam
 from voronerf.native.cell_sort import WAYS
 from voronerf.native.cell_sort import sort as sort_cells
+from voronerf.reference import draw_pixels as draw_pixels_reference
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)
@@ -102,3 +104,60 @@ def test_cell_sort_keeps_cells_that_are_none_at_the_ends(way, k):
     keys = cells.clamp(-1, k)
     assert torch.equal(order.long(), keys.sort(stable=True).indices)
     assert torch.equal(offsets, (keys[None] < torch.arange(k + 1)[:, None]).sum(1).int())
+
+
+def test_draw_pixels():
+    lengths = torch.randint(1, 9, (70,))
+    runs = draw_pixels_reference.Runs.of(torch.arange(70) * 10, lengths)
+    for below, given in ((10**10, None), (runs.total, runs)):
+        for count in (0, 1, 300):
+            arguments = torch.randint(-(2**31), 2**31, (1,), dtype=torch.int32), count, below, given
+            expected = draw_pixels_reference.draw_pixels(*arguments)
+            assert same(draw_pixels.draw_pixels(*arguments), expected)
+
+
+def adam_on_both(count, *, scale=None, spoilt=None, limit=1e18):
+    """Steps of parameters, every second of which is updated by entries, beside the CPU's; one of them is spoilt."""
+    sizes = [(7 * number) % 1030 + 1 for number in range(count)]
+    rates, betas, epsilon = torch.tensor(0.01), (0.9, 0.99), 1e-6
+    every = [number % 2 == 0 for number in range(count)]
+    found = [[torch.randn(n) for n in sizes], [torch.zeros(n) for n in sizes], [torch.zeros(n) for n in sizes]]
+    steps = [torch.zeros(()) for _ in sizes]
+    judged = sparse_adam.Judged(torch.zeros(()), torch.zeros(()), torch.zeros(()))
+    expected = [[tensor.double() for tensor in kind] for kind in found]
+    done = 0
+    for step in range(3):
+        gradients = [torch.randn(n) * (torch.rand(n) < 0.5) for n in sizes]
+        loss = torch.tensor(torch.nan if spoilt == "loss" and step == 1 else 0.5)
+        if isinstance(spoilt, int) and step == 1:
+            gradients[spoilt][-1] = 2 * limit
+        given = gradients if scale is None else [gradient * scale for gradient in gradients]
+        rules = [sparse_adam.Rule(rates, at, *betas, epsilon, dense) for at, dense in zip(steps, every)]
+        sparse_adam.adam_on_device(rules, given, *found, loss=loss, judged=judged, scale=scale, limit=limit)
+        left_out = step == 1 and spoilt is not None
+        assert bool(judged.found) == left_out and float(judged.in_a_row) == left_out
+        if left_out:
+            continue
+        done += 1
+        rate = 0.01 * (1 - betas[1] ** done) ** 0.5 / (1 - betas[0] ** done)
+        for dense, gradient, parameter, mean, square in zip(every, gradients, *expected):
+            present = (gradient != 0) | dense
+            mean[present] = (betas[0] * mean + (1 - betas[0]) * gradient)[present]
+            square[present] = (betas[1] * square + (1 - betas[1]) * gradient.double().square())[present]
+            moved = rate * mean / (square.sqrt() + epsilon * (1 - betas[1] ** done) ** 0.5)
+            parameter[present] -= moved[present]
+    assert all(float(step) == done for step in steps) and float(judged.skipped) == 3 - done
+    for kind, wanted in zip(found, expected):
+        torch.testing.assert_close(kind, [tensor.float() for tensor in wanted], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 40, 83])
+def test_adam_is_that_of_the_formula(count):
+    adam_on_both(count)
+    adam_on_both(count, scale=torch.tensor(1024.0))
+
+
+@pytest.mark.parametrize("spoilt", ["loss", 0, 44])
+def test_adam_leaves_out_a_step_that_is_not_finite(spoilt):
+    adam_on_both(45, spoilt=spoilt)
+    adam_on_both(45, spoilt=spoilt, limit=torch.inf if spoilt == "loss" else 1e3)

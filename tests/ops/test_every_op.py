@@ -213,12 +213,18 @@ def columns(tensor):
     return tensor.mT.contiguous().mT if tensor.dim() > 1 else tensor
 
 
+def negated(tensor):
+    """The same values in a view with the negative bit, as ``.conj().imag`` gives; memory holds them negated."""
+    return torch._neg_view(-tensor) if tensor.is_floating_point() else tensor
+
+
 @every_op
-def test_any_strides(device, backend, name):
+def test_any_view(device, backend, name):
+    """Values count, and not how memory holds them."""
     run, tensors = prepare(name, backend, device)
     given = tensors(33)
     expected = results(run, given)
-    for form in (strided, columns):
+    for form in (strided, columns, negated):
         spread = lambda tensor, form=form: form(tensor.detach()).requires_grad_(tensor.requires_grad)  # noqa: E731
         assert_close(results(run, tree_map_only(Tensor, spread, given)), expected)
 

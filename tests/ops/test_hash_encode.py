@@ -153,6 +153,16 @@ def test_a_table_for_each_cell(device, backend):
         torch.testing.assert_close(found[rows], hash_encode(x[rows], table, grid, backend=backend), rtol=0, atol=1e-6)
 
 
+def test_gradients_of_a_half_table_are_summed_in_float32(device, backend):
+    grid = GRIDS["one level"]
+    table = features(grid, torch.bfloat16).to(device).requires_grad_()
+    need("hash_encode", backend, device, torch.bfloat16)
+    places = torch.zeros(1000, 3, device=device)
+    out = hash_encode(places, table, grid, backend=backend)
+    (found,) = torch.autograd.grad(out.sum(), table)
+    assert float(found.float().sum()) == pytest.approx(1000, rel=0.01), "bfloat16 counts to 256"
+
+
 def test_outside_of_the_box_and_nan(device, backend):
     grid = HashGrid(levels=2, base=4, finest=8, box=BOX)
     table = features(grid).to(device)

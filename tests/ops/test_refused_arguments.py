@@ -11,6 +11,7 @@ from voronerf.layers import POSITIONS
 
 POINTS, TREE = torch.rand(4, 3), (torch.tensor([0, 2], dtype=torch.int32), torch.tensor([-1, -2], dtype=torch.int32))
 GRID = torch.rand(2, 2, 2)
+ONE_LAYER = {"weights": [torch.rand(1, 1, 3)], "biases": [None]}
 CELLS = torch.zeros(4, dtype=torch.int32)
 
 
@@ -46,6 +47,7 @@ def network(**given):
         ),
         (TypeError, "composite: background must be a tensor, got str", lambda: composite(background="x")),
         (TypeError, "grouped_mlp: layers must be an MLP, got NoneType", lambda: network(layers=None)),
+        (TypeError, "grouped_mlp: features must be a tensor, got list", lambda: network(**ONE_LAYER, features=[1.0])),
         (
             ValueError,
             "frequency_encode: octaves must be at most 127, got 3000",

@@ -98,5 +98,12 @@ def test_refuses_what_makes_no_sense():
         sparse_adam(p, g, m, v, step=0, learning_rate=0.1)
     with refused(ValueError, "sparse_adam: betas must lie in [0, 1), got (0.9, 1.0)"):
         sparse_adam(p, g, m, v, **rule, betas=(0.9, 1.0))
+    for betas in (0.9, (0.9,), "ab", {0.9, 0.99}):
+        with refused(TypeError, "sparse_adam: betas must be a pair of numbers, got ..."):
+            sparse_adam(p, g, m, v, **rule, betas=betas)
+    with refused(TypeError, "sparse_adam: betas must be a number, got Tensor"):
+        sparse_adam(p, g, m, v, **rule, betas=(0.9, torch.tensor(0.9)))
+    with refused(ValueError, "sparse_adam: square must be a tensor of its own (clone), got a negative view"):
+        sparse_adam(p, g, m, torch._neg_view(v), **rule)
     with refused(ValueError, "sparse_adam: epsilon must be positive, got 0.0"):
         sparse_adam(p, g, m, v, **rule, epsilon=0.0)

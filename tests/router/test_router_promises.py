@@ -99,16 +99,6 @@ def test_what_does_not_fuse_is_refused_with_its_line(step: Any, says: str) -> No
         torch.set_grad_enabled(before)
 
 
-def test_a_network_that_could_fuse_is_said_once_where_the_router_is_called() -> None:
-    router = VoronoiRouter(SkipNet(), centres(), coords="first3")
-    with pytest.warns(UserWarning, match=r"SkipNet.forward runs grouped; .* fuse=True\) runs it") as said:
-        for n in (50, 60):
-            router(uniform((n,), 15))
-            router(uniform((n,), 15).requires_grad_())
-    assert [warning.filename for warning in said] == [__file__]
-    assert router.explain() == "forward: grouped"
-
-
 def test_fused_networks_follow_parameters(generator: torch.Generator) -> None:
     x = torch.rand(60, 15, generator=generator) * 2 - 1
     router = perturb(VoronoiRouter(SkipNet(), centres(), coords="first3", fuse=True), generator)

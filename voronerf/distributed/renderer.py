@@ -28,7 +28,6 @@ from voronerf.rendering.renderer import RenderedImage, Renderer
 from voronerf.rendering.sampling import NEARBY, stratified_depths
 from voronerf.rendering.volume import weaken_near
 from voronerf.router import VoronoiRouter
-from voronerf.router.fused import routed_arguments
 
 #: Rays of a picture at a time: no ray ends at the first surface, since other ranks do not know it in time.
 PICTURE_CHUNK = 16_384
@@ -223,7 +222,7 @@ class RankRenderer(Renderer):
         scale = float(cast(Any, field.module).density_scale)
         cells = self.sharing.diagram.locate(march.positions, backend=self.backend)
         samples = ray_runs.own_samples(march, cells, self._numbers, bent=self.contraction is not None)
-        routed = routed_arguments(field, samples.positions, rays.directions, samples.ray_index)
+        routed = field.table_arguments(samples.positions, rays.directions, samples.ray_index)
         assert routed is not None
         networks = ray_runs.Networks(routed, samples.cells)
         sums, density = ray_runs.run_sums(networks.out, samples, scale)

@@ -11,10 +11,10 @@ from voronerf.reference.draw_pixels import Runs
 
 def draw_pixels(seed: Tensor, count: int, below: int, runs: Runs | None) -> tuple[Tensor, Tensor]:
     """Pixels, and three uniform numbers for each; see ``voronerf.reference.draw_pixels``."""
-    pixels, uniforms = torch.empty(count, dtype=torch.int64), torch.empty(count, 3)
+    pixels, uniforms = seed.new_empty(count, dtype=torch.int64), seed.new_empty(count, 3, dtype=torch.float32)
     ends, shift, first, bits, _ = (None, None, None, 0, below) if runs is None else runs
     given = native.compiled.DrawPixelsInputs(
         seed=seed, ends=ends, shift=shift, first=first, bits=bits, below=below, b=count
     )
-    native.compiled.draw_pixels(given, pixels, uniforms, native.cpu())
+    native.compiled.draw_pixels(given, pixels, uniforms, native.machine(seed))
     return pixels, uniforms

@@ -42,7 +42,7 @@ def march_rays(
     return March(offsets, *_fill(*tensors, mask, offsets, *rest, rows))
 
 
-@custom_op("march_rays_native_count", devices=("cpu",))
+@custom_op("march_rays_native_count")
 def _count(
     origins: Tensor,
     directions: Tensor,
@@ -66,10 +66,10 @@ def _count(
     given = _inputs(
         origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
     )
-    native.compiled.march_rays_count(given, mask, offsets, capacity, native.cpu())
+    native.compiled.march_rays_count(given, mask, offsets, capacity, native.machine(near))
 
 
-@custom_op("march_rays_native_fill", devices=("cpu",))
+@custom_op("march_rays_native_fill")
 def _fill(
     origins: Tensor,
     directions: Tensor,
@@ -95,7 +95,7 @@ def _fill(
     given = _inputs(
         origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
     )
-    native.compiled.march_rays_fill(given, mask, offsets, rows, *results, native.cpu())
+    native.compiled.march_rays_fill(given, mask, offsets, rows, *results, native.machine(near))
 
 
 def _inputs(

@@ -20,13 +20,14 @@ def update_occupancy(
     return remembered, occupied
 
 
-@custom_op("update_occupancy_native", devices=("cpu",))
+@custom_op("update_occupancy_native")
 def _update(
     density: Tensor, cells: Tensor, values: Tensor, decay: float, threshold: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
     remembered, occupied = density.new_empty(density.shape), density.new_empty(density.shape, dtype=torch.bool)
     yield remembered, occupied
     n, q = density.numel(), cells.shape[0]
-    results = remembered, occupied.view(torch.uint8)
-    if not native.compiled.update_occupancy(density, cells, values, *results, n, q, decay, threshold, native.cpu()):
+    given = density, cells, values, remembered, occupied.view(torch.uint8), n, q, decay, threshold
+    # On CUDA numbers that are not those of a cell are left out; None is no complaint.
+    if native.compiled.update_occupancy(*given, native.machine(density)) is False:
         check_range("update_occupancy", "cells", cells, n)

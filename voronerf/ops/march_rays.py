@@ -21,7 +21,7 @@ from voronerf.reference.march_rays import March
 
 _OP = backends.declare(
     "march_rays",
-    native=Implementation(("cpu",), (torch.float32,)),
+    native=Implementation(EVERYWHERE, (torch.float32,)),
     warp=Implementation(EVERYWHERE, (torch.float32,)),
 )
 _SPACINGS = ("linear", "disparity")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from voronerf.checks import FLOATS, INDEX, check_dtype, check_same_dtype, check_shape
+from voronerf.checks import FLOATS, INDEX, check_dtype, check_same_dtype, check_shape, check_tensor
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 
 
@@ -71,6 +71,7 @@ def _check_directions(
 def _check_features(op: str, features: Tensor | None, layers: MLP, sizes: dict[str, int]) -> None:
     if layers.grid is None:
         if features is not None:
+            check_tensor(op, "features", features)
             raise ValueError(f"{op}: features must be None for layers without a hash grid, got {list(features.shape)}")
         return
     if features is None:
@@ -78,5 +79,6 @@ def _check_features(op: str, features: Tensor | None, layers: MLP, sizes: dict[s
     if sizes["p"] != 3:
         raise ValueError(f"{op}: positions must have 3 features where they are hashed, got {sizes['p']}")
     shape = layers.grid.table_shape
+    check_tensor(op, "features", features)
     check_shape(op, "features", features, ("k", *shape) if features.dim() == 3 else shape, sizes)
     check_dtype(op, "features", features)

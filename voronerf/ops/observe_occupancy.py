@@ -7,7 +7,15 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import check_count, check_dtype, check_number, check_same_device, check_same_dtype, check_shape
+from voronerf.checks import (
+    check_count,
+    check_dtype,
+    check_number,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+    check_writable,
+)
 
 _OP = backends.declare(
     "observe_occupancy",
@@ -81,8 +89,7 @@ def observe_occupancy(
     check_count(_OP, "density", density.numel())
     check_count(_OP, "positions", sizes["m"])
     for name, grid in (("density", density), ("occupied", occupied)):
-        if not grid.is_contiguous():
-            raise ValueError(f"{_OP}: {name} must be contiguous, got strides {grid.stride()}")
+        check_writable(_OP, name, grid)
     if density.numel() < 1:
         raise ValueError(f"{_OP}: density must have at least one cell, got {list(density.shape)}")
     for name, number in (("decay", decay), ("threshold", threshold), ("hidden", hidden)):

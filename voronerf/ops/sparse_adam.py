@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import check_dtype, check_integer, check_number, check_same_device, check_tensor
+from voronerf.checks import check_dtype, check_integer, check_number, check_same_device, check_tensor, check_writable
 
 _OP = backends.declare(
     "sparse_adam",
@@ -75,14 +75,18 @@ def sparse_adam(
         check_dtype(_OP, name, tensor, (torch.float32,))
         if tensor.shape != parameter.shape:
             raise ValueError(f"{_OP}: {name} must have shape {list(parameter.shape)}, got {list(tensor.shape)}")
-        if name != "gradient" and not tensor.is_contiguous():
-            raise ValueError(f"{_OP}: {name} must be contiguous, got strides {tensor.stride()}")
+        if name != "gradient":
+            check_writable(_OP, name, tensor)
     check_same_device(_OP, **tensors)
     check_integer(_OP, "step", step, 1)
     check_number(_OP, "learning_rate", learning_rate)
     check_number(_OP, "epsilon", epsilon)
-    if not all(0 <= beta < 1 for beta in betas):
-        raise ValueError(f"{_OP}: betas must lie in [0, 1), got {betas}")
+    if not isinstance(betas, (tuple, list)) or len(betas) != 2:
+        raise TypeError(f"{_OP}: betas must be a pair of numbers, got {betas!r:.60}")
+    for beta in betas:
+        check_number(_OP, "betas", beta)
+        if not 0 <= beta < 1:
+            raise ValueError(f"{_OP}: betas must lie in [0, 1), got {betas}")
     if not epsilon > 0:
         raise ValueError(f"{_OP}: epsilon must be positive, got {epsilon}")
     run = backends.resolve(_OP, backend=backend, device=parameter.device, dtype=torch.float32)

@@ -11,7 +11,7 @@ from voronerf.checks import INDEX, check_count, check_dtype, check_number, check
 
 _OP = backends.declare(
     "update_occupancy",
-    native=Implementation(("cpu",), (torch.float32,)),
+    native=Implementation(EVERYWHERE, (torch.float32,)),
     warp=Implementation(EVERYWHERE, (torch.float32,)),
 )
 

@@ -26,7 +26,7 @@ def interpolate(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor 
     low, high = torch.tensor(grid.box, dtype=dtype, device=positions.device)
     places = ((positions.to(dtype) - low) * (1 / (high - low))).clamp(0, 1)
     start = 0 if cells is None else cells.long() * table.shape[-2]
-    rows = table.reshape(-1, grid.features)
+    rows = table.reshape(-1, grid.features).to(dtype)  # whose gradient is summed in this dtype
     return torch.cat([_level(places, rows, start, level, grid) for level in grid.rows], dim=1)
 
 
@@ -43,7 +43,7 @@ def _level(places: Tensor, rows: Tensor, start: Tensor | int, level: GridLevel, 
         for axis, one in enumerate(step):
             weight = weight * (inside[:, axis] if one else 1 - inside[:, axis])
         entry = start + level.offset + _entry(corner + corner.new_tensor(step), level)
-        total = total + weight[:, None] * rows[entry].to(total.dtype)
+        total = total + weight[:, None] * rows[entry]
     return total
 
 

@@ -20,7 +20,6 @@ from voronerf.rendering.marching import Marched, march_grid
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid
 from voronerf.rendering.volume import Rendered, weaken_near
 from voronerf.router import VoronoiRouter
-from voronerf.router.fused import routed_arguments
 
 
 class Comparison(NamedTuple):
@@ -127,7 +126,7 @@ def compare_samples(
         "hidden": HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
     }
     given = march.positions, rays.directions, march.ray_index
-    routed = routed_arguments(field, *given) if _learns_natively(renderer, march.positions) else None
+    routed = field.table_arguments(*given) if _learns_natively(renderer, march.positions) else None
     if routed is not None and _in_float32(routed):
         from voronerf.native.learn_rays import learn_rays  # which is there where the compiled module is
 

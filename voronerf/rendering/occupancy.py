@@ -24,7 +24,6 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
 from voronerf.router import VoronoiRouter
-from voronerf.router.fused import last_output
 
 CHUNK = 1 << 17  # points that a field evaluates at a time
 HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
@@ -294,5 +293,5 @@ def density_of(field: Field, points: Tensor) -> Tensor:
 def _density_alone(field: VoronoiRouter, points: Tensor) -> Tensor | None:
     """The density without the networks' colour, where they give it as the last of their outputs; else None."""
     radiance = getattr(type(field.module), "activate", None) is activate_radiance
-    raw = last_output(field, points) if radiance and field.by_table and field.blend == 0 else None
+    raw = field.last_output(points) if radiance and field.by_table and field.blend == 0 else None
     return None if raw is None else activate_density(field.module, raw[:, 0].float())

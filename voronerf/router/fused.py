@@ -1,6 +1,6 @@
-"""Networks as one operation: fields with a layer table, and any module whose ``forward`` is fixed.
+"""The network of a module whose ``forward`` is fixed, as one operation.
 
-Such a module is traced once (:mod:`voronerf.router.trace`). Later calls run its layers as one operation, and do the
+The module is traced once (:mod:`voronerf.router.trace`). Later calls run its layers as one operation, and do the
 steps before and behind them again as they were, on rows in the original order. There, samples may meet parameters that
 all cells share: tables, planes.
 
@@ -9,146 +9,26 @@ Letters: n samples, k cells.
 
 from __future__ import annotations
 
-import copy
-import functools
 import itertools
 import operator
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from collections.abc import Iterable
+from typing import Any
 
 import torch
-from torch import Tensor, fx, nn
+from torch import Tensor, fx
 from torch.fx.node import map_arg
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer, for_last_output
-from voronerf.ops.routed_mlp import of_one_dtype, routed_mlp
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.router.grouped import PerCell, for_all_cells
 from voronerf.router.grouping import Grouping, owned_parameters
 from voronerf.router.layout import Call, Results, map_tensors, map_tree
 from voronerf.router.trace import BEFORE, BEHIND, CELLS, LAYERS, Column, Linear, Trace, Unfusable
 
-if TYPE_CHECKING:
-    from voronerf.router.router import VoronoiRouter
 
-# Fields with a layer table --------------------------------------------------------------------------------------------
-
-
-@runtime_checkable
-class LayeredField(Protocol):
-    """A field that describes its network by a layer table, like :class:`voronerf.fields.NeRF`. It runs fused.
-
-    Where the table has a hash grid, the field has a parameter ``features``, [e, f], as :class:`voronerf.HashGridField`.
-
-    Examples:
-        >>> from voronerf import NeRF
-        >>> from voronerf.router import LayeredField
-        >>> isinstance(NeRF(width=16, depth=2), LayeredField)
-        True
-    """
-
-    layers: MLP
-
-    def linears(self) -> list[nn.Linear]:
-        """The linear layers in the table's order."""
-        ...
-
-    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Turns the table's outputs [n, out] into what the field returns."""
-        ...
-
-
-def described_by_table(field: nn.Module) -> bool:
-    """Whether the table, the weights and ``activate`` of a field describe all that it computes.
-
-    They do not if a class has its own ``forward`` without its own ``linears`` and ``activate``, or if hooks or
-    parametrisations, such as weight normalisation, change inputs, outputs or weights of layers.
-    """
-    kind: Any = type(field)
-    return "forward" not in vars(field) and _class_described_by_table(kind) and _is_plain(field)
-
-
-@functools.cache
-def _class_described_by_table(kind: type[nn.Module]) -> bool:
-    first = {}
-    for name in ("forward", "linears", "activate"):
-        first[name] = next((i for i, base in enumerate(kind.__mro__) if name in vars(base)), 0)
-    return first["forward"] >= max(first["linears"], first["activate"])
-
-
-def _is_plain(part: nn.Module) -> bool:
-    """Whether nothing is hooked into a module and its parts; the iterators of ``nn.Module`` take ten times as long."""
-    parts = part._modules
-    if part._forward_hooks or part._forward_pre_hooks or part._backward_hooks or part._backward_pre_hooks:
-        return False
-    return "parametrizations" not in parts and all(_is_plain(each) for each in parts.values() if each is not None)
-
-
-def run_table(
-    field: LayeredField,
-    k: int,
-    backend: str,
-    positions: Tensor,
-    directions: Tensor | None,
-    ray_index: Tensor | None,
-    where: dict[str, Any],
-) -> Tensor:
-    """What the networks of a field give before its ``activate``: [n, out]; ``where`` tells ``routed_mlp`` the cells."""
-    given: dict[str, Any] = {"directions": directions, "direction_index": ray_index, "backend": backend}
-    return routed_mlp(positions, **parameters_of_table(field, k), **given, **where)[0]
-
-
-def parameters_of_table(field: LayeredField, k: int) -> dict[str, Any]:
-    """The layers of a field with its parameters for k cells, as ``routed_mlp`` takes them."""
-    linears = field.linears()
-    # A parameter that all cells share has no dimension of cells; the operation takes one for each.
-    weights = [w if w.dim() == 3 else w.expand(k, -1, -1) for w in [layer.weight for layer in linears]]
-    biases = [b if b is None or b.dim() == 2 else b.expand(k, -1) for b in [layer.bias for layer in linears]]
-    features = None if field.layers.grid is None else field.features  # type: ignore[attr-defined]
-    return {"layers": field.layers, "weights": weights, "biases": biases, "features": features}
-
-
-def routed_arguments(
-    router: VoronoiRouter, positions: Tensor, directions: Tensor, ray_index: Tensor
-) -> dict[str, Any] | None:
-    """The arguments with which ``routed_mlp`` gives what ``router.raw`` does; None where that is not all it does."""
-    rule = router._coords_of_table(None, (positions,), {}) if router.by_table else positions
-    if rule is not None or router._shards is not None:
-        return None
-    given = {"positions": positions, **parameters_of_table(router.field, router.num_cells)}
-    if router.field.layers.uses_directions:
-        given.update(directions=directions, direction_index=ray_index)
-    where = router._where(positions, None)
-    if "centres" in where:
-        compared = of_one_dtype(positions, where["centres"], where["centre_weights"])
-        where.update(zip(("coords", "centres", "centre_weights"), compared))
-    return {**given, **where}
-
-
-def last_output(router: VoronoiRouter, positions: Tensor) -> Tensor | None:
-    """The last of the outputs of ``router.raw``, [n, width], without the layers that it does not need.
-
-    None where it needs the view direction, or ``router.raw`` does more than the networks.
-    """
-    table, kept = for_last_output(router.field.layers)
-    rule = router._coords_of_table(None, (positions,), {})
-    if table.uses_directions or rule is not None or router._shards is not None:
-        return None
-    given = parameters_of_table(router.field, router.num_cells)
-    given.update({name: [given[name][i] for i in kept] for name in ("weights", "biases")}, layers=table)
-    return routed_mlp(positions, **given, backend=router.backend, **router._where(positions, None))[0]
-
-
-def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The arguments for a field's own ``forward``: a direction for each sample, in the place of one for each ray."""
-    names = ("positions", "directions", "ray_index")
-    positions, directions, index = ((dict(zip(names, args)) | kwargs).get(name) for name in names)
-    if directions is None or index is None:
-        return args, kwargs
-    others = {name: value for name, value in kwargs.items() if name not in names}
-    return (positions, directions.index_select(0, index), None, *args[3:]), others
-
-
-# Modules with a fixed forward -----------------------------------------------------------------------------------------
+def fuse(call: Call, given: list[Tensor]) -> Program:
+    """The fused way of a call, traced for the first cell on ``ROWS`` rows of its arguments, or raises Unfusable."""
+    return Program(call, given)
 
 
 class Program:
@@ -162,7 +42,10 @@ class Program:
         Unfusable: For a step that is no such network, or that cannot be done again for other samples.
     """
 
+    name, why = "fused", ""
+
     def __init__(self, call: Call, given: list[Tensor]) -> None:
+        self._module = call.module
         trace = Trace(call, given)
         self._n, self._inputs, self._parameters = trace.n, trace.inputs, trace.parameters
         self._result, self._outputs = trace.result, trace.outputs
@@ -190,12 +73,6 @@ class Program:
         self._make_table(trace, returned)
         for node in nodes:
             node.meta.pop("value", None)
-
-    def with_parameters_of(self, module: nn.Module) -> Program:
-        """The same for a copy of the module, with parameters of its own."""
-        copied = copy.copy(self)
-        copied._owned = [(owner, name) for owner, name, _ in owned_parameters(module)]
-        return copied
 
     def _make_table(self, trace: Trace, returned: dict[fx.Node, list[Column]]) -> None:
         """The table of the layers that some values come from. Layers read others, and blocks of values, whole."""
@@ -239,13 +116,17 @@ class Program:
 
     # Running ----------------------------------------------------------------------------------------------------------
 
-    def run(self, inputs: Sequence[Tensor], grouping: Grouping) -> Results:
-        """The method's results for arguments in the original order, or sorted where the grouping has ``rows``."""
+    def run(self, call: Call, grouping: Grouping) -> Results:
+        """The method's results, in the order of the call, but for entries and placeholders."""
+        order = grouping if grouping.rows is not None or not call.layout.n else None
+        inputs, owned = call.arranged(order), self._owned
+        if call.module is not self._module:  # a copy of the module, with parameters of its own
+            owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         n = inputs[0].shape[0]
         values: dict[fx.Node, Any] = {self._n: n}
         values.update(zip(self._inputs, [x.clone() for x in inputs] if self._writes else inputs))
         for node, place in self._parameters.items():
-            owner, name = self._owned[place]
+            owner, name = owned[place]
             values[node] = owner._parameters[name]
         _run(self._before, values)
         blocks = [_joined([values[value].reshape(n, -1) for value in block]).contiguous() for block in self._blocks]
@@ -260,7 +141,7 @@ class Program:
         for value, shape, start, stop in self._values:
             values[value] = raw[:, start:stop].reshape(n, *shape)
         _run(self._behind, values)
-        return Results(self._result, [values[value] for value in self._outputs])
+        return Results(self._result, [values[value] for value in self._outputs], order)
 
     def _stacked(self, values: dict[fx.Node, Any], k: int) -> tuple[list[Tensor], list[Tensor | None]]:
         """Weights [k, o, i] and biases [k, o] of the table, in its order."""

@@ -15,8 +15,8 @@ import inspect
 import linecache
 import os
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -313,49 +313,89 @@ class GroupedRun(TorchFunctionMode):
         return result
 
 
-def run_grouped(call: Call, given: list[Tensor], grouping: Grouping, piece: int) -> tuple[Results, int]:
-    """A module's results for sorted rows of all cells, and the bytes of the largest tensor of rows that was made.
+class Way(Protocol):
+    """How the calls of a kind are carried out.
 
-    On a CPU it runs on pieces of so many rows, so that the cache holds their tensors. Raises :class:`Ungroupable`.
+    Attributes:
+        name: "fused", "grouped" or "cell by cell".
+        why: What stands in the way of a faster one; empty for nothing.
     """
-    parts = grouping.parts(piece) if grouping.device.type == "cpu" else [grouping]
-    # Parameters are split once for all parts: their gradient is then put together once, where that of a slice would
-    # fill a tensor of all cells for each part. Parts of one cell have the same piece.
-    sizes, pieces = {part.start: part.k for part in parts}, []
-    for p in cell_parameters(call.module):
-        pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
-    values, widest, tables = [], 1, dict[Any, Any]()
-    for part, rows in zip(parts, split_rows(given, [part.n for part in parts]), strict=True):
-        run = GroupedRun(part, tables)
-        for tensor in rows:
-            run.mark(tensor)
-        origin = part.start
-        stand_ins = {id(p): PerCell(own[origin], (p, origin)) for p, own in pieces}
-        with in_place_of_parameters(call.module, stand_ins), run:
-            values.append(call.run(rows))
-        if run.failed is not None:
-            raise run.failed
-        if any(isinstance(tensor, PerCell) for tensor in tensors_of(values[-1])):
-            raise Ungroupable("a result is made of parameters alone")
-        widest = max(widest, run.widest)
-    return Results.joined(values, [part.n for part in parts]), widest
+
+    name: str
+    why: str
+
+    def run(self, call: Call, grouping: Grouping) -> Results:
+        """The results of a call with the parameters of its module."""
+        ...
 
 
-def run_cells(call: Call, given: list[Tensor], bounds: list[tuple[int, int, int]], *, again: bool = False) -> Results:
-    """A module's results for sorted rows, one call for each (cell, first row, row behind the last).
+@dataclass
+class Grouped:
+    """The module's own ``forward`` once for the rows of all cells.
+
+    On a CPU it runs on pieces of rows, so that the cache holds their tensors.
+    """
+
+    piece: int = 1 << 16  # rows
+    name: str = "grouped"
+    why: str = ""
+    widest: int = 1  # bytes of the largest tensor of rows that the last call made
+
+    def run(self, call: Call, grouping: Grouping) -> Results:
+        """Results in the order of the grouping; raises :class:`Ungroupable`."""
+        given = call.arranged(grouping)
+        parts = grouping.parts(self.piece) if grouping.device.type == "cpu" else [grouping]
+        # Parameters are split once for all parts: their gradient is then put together once, where that of a slice would
+        # fill a tensor of all cells for each part. Parts of one cell have the same piece.
+        sizes, pieces = {part.start: part.k for part in parts}, []
+        for p in cell_parameters(call.module):
+            pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
+        values, widest, tables = [], 1, dict[Any, Any]()
+        for part, rows in zip(parts, split_rows(given, [part.n for part in parts]), strict=True):
+            run = GroupedRun(part, tables)
+            for tensor in rows:
+                run.mark(tensor)
+            origin = part.start
+            stand_ins = {id(p): PerCell(own[origin], (p, origin)) for p, own in pieces}
+            with in_place_of_parameters(call.module, stand_ins), run:
+                values.append(call.run(rows))
+            if run.failed is not None:
+                raise run.failed
+            if any(isinstance(tensor, PerCell) for tensor in tensors_of(values[-1])):
+                raise Ungroupable("a result is made of parameters alone")
+            widest = max(widest, run.widest)
+        self.widest = widest
+        return Results.joined(values, [part.n for part in parts], grouping)
+
+
+@dataclass
+class Loop:
+    """The module once for each cell that has samples: the definition of a routed call.
 
     Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a copy of the
     module, which keeps the cell's parameters.
     """
-    module, counts = call.module, [last - first for _, first, last in bounds]
-    pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
-    values = []
-    for (cell, _, _), part in zip(bounds, split_rows(given, counts), strict=True):
-        own: dict[int, Any] = {key: piece[cell] for key, piece in pieces.items()}
-        if again:
-            kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
-            values.append(replace(call, module=clone_module(module, kept | own)).run(part))
-            continue
-        with in_place_of_parameters(module, own):
-            values.append(call.run(part))
-    return Results.joined(values, counts)
+
+    why: str = ""
+    again: bool = False
+    open: bool = False  # another batch may be carried out in a faster way
+    name: str = "cell by cell"
+
+    def run(self, call: Call, grouping: Grouping) -> Results:
+        """Results in the order of the grouping."""
+        return self.on(call, grouping, grouping.occupied)
+
+    def on(self, call: Call, grouping: Grouping, bounds: list[tuple[int, int, int]]) -> Results:
+        """The same with one call of the module for each (cell, first row, row behind the last)."""
+        module, counts = call.module, [last - first for _, first, last in bounds]
+        pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
+        values = []
+        for (cell, _, _), part in zip(bounds, split_rows(call.arranged(grouping), counts), strict=True):
+            own: dict[int, Any] = {key: piece[cell] for key, piece in pieces.items()}
+            if self.again:
+                kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
+                values.append(replace(call, module=clone_module(module, kept | own)).run(part))
+                continue
+            with in_place_of_parameters(module, own):
+                values.append(call.run(part))
+        return Results.joined(values, counts, grouping)

@@ -279,9 +279,10 @@ class Results:
 
     value: Any  # of any structure
     tensors: list[Tensor]  # its tensors, [n, ...]
+    order: Grouping | None = None  # by which the rows are sorted; None for the order of the call
 
     @staticmethod
-    def joined(values: list[Any], counts: list[int]) -> Results:
+    def joined(values: list[Any], counts: list[int], order: Grouping | None) -> Results:
         """What a method returned for parts of the rows, as one."""
         parts = [tensors_of(value) for value in values]
         if any(len(part) != len(parts[0]) for part in parts):
@@ -292,12 +293,16 @@ class Results:
                     f"{_OP}: results must have a row for each sample, got {list(tensor.shape)} for {n} samples"
                 )
         joined = [torch.cat(pieces) if len(pieces) > 1 else pieces[0] for pieces in zip(*parts, strict=True)]
-        return Results(values[0], joined)
+        return Results(values[0], joined, order)
 
-    def restored(self, layout: Layout, grouping: Grouping | None) -> Any:
-        """The results with the leading dimensions of the call, from the order of a grouping, or None for the call's."""
-        tensors = self.tensors if grouping is None else [grouping.unsort(tensor) for tensor in self.tensors]
-        return rebuild(self.value, [layout.restore(tensor if layout.n else tensor[:0]) for tensor in tensors])
+    @property
+    def unsorted(self) -> list[Tensor]:
+        """The tensors in the order of the call."""
+        return self.tensors if self.order is None else [self.order.unsort(tensor) for tensor in self.tensors]
+
+    def restored(self, layout: Layout) -> Any:
+        """The results in the order of the call, with its leading dimensions."""
+        return rebuild(self.value, [layout.restore(rows if layout.n else rows[:0]) for rows in self.unsorted])
 
 
 def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+import weakref
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from voronerf.router.grouping import cell_parameters
 
@@ -22,18 +23,25 @@ def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, 
 
 
 def move_state(
-    optimizer: torch.optim.Optimizer, module: nn.Module, take: Callable[[Tensor], Tensor], k: int, fresh: Tensor | None
+    optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
 ) -> None:
     """Gives every cell the state that an optimiser has for its parent among k cells, or zero to those of ``fresh``.
 
     The parameters have their new shapes already. A state that is not of cells begins anew.
+
+    Args:
+        optimizer: Holds parameters of the module.
+        module: The routed module.
+        parents: int64 [new cells].
+        k: Cells before.
+        fresh: bool [new cells], the cells with newly drawn parameters; None for none.
     """
     lost = False
     for parameter in cell_parameters(module):
         state = optimizer.state.get(parameter, {})
         for key, value in state.items():
             if isinstance(value, Tensor) and value.shape == (k, *parameter.shape[1:]):
-                state[key] = take(value)
+                state[key] = value[parents.to(value.device)]
                 if fresh is not None:
                     state[key][fresh.to(value.device)] = 0
             else:
@@ -42,7 +50,7 @@ def move_state(
         _begin_anew(optimizer)
         warnings.warn(
             f"{_OP}.subdivide: the state of {type(optimizer).__name__} cannot be inherited by cells and begins anew",
-            stacklevel=5,
+            stacklevel=4,
         )
 
 
@@ -69,3 +77,30 @@ def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
     """Whether an optimiser has a state of another shape than a parameter."""
     state = optimizer.state.get(parameter, {})
     return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())
+
+
+def watch_optimizers(module: nn.Module, line: str) -> Any:
+    """Has an optimiser raise at its next step if it holds state of other cells than a module has.
+
+    Args:
+        module: The routed module, whose parameters have their new shapes already.
+        line: What to write, for the message.
+
+    Returns:
+        A handle whose ``remove()`` ends it.
+    """
+    watched = {id(parameter): weakref.ref(parameter) for parameter in cell_parameters(module)}
+
+    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched]
+        if any(watched[id(parameter)]() is parameter and is_stale(optimizer, parameter) for parameter in held):
+            raise ValueError(
+                f"{_OP}: optimizer ({type(optimizer).__name__}) holds the state of other cells than the router "
+                f"has; write {line}, or make the optimizer afterwards"
+            )
+        if held:
+            watched.clear()  # torch does not let a hook remove itself
+
+    handle = register_optimizer_step_pre_hook(check)
+    weakref.finalize(module, handle.remove)
+    return handle

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, cast
 
 import torch
@@ -17,12 +17,24 @@ from voronerf.backends import BACKENDS
 from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.blending import Mixture
-from voronerf.router.cells import check_module, fill_cell
-from voronerf.router.evaluate import Choices
-from voronerf.router.fused import LayeredField, described_by_table, each_direction, run_table
+from voronerf.diagram.subdivision import finer_diagram
+from voronerf.layers import for_last_output
+from voronerf.ops.routed_mlp import of_one_dtype, routed_mlp
+from voronerf.router.cells import (
+    check_module,
+    clone_module,
+    detach_results,
+    draw_parameters,
+    fill_cell,
+    plain_cell,
+    renew_cells,
+    stack_parameters,
+)
 from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
-from voronerf.router.shard import ShardedCells, evaluate_over_ranks
+from voronerf.router.optimizers import check_optimizer, drop_state, move_state, watch_optimizers
+from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
+from voronerf.router.ways import Choices, evaluate
 
 # Centres of a flat diagram beyond which it may look cells up by a grid of its own.
 _MANY = 256
@@ -30,7 +42,7 @@ Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
 
-class VoronoiRouter(ShardedCells):
+class VoronoiRouter(nn.Module):
     """k copies of a module, one for each cell of a Voronoi diagram; the copy of its cell evaluates each sample.
 
     ``router(...)`` takes the arguments of the module's ``forward`` and returns what it returns, in the same order and
@@ -125,8 +137,14 @@ class VoronoiRouter(ShardedCells):
         options = {"coords": coords, "assignment": assignment, "temperature": temperature, "layout": layout}
         lists = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
         _check_options(module, lists, **options, backend=backend, blend=blend)
+        super().__init__()
         own = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
-        super().__init__(module, own, share)
+        first = next(module.parameters(), None)
+        self.diagram = own if first is None or first.is_meta else own.to(first.device)
+        self.module: nn.Module = clone_module(module)
+        stack_parameters(self.module, own.num_cells, share)
+        self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
+        self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature, self.blend = assignment, temperature, blend
         self.backend, self.coords, self.fuse, self.layout = backend, coords, fuse, layout
         self.per_ray = None if per_ray is None else tuple(per_ray)
@@ -159,6 +177,148 @@ class VoronoiRouter(ShardedCells):
         for index, module in enumerate(modules):
             fill_cell(router.module, index, module, f"VoronoiRouter.from_modules: modules[{index}]")
         return router
+
+    # Cells ------------------------------------------------------------------------------------------------------------
+
+    @property
+    def num_cells(self) -> int:
+        """Cells of the diagram, networks of the router."""
+        return self.diagram.num_cells
+
+    def cell(self, index: int) -> nn.Module:
+        """A plain copy of one cell's module, with parameters of its own.
+
+        Raises:
+            IndexError: If there is no such cell.
+        """
+        return plain_cell(self.module, self._check_index("cell", index))
+
+    def load_cell(self, index: int, module: nn.Module) -> None:
+        """Copies the parameters of a plain module into one cell. Parameter objects and optimisers stay the same.
+
+        Raises:
+            IndexError: If there is no such cell.
+            ValueError: For parameters of other names or shapes, or buffers that differ from the shared ones.
+        """
+        fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
+
+    def _check_index(self, method: str, index: int) -> int:
+        if not -self.num_cells <= index < self.num_cells:
+            raise IndexError(f"VoronoiRouter.{method}: index must be below {self.num_cells}, got {index}")
+        return index
+
+    @torch.no_grad()
+    def subdivide(
+        self,
+        diagram: VoronoiDiagram | int,
+        parents: Tensor | None = None,
+        *,
+        optimizer: torch.optim.Optimizer | None = None,
+        inherit: bool = True,
+        points: Tensor | None = None,
+        weights: Tensor | None = None,
+        **split: Any,
+    ) -> Tensor:
+        """Replaces the diagram by a finer one; every new cell starts as a copy of its parent.
+
+        Parameters are copied from the parent and, with ``optimizer``, so is the state of Adam, AdamW, RAdam, SGD and
+        similar optimisers; others start afresh, with a warning. The parameter objects stay the same, so groups,
+        learning rates and schedules continue. A wrapper with parameters of its own, such as
+        ``DistributedDataParallel``, has to be made again.
+
+        Args:
+            diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children that
+                :func:`voronerf.split_diagram` gives each cell that has enough samples.
+            parents: int64 [new cells], the present cell that each new cell lies in; None for the cell that holds the
+                new centre.
+            optimizer: The optimiser that holds this router's parameters.
+            inherit: False draws new parameters for the children of every cell that is split, with moments of zero: the
+                ablation that shows ghosting.
+            points: [m, 3], samples in scene units, if ``diagram`` is a number of children.
+            weights: [m], the importance of the samples, by which the new cells are balanced.
+            **split: Further options of ``split_diagram``, such as cells, centres, min_samples.
+
+        Returns:
+            int64 [new cells], the parents.
+
+        Raises:
+            ValueError: If ``parents`` does not fit, ``points`` or ``weights`` are missing, or the module cannot draw
+                new parameters.
+            TypeError: If ``diagram`` is neither a diagram nor a number, or ``parents`` are not int64.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 1), torch.zeros(1, 3), coords="first3")
+            >>> optimizer = torch.optim.Adam(router.parameters())
+            >>> points, weights = torch.rand(500, 3), torch.rand(500)  # see SampleReservoir
+            >>> parents = router.subdivide(8, optimizer=optimizer, points=points, weights=weights)
+            >>> router.num_cells, router.module.weight.shape
+            (8, torch.Size([8, 1, 3]))
+        """
+        split = {"backend": self.backend, "generator": self.generator, **split}
+        check_optimizer(optimizer, self.module, "subdivide")
+        k = self.num_cells
+        finer, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
+        # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
+        new = torch.bincount(parents, minlength=k)[parents] > 1
+        fresh = None if inherit else draw_parameters(plain_cell(self.module, 0), len(new), self.generator)
+        renew_cells(self.module, parents, new, fresh)
+        self.diagram = copy.deepcopy(finer).to(self.diagram.centres.device)
+        if optimizer is not None:
+            move_state(optimizer, self.module, parents, k, None if fresh is None else new)
+        else:
+            self._watch_optimizers("router.subdivide(..., optimizer=optimizer)")
+        return parents
+
+    def _watch_optimizers(self, line: str) -> None:
+        """Has an optimiser with the state of other cells raise at its next step, and say which ``line`` to write."""
+        if self._watch is not None:
+            self._watch.remove()
+        self._watch = watch_optimizers(self.module, line)
+
+    def load_state_dict(
+        self,
+        state_dict: Mapping[str, Any],
+        strict: bool = True,
+        assign: bool = False,
+        *,
+        optimizer: torch.optim.Optimizer | None = None,
+    ) -> Any:
+        """Loads a state of any number of cells; the parameter objects stay, so an optimiser goes on with them.
+
+        Args:
+            state_dict: What ``state_dict()`` of a router around the same module gave.
+            strict: As of ``nn.Module``.
+            assign: As of ``nn.Module``; parameters are new objects then.
+            optimizer: The optimiser that holds this router's parameters. Where the number of cells changes, its state
+                begins anew, if its own ``load_state_dict`` does not follow. Without it an optimiser that has state of
+                the cells before raises at its next step.
+
+        Returns:
+            Missing and unexpected keys.
+
+        Raises:
+            ValueError: If the optimiser holds none of the router's parameters.
+        """
+        check_optimizer(optimizer, self.module, "load_state_dict")
+        result = super().load_state_dict(state_dict, strict, assign)
+        if optimizer is not None:
+            drop_state(optimizer)
+        return result
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Takes over the stored diagram first, so that parameters of any number of cells fit."""
+        if f"{prefix}diagram.centres" in state_dict:
+            diagram, k = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram."), self.num_cells
+            self.diagram = diagram.to(self.diagram.centres.device)
+            if diagram.num_cells != k:
+                parents = torch.zeros(diagram.num_cells, dtype=torch.int64)
+                renew_cells(self.module, parents, parents > 0)
+                self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    # Calls ------------------------------------------------------------------------------------------------------------
 
     @property
     def field(self) -> LayeredField:
@@ -234,11 +394,10 @@ class VoronoiRouter(ShardedCells):
         if not table.uses_directions:
             directions = ray_index = None
         mixture = None if raw else self._mixture(positions[:, :3] if coords is None else coords)
-        if self._shards is not None:
-            return self._run_over_ranks(raw, mixture, self._where(positions, coords), positions, directions, ray_index)
 
-        def run(*samples: Any) -> Any:
-            outputs = run_table(field, self.num_cells, self.backend, *samples)
+        def run(positions: Tensor, directions: Any, ray_index: Any, where: dict[str, Any]) -> Any:
+            given: dict[str, Any] = {"directions": directions, "direction_index": ray_index, "backend": self.backend}
+            outputs = routed_mlp(positions, **parameters_of_table(field, self.num_cells), **given, **where)[0]
             return outputs if raw else field.activate(outputs)
 
         own = run(positions, directions, ray_index, self._where(positions, coords))
@@ -251,6 +410,37 @@ class VoronoiRouter(ShardedCells):
         others = run(positions[mixture.rows], directions, ray_index, {"cells": mixture.cells})
         return mixture.mix(own[0], others[0]), mixture.mix(own[1], others[1])
 
+    def table_arguments(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any] | None:
+        """The arguments with which ``routed_mlp`` gives what :meth:`raw` does; None where that is not all it does.
+
+        Arguments are those of ``forward``.
+        """
+        if not self.by_table or self._coords_of_table(None, (positions,), {}) is not None:
+            return None
+        given = {"positions": positions, **parameters_of_table(self.field, self.num_cells)}
+        if self.field.layers.uses_directions:
+            given.update(directions=directions, direction_index=ray_index)
+        where = self._where(positions, None)
+        if "centres" in where:
+            compared = of_one_dtype(positions, where["centres"], where["centre_weights"])
+            where.update(zip(("coords", "centres", "centre_weights"), compared))
+        return {**given, **where}
+
+    def last_output(self, positions: Tensor) -> Tensor | None:
+        """The last of the outputs of :meth:`raw`, [n, width], without the layers that it does not need.
+
+        None where it needs the view direction, or :meth:`raw` does more than the networks.
+
+        Args:
+            positions: [n, 3] in scene units.
+        """
+        table, kept = for_last_output(self.field.layers)
+        if table.uses_directions or self._coords_of_table(None, (positions,), {}) is not None:
+            return None
+        given = parameters_of_table(self.field, self.num_cells)
+        given.update({name: [given[name][i] for i in kept] for name in ("weights", "biases")}, layers=table)
+        return routed_mlp(positions, **given, backend=self.backend, **self._where(positions, None))[0]
+
     def explain(self) -> str:
         """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
 
@@ -261,8 +451,9 @@ class VoronoiRouter(ShardedCells):
             >>> router.explain()
             'forward: not called yet'
         """
-        ways = self._choices.explain(("forward", *self.methods))
-        return ("forward: fused, by the layer table of the field" if self._by_table else ways) + self._explain_shards()
+        if self._by_table:
+            return "forward: fused, by the layer table of the field"
+        return self._choices.explain(("forward", *self.methods))
 
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
@@ -305,7 +496,7 @@ class VoronoiRouter(ShardedCells):
         call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
         with self._choices.lock:  # what stands in for the module's parameters does so for one call at a time
             mixture, grouping = self._mixture(positions), self._group(method, positions)
-            return evaluate_over_ranks(self._shards, call, grouping, mixture, self._choices, self.fuse)
+            return evaluate(call, grouping, mixture, self._choices, fused=self.fuse)
 
     def _mixture(self, positions: Tensor) -> Mixture | None:
         """The other cells that samples near borders are evaluated in too."""
@@ -337,7 +528,7 @@ class VoronoiRouter(ShardedCells):
         if self.num_cells == 1:
             return {}
         drawn = self.assignment == "stochastic" and self.training
-        if drawn or self._shards is not None or (diagram.depth == 1 and self.num_cells > _MANY):
+        if drawn or (diagram.depth == 1 and self.num_cells > _MANY):
             return {"cells": self.assign((positions[:, :3] if coords is None else coords).detach())}
         tables = {"centres": diagram.centres, "centre_weights": diagram.power, "coords": coords}
         if diagram.depth == 1:
@@ -345,7 +536,13 @@ class VoronoiRouter(ShardedCells):
         return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_assigned": None}
+        return {**self.__dict__, "_watch": None, "_assigned": None}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
+        detach_results(self, memo)
+        copied = memo[id(self)] = type(self).__new__(type(self))
+        copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
+        return copied
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
         self._choices.forget()

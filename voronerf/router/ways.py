@@ -8,13 +8,11 @@ module whose cells have parameters of their own, and results and gradients are c
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import os
 import threading
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +23,8 @@ from voronerf.backends import BackendUnavailable
 from voronerf.diagram.blending import Mixture
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.cells import clone_module
-from voronerf.router.fused import Program
-from voronerf.router.grouped import NoRandomness, Ungroupable, run_cells, run_grouped
+from voronerf.router.fused import fuse
+from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, in_place_of_parameters, keep_freed_memory
 from voronerf.router.layout import RAY, Call, Results, map_tensors, rebuild, tensors_of
 from voronerf.router.trace import ROWS, Unfusable
@@ -40,19 +38,6 @@ _KINDS = 256  # kinds of calls that are remembered
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
 
 
-@dataclass
-class Choice:
-    """How calls of a kind are carried out."""
-
-    way: str  # "fused", "grouped" or "cell by cell"
-    why: str = ""  # what stands in the way of a faster one
-    piece: int = 1 << 16  # rows that a grouped module runs on at once on a CPU
-    again: bool = False  # the module's code runs again in the backward pass
-    open: bool = False  # another batch may be carried out in a faster way
-    fusable: bool = False  # ``fuse=True`` would serve
-    program: Program | None = None  # the fused network
-
-
 class Choices:
     """What a router has found out about its module. Copies of a router begin anew."""
 
@@ -62,14 +47,13 @@ class Choices:
 
     def forget(self) -> None:
         """Begins anew, after a change of dtype, device or parameters' names."""
-        self.kinds: dict[Any, Choice] = {}
-        self.checked: set[Any] = set()  # kinds of calls with rays over ranks
+        self.kinds: dict[Any, Way] = {}
         self._said: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
-    def note(self, call: Call, choice: Choice) -> None:
+    def note(self, call: Call, name: str, why: str) -> None:
         """For :meth:`explain`: how a method was carried out."""
-        self._latest.setdefault(call.method, {})[choice.way] = choice.why
+        self._latest.setdefault(call.method, {})[name] = why
 
     def explain(self, methods: tuple[str, ...]) -> str:
         """How each method has been carried out so far, and why."""
@@ -88,7 +72,7 @@ class Choices:
         return Choices, ()
 
 
-def kind_of(call: Call, device: torch.device, fuse: bool) -> Any:
+def kind_of(call: Call, device: torch.device, fused: bool) -> Any:
     """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
 
     Numbers count by what they are only where they would go into a fused network.
@@ -101,7 +85,7 @@ def kind_of(call: Call, device: torch.device, fuse: bool) -> Any:
             ones = tuple(size == 1 for size in value.shape[:d])
             kind.append((tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad, ones))
         else:
-            by_value = (type(None), bool, str, int, float) if fuse else (type(None), bool, str)
+            by_value = (type(None), bool, str, int, float) if fused else (type(None), bool, str)
             kind.append(value if isinstance(value, by_value) else type(value))
     return tuple(kind)
 
@@ -109,80 +93,67 @@ def kind_of(call: Call, device: torch.device, fuse: bool) -> Any:
 # Carrying out ---------------------------------------------------------------------------------------------------------
 
 
-def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, *, fuse: bool) -> Any:
+def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, *, fused: bool) -> Any:
     """What a method returns for the samples of all cells (or two placeholders), some mixed with those of others."""
     if grouping.device.type == "cpu":
         keep_freed_memory()
-    choice = choose(call, grouping, choices, fuse)
-    results, choice = carry_out(call, grouping, choices, choice)
-    order = grouping if choice.program is None or not call.layout.n else None
-    own = results.restored(call.layout, order)
+    way = choose(call, grouping, choices, fused)
+    own = carry_out(way, call, grouping, choices).restored(call.layout)
     if mixture is None:
         return own
     entries, tensors = grouping.of_entries(mixture.rows, mixture.cells), tensors_of(own)
-    results, _ = carry_out(call, entries, choices, choice)
-    for i, tensor in enumerate(results.tensors):
-        tensors[i] = mixture.mix(tensors[i], entries.unsort(tensor.reshape(entries.n, -1)))
+    for i, tensor in enumerate(carry_out(way, call, entries, choices).unsorted):
+        tensors[i] = mixture.mix(tensors[i], tensor.reshape(entries.n, -1))
     return rebuild(own, tensors)
 
 
-def carry_out(call: Call, grouping: Grouping, choices: Choices, choice: Choice) -> tuple[Results, Choice]:
-    """Results sorted by cell; of a fused network in the original order, but for entries and placeholders."""
-    if choice.program is not None:
-        choices.note(call, choice)
-        rows = call.arranged(None if call.layout.n and grouping.rows is None else grouping)
-        return choice.program.run(rows, grouping), choice
-    if choice.way == "grouped" and grouping.k > 1:
+def carry_out(way: Way, call: Call, grouping: Grouping, choices: Choices) -> Results:
+    """The results of a way, or of the loop where a batch cannot be grouped."""
+    if isinstance(way, Grouped):
+        if grouping.k == 1:
+            choices.note(call, "the module itself", "there is one cell")
+            return Loop().run(call, grouping)
         try:
-            results, _ = run_grouped(call, call.arranged(grouping), grouping, choice.piece)
-            choices.note(call, choice)
-            return results, choice
+            results = way.run(call, grouping)
+            choices.note(call, way.name, way.why)
+            return results
         except Exception as error:
             lacking = (BackendUnavailable, MemoryError, torch.OutOfMemoryError)
             if isinstance(error, lacking) or "can't allocate memory" in str(error):
                 raise
             why = error if isinstance(error, Ungroupable) else f"its forward fails ({error})"
-            choice = replace(choice, way="cell by cell", why=f"for some batches, since {why}")
+            way = Loop(f"for some batches, since {why}")
     try:
-        results = run_cells(call, call.arranged(grouping), grouping.occupied, again=choice.again)
+        results = way.run(call, grouping)
     except Exception as error:
         if hasattr(error, "add_note") and len(call.layout.lead) > 1 and not call.layout.flat:  # since Python 3.11
             error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
         raise
-    if grouping.k == 1 and choice.way == "grouped":
-        choice = replace(choice, way="the module itself", why="there is one cell")
-    choices.note(call, choice)
-    if grouping.k > 1 and choice.why and call.layout.n >= _FEWEST:
-        choices.say_once(f"cells {call.method}", f"{call.name} runs cell by cell: {choice.why}")
-    return results, choice
+    choices.note(call, way.name, way.why)
+    if isinstance(way, Loop) and grouping.k > 1 and way.why and call.layout.n >= _FEWEST:
+        choices.say_once(f"cells {call.method}", f"{call.name} runs cell by cell: {way.why}")
+    return results
 
 
-def choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Choice:
+def choose(call: Call, grouping: Grouping, choices: Choices, fused: bool) -> Way:
     """How to carry out a call of this kind, found out if it is the first."""
-    layout, kind = call.layout, kind_of(call, grouping.device, fuse)
-    choice = choices.kinds.get(kind)
-    if choice is not None and not choice.open:
-        return choice
+    layout, kind = call.layout, kind_of(call, grouping.device, fused)
+    way = choices.kinds.get(kind)
+    if way is not None and not getattr(way, "open", False):
+        return way
     if layout.n < _FEWEST:
-        return Choice("cell by cell", f"for fewer than {_FEWEST} samples") if choice is None else choice
+        return Loop(f"for fewer than {_FEWEST} samples") if way is None else way
     call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is found out
     with torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else []):
         trial = Trial(call, grouping)
-        if choice is not None and not trial.is_groupable():
-            return choice
+        if way is not None and not trial.is_groupable():
+            return way
         if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
             check_rays(call)
-        found = admitted(trial, fuse)
+        found = admitted(trial, fused)
     if len(choices.kinds) >= _KINDS:
         choices.kinds.clear()
     choices.kinds[kind] = found
-    if found.fusable and all(known.fusable for known in choices.kinds.values()):
-        choices.say_once(
-            f"fuse {call.method}",
-            f"{call.name} runs grouped; its network is a layer table, and VoronoiRouter(..., fuse=True) runs it as one "
-            "operation, about 1.5 times as fast at width 64 and 65,536 samples, if its forward does the same in every "
-            "call",
-        )
     return found
 
 
@@ -190,14 +161,13 @@ def choose(call: Call, grouping: Grouping, choices: Choices, fuse: bool) -> Choi
 
 
 Outcome = tuple[Results, list[Tensor]]  # and gradients
-Way = Callable[["Trial", list[Tensor]], Results]
 
 
 class Trial:
     """A copy of a module and a few samples of a call, in cells of their own whose parameters differ."""
 
     def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
-        self.made_of, self.again, self.widest = (call, grouping), False, 1
+        self.made_of = call, grouping
         device = grouping.device
         picked = torch.arange(_TRIED, device=device) * call.layout.n // _TRIED
         cells = (torch.arange(_TRIED, device=device) * 7 % 5 // 2).int()
@@ -218,9 +188,9 @@ class Trial:
         self.call = replace(call, module=module, args=args, kwargs=kwargs)
 
     def run(self, way: Way) -> Results:
-        """The results of a way, with rows that are fresh for it."""
+        """The results of a way."""
         with NoRandomness():
-            return way(self, self.call.arranged(self.entries))
+            return way.run(self.call, self.entries)
 
     def outcome(self, way: Way) -> Outcome:
         """Results, and gradients of a weighted sum of them."""
@@ -238,7 +208,7 @@ class Trial:
             leaf.grad = None
         return results, gradients
 
-    def agrees(self, way: Way, expected: Outcome) -> bool:
+    def agrees(self, way: Way, loop: Way, expected: Outcome) -> bool:
         """Whether a way gives what the loop gives; where it does not, whether it does in float64.
 
         A deep network of fast sines makes its own rounding as large as its results.
@@ -247,45 +217,35 @@ class Trial:
             return True
         try:
             exact = Trial(*self.made_of, dtype=torch.float64)
-            exact.again = self.again
-            return _same(exact.outcome(way), exact.outcome(Trial.by_cells))
+            return _same(exact.outcome(way), exact.outcome(loop))
         except Exception:
             return False
-
-    def by_cells(self, given: list[Tensor]) -> Results:
-        """The loop."""
-        return run_cells(self.call, given, self.entries.occupied, again=self.again)
-
-    def grouped(self, given: list[Tensor]) -> Results:
-        """All cells at once."""
-        results, self.widest = run_grouped(self.call, given, self.entries, _TRIED)
-        return results
 
     def is_groupable(self) -> bool:
         """Whether the module runs for all cells at once on this batch, right or wrong."""
         try:
             with torch.no_grad():
-                self.run(Trial.grouped)
+                self.run(Grouped())
         except Exception:
             return False
         return True
 
-    def fused(self, expected: Outcome) -> Program:
+    def fused(self, loop: Way, expected: Outcome) -> Way:
         """The network as one operation; raises where something stands in the way."""
         with NoRandomness():
             rows = [rows[:ROWS] for rows in self.call.arranged(self.entries)]
-            program = Program(replace(self.call, module=self.made_of[0].module), rows)
-        if not self.agrees(lambda t, rows: program.with_parameters_of(t.call.module).run(rows, t.entries), expected):
+            way = fuse(replace(self.call, module=self.made_of[0].module), rows)
+        if not self.agrees(way, loop, expected):
             raise Unfusable("the traced network gives other results than its forward")
-        return program
+        return way
 
-    def check_rows(self) -> None:
+    def check_rows(self, loop: Loop) -> None:
         """Raises TypeError where results for samples change when others are left out."""
         bounds = [(cell, first, (first + last) // 2, last) for cell, first, last in self.entries.occupied]
         halves = [half for cell, a, b, c in bounds for half in ((cell, a, b), (cell, b, c))]
-        whole = self.run(Trial.by_cells)
-        apart = self.run(lambda trial, given: run_cells(trial.call, given, halves, again=trial.again))
-        if not all(map(agree, apart.tensors, whole.tensors)):
+        with NoRandomness():
+            apart = loop.on(self.call, self.entries, halves)
+        if not all(map(agree, apart.tensors, self.run(loop).tensors)):
             name = type(self.call.module).__name__
             raise TypeError(
                 f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when other "
@@ -311,42 +271,39 @@ def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Paramet
         return nn.Parameter(values, requires_grad=parameter.requires_grad)
 
 
-def admitted(trial: Trial, fuse: bool) -> Choice:
+def admitted(trial: Trial, fused: bool) -> Way:
     """The fastest way that gives what the loop gives, or an error where that must be the fused one."""
-    for trial.again in (False, True):
+    for loop in (Loop(), Loop(again=True)):
         try:
-            expected = trial.outcome(Trial.by_cells)
+            expected = trial.outcome(loop)
             break
         except Exception as error:  # perhaps its code runs again in the backward pass
             why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
     else:
-        return Choice("cell by cell", why)
-    if fuse:
+        return Loop(why)
+    if fused:
         try:
-            return Choice("fused", program=trial.fused(expected))
+            return trial.fused(loop, expected)
         except Exception as error:
-            trial.check_rows()
+            trial.check_rows(loop)
             why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
         raise ValueError(
             f"{_OP}: fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
         )
-    choice = Choice("cell by cell", again=trial.again)
     try:
-        if trial.agrees(Trial.grouped, expected):
-            piece = min(max(_PIECE * _TRIED // trial.widest, 1 << 10), 1 << 16)
-            choice = replace(choice, way="grouped", piece=piece)
-            with contextlib.suppress(Exception):
-                choice.fusable = bool(trial.fused(expected))
-            return choice
-        choice.why = "its forward on the samples of all cells gives other results than on those of one cell"
+        way = Grouped()
+        if trial.agrees(way, loop, expected):
+            way.piece = min(max(_PIECE * _TRIED // way.widest, 1 << 10), 1 << 16)
+            return way
+        loop.why = "its forward on the samples of all cells gives other results than on those of one cell"
     except BackendUnavailable:
         raise
     except Ungroupable as error:
-        choice.why, choice.open = str(error), error.of_batch
+        loop.why, loop.open = str(error), error.of_batch
     except Exception as error:
-        choice.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
-    trial.check_rows()
-    return choice
+        loop.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
+    trial.check_rows(loop)
+    return loop
 
 
 # Rays -----------------------------------------------------------------------------------------------------------------

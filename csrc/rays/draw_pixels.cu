@@ -1,0 +1,35 @@
+// The pixels of a training step on CUDA, a thread a pixel. The run of a place is looked for from the first that can
+// hold it, a few before, as on the CPU.
+#include "common/cuda_wrappers.h"
+#include "rays/draw_pixels.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kThreads = 128;
+
+__global__ void __launch_bounds__(kThreads)
+    draw_pixels_kernel(DrawPixelsInputs in, int64_t* __restrict__ pixels, float* __restrict__ uniforms) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= in.b) return;
+  const uint32_t key = hash_key(*in.seed, i);
+  int64_t place = draw_place(key, in.below);
+  for (int channel = 0; channel < 3; ++channel) uniforms[3 * i + channel] = hashed(key, 2 + channel);
+  if (in.ends != nullptr) {
+    int64_t run = in.first[place >> in.bits];
+    while (in.ends[run] <= place) ++run;
+    place += in.shift[run];
+  }
+  pixels[i] = place;
+}
+
+}  // namespace
+
+void draw_pixels_cuda(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, void* stream) {
+  if (in.b == 0) return;
+  const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(in.b, kThreads));
+  VN_LAUNCH(draw_pixels_kernel, blocks, kThreads, 0, stream, in, pixels, uniforms);
+}
+
+}  // namespace voronerf

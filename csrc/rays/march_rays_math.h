@@ -1,0 +1,121 @@
+// Arithmetic of march_rays, one stratum at a time, for the CPU and for CUDA. Each operation is rounded on its own, as
+// the reference does it: a sample lies in the same cell on every path. The C++ of the build has contraction off; nvcc
+// contracts, but not the products that are written as march_product.
+#pragma once
+
+#include "common/hashed.h"
+#include "rays/march_rays.h"
+
+namespace voronerf {
+
+VN_HD float march_product(float a, float b) {
+#ifdef __CUDA_ARCH__
+  return __fmul_rn(a, b);
+#else
+  return a * b;
+#endif
+}
+
+VN_HD float march_root(float a) {
+#ifdef __CUDA_ARCH__
+  return __fsqrt_rn(a);
+#else
+  return __builtin_sqrtf(a);
+#endif
+}
+
+struct MarchRay {
+  float near, far, count;
+};
+
+VN_HD MarchRay march_ray(const MarchInputs& in, int64_t i) {
+  return {in.near[i], in.far[i], static_cast<float>(in.s)};
+}
+
+VN_HD float march_depth(const MarchRay& ray, float fraction, bool disparity) {
+  if (!disparity) return ray.near + march_product(ray.far - ray.near, fraction);
+  const float inverse = march_product(ray.far, 1.0f - fraction) + march_product(ray.near, fraction);
+  return march_product(ray.near, ray.far) / (inverse < 1.17549435e-38f ? 1.17549435e-38f : inverse);
+}
+
+VN_HD float march_edge(const MarchRay& ray, int64_t i, bool disparity) {
+  const float number = static_cast<float>(i);
+  return number < ray.count ? march_depth(ray, number / ray.count, disparity) : ray.far;
+}
+
+VN_HD float march_sample(const MarchRay& ray, int64_t i, float inside, float first, float last, bool disparity) {
+  const float at = march_depth(ray, (static_cast<float>(i) + inside) / ray.count, disparity);
+  const float above = at < first ? first : at;
+  return above > last ? last : above;
+}
+
+VN_HD uint32_t march_key(const MarchInputs& in, int64_t i) {
+  return in.seed == nullptr ? 0 : hash_key(*in.seed, i);
+}
+
+// The place of a sample in its stratum.
+VN_HD float march_inside(const MarchInputs& in, uint32_t key, int64_t i, int64_t stratum) {
+  if (in.seed != nullptr) return hashed(key, static_cast<uint32_t>(stratum));
+  return in.uniforms != nullptr ? in.uniforms[i * in.s + stratum] : 0.5f;
+}
+
+enum class MarchWhere { kWorld, kSphere, kPerspective };
+
+VN_HD MarchWhere march_where(const MarchInputs& in) {
+  if (in.space.sphere != nullptr) return MarchWhere::kSphere;
+  return in.space.perspective != nullptr ? MarchWhere::kPerspective : MarchWhere::kWorld;
+}
+
+// The point at a distance along a ray, in the space of the grid.
+VN_HD void march_point(const MarchInputs& in, MarchWhere where, const float* origin, const float* direction, float at,
+                       float* point) {
+  for (int axis = 0; axis < 3; ++axis) point[axis] = origin[axis] + march_product(at, direction[axis]);
+  if (where == MarchWhere::kSphere) {
+    const float *centre = in.space.sphere, radius = in.space.sphere[3];
+    for (int axis = 0; axis < 3; ++axis) point[axis] = (point[axis] - centre[axis]) / radius;
+    const float whole = march_root(march_product(point[0], point[0]) + march_product(point[1], point[1]) +
+                                   march_product(point[2], point[2]));
+    const float length = whole < 1.0f ? 1.0f : whole;
+    const float factor = (2.0f - 1.0f / length) / length;
+    for (int axis = 0; axis < 3; ++axis) {
+      point[axis] = centre[axis] + march_product(march_product(radius, point[axis]), factor);
+    }
+  } else if (where == MarchWhere::kPerspective) {
+    const float *centre = in.space.perspective, *slopes = in.space.perspective + 12;
+    const float x = point[0] - centre[0], y = point[1] - centre[1], z = point[2] - centre[2];
+    float local[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const float* along = in.space.perspective + 3 * (axis + 1);
+      local[axis] = march_product(x, along[0]) + march_product(y, along[1]) + march_product(z, along[2]);
+    }
+    const float nearest = slopes[0] / 2.0f;
+    const float depth = local[2] < nearest ? nearest : local[2];
+    point[0] = local[0] / march_product(depth, slopes[1]);
+    point[1] = local[1] / march_product(depth, slopes[2]);
+    point[2] = 1.0f - march_product(2.0f, slopes[0]) / depth;
+  }
+}
+
+// The cell of the grid at a point, -1 outside the box; scale: cells in a unit of length along each axis.
+VN_HD int32_t march_cell(const MarchInputs& in, const float* scale, const float* point) {
+  const int64_t size[3] = {in.x, in.y, in.z};
+  int32_t cell = 0;
+  int inside = 1;
+  for (int axis = 0; axis < 3; ++axis) {
+    const float place = march_product(point[axis] - in.box[axis], scale[axis]);
+    const int here = (place >= 0.0f) & (place <= static_cast<float>(size[axis]));
+    const int32_t count = static_cast<int32_t>(size[axis]), whole = static_cast<int32_t>(here ? place : 0.0f);
+    cell = cell * count + (whole < count ? whole : count - 1);
+    inside &= here;
+  }
+  return inside ? cell : -1;
+}
+
+VN_HD void march_scale(const MarchInputs& in, float* scale) {
+  const int64_t size[3] = {in.x, in.y, in.z};
+  for (int axis = 0; axis < 3; ++axis) {
+    scale[axis] = static_cast<float>(size[axis]) / (in.box[3 + axis] - in.box[axis]);
+  }
+}
+
+}  // namespace voronerf
