@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
-from voronerf.reference.camera_rays import FISHEYE, FOV, NEWTON_STEPS, PERSPECTIVE, TINY
+from voronerf.ops.camera_rays.reference import FISHEYE, FOV, NEWTON_STEPS, PERSPECTIVE, TINY
 
 wp.set_module_options({"enable_backward": False})
 

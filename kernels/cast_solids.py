@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch, on_stream
-from voronerf.reference.cast_solids import BOX, CYLINDER, SPHERE, SURFACE, TINY, TRACE_STEPS, bounds
+from voronerf.ops.cast_solids.reference import BOX, CYLINDER, SPHERE, SURFACE, TINY, TRACE_STEPS, bounds
 
 wp.set_module_options({"enable_backward": False})
 

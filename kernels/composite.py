@@ -18,14 +18,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.derivatives import (
+from voronerf.kernels._launch import array, launch
+from voronerf.ops.composite.autograd import (
     composite_backward_backward,
     composite_backward_setup,
     composite_forward_backward,
     composite_forward_setup,
 )
-from voronerf.kernels._launch import array, launch
-from voronerf.reference.composite import Composite
+from voronerf.ops.composite.reference import Composite
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,13 +11,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.derivatives import (
+from voronerf.kernels._launch import array, launch
+from voronerf.ops.frequency_encode.autograd import (
     encode_backward_backward,
     encode_backward_setup,
     encode_gradients,
     encode_setup,
 )
-from voronerf.kernels._launch import array, launch
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,9 +13,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.derivatives import HashDerivatives
 from voronerf.grids import HashGrid
 from voronerf.kernels._launch import array, launch
+from voronerf.ops.hash_encode.autograd import HashDerivatives
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from voronerf.checks import MAX_COUNT
 from voronerf.kernels._launch import array, launch
-from voronerf.reference.march_rays import March
+from voronerf.ops.march_rays.reference import March
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -2,7 +2,7 @@
 
 A thread takes a point: its cell of the grid, through bricks of finer cells where there are some, and the candidates of
 that cell by their float64 distances, each operation rounded on its own. Tables are those of any backend
-(``voronerf/reference/centre_grid.py`` says what is in them); points that the grid does not reach meet every centre.
+(``voronerf/ops/centre_grid/reference.py`` says what is in them); points that the grid does not reach meet every centre.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
-from voronerf.reference.centre_grid import BRICK_BITS, CELL_BITS, REACH, GridTables
+from voronerf.ops.centre_grid.reference import BRICK_BITS, CELL_BITS, REACH, GridTables
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

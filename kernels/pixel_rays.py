@@ -11,7 +11,7 @@ from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
 from voronerf.kernels.camera_rays import camera_rays
-from voronerf.reference.pixel_rays import PixelRays
+from voronerf.ops.pixel_rays.reference import PixelRays
 
 wp.set_module_options({"enable_backward": False})
 

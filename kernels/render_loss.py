@@ -11,11 +11,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.derivatives import render_loss_backward, render_loss_setup
 from voronerf.kernels._launch import array, launch
 from voronerf.kernels.composite import _OPAQUE, _absorbed, _density
-from voronerf.reference.composite import check_ray_offsets
-from voronerf.reference.render_loss import RenderLoss
+from voronerf.ops.composite.reference import check_ray_offsets
+from voronerf.ops.render_loss.autograd import render_loss_backward, render_loss_setup
+from voronerf.ops.render_loss.reference import RenderLoss
 
 wp.set_module_options({"enable_backward": False})
 

@@ -9,13 +9,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.derivatives import (
+from voronerf.kernels._launch import array, launch
+from voronerf.ops.spherical_harmonics.autograd import (
     harmonics_backward_backward,
     harmonics_backward_setup,
     harmonics_gradient,
     harmonics_setup,
 )
-from voronerf.kernels._launch import array, launch
 
 wp.set_module_options({"enable_backward": False})
 

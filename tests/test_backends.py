@@ -47,16 +47,16 @@ def test_named_backend_never_falls_back() -> None:
 
 def test_auto_takes_what_supports_the_call() -> None:
     function = resolve("cell_sort", backend="auto", device=CPU, dtype=torch.int64)
-    assert function.__module__ == "voronerf.reference.cell_sort"
+    assert function.__module__ == "voronerf.ops.cell_sort.reference"
     function = resolve("nearest_centre", backend="auto", device=torch.device("meta"), dtype=torch.float32)
-    assert function.__module__ == "voronerf.reference.nearest_centre"
+    assert function.__module__ == "voronerf.ops.nearest_centre.reference"
 
 
 @pytest.mark.native
 def test_auto_prefers_native_on_the_cpu() -> None:
     assert (
         resolve("nearest_centre", backend="auto", device=CPU, dtype=torch.float32).__module__
-        == "voronerf.native.nearest_centre"
+        == "voronerf.ops.nearest_centre.native"
     )
 
 
@@ -107,7 +107,7 @@ sys.modules["warp"] = None  # as if it were not installed
 from voronerf import backends
 points = torch.zeros(2, 3)
 run = backends.resolve("nearest_centre", backend="auto", device=points.device, dtype=points.dtype)
-assert run.__module__ == "voronerf.reference.nearest_centre", run
+assert run.__module__ == "voronerf.ops.nearest_centre.reference", run
 for backend, remedy in (("native", "pip install -e ."), ("warp", "voronerf[warp]")):
     try:
         backends.resolve("nearest_centre", backend=backend, device=points.device, dtype=points.dtype)
@@ -152,7 +152,7 @@ assert reason is not None and reason.startswith("the compiled module is of anoth
 assert reason.endswith("build it again with `pip install -e .`"), reason
 points = torch.zeros(2, 3)
 run = backends.resolve("nearest_centre", backend="auto", device=points.device, dtype=points.dtype)
-assert run.__module__ == "voronerf.reference.nearest_centre", run
+assert run.__module__ == "voronerf.ops.nearest_centre.reference", run
 assert backends.describe()["native"]["reason"] == reason
 """
     result = run_python(code)

@@ -30,7 +30,8 @@ import torch
 from voronerf.compiler import constant_result
 
 BACKENDS = ("reference", "native", "warp")
-_PACKAGES = {"reference": "voronerf.reference", "native": "voronerf.native", "warp": "voronerf.kernels"}
+_MODULES = {"reference": "voronerf.ops.{}.reference", "native": "voronerf.ops.{}.native", "warp": "voronerf.kernels.{}"}
+_PACKAGES = {"native": "voronerf.native", "warp": "voronerf.kernels"}
 ORDER = {"cpu": ("native", "reference"), "cuda": ("native", "warp", "reference")}
 
 
@@ -45,7 +46,7 @@ class Implementation:
     Attributes:
         devices: device types it runs on; empty means any.
         dtypes: dtypes of the op's first tensor it takes; empty means any.
-        file: module below the backend's package that has the function; None for the op's name.
+        file: the op whose module has the function; None for its own.
     """
 
     devices: tuple[str, ...] = ()
@@ -95,7 +96,7 @@ def declare(
     """Puts the row of an op into the table, and returns its name. None: the op has no such implementation.
 
     An implementation is the function of the op's name in a module of the op's name, unless ``file`` says another:
-    ``voronerf.reference.<op>``, ``voronerf.native.<op>`` or ``voronerf.kernels.<op>``; it is imported on first use.
+    ``voronerf.ops.<op>.reference``, ``voronerf.ops.<op>.native`` or ``voronerf.kernels.<op>``, imported on first use.
     """
     for backend, implementation in zip(BACKENDS, (reference, native, warp), strict=True):
         if implementation is not None:
@@ -270,7 +271,7 @@ def _choose_once(op: str, backend: str, device_type: str, index: int | None, dty
         reason = why_not(op, backend, device, dtype)
         if reason is not None:
             raise BackendUnavailable(f"{op}: backend {backend!r} is not available: {reason}")
-    module = importlib.import_module(f"{_PACKAGES[backend]}.{_TABLE[op, backend].file or op}")
+    module = importlib.import_module(_MODULES[backend].format(_TABLE[op, backend].file or op))
     _FUNCTIONS[op, backend] = getattr(module, op)
     return backend
 

@@ -47,9 +47,9 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     import voronerf
     from voronerf.fields import NeRF
     from voronerf.layers import MLP, POSITIONS, Layer
-    from voronerf.native.cell_sort import sort as sort_cells
-    from voronerf.native.grouped_mlp import using_way
-    from voronerf.reference.cell_sort import cell_sort as specified
+    from voronerf.ops.cell_sort.native import sort as sort_cells
+    from voronerf.ops.cell_sort.reference import cell_sort as specified
+    from voronerf.ops.grouped_mlp.native import using_way
 
     where = torch.device(device)
 

@@ -110,8 +110,8 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     from ops.networks import NETS, cost, make_batch
 
     import voronerf
-    from voronerf.native.cell_sort import sort as sort_cells
-    from voronerf.native.grouped_mlp import using_way
+    from voronerf.ops.cell_sort.native import sort as sort_cells
+    from voronerf.ops.grouped_mlp.native import using_way
 
     rows = Rows(out, "roofs", again, device)
     where, row = rows.device, rows.add

@@ -19,7 +19,7 @@ from ops.case import BACKWARD, Contender, NotApplicable, optional
 from ops.networks import Batch, with_gradients
 from voronerf import ops
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
-from voronerf.reference.grouped_mlp import encode
+from voronerf.ops.grouped_mlp.reference import encode
 
 PIECE = 4096
 """Rows of a piece whose activations stay in cache."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from ops.case import FORWARD, Case, Contender, NotApplicable, Work, generator, optional, relative_error, rotation
 from ops.cases_lookup import FLOPS
 from voronerf import ops
-from voronerf.reference.camera_rays import camera_rays as reference_camera_rays
+from voronerf.ops.camera_rays.reference import camera_rays as reference_camera_rays
 from voronerf.rendering.cameras import look_at
 
 FULL = torch.float32

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation
 from voronerf import ops
-from voronerf.reference.observe_occupancy import cells_of
+from voronerf.ops.observe_occupancy.reference import cells_of
 from voronerf.rendering.cameras import orbit_cameras
 
 RAYS, SAMPLES = 1 << 10, 1 << 13

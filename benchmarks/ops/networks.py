@@ -16,7 +16,7 @@ from ops.case import BACKWARD, generator, relative_error, rotation, uniform_poin
 from voronerf import ops
 from voronerf.fields import NeRF
 from voronerf.layers import MLP, POSITIONS, Layer
-from voronerf.reference import grouped_mlp as specification
+from voronerf.ops.grouped_mlp import reference as specification
 
 RAY = 64
 """Consecutive samples of one view direction."""

@@ -1,6 +1,6 @@
 // frequency_encode and integrated_encode with their gradients: x [n,d] -> [n, width], [x, sin x, cos x, sin 2x, cos 2x,
 // ...] in blocks of d, the input left out or not; with variances [n,d], each value is multiplied by exp(-4^l variance /
-// 2). As in voronerf/reference/frequency_encode.py and integrated_encode.py. n, d and octaves may be 0.
+// 2). As in voronerf/ops/frequency_encode and integrated_encode. n, d and octaves may be 0.
 #pragma once
 
 #include <cstdint>

@@ -1,6 +1,6 @@
 // The encodings of the rows of a tile, and their gradients: [x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...], each a
-// block of d features, with or without x, as in voronerf/reference/frequency_encode.py; and for a Gaussian of mean x
-// each value times exp(-4^l variance / 2), as in integrated_encode.py beside it.
+// block of d features, with or without x, as in voronerf/ops/frequency_encode/reference.py; and for a Gaussian of mean
+// x each value times exp(-4^l variance / 2), as in integrated_encode beside it.
 //
 // A lane is a column of the encoding: a permutation brings it its feature, a table its octave and phase, and one sine
 // with one range reduction does the rest. So rows come out in the layout the products read, with no transposition.

@@ -1,6 +1,7 @@
 // hash_encode (Mueller et al. 2022) with its gradients: positions [n,3] and a table [tables, entries, features] ->
-// [n, levels x features], as in voronerf/reference/hash_encode.py. With a direction for each point everything is of the
-// derivative along it, with which second derivatives are made of the same kernels (voronerf/derivatives.py).
+// [n, levels x features], as in voronerf/ops/hash_encode/reference.py. With a direction for each point everything is of
+// the derivative along it, with which second derivatives are made of the same kernels
+// (voronerf/ops/hash_encode/autograd.py).
 #pragma once
 
 #include <cstddef>

@@ -1,4 +1,4 @@
-// Adam on the entries that have a gradient. n entries; the formula is in voronerf/ops/sparse_adam.py.
+// Adam on the entries that have a gradient. n entries; the formula is in voronerf/ops/sparse_adam.
 #pragma once
 
 #include <cstdint>

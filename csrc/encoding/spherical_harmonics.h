@@ -1,5 +1,5 @@
 // spherical_harmonics with its gradient: directions [n,3] -> [n, degree^2], degree 1 to 4. As in
-// voronerf/reference/spherical_harmonics.py. n may be 0.
+// voronerf/ops/spherical_harmonics/reference.py. n may be 0.
 #pragma once
 
 #include <cstdint>

@@ -1,5 +1,5 @@
 // Moving centres until their cells hold equal importance: m samples, k centres. What it computes is said in
-// voronerf/ops/balance_centres.py.
+// voronerf/ops/balance_centres.
 #pragma once
 
 #include <cstdint>

@@ -14,7 +14,7 @@
 namespace voronerf {
 
 struct ProgramInputs {
-  const int32_t* code;     // as voronerf/native/grouped_program.py writes it and program_code.h reads it
+  const int32_t* code;     // as voronerf/ops/grouped_program/native.py writes it and program_code.h reads it
   const float* constants;  // the numbers of functions
   const float* const* inputs;
   const float* const* parameters;

@@ -1,5 +1,5 @@
 // Volume rendering along rays: r rays, m samples, c channels. Samples of a ray lie side by side: ray i owns samples
-// offsets[i] : offsets[i + 1], or without offsets s of them. What it computes is said in voronerf/ops/composite.py.
+// offsets[i] : offsets[i + 1], or without offsets s of them. What it computes is said in voronerf/ops/composite.
 #pragma once
 
 #include <cstdint>

@@ -1,5 +1,5 @@
 // The pixels of a training step, drawn from runs of pixels: n runs, b pixels. What it computes is said in
-// voronerf/reference/draw_pixels.py.
+// voronerf/ops/draw_pixels/reference.py.
 #pragma once
 
 #include <cstdint>

@@ -1,5 +1,5 @@
 // Samples of rays in the occupied cells of a grid: r rays, s strata each, m samples that are kept. What it computes is
-// said in voronerf/ops/march_rays.py, operation by operation in voronerf/reference/march_rays.py.
+// said in voronerf/ops/march_rays, operation by operation in voronerf/ops/march_rays/reference.py.
 //
 // Two calls, since the number of samples is known after the first: it leaves a bit for every stratum that is kept,
 // which the second reads instead of looking at the grid again.

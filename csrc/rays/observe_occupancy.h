@@ -1,5 +1,5 @@
 // Updates an occupancy grid from rendered samples, in place: x, y, z cells, m samples. The formula is in
-// voronerf/ops/observe_occupancy.py.
+// voronerf/ops/observe_occupancy.
 #pragma once
 
 #include <cstdint>

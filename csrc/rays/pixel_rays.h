@@ -1,5 +1,5 @@
 // Rays through the pixels of images, where they meet a box, and the colours of the pixels: c images of h x w pixels, b
-// rays. What it computes is said in voronerf/ops/pixel_rays.py.
+// rays. What it computes is said in voronerf/ops/pixel_rays.
 #pragma once
 
 #include <cstdint>
@@ -9,8 +9,8 @@ namespace voronerf {
 struct PixelRaysInputs {
   const float* poses;       // [c,4,4], camera to world
   const float* intrinsics;  // [c,4]: fx, fy, cx, cy
-  const float* distortion;  // [c,8], voronerf/reference/camera_rays.py; or null
-  const int32_t* models;    // [c], camera models, voronerf/reference/camera_rays.py; or null
+  const float* distortion;  // [c,8], voronerf/ops/camera_rays/reference.py; or null
+  const int32_t* models;    // [c], camera models, voronerf/ops/camera_rays/reference.py; or null
   const uint8_t* images;    // [c,h,w,channels]
   const int64_t* pixels;    // [b], numbered through all images
   const float* box;         // [2,3], or null for all of space

@@ -1,5 +1,5 @@
 // The loss of rendered rays and its gradient, from the outputs of the networks: r rays, m samples. Ray i owns samples
-// offsets[i] : offsets[i + 1]. What it computes is said in voronerf/ops/render_loss.py.
+// offsets[i] : offsets[i + 1]. What it computes is said in voronerf/ops/render_loss.
 #pragma once
 
 #include <cstdint>

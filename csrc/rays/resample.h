@@ -1,5 +1,5 @@
 // Hierarchical sampling: weights [r,s], edges [r,s+1], uniforms [r,count] or null (midpoints of equal strata) -> depths
-// [r,count], rising along a ray. s, count >= 1; r = 0 is legal. As in voronerf/reference/resample.py.
+// [r,count], rising along a ray. s, count >= 1; r = 0 is legal. As in voronerf/ops/resample/reference.py.
 #pragma once
 
 #include <cstdint>

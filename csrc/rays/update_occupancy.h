@@ -1,5 +1,5 @@
 // Updates an occupancy grid: n cells, q updates. The formula is in
-// voronerf/ops/update_occupancy.py.
+// voronerf/ops/update_occupancy.
 #pragma once
 
 #include <cstdint>

@@ -5,7 +5,9 @@ from emulated import module
 from emulated_networks import KIB
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.native import compiled, grouped_mlp, layer_table
+from voronerf.native import compiled
+from voronerf.ops.grouped_mlp import layer_table
+from voronerf.ops.grouped_mlp import native as grouped_mlp
 
 PRECISIONS = compiled.MlpPrecision
 WAYS = grouped_mlp.WAYS

@@ -30,8 +30,8 @@ from network_plans import PRECISIONS, WAYS, plain, plan, way
 import voronerf
 from voronerf.fields import NeRF
 from voronerf.layers import MLP, POSITIONS, Layer
-from voronerf.native import layer_table
-from voronerf.native.grouped_mlp import _choose_way, using_way
+from voronerf.ops.grouped_mlp import layer_table
+from voronerf.ops.grouped_mlp.native import _choose_way, using_way
 
 HALVES = ("bfloat16", "float16")
 FUSED = (227, 99, 64, 40, 20)

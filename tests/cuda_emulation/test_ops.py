@@ -10,10 +10,11 @@ from helpers import same
 
 import voronerf
 from voronerf import VoronoiDiagram
-from voronerf.native import draw_pixels, sparse_adam
-from voronerf.native.cell_sort import WAYS
-from voronerf.native.cell_sort import sort as sort_cells
-from voronerf.reference import draw_pixels as draw_pixels_reference
+from voronerf.ops.cell_sort.native import WAYS
+from voronerf.ops.cell_sort.native import sort as sort_cells
+from voronerf.ops.draw_pixels import native as draw_pixels
+from voronerf.ops.draw_pixels import reference as draw_pixels_reference
+from voronerf.ops.sparse_adam import native as sparse_adam
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)

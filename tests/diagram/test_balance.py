@@ -10,7 +10,7 @@ from helpers import refuses, seeded
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.balance import balance, cell_weights, first_centres, imbalance
 from voronerf.diagram.transport import anneal, fair_share
-from voronerf.reference.balance_centres import published_step
+from voronerf.ops.balance_centres.reference import published_step
 
 
 def surface_samples(seed, m=10_000, objects=1, tail=1.0):

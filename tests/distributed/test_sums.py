@@ -53,7 +53,7 @@ def test_partial_sums_are_one_composite(ranks):
 @pytest.mark.parametrize("ranks", [1, 3])
 def test_compiled_partial_sums_are_one_loss(ranks):
     """Loss, gradients, weights and importance of `render_loss`, whatever rank has which sample; long and empty rays."""
-    ray_runs = pytest.importorskip("voronerf.native.ray_runs", reason="the extension is not built")
+    ray_runs = pytest.importorskip("voronerf.ops.ray_runs.native", reason="the extension is not built")
     generator, counts = seeded(), torch.tensor([5, 0, 1, 300, 40, 0, 7])
     n, rays = int(counts.sum()), len(counts)
     index = torch.repeat_interleave(counts).int()

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from voronerf import backends
-from voronerf.reference.nearest_centre import nearest_centre as reference
+from voronerf.ops.nearest_centre.reference import nearest_centre as reference
 
 pytestmark = pytest.mark.warp
 

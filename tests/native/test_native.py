@@ -13,10 +13,10 @@ from helpers import on_any_number_of_threads, refuses
 from torch import Tensor
 
 from voronerf import backends, cell_sort, locate_cell, nearest_centre
-from voronerf.reference.cell_sort import cell_sort as reference_sort
-from voronerf.reference.locate_cell import locate_cell as reference_locate
-from voronerf.reference.nearest_centre import distances
-from voronerf.reference.nearest_centre import nearest_centre as reference_nearest
+from voronerf.ops.cell_sort.reference import cell_sort as reference_sort
+from voronerf.ops.locate_cell.reference import locate_cell as reference_locate
+from voronerf.ops.nearest_centre.reference import distances
+from voronerf.ops.nearest_centre.reference import nearest_centre as reference_nearest
 
 pytestmark = pytest.mark.native
 

@@ -13,9 +13,9 @@ from helpers import on_any_number_of_threads
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from voronerf.reference import grouped_linear as specification
+from voronerf.ops.grouped_linear import reference as specification
 
-native = pytest.importorskip("voronerf.native.grouped_linear")
+native = pytest.importorskip("voronerf.ops.grouped_linear.native")
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
 # Rows of every form: pairs or none, whole vectors of 16 or 32 or none, more than a panel; o over and under a granule.

@@ -354,7 +354,7 @@ def test_float64_positions_are_encoded_in_float64() -> None:
 
 
 def test_opcheck() -> None:
-    layer_table, ops = pytest.importorskip("voronerf.native.layer_table"), torch.ops.voronerf
+    layer_table, ops = pytest.importorskip("voronerf.ops.grouped_mlp.layer_table"), torch.ops.voronerf
     given = cast(arguments(nerf(6, 2), [5, 0, 8], rays=4), torch.float32)
     passed = [given[name] for name in ("positions", "weights", "biases", "layers", "directions")]
     table = layer_table.network(*passed).table
@@ -383,9 +383,9 @@ def test_an_index_of_no_ray_is_refused() -> None:
 
 
 def test_a_plan_without_features_is_refused() -> None:
-    native = pytest.importorskip("voronerf.native.grouped_mlp")
+    native = pytest.importorskip("voronerf.ops.grouped_mlp.native")
     offsets, weight = torch.tensor([0, 5], dtype=torch.int32), torch.zeros(1, 2, 0)
-    linear = pytest.importorskip("voronerf.native.grouped_linear")
+    linear = pytest.importorskip("voronerf.ops.grouped_linear.native")
     with pytest.raises(RuntimeError, match="grouped_linear: a layer must have inputs and outputs"):
         linear.grouped_linear(torch.zeros(5, 0), offsets, weight)
     with pytest.raises(RuntimeError, match="grouped_mlp: every layer must have outputs, and inputs from sources"):

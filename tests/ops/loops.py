@@ -8,7 +8,7 @@ import itertools
 import torch
 from torch.nn.functional import linear, softplus
 
-from voronerf.reference import grouped_mlp as reference
+from voronerf.ops.grouped_mlp import reference
 
 ACTIVATIONS = {
     "none": lambda z: z,

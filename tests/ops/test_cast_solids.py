@@ -53,7 +53,7 @@ def test_first_hits(device, backend, r, count):
         assert bool((gap(int(tables[0][number]), tables[2][number], local).abs() < 1e-3).all())
     # The brackets are taken from the reference in float64.
     wide = [tensor.double() if tensor.is_floating_point() else tensor for tensor in (*tables, origins, directions)]
-    from voronerf.reference.cast_solids import cast_solids as exact
+    from voronerf.ops.cast_solids.reference import cast_solids as exact
 
     smaller, larger = (exact(wide[0], wide[1], wide[2] + shift, *wide[3:])[0] for shift in (-2e-3, 2e-3))
     assert bool((depths <= smaller + 1e-3).all()) and bool((depths >= larger - 1e-3).all())

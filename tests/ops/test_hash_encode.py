@@ -10,7 +10,7 @@ from tolerances import assert_as_exact
 
 from voronerf import HashGrid
 from voronerf.ops import hash_encode
-from voronerf.reference.hash_encode import hash_encode as reference
+from voronerf.ops.hash_encode.reference import hash_encode as reference
 
 pytestmark = pytest.mark.op("hash_encode")
 

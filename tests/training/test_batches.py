@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from voronerf.reference.draw_pixels import Runs, draw_pixels
+from voronerf.ops.draw_pixels.reference import Runs, draw_pixels
 
 SEED = torch.tensor([-7], dtype=torch.int32)
 # The first pixels and the lengths of runs: one pixel, many runs of the same length, and some that are much longer.
@@ -32,7 +32,7 @@ def test_every_pixel_of_the_runs_is_drawn_as_often(name):
 @pytest.mark.parametrize("name", [None, *RUNS])
 @pytest.mark.parametrize("count", [0, 1, 257, 5000])
 def test_native_draws_are_those_of_the_reference(name, count):
-    from voronerf.native.draw_pixels import draw_pixels as drawn
+    from voronerf.ops.draw_pixels.native import draw_pixels as drawn
 
     runs = None if name is None else runs_of(*map(list, RUNS[name]))
     below = 10**9 if runs is None else runs.total

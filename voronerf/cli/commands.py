@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType, ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from rich.console import Console
@@ -22,7 +22,7 @@ from rich.table import Table
 
 from voronerf import backends
 from voronerf.cli.board import Board
-from voronerf.cli.display import TrainingDisplay, printable
+from voronerf.cli.display import StageDisplay, TrainingDisplay, printable
 from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.cli.ranks import train_on_ranks
 from voronerf.data import Scene, load_scene
@@ -311,17 +311,44 @@ def preload(device: str = "cpu") -> int:
     return 0
 
 
-def process(source: Path, out: Path, /, frames: int = 150, fisheye: bool = False) -> int:
-    """Make a scene of a video or of images: COLMAP finds the cameras, by pycolmap or by its program.
+def process(
+    source: Path,
+    out: Path,
+    /,
+    frames: int = 150,
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto",
+    camera_model: str = "SIMPLE_RADIAL",
+    mapper: Literal["auto", "global", "incremental"] = "auto",
+    max_features: int = 4096,
+    verbose: bool = False,
+) -> int:
+    """Make a scene of a video or of images: COLMAP finds the cameras. A stopped one goes on with the same command.
 
     Args:
         source: A video, or a folder of PNG or JPEG images.
-        out: The folder to make; it gets images and sparse/0.
+        out: The folder to make; it gets images, sparse/0, transforms.json and colmap, which keeps every stage.
         frames: Frames taken of a video, evenly spread.
-        fisheye: The lens is a fisheye.
+        matching: Which images are compared: all with all, each with those next to it by name, or those that share
+            their largest features (auto).
+        camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
+        mapper: How cameras are found; auto is global, and incremental too if that model has faults.
+        max_features: Of an image.
+        verbose: Show what COLMAP says.
     """
-    check_counts(frames=frames)
-    make_scene(source, out, frames=frames, fisheye=fisheye, say=say)
+    check_counts(frames=frames, max_features=max_features)
+    with StageDisplay(console) as display:
+        make_scene(
+            source,
+            out,
+            frames=frames,
+            matching=matching,
+            camera_model=camera_model,
+            mapper=mapper,
+            max_features=max_features,
+            verbose=verbose,
+            say=display.say,
+            progress=display.show,
+        )
     return 0
 
 

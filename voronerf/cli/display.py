@@ -7,7 +7,16 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 from voronerf.training.progress import Progress as TrainingProgress
@@ -88,3 +97,47 @@ class TrainingDisplay:
     def on_event(self, line: str) -> None:
         """Prints a line that stays, above the live one."""
         self.console.print(printable(line), highlight=False, markup=False, emoji=False)
+
+
+class StageDisplay:
+    """Shows the stages of a long command: a bar for each on a terminal, with the time left; plain lines elsewhere.
+
+    Args:
+        console: Where to write.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.progress = Progress(
+            TextColumn("[bold]{task.description:<10}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[count]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            refresh_per_second=4,
+        )
+        self.tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> StageDisplay:
+        self.progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.progress.stop()
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Shows how much of a stage is done; a total of 0 is not known."""
+        if stage not in self.tasks:
+            self.tasks[stage] = self.progress.add_task(stage, total=None, count="")
+            if not self.console.is_terminal:
+                self.say(stage)
+        count = f"{done} of {total}" if total else str(done or "")
+        self.progress.update(self.tasks[stage], completed=done, total=total or None, count=count)
+
+    def say(self, line: str) -> None:
+        """Prints a line that stays."""
+        self.console.print(printable(line), highlight=False, markup=False, emoji=False, soft_wrap=True)

@@ -31,8 +31,8 @@ CITY = "builtin-city"  # of one block, or with their number: builtin-city:4x4
 #: In the order in which a folder is tried, with what shows each.
 FORMATS = {
     "blender": "transforms_train.json",
-    "transforms": "transforms.json",
     "colmap": "a COLMAP model in sparse/0",
+    "transforms": "transforms.json",
     "llff": FILE,
 }
 
@@ -105,11 +105,13 @@ def load_scene(
         raise SceneError(f"{folder}: there is no such folder")
     if not folder.is_dir():
         raise SceneError(f"{folder}: is not a folder")
+    model = find_model(folder)
     held = [
-        name
-        for name, sign in FORMATS.items()
-        if (find_model(folder) is not None if name == "colmap" else (folder / sign).is_file())
+        name for name, sign in FORMATS.items() if (model is not None if name == "colmap" else (folder / sign).is_file())
     ]
+    if model == folder / "colmap/sparse/0" and "transforms" in held:
+        held.remove("colmap")  # nerfstudio's, whose transforms.json was made of it and says more
+        held.append("colmap")
     if not held:
         raise SceneError(f"{folder}: is not a scene, it has none of {', '.join(FORMATS.values())}")
     if format != "auto" and format not in held:

@@ -289,8 +289,8 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     for file, image in zip(named_images(model.path, chosen.path, names, reading.allow_outside), model.images):
         if file is not None:
             size = (float(image.camera.width), float(image.camera.height))
-            points = _seen(image, model)
-            bounds, pose = _bounds(image, points), torch.from_numpy(image.pose)
+            points = points_seen(image, model)
+            bounds, pose = depth_bounds(image, points), torch.from_numpy(image.pose)
             views.append(View(file, pose, image.camera.lens, size, None, bounds, torch.from_numpy(points)))
     models = sorted({image.camera.model for image in model.images})
     about = [f"COLMAP model {place.relative_to(folder)} of {len(views)} images, {' and '.join(models)}", *chosen.notes]
@@ -300,14 +300,14 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     return photograph_scene(folder, found, reading)
 
 
-def _seen(image: ColmapImage, model: ColmapModel) -> Array:
+def points_seen(image: ColmapImage, model: ColmapModel) -> Array:
     """The points of the model that an image sees, float64 [s, 3]."""
     at = np.searchsorted(model.numbers, image.points)
     known = at < len(model.numbers)
     return np.asarray(model.points[at[known][model.numbers[at[known]] == image.points[known]]])
 
 
-def _bounds(image: ColmapImage, points: Array) -> tuple[float, float] | None:
+def depth_bounds(image: ColmapImage, points: Array) -> tuple[float, float] | None:
     """The depths between which the points [s, 3] of an image lie, but for outliers; None if they are too few."""
     depth = -(points - image.pose[:3, 3]) @ image.pose[:3, 2]
     depth = depth[depth > 0]

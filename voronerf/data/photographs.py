@@ -20,6 +20,7 @@ from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images, read_masks
 from voronerf.data.lenses import PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.data.scene import Scene, SceneError, Sightings, Split
+from voronerf.data.soundness import camera_faults, lost_cameras
 from voronerf.data.transforms import distinct_names
 from voronerf.rendering.cameras import Cameras, focus_point
 from voronerf.rendering.contraction import Contraction, Perspective
@@ -144,7 +145,10 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
         for part in (slice(count), slice(count, None))
     ]
     parts[0] = replace(parts[0], sightings=find_sightings(parts[0], views[:count], frame))
-    notes = [*found.notes, _note(kind, frame, reading)]
+    faults = camera_faults(poses[:, :3, 3], bounds, ((view.lens, view.size[0]) for view in views))
+    if lost := int(lost_cameras(poses[:, :3, 3]).sum()):
+        faults.append(f"{lost} of {len(poses)} lie far from all others")
+    notes = [*found.notes, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
     if reading.downscale is None and found.factor > 1:
         size = f"{cameras.width} x {cameras.height}"
         notes.append(f"images are reduced by {found.factor}, to {size} (--downscale 1 keeps their size)")

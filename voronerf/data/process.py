@@ -1,84 +1,234 @@
-"""From a video or a folder of images to a scene: COLMAP finds the cameras, by pycolmap or by its program."""
+"""From a video or a folder of images to a scene: COLMAP finds the cameras, by pycolmap.
+
+Its stages leave what they found in `OUT/colmap`, where a stopped process goes on and COLMAP's own program can look:
+
+    features   `database.db`: the features of each image
+    pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: those that share some
+    matches    `database.db`: matches of those pairs
+    cameras    `global` and, if that model has faults, `incremental`: the better of both becomes `OUT/sparse/0`
+
+Matching the largest features first is the preemptive matching of Wu 2013, "Towards Linear-time Incremental Structure
+from Motion", section 4; the global mapper is that of Pan et al. 2024, "Global Structure-from-Motion Revisited".
+"""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
+import json
 import os
 import re
 import shutil
 import subprocess
-import tempfile
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
-from voronerf.data.colmap import read_model
+import numpy as np
+import torch
+from PIL import Image
+
+from voronerf.data.colmap import FILES, ColmapImage, depth_bounds, points_seen, read_model
 from voronerf.data.folders import listed_images
 from voronerf.data.images import read_header
+from voronerf.data.lenses import COEFFICIENTS, MODELS
 from voronerf.data.scene import SceneError
+from voronerf.data.soundness import camera_faults, lost_cameras
+from voronerf.files import write_text
+from voronerf.reference.camera_rays import FISHEYE, FOV
 
 #: Of a video. A playlist would name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
-#: More images than this are matched with their neighbours in the order of their names alone, as frames of a video are.
-MOST_PAIRED = 200
 LEAST_IMAGES = 3
+MATCHINGS = ("auto", "exhaustive", "sequential")
+MAPPERS = ("auto", "global", "incremental")
+#: "auto" matches at most so many images all with all.
+FEW_IMAGES = 40
+#: Of the largest features of an image that choose its pairs; with how many images it is matched, and how many matches
+#: of the largest features make a pair. Images are also matched with this many that follow by name.
+LARGEST_FEATURES, NEIGHBOURS, LEAST_MATCHES, FOLLOWING = 800, 20, 10, 2
+#: "sequential" matches an image with so many that follow, and with as many at distances of powers of two.
+SEQUENTIAL = 10
+#: Shares of the images with a camera: below the first a model is refused, below the second other mappers are tried.
+LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
+#: Mean error of the points of a sound model, in pixels.
+LARGEST_ERROR = 2.0
+#: Reduced images are written while their longer side has so many pixels.
+LEAST_SIDE = 256
+
+Progress = Callable[[str, int, int], None]
+Pair = tuple[str, str]
+Item = TypeVar("Item")
+
+
+class Settings(NamedTuple):
+    """What the stages are asked to do; a folder of other settings is not gone on with."""
+
+    source: str
+    frames: int
+    matching: str
+    camera_model: str
+    max_features: int
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a mapper found.
+
+    Attributes:
+        folder: of its files.
+        mapper: "global" or "incremental".
+        images: in the order of their names.
+        placed: images whose camera lies with others.
+        error: mean distance of the points from where they were seen, in pixels.
+        faults: what is wrong with it, as parts of a line.
+    """
+
+    folder: Path
+    mapper: str
+    images: list[ColmapImage]
+    placed: int
+    error: float
+    faults: list[str]
 
 
 def process(
-    source: Path, out: Path, *, frames: int = 150, fisheye: bool = False, say: Callable[[str], None] = print
+    source: Path,
+    out: Path,
+    *,
+    frames: int = 150,
+    matching: str = "auto",
+    camera_model: str = "SIMPLE_RADIAL",
+    mapper: str = "auto",
+    max_features: int = 4096,
+    verbose: bool = False,
+    say: Callable[[str], None] = print,
+    progress: Progress = lambda stage, done, total: None,
 ) -> None:
-    """Makes a scene: `out/images`, and a COLMAP model in `out/sparse/0`. `out` appears when it is complete.
+    """Makes a scene: `out/images`, reduced copies, a COLMAP model in `out/sparse/0` and `out/transforms.json`.
 
-    The images of a video, and images of one size, share a camera of the model OPENCV or OPENCV_FISHEYE; else each has
-    its own. The largest of several models is kept.
+    The images of a video, and images of one size, share a camera; else each has its own. `out/colmap` keeps what each
+    stage found, and a process with the same settings goes on there. `out/sparse/0` appears when all is done.
 
     Args:
         source: a video, or a folder of PNG or JPEG images.
-        out: the folder to make, which must not exist or be empty.
+        out: the folder to make. It must not exist, be empty, or be that of a process that was stopped.
         frames: of a video, evenly spread.
-        fisheye: the lens is a fisheye.
+        matching: which images are matched: "exhaustive", all with all; "sequential", with those next to them by name;
+            "auto", those whose largest features match, and the next two by name.
+        camera_model: COLMAP's name of the model of the lens.
+        mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults.
+        max_features: of an image.
+        verbose: show what COLMAP says.
         say: takes a line about each step.
+        progress: takes the name of a stage, how much of it is done and how much there is; 0 where that is not known.
 
     Raises:
-        SceneError: the source is neither, or COLMAP finds no model.
-        ImportError: COLMAP is not installed.
+        ValueError: an unknown matching, mapper or model of a lens, or too few features.
+        SceneError: the source is neither, or COLMAP finds no model that is sound.
+        ImportError: pycolmap is not installed.
         OSError: a file cannot be written.
     """
-    run = _pycolmap() or _program()
-    if run is None:
-        raise ImportError("voronerf process needs COLMAP: pip install pycolmap, or install the program colmap")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise SceneError(f"{out}: must not exist yet, or be an empty folder")
+    names = [name for name, _ in MODELS.values()]
+    for argument, value, known in (
+        ("matching", matching, MATCHINGS),
+        ("mapper", mapper, MAPPERS),
+        ("camera_model", camera_model, names),
+    ):
+        if value not in known:
+            raise ValueError(f"process: {argument} must be one of {', '.join(known)}, got {value!r:.60}")
+    if max_features < 100:
+        raise ValueError(f"process: max_features must be at least 100, got {max_features}")
+    try:
+        import pycolmap
+    except ImportError:
+        raise ImportError("voronerf process needs pycolmap: pip install pycolmap") from None
     if not source.exists():
         raise SceneError(f"{source}: there is no such video or folder")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as name:
-        work = Path(name)
-        images = work / "scene" / "images"
-        images.mkdir(parents=True)
+    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features)
+    work = _begin(out, settings)
+    level = pycolmap.logging.Level
+    pycolmap.logging.minloglevel = (level.INFO if verbose else level.ERROR).value
+    pycolmap.logging.alsologtostderr = verbose
+    if not (images := out / "images").is_dir():
+        _gather(source, out, frames)
+    files = listed_images(images)
+    shared = len({read_header(path, 1).size for path in files}) == 1
+    say(f"{len(files)} images with {'one camera' if shared else 'a camera each'}; {work} keeps what COLMAP finds")
+    stages = Stages(pycolmap, work, images, progress)
+    _match(stages, [path.name for path in files], settings, shared)
+    models: list[Model] = []
+    for name in ("global", "incremental"):
+        # The other mapper has its say if the first one's model is not good.
+        if mapper == name or (mapper == "auto" and not (models and _is_good(models[0], len(files)))):
+            model = _map(stages, name)
+            say(f"{name} mapping: {_described(model, len(files))}")
+            models += [model] if model is not None else []
+    if not models:
+        raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
+    best = max(models, key=lambda model: (not model.faults, model.placed, -model.error))
+    rest = "; ".join(best.faults)
+    if best.placed < LEAST_SHARE * len(files) and not rest:
+        rest = "less than half of the images have a camera"
+    if rest:
+        raise SceneError(
+            f"{out}: no sound model of {len(files)} images: {rest}. Try --matching exhaustive, --max-features 8192, "
+            f"another --camera-model, or more images; {work} has what was found"
+        )
+    _write_reduced(files, out)
+    _write_transforms(best.images, out)
+    (out / "sparse").mkdir(exist_ok=True)
+    part = out / "sparse" / ".0"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    for name in FILES:
+        shutil.copyfile(best.folder / f"{name}.bin", part / f"{name}.bin")
+    os.replace(part, out / "sparse" / "0")
+    say(f"wrote {out}: cameras of {best.placed} of {len(files)} images; voronerf train --data {out}")
+
+
+def _begin(out: Path, settings: Settings) -> Path:
+    """The folder of the stages, new or that of a process with the same settings that was stopped."""
+    work = out / "colmap"
+    noted = work / "settings.json"
+    if noted.is_file():
+        found, asked = json.loads(noted.read_text()), settings._asdict()
+        if other := [name for name, value in asked.items() if found.get(name) != value]:
+            name = other[0]
+            raise SceneError(
+                f"{work}: was begun with --{name.replace('_', '-')} {found.get(name)}, not {asked[name]}; give the "
+                "same, or another folder"
+            )
+        if (out / "sparse" / "0").exists():
+            raise SceneError(f"{out}: is a scene already")
+        return work
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SceneError(f"{out}: must not exist yet, be an empty folder, or be that of a process that was stopped")
+    work.mkdir(parents=True)
+    write_text(noted, json.dumps(settings._asdict(), indent=1))
+    return work
+
+
+def _gather(source: Path, out: Path, frames: int) -> None:
+    """Copies the images of a folder, or takes those of a video, to `out/images`."""
+    part = out / ".images"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    try:
         if source.is_dir():
             for path in listed_images(source):
-                shutil.copyfile(path, images / path.name)
+                shutil.copyfile(path, part / path.name)
         else:
-            _take_frames(source, images, frames)
-        files = listed_images(images)
-        if len(files) < LEAST_IMAGES:
-            raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {len(files)}")
-        shared = len({read_header(path, 1).size for path in files}) == 1
-        in_order = not source.is_dir() or len(files) > MOST_PAIRED
-        say(f"{len(files)} images with {'one camera' if shared else 'a camera each'}; COLMAP looks for the cameras")
-        models = work / "models"
-        models.mkdir()
-        run(images, work / "database.db", models, "OPENCV_FISHEYE" if fisheye else "OPENCV", shared, in_order)
-        found = {path: len(read_model(path).images) for path in models.iterdir() if (path / "images.bin").is_file()}
-        if not found:
-            raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
-        best = max(found, key=lambda path: found[path])
-        (work / "scene" / "sparse").mkdir()
-        os.replace(best, work / "scene" / "sparse" / "0")
-        with contextlib.suppress(OSError):
-            out.rmdir()
-        os.replace(work / "scene", out)
-        say(f"wrote {out}: cameras of {found[best]} of {len(files)} images; voronerf train --data {out}")
+            _take_frames(source, part, frames)
+        count = len(listed_images(part))
+        if count < LEAST_IMAGES:
+            raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}")
+    except BaseException:
+        shutil.rmtree(out, ignore_errors=True)  # it holds nothing else yet
+        raise
+    os.replace(part, out / "images")
 
 
 def _take_frames(video: Path, folder: Path, count: int) -> None:
@@ -101,47 +251,226 @@ def _take_frames(video: Path, folder: Path, count: int) -> None:
         raise SceneError(f"{video}: ffmpeg cannot read it: {reason:.200}")
 
 
-Run = Callable[[Path, Path, Path, str, bool, bool], None]
+# Stages ---------------------------------------------------------------------------------------------------------------
 
 
-def _pycolmap() -> Run | None:
-    """COLMAP by its Python package, or None where that is missing."""
+@dataclass(frozen=True)
+class Stages:
+    """What all stages work on.
+
+    Attributes:
+        colmap: the module pycolmap.
+        work: the folder of what the stages leave.
+        images: the folder of the images.
+        progress: as of :func:`process`.
+    """
+
+    colmap: Any
+    work: Path
+    images: Path
+    progress: Progress
+
+    @property
+    def database(self) -> Path:
+        """Features and matches of all images."""
+        return self.work / "database.db"
+
+    def in_parts(self, name: str, items: Sequence[Item], size: int, work: Callable[[Sequence[Item]], None]) -> None:
+        """Does the work of a stage in parts, so that it can be shown and stopped; COLMAP passes over what is done.
+
+        Raises:
+            SceneError: COLMAP fails.
+        """
+        for first in range(0, len(items), size):
+            self.progress(name, first, len(items))
+            with _told(name):
+                work(items[first : first + size])
+        self.progress(name, len(items), len(items))
+
+
+@contextlib.contextmanager
+def _told(stage: str) -> Iterator[None]:
     try:
-        import pycolmap
-    except ImportError:
+        yield
+    except (RuntimeError, ValueError) as error:
+        raise SceneError(f"pycolmap: {stage}: {' '.join(str(error).split())[:300]}") from None
+
+
+def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: bool) -> None:
+    """Finds the features of the images, and matches them."""
+    colmap, database = stages.colmap, stages.database
+    extraction = colmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = settings.max_features
+    reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
+
+    def extract(some: Sequence[str]) -> None:
+        colmap.extract_features(
+            database,
+            stages.images,
+            image_names=list(some),
+            camera_mode=colmap.CameraMode.SINGLE if shared else colmap.CameraMode.PER_IMAGE,
+            reader_options=reader,
+            extraction_options=extraction,
+        )
+        if shared:
+            reader.existing_camera_id = 1  # for the next images
+
+    def match(where: Path, name: str, pairs: Sequence[Pair]) -> None:
+        listed = stages.work / "part.txt"
+
+        def match_part(some: Sequence[Pair]) -> None:
+            listed.write_text("".join(f"{a} {b}\n" for a, b in some))
+            colmap.match_image_pairs(where, pairing_options=colmap.ImportedPairingOptions(match_list_path=listed))
+
+        stages.in_parts(name, pairs, 64, match_part)
+        listed.unlink(missing_ok=True)
+
+    stages.in_parts("features", names, 4, extract)
+    if settings.matching == "sequential":
+        steps = {*range(1, SEQUENTIAL + 1), *(2**i for i in range(SEQUENTIAL))}
+        pairs = [pair for step in sorted(steps) for pair in zip(names, names[step:])]
+    else:
+        pairs = list(itertools.combinations(names, 2))
+        if settings.matching == "auto" and len(names) > FEW_IMAGES:
+            few, chosen = stages.work / "few.db", stages.work / "pairs.json"
+            if not chosen.is_file():
+                if not few.is_file():
+                    _keep_largest(colmap, database, few)
+                match(few, "pairs", pairs)
+                write_text(chosen, json.dumps(_choose_pairs(colmap, few)))
+            pairs = [(a, b) for a, b in json.loads(chosen.read_text())]
+    match(database, "matches", pairs)
+
+
+def _keep_largest(colmap: Any, database: Path, few: Path) -> None:
+    """Copies a database with the largest features of each image alone."""
+    part = few.with_suffix(".part")
+    shutil.copyfile(database, part)
+    with colmap.Database.open(part) as opened:
+        kept = {}
+        for image in opened.read_all_images():
+            places, described = opened.read_keypoints(image.image_id), opened.read_descriptors(image.image_id)
+            # A feature is x, y and a scale, or x, y and an affine shape of 2 x 2.
+            a, *rest = places[:, 2:].T
+            area = np.abs(a * rest[2] - rest[0] * rest[1]) if len(rest) == 3 else a**2
+            top = np.argsort(-area, kind="stable")[:LARGEST_FEATURES]
+            kept[image.image_id] = places[top], type(described)(data=described.data[top], type=described.type)
+        opened.clear_keypoints()
+        opened.clear_descriptors()
+        for number, (places, described) in kept.items():
+            opened.write_keypoints(number, places)
+            opened.write_descriptors(number, described)
+    os.replace(part, few)
+
+
+def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
+    """The names of the images that are worth matching with all features: each with its best, and the next by name."""
+    with colmap.Database.open(few) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        numbers, matches = opened.read_two_view_geometry_num_inliers()
+    shared: dict[str, list[tuple[int, str]]] = {name: [] for name in names.values()}
+    for number, count in zip(numbers, matches):
+        a, b = (names[image] for image in colmap.pair_id_to_image_pair(number))
+        if count >= LEAST_MATCHES:
+            shared[a].append((count, b))
+            shared[b].append((count, a))
+    pairs = {tuple(sorted((a, b))) for a, best in shared.items() for _, b in sorted(best, reverse=True)[:NEIGHBOURS]}
+    ordered = sorted(shared)
+    for step in range(1, FOLLOWING + 1):
+        pairs.update(zip(ordered, ordered[step:]))
+    return sorted((a, b) for a, b in pairs)
+
+
+def _map(stages: Stages, name: str) -> Model | None:
+    """The largest model of a mapper, or None if it finds none."""
+    colmap, folder = stages.colmap, stages.work / name
+    if not folder.is_dir():
+        part = stages.work / f".{name}"
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        errors: list[Exception] = []
+
+        def find() -> None:
+            try:
+                if name == "global":
+                    options = colmap.GlobalPipelineOptions(random_seed=0)
+                    colmap.global_mapping(stages.database, stages.images, part, options)
+                else:
+                    options = colmap.IncrementalPipelineOptions(random_seed=0)
+                    colmap.incremental_mapping(stages.database, stages.images, part, options)
+            except Exception as error:
+                errors.append(error)
+
+        # In a thread, since Ctrl-C does not reach COLMAP.
+        thread = threading.Thread(target=find, daemon=True)
+        thread.start()
+        while thread.is_alive():
+            stages.progress(f"{name} mapping", 0, 0)
+            thread.join(0.5)
+        with _told("mapping"):
+            for failure in errors:
+                raise failure
+        os.replace(part, folder)
+    found = [path for path in folder.iterdir() if (path / "images.bin").is_file()]
+    if not found:
         return None
-
-    def run(images: Path, database: Path, models: Path, model: str, shared: bool, in_order: bool) -> None:
-        pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-        mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
-        options = pycolmap.ImageReaderOptions(camera_model=model)
-        try:
-            pycolmap.extract_features(database, images, camera_mode=mode, reader_options=options)
-            (pycolmap.match_sequential if in_order else pycolmap.match_exhaustive)(database)
-            pycolmap.incremental_mapping(database, images, models)
-        except (RuntimeError, ValueError) as error:
-            raise SceneError(f"pycolmap: {' '.join(str(error).split())[:300]}") from None
-
-    return run
+    largest = max(found, key=lambda path: len(read_model(path).images))
+    model = read_model(largest)
+    origins = torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images]))
+    bounds = [bound for image in model.images if (bound := depth_bounds(image, points_seen(image, model))) is not None]
+    lenses = ((image.camera.lens, image.camera.width) for image in model.images)
+    lost = int(lost_cameras(origins).sum())  # which count as images without a camera
+    faults = camera_faults(origins, torch.tensor(bounds), lenses)
+    error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
+    if error > LARGEST_ERROR:
+        faults.append(f"its points are off by {error:.2f} pixels")
+    return Model(largest, name, model.images, len(origins) - lost, error, faults)
 
 
-def _program() -> Run | None:
-    """COLMAP by its program, or None where that is missing."""
-    program = shutil.which("colmap")
-    if program is None:
-        return None
+def _is_good(model: Model, images: int) -> bool:
+    return not model.faults and model.placed >= GOOD_SHARE * images
 
-    def run(images: Path, database: Path, models: Path, model: str, shared: bool, in_order: bool) -> None:
-        camera = ["--ImageReader.camera_model", model, "--ImageReader.single_camera", str(int(shared))]
-        places = ["--database_path", str(database), "--image_path", str(images)]
-        for step in (
-            ["feature_extractor", *places, *camera],
-            ["sequential_matcher" if in_order else "exhaustive_matcher", *places[:2]],
-            ["mapper", *places, "--output_path", str(models)],
-        ):
-            done = subprocess.run([program, *step], capture_output=True, text=True, errors="replace")
-            if done.returncode:
-                reason = (done.stderr.strip().splitlines() or ["no reason"])[-1]
-                raise SceneError(f"{program} {step[0]} failed: {reason:.300}")
 
-    return run
+def _described(model: Model | None, images: int) -> str:
+    if model is None:
+        return "no model"
+    rest = "".join(f"; {fault}" for fault in model.faults)
+    return f"{model.placed} of {images} images, points off by {model.error:.2f} pixels{rest}"
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def _write_reduced(files: Sequence[Path], out: Path) -> None:
+    """Writes `images_2` and `images_4`, reduced by area."""
+    longest = max(max(read_header(path, 1).size) for path in files)
+    for factor in (2, 4):
+        folder = out / f"images_{factor}"
+        if longest // factor < LEAST_SIDE or folder.is_dir():
+            continue
+        part = out / f".images_{factor}"
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        for path in files:
+            with Image.open(path) as image:
+                quality = {} if path.suffix.lower() == ".png" else {"quality": 95}
+                image.reduce(factor).save(part / path.name, **quality)
+        os.replace(part, folder)
+
+
+def _write_transforms(images: Sequence[ColmapImage], out: Path) -> None:
+    """Writes the cameras as nerfstudio and instant-ngp read them, unless the lens is none that they have."""
+    frames = []
+    for image in images:
+        (fx, fy, cx, cy), coefficients, model = image.camera.lens
+        values = {name: value for name, value in zip(COEFFICIENTS[model], coefficients) if value}
+        known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "p1", "p2", "k3")
+        if model == FOV or not values.keys() <= set(known):
+            return
+        lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": image.camera.width, "h": image.camera.height}
+        lens |= {name: values.get(name, 0.0) for name in known}
+        kind = {"camera_model": "OPENCV_FISHEYE" if model == FISHEYE else "OPENCV"}
+        frames.append({"file_path": f"images/{image.name}", "transform_matrix": image.pose.tolist(), **lens, **kind})
+    shared = {key: value for key, value in frames[0].items() if all(frame.get(key) == value for frame in frames)}
+    rest = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
+    write_text(out / "transforms.json", json.dumps({**shared, "frames": rest}, indent=1))

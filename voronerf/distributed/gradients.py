@@ -22,7 +22,7 @@ def pack_entries(gradient: Tensor) -> Tensor:
     these. Where that would be as long, it is the gradient itself.
     """
     if _natively(gradient):
-        from voronerf.native.touched_entries import pack_touched  # which is there where the compiled module is
+        from voronerf.ops.touched_entries.native import pack_touched  # which is there where the compiled module is
 
         message = pack_touched(gradient)
     else:
@@ -50,7 +50,7 @@ def add_entries(parts: Sequence[Tensor], n: int) -> Tensor:
         if len(part) == n:
             total += part
         elif _natively(part):
-            from voronerf.native.touched_entries import add_touched
+            from voronerf.ops.touched_entries.native import add_touched
 
             add_touched(part, total)
         else:

@@ -24,7 +24,7 @@ def observations(grid: OccupancyGrid, found: Learnt, several: Tensor | None) -> 
     """
     positions, density, deltas, weights = found.positions, found.density.float(), found.deltas, found.weights
     if _natively(grid):
-        from voronerf.native.observe_occupancy import tell_observed  # which is there where the compiled module is
+        from voronerf.ops.observe_occupancy.native import tell_observed  # which is there where the compiled module is
 
         return tell_observed(grid.density, grid.box, several, (positions, density, deltas, weights), hidden=HIDDEN)
     cells = grid.cells(positions)
@@ -55,7 +55,7 @@ def observe(
     """
     own = found.positions, found.density.float(), found.deltas, found.weights
     if _natively(grid) and backend in ("auto", "native"):
-        from voronerf.native.observe_occupancy import observe_told
+        from voronerf.ops.observe_occupancy.native import observe_told
 
         rule = {"decay": decay, "threshold": grid.threshold, "hidden": HIDDEN}
         observe_told(grid.density, grid.occupied, grid.box, others, reached, own, **rule)

@@ -215,7 +215,7 @@ class RankRenderer(Renderer):
         self, rays: Rays, march: March, target: Tensor, background: Tensor | None, own: slice
     ) -> Learnt:
         """:meth:`learn` from the outputs of the networks, where these mean a colour and a density."""
-        from voronerf.native import ray_runs  # which is there where the compiled module is
+        from voronerf.ops.ray_runs import native as ray_runs
 
         assert self.sharing is not None
         field = cast(VoronoiRouter, self.field)

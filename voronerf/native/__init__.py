@@ -1,6 +1,6 @@
 """The compiled module: finds torch's OpenMP for it, loads it, chooses an instruction set, and says how it was built.
 
-The files beside this one are its ops, one each. Importing this package raises ``BackendUnavailable`` where the
+Importing this package raises ``BackendUnavailable`` where the
 extension is missing or was built for other sources than these.
 
 OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch

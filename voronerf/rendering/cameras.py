@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops.camera_rays import camera_rays
-from voronerf.reference.camera_rays import FISHEYE, PERSPECTIVE, distort, undistort
+from voronerf.ops.camera_rays.reference import FISHEYE, PERSPECTIVE, distort, undistort
 
 __all__ = [
     "Cameras",

@@ -128,7 +128,7 @@ def compare_samples(
     given = march.positions, rays.directions, march.ray_index
     routed = field.table_arguments(*given) if _learns_natively(renderer, march.positions) else None
     if routed is not None and _in_float32(routed):
-        from voronerf.native.learn_rays import learn_rays  # which is there where the compiled module is
+        from voronerf.ops.learn_rays.native import learn_rays  # which is there where the compiled module is
 
         check_targets("compare", target, background, (torch.float32,), {"r": len(rays)})
         found = learn_rays(march, routed, target, **rest)

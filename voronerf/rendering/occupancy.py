@@ -18,8 +18,8 @@ from voronerf.checks import MAX_COUNT
 from voronerf.fields.radiance import activate_density, activate_radiance
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
+from voronerf.ops.observe_occupancy.reference import cells_of
 from voronerf.ops.update_occupancy import update_occupancy
-from voronerf.reference.observe_occupancy import cells_of
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field

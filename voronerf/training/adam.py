@@ -77,7 +77,7 @@ class Adam(torch.optim.Adam):
         return loss
 
     def _step_together(self, entries: list[tuple[Tensor, Tensor, dict[str, Any]]]) -> None:
-        from voronerf.native.sparse_adam import adam  # which is there where the compiled module is
+        from voronerf.ops.sparse_adam.native import adam  # which is there where the compiled module is
 
         rules, states = [], []
         for parameter, _, group in entries:

@@ -14,8 +14,8 @@ from voronerf import backends
 from voronerf.data import Scene
 from voronerf.data.scene import Sightings
 from voronerf.data.store import Pages
+from voronerf.ops.draw_pixels.reference import Runs, draw_pixels
 from voronerf.ops.pixel_rays import pixel_rays
-from voronerf.reference.draw_pixels import Runs, draw_pixels
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.marching import draw_seed
 from voronerf.rendering.rays import intersect_box
@@ -71,7 +71,7 @@ class RayBatches:
         self.useful = self._useful_pixels()
         self._draw_pixels = draw_pixels
         if self.place.type == "cpu" and backends.missing("native", self.place) is None:
-            from voronerf.native.draw_pixels import draw_pixels as native  # which is there where the module is
+            from voronerf.ops.draw_pixels.native import draw_pixels as native  # which is there where the module is
 
             self._draw_pixels = native
         self.sightings = None

@@ -1,5 +1,5 @@
 // A program as the kernels read it: a header, what is packed for a cell, the steps, and the sums, all of 32-bit
-// integers. voronerf/native/grouped_program.py writes them.
+// integers. voronerf/ops/grouped_program/native.py writes them.
 #pragma once
 
 #include <cstdint>

@@ -11,7 +11,7 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// In the order of voronerf/native/grouped_program.py and of BINARY in voronerf/program.py.
+// In the order of voronerf/ops/grouped_program/native.py and of BINARY in voronerf/program.py.
 enum { kInput, kOutput, kLinear, kFunction, kBinary, kTotal, kMove, kOuter, kColumns };
 enum { kAdd, kSub, kMul, kDiv, kGate };
 

@@ -1,0 +1,96 @@
+"""Volume rendering. r rays, s samples of a ray, m samples of all rays (packed), c channels."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.checks import (
+    INDEX,
+    check_count,
+    check_dtype,
+    check_no_inference,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+    check_tensor,
+)
+from voronerf.ops.composite.reference import Composite
+
+_OP = backends.declare(
+    "composite",
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+)
+
+
+def composite(
+    sigma: Tensor,
+    rgb: Tensor,
+    depths: Tensor,
+    deltas: Tensor,
+    *,
+    ray_offsets: Tensor | None = None,
+    background: Tensor | None = None,
+    backend: str = "auto",
+) -> Composite:
+    """Volume rendering: colour, opacity and depth of rays, from the density and colour of their samples.
+
+    ``weight_i = T_i (1 - exp(-sigma_i delta_i))`` with ``T_i = exp(-sum over j < i of sigma_j delta_j)``: Max 1995, and
+    Mildenhall et al. 2020, equation 3. The samples of a ray are in order of depth. Infinite density is opaque, unless
+    its delta is 0. A NaN sample affects only its own ray.
+
+    Args:
+        sigma: density, per unit of length, at least 0: [r, s], or [m] packed.
+        rgb: [r, s, c] or [m, c].
+        depths: distance along the ray: [r, s] or [m].
+        deltas: length of the part of the ray that a sample stands for, at least 0: [r, s] or [m].
+        ray_offsets: int32 [r + 1] for packed samples: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``,
+            possibly none. None for the dense form.
+        background: [c] or [r, c], added with weight 1 - opacity, or None. A ray without samples shows only the
+            background.
+        backend: "auto", "reference", "native" or "warp".
+
+    All floating-point arguments share one dtype, float16 to float64; sums are taken in float32 at least. Differentiable
+    in all of them.
+
+    Returns:
+        Composite(colour [r, c], opacity [r], depth [r], weights like sigma). ``depth`` is the sum of weight times depth
+        and is not divided by the opacity.
+
+    Raises:
+        ValueError: shapes, devices or an unknown backend; on the CPU also offsets that fall or exceed m.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import composite
+        >>> sigma = torch.tensor([[0.0, float("inf"), 1.0]])  # one ray: air, a wall, what is behind it
+        >>> rgb = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]]])
+        >>> depths, deltas = torch.tensor([[1.0, 2.0, 3.0]]), torch.ones(1, 3)
+        >>> result = composite(sigma, rgb, depths, deltas)
+        >>> result.colour, result.depth, result.weights
+        (tensor([[1., 0., 0.]]), tensor([2.]), tensor([[0., 1., 0.]]))
+    """
+    sizes: dict[str, int] = {}
+    samples = ("r", "s") if ray_offsets is None else ("m",)
+    check_shape(_OP, "sigma", sigma, samples, sizes)
+    check_shape(_OP, "rgb", rgb, (*samples, "c"), sizes)
+    check_shape(_OP, "depths", depths, samples, sizes)
+    check_shape(_OP, "deltas", deltas, samples, sizes)
+    check_dtype(_OP, "sigma", sigma)
+    if ray_offsets is not None:
+        check_shape(_OP, "ray_offsets", ray_offsets, ("r+1",), sizes)
+        check_dtype(_OP, "ray_offsets", ray_offsets, INDEX)
+    if background is not None:
+        check_tensor(_OP, "background", background)
+        check_shape(_OP, "background", background, ("c",) if background.dim() == 1 else ("r", "c"), sizes)
+    check_same_dtype(_OP, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas, background=background)
+    tensors = {"sigma": sigma, "rgb": rgb, "depths": depths, "deltas": deltas, "ray_offsets": ray_offsets}
+    check_same_device(_OP, **tensors, background=background)
+    check_no_inference(_OP, **tensors, background=background)
+    check_count(_OP, "sigma", sigma.numel())
+    run = backends.resolve(_OP, backend=backend, device=sigma.device, dtype=sigma.dtype)
+    return Composite(*run(sigma, rgb, depths, deltas, ray_offsets=ray_offsets, background=background))

@@ -1,0 +1,60 @@
+"""Leaves drawn by their distances. n points, m centres of all diagrams together, g diagrams."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf.ops.nearest_centre.reference import in_pieces
+
+_PIECE = {"cpu": 1 << 17}
+"""Distances held at a time on a device: what a core's second-level cache holds."""
+_LARGE_PIECE = 1 << 22
+"""The same on other devices, where few launches count."""
+
+
+def draw_cell(
+    points: Tensor,
+    centres: Tensor,
+    child_offsets: Tensor,
+    child: Tensor,
+    uniforms: Tensor,
+    *,
+    temperature: float,
+    depth: int,
+    weights: Tensor | None = None,
+) -> Tensor:
+    """A leaf for every point, drawn from its distances; see ``voronerf.ops.draw_cell``.
+
+    Distances to all centres of the tree are taken once; at each level those of other diagrams have no mass.
+    """
+    # Neither 0 nor infinite in float32: the nearest centre's mass is 1 at any temperature.
+    temperature = min(max(temperature, 1e-37), 3e38)
+    table = torch.arange(centres.shape[0], dtype=torch.int32, device=centres.device)
+    owner = torch.searchsorted(child_offsets, table, right=True) - 1
+
+    def run(points: Tensor, uniforms: Tensor) -> Tensor:
+        squared = (points[:, None] - centres).square().sum(2)
+        if weights is not None:
+            lowest = weights.new_full((child_offsets.shape[0] - 1,), -torch.inf)
+            squared = squared + (lowest.scatter_reduce(0, owner, weights, "amax")[owner] - weights)
+        distance = squared.sqrt()
+        # How much of the distribution the drawn centre and those before it must hold: more than nothing, at most all.
+        wanted = (1 - uniforms.nan_to_num(0.0)).clamp(torch.finfo(torch.float32).eps / 2, 1)
+        # `state` is the diagram a point is in, or (negative) the leaf it has reached.
+        state = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
+        for level in range(depth):
+            elsewhere = owner[None, :] != state[:, None]
+            nearest = distance.masked_fill(elsewhere, torch.inf).amin(1, keepdim=True)
+            # Infinity and NaN have no mass.
+            mass = ((nearest - distance) / temperature).exp().masked_fill(elsewhere, 0).nan_to_num(0.0)
+            # A device sums as a tree, each place with roundings of its own: a sum may be below the one before it, and
+            # the last above that at the last centre with mass. Of those with mass the first counts that has enough.
+            sums = mass.cumsum(1).masked_fill(mass == 0, 0)
+            total = sums.amax(1, keepdim=True)
+            drawn = (sums >= wanted[:, level, None] * total).to(torch.uint8).argmax(1)
+            drawn = torch.where(total[:, 0] > 0, drawn, child_offsets[state.clamp(min=0)])
+            state = torch.where(state < 0, state, child[drawn])
+        return -state - 1
+
+    return in_pieces(run, _PIECE.get(points.device.type, _LARGE_PIECE) // centres.shape[0], points, uniforms)

@@ -1,0 +1,1 @@
+"""Pixels of a step, drawn by a hash of its number."""

@@ -1,0 +1,358 @@
+"""Whole per-cell networks of the compiled module: ``grouped_mlp``, and ``grouped_linear`` on CUDA.
+
+n samples, r rays, k cells, p and q features of a raw position and direction, i inputs and o outputs of a layer. Tensors
+are cast to float32 on the way in and back on the way out, a cell having few weights. With bfloat16 storage, or under
+autocast to it, products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16), and float32
+ones elsewhere; sums are float32 always. Gradients that will be differentiated again are taken layer by layer
+(``layerwise.py``).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf import native
+from voronerf.derivatives import asked_for
+from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
+from voronerf.native.custom_op import custom_op, on_huge_pages
+from voronerf.ops.grouped_mlp.layer_table import (
+    Network,
+    Table,
+    compiled_table,
+    in_float32,
+    network,
+    operands,
+    storage,
+    table_text,
+)
+from voronerf.ops.grouped_mlp.reference import cells_of
+
+# Of one layer, whose width does not matter here.
+_LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
+WAYS = native.compiled.MlpCudaWay
+"""Through a network on CUDA (csrc/network/grouped_mlp.h)."""
+
+
+def _choose_way() -> str:
+    """The way of VORONERF_CUDA_MLP, with which gpu-check and benchmarks compare what the kernels reach."""
+    wanted = os.environ.get("VORONERF_CUDA_MLP") or WAYS[0]
+    if wanted not in WAYS:
+        raise ValueError(f"VORONERF_CUDA_MLP must be one of {', '.join(WAYS)}, got {wanted!r}")
+    return wanted
+
+
+_way = _choose_way()
+
+
+@contextmanager
+def using_way(way: str) -> Iterator[None]:
+    """Every network on CUDA goes this way, one of ``WAYS``, or is refused, while the context lasts."""
+    global _way
+    if way not in WAYS:
+        raise ValueError(f"using_way: way must be one of {', '.join(WAYS)}, got {way!r}")
+    before, _way = _way, way
+    try:
+        yield
+    finally:
+        _way = before
+
+
+def grouped_mlp(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    *,
+    layers: MLP,
+    directions: Tensor | None = None,
+    direction_index: Tensor | None = None,
+    features: Tensor | None = None,
+) -> Tensor:
+    """Every sample through the network of its cell; see ``voronerf.ops.grouped_mlp``.
+
+    Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
+    """
+    own, before = features is not None and features.dim() == 3, hashes_before(positions, weights, layers, directions)
+    cells = cells_of(offsets, positions) if own and before else None
+    given = network(positions, weights, biases, layers, directions, features, cells, hashed_before=before)
+    out: Tensor
+    out, _ = _forward(
+        given.positions,
+        offsets,
+        given.weights,
+        given.biases,
+        given.table,
+        given.directions,
+        direction_index,
+        given.features,
+        keeps_encoded(given),
+    )
+    return out.to(given.dtype)
+
+
+def grouped_linear(
+    x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
+) -> Tensor:
+    """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer.
+
+    For CUDA; the CPU has kernels of one layer (``voronerf/ops/grouped_linear/native.py``).
+    """
+    given = in_float32(x, [weight], [bias], _LINEAR[activation], None, "grouped_linear")
+    out: Tensor
+    out, _ = _forward(given.positions, offsets, given.weights, given.biases, given.table, None, None, None, False)
+    return out.to(given.dtype)
+
+
+@custom_op("grouped_mlp_native")
+def _forward(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: str,
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    features: Tensor | None,
+    keep: bool,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Output, and for the backward pass what `new_encoded` says."""
+    out, encoded = new_output(positions, table, weights), new_encoded(positions, table, keep)
+    yield out, encoded
+    run(out, encoded, positions, offsets, weights, biases, table, directions, direction_index, features, None)
+
+
+def hashes_before(positions: Tensor, weights: Sequence[Tensor], layers: MLP, directions: Tensor | None) -> bool:
+    """Whether a hash grid is looked up before the network: on CUDA, where its kernels do not do it themselves."""
+    if layers.grid is None or not native.on_cuda(positions):
+        return False
+    if torch.compiler.is_compiling():  # which cannot ask the compiled module
+        return True
+    multiplied = operands(positions, storage(positions, weights))
+    table = compiled_table(table_text(layers.text, "grouped_mlp", multiplied, ""), positions, weights, directions)
+    machine = native.machine(positions)
+    assert isinstance(machine, native.compiled.Cuda)
+    return not native.compiled.grouped_mlp_hashes(table, _precision(multiplied), _way, machine)
+
+
+def keeps_encoded(given: Network) -> bool:
+    """Whether the forward pass of a network keeps hashed positions for the backward pass.
+
+    To look 16 features of 8 levels up again takes some 70 ns a sample, to write them 9 (Zen 4, one thread).
+    """
+    inputs = (given.positions, given.directions, given.features, *given.weights, *given.biases)
+    differentiable = any(tensor is not None and tensor.requires_grad for tensor in inputs)
+    return given.features is not None and torch.is_grad_enabled() and differentiable
+
+
+def new_encoded(positions: Tensor, table: str, keep: bool) -> Tensor:
+    """For hashed positions in the order of their cells, [n, features rounded up to 16]; empty if they are not kept."""
+    grid = Table.parse(table).layers.grid
+    if grid is None or not keep:
+        return positions.new_empty(0)
+    return positions.new_empty(positions.shape[0], -(-grid.out_features // 16) * 16)
+
+
+def new_output(positions: Tensor, table: str, weights: Sequence[Tensor]) -> Tensor:
+    """[n, features of all outputs]."""
+    features = sum(weights[output].shape[1] for output in Table.parse(table).layers.outputs)
+    return positions.new_empty(positions.shape[0], features)
+
+
+def run(
+    out: Tensor,
+    encoded: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: str,
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    features: Tensor | None,
+    order: Tensor | None,
+) -> None:
+    """Fills the output of sorted rows, or of those that ``order`` int32 [n] sorts."""
+    on_huge_pages(out)
+    on_huge_pages(encoded)
+    given = compiled_table(table, positions, weights, directions)
+    inputs = _inputs(positions, offsets, weights, biases, directions, direction_index, features, order, encoded)
+    compiled, machine = native.compiled, native.machine(positions)
+    if isinstance(machine, compiled.Cuda):
+        rest = _on_cuda(table, given, inputs, machine, backward=False, parameters=False)
+        compiled.grouped_mlp(given, inputs, out, *rest, machine)
+    else:
+        compiled.grouped_mlp(given, inputs, out, machine)
+
+
+@custom_op("grouped_mlp_native_backward")
+def backward(
+    gradient: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: str,
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    features: Tensor | None,
+    order: Tensor | None,
+    encoded: Tensor,
+    wanted: Sequence[bool],
+) -> Iterator[list[Tensor]]:
+    """Gradients of weights, biases, positions, directions and features, in float32.
+
+    They are empty unless wanted: (parameters, positions, directions, features).
+    """
+    count = len(weights)
+    chosen = [wanted[0]] * (2 * count) + list(wanted[1:])
+    results = [
+        positions.new_empty(tensor.shape if tensor is not None and want else 0)
+        for tensor, want in zip((*weights, *biases, positions, directions, features), chosen)
+    ]
+    yield results
+    for result in results:
+        on_huge_pages(result)
+    compiled, machine = native.compiled, native.machine(positions)
+    given = compiled_table(table, positions, weights, directions)
+    inputs = _inputs(positions, offsets, weights, biases, directions, direction_index, features, order, encoded)
+    to_directions = results[-2] if wanted[2] else None
+    of_samples = None
+    if isinstance(machine, compiled.Cuda) and wanted[2] and direction_index is not None and directions is not None:
+        to_directions = of_samples = positions.new_empty(positions.shape[0], directions.shape[1])
+    gradients = compiled.MlpGradients(
+        output=gradient,
+        weights=results[:count] if wanted[0] else None,
+        biases=_present(results[count : 2 * count]) if wanted[0] else None,
+        positions=results[-3] if wanted[1] else None,
+        directions=to_directions,
+        features=results[-1] if wanted[3] else None,
+    )
+    if isinstance(machine, compiled.Cuda):
+        rest = _on_cuda(table, given, inputs, machine, backward=True, parameters=wanted[0])
+        compiled.grouped_mlp_backward(given, inputs, gradients, *rest, machine)
+    else:
+        compiled.grouped_mlp_backward(given, inputs, gradients, machine)
+    if of_samples is not None and direction_index is not None:
+        # torch adds in a fixed order where deterministic algorithms are asked for.
+        results[-2].zero_().index_add_(0, direction_index, of_samples)
+
+
+def _inputs(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    features: Tensor | None,
+    order: Tensor | None,
+    encoded: Tensor,
+) -> native.compiled.MlpInputs:
+    return native.compiled.MlpInputs(
+        positions=positions,
+        directions=directions,
+        direction_index=direction_index,
+        offsets=offsets,
+        weights=weights,
+        biases=_present(biases),
+        n=positions.shape[0],
+        r=0 if directions is None else directions.shape[0],
+        k=offsets.shape[0] - 1,
+        order=order,
+        features=features,
+        features_type="float32" if features is None else str(features.dtype).removeprefix("torch."),
+        tables=1 if features is None or features.dim() == 2 else features.shape[0],
+        encoded=encoded if encoded.numel() else None,
+    )
+
+
+def _present(biases: Sequence[Tensor]) -> list[Tensor | None]:
+    """Biases with None for the empty tensors of layers that have none."""
+    return [bias if bias.numel() else None for bias in biases]
+
+
+def _on_cuda(
+    table: str,
+    given: native.compiled.MlpTable,
+    inputs: native.compiled.MlpInputs,
+    machine: native.compiled.Cuda,
+    *,
+    backward: bool,
+    parameters: bool,
+) -> tuple[str, str, Tensor]:
+    """What a call takes besides its tensors: the type of the products, the way, a workspace."""
+    precision, positions = _precision(Table.parse(table).operands), inputs.positions
+    size = native.compiled.grouped_mlp_workspace(
+        given, inputs.n, inputs.k, backward, parameters, precision, _way, machine
+    )
+    assert positions is not None
+    return precision, _way, positions.new_empty(size, dtype=torch.uint8)
+
+
+def _precision(multiplied: str) -> str:
+    """What products take on CUDA."""
+    tf32 = multiplied == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32"
+    return "tf32" if tf32 else multiplied
+
+
+def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    positions, offsets, weights, biases, ctx.table, directions, direction_index, features, _ = inputs
+    ctx.count = len(weights)
+    ctx.mark_non_differentiable(output[1])
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(output[1], positions, offsets, *weights, *biases, directions, direction_index, features)
+
+
+def _forward_backward(ctx: Any, gradient: Tensor | None, _of_encoded: None) -> tuple[Any, ...]:
+    if gradient is None:
+        return (None, None, [None] * ctx.count, [None] * ctx.count, *[None] * 5)
+    encoded, *saved = ctx.saved_tensors
+    positions, offsets, *parameters, directions, direction_index, features = saved
+    to_positions, _, *to_parameters, to_directions, _, to_features = asked_for(ctx, saved)
+    network = positions, offsets, parameters[: ctx.count], parameters[ctx.count :], ctx.table, directions
+    asked = *to_parameters, to_positions, to_directions, to_features
+    found = gradients(gradient, *network, direction_index, features, None, encoded, asked=asked)
+    *of_parameters, of_positions, of_directions, of_features = found
+    of_weights, of_biases = of_parameters[: ctx.count], of_parameters[ctx.count :]
+    return of_positions, None, of_weights, of_biases, None, of_directions, None, of_features, None
+
+
+def gradients(
+    gradient: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    table: str,
+    directions: Tensor | None,
+    direction_index: Tensor | None,
+    features: Tensor | None,
+    order: Tensor | None,
+    encoded: Tensor,
+    *,
+    asked: Sequence[bool],
+) -> list[Tensor | None]:
+    """Gradients of weights, biases, positions, directions and features, None for those that are not asked for."""
+    if torch.is_grad_enabled():
+        # Late: that module takes grouped_linear, which takes this one for CUDA.
+        from voronerf.ops.grouped_mlp.layerwise import gradients as differentiable
+
+        layers = Table.parse(table).with_widths(weights)
+        given = gradient, positions, offsets, weights, biases, layers, directions, direction_index, features, order
+        return differentiable(*given, asked=asked)
+    *parameters, to_positions, to_directions, to_features = asked
+    wanted = [any(parameters), to_positions, to_directions, to_features]
+    network = positions, offsets, weights, biases, table, directions, direction_index, features, order
+    *results, of_features = backward(gradient, *network, encoded, wanted)
+    if features is not None and to_features:
+        of_features = of_features.to(features.dtype)
+    return [result if want else None for result, want in zip((*results, of_features), asked)]
+
+
+_forward.register_autograd(_forward_backward, setup_context=_forward_setup)

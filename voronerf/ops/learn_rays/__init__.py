@@ -1,0 +1,1 @@
+"""A whole training step of a fused network, over its rays."""

@@ -1,0 +1,65 @@
+"""``locate_cell`` of the compiled module. n points, m centres of g diagrams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from voronerf import native
+from voronerf.native.custom_op import custom_op
+from voronerf.ops.nearest_centre.native import as_compared
+
+
+def locate_cell(
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, *, depth: int, weights: Tensor | None = None
+) -> Tensor:
+    """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
+    points, centres, weights = as_compared(points, centres, weights)
+    leaves: Tensor = _locate_cell(points, centres, child_offsets, child, depth, weights)
+    return leaves
+
+
+@custom_op("locate_cell")
+def _locate_cell(
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
+) -> Iterator[Tensor]:
+    leaves = points.new_empty(points.shape[0], dtype=torch.int32)
+    yield leaves
+    find(leaves, points, centres, child_offsets, child, depth, weights, "locate_cell")
+
+
+def find(
+    leaves: Tensor,
+    points: Tensor,
+    centres: Tensor,
+    child_offsets: Tensor,
+    child: Tensor,
+    depth: int,
+    weights: Tensor | None,
+    caller: str,
+) -> None:
+    """Fills ``leaves``, int32 [n]; coordinates and weights are of one dtype. ``caller``: whom errors name."""
+    compiled, machine = native.compiled, native.machine(points)
+    n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
+    given = points, centres, weights, child_offsets, child, leaves
+    if isinstance(machine, compiled.Cuda):
+        compiled.locate_cell(*given, n, m, g, depth, machine)
+        return
+    check_tree(child_offsets, child, m, caller)
+    workspace = leaves.new_empty(compiled.locate_cell_workspace(m, machine))
+    if not compiled.locate_cell(*given, workspace, n, m, depth, machine):
+        raise too_shallow(depth, caller)
+
+
+def check_tree(child_offsets: Tensor, child: Tensor, m: int, caller: str) -> None:
+    """Raises what is wrong with the tables of a tree on the CPU."""
+    fault = native.compiled.locate_cell_fault(child_offsets, child, child_offsets.shape[0] - 1, m)
+    if fault is not None:
+        raise ValueError(f"{caller}: {fault}")
+
+
+def too_shallow(depth: int, caller: str) -> ValueError:
+    """A point was at no leaf after that many levels."""
+    return ValueError(f"{caller}: depth must be the number of levels of the tree, got {depth}, which is too few")

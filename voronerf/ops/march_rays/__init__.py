@@ -1,0 +1,177 @@
+"""Ray marching through an occupancy grid. r rays, s strata of a ray, m samples of all rays (packed)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
+from voronerf.checks import (
+    INDEX,
+    check_choice,
+    check_count,
+    check_dtype,
+    check_integer,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+)
+from voronerf.ops.march_rays.reference import March
+
+_OP = backends.declare(
+    "march_rays",
+    native=Implementation(EVERYWHERE, (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
+_SPACINGS = ("linear", "disparity")
+
+
+def march_rays(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    samples: int,
+    *,
+    uniforms: Tensor | None = None,
+    seed: Tensor | None = None,
+    spacing: str = "linear",
+    start: Tensor | None = None,
+    most: int | None = None,
+    capacity: int | None = None,
+    contraction: Tensor | None = None,
+    backend: str = "auto",
+) -> March:
+    """Stratified samples of rays without those in empty cells of a grid, packed for ``composite``.
+
+    Each ray is cut into ``samples`` strata between its near and its far end, with one sample in each, as in
+    ``rendering.stratified_depths``. A sample is kept if its cell of the grid is occupied. Space outside the box is
+    empty. If every cell is occupied, the result is the stratified one.
+
+    With a ``contraction``, rays and their samples are still those of the world, and the grid, its box and the positions
+    are of the contracted space (Barron et al. 2022, "Mip-NeRF 360", equation 10; or Mildenhall et al. 2020, "NeRF",
+    appendix C).
+
+    Rays can be walked piece by piece, to stop at opaque surfaces: ``most`` samples at a time, with the ``stop`` of one
+    call as the ``start`` of the next.
+
+    The number of samples depends on the values. Without ``capacity`` it is read on the host. With ``capacity`` the
+    result has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that do not fit are
+    cut, which ``stop`` shows. This form can be captured in a CUDA graph and compiled. Not differentiable.
+
+    Args:
+        origins: float32 or float64 [r, 3].
+        directions: [r, 3], unit vectors.
+        near: [r], start of the first stratum.
+        far: [r], end of the last stratum; a ray with far <= near has no samples.
+        occupied: bool [x, y, z], which cells of the box are not empty; x, y, z >= 1.
+        box: [2, 3], lowest and highest corner, the second above the first.
+        samples: strata of a ray, s, 1 to 65,535.
+        uniforms: [r, s] in 0 to 1, the place of each sample in its stratum; None for the middles.
+        seed: int32 [1], in place of ``uniforms``: they are hashes of stratum and seed + number of the ray, the same for
+            every backend.
+        spacing: of the strata, "linear" or "disparity" (equal steps of 1 / distance).
+        start: int32 [r], the first stratum to consider, >= 0; None for 0.
+        most: largest number of samples of a ray, at least 1; None for all.
+        capacity: rows of the result, at least 1; None for the number of samples.
+        contraction: [4], centre and radius of a sphere; [5, 3], centre, right, up, ahead and (near, a, b) of normalised
+            device coordinates; or None. See ``voronerf.rendering.Contraction`` and ``Perspective``.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        March(ray_offsets, ray_index, depths, deltas, positions, stop). Floating-point arguments share one dtype, which
+        is that of depths, deltas and positions.
+
+    Raises:
+        ValueError: shapes, devices, counts, an unknown spacing or backend.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import march_rays
+        >>> origins, directions = torch.tensor([[-1.0, 0.5, 0.5]]), torch.tensor([[1.0, 0.0, 0.0]])
+        >>> near, far = torch.zeros(1), torch.tensor([4.0])
+        >>> occupied = torch.tensor([False, True]).reshape(2, 1, 1)  # the second half of the box
+        >>> box = torch.tensor([[0.0, 0, 0], [2.0, 1, 1]])
+        >>> march = march_rays(origins, directions, near, far, occupied, box, 8)
+        >>> march.depths  # two of eight strata
+        tensor([2.2500, 2.7500])
+        >>> march.ray_offsets
+        tensor([0, 2], dtype=torch.int32)
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "origins", origins, ("r", 3), sizes)
+    check_shape(_OP, "directions", directions, ("r", 3), sizes)
+    check_shape(_OP, "near", near, ("r",), sizes)
+    check_shape(_OP, "far", far, ("r",), sizes)
+    check_shape(_OP, "occupied", occupied, ("x", "y", "z"), sizes)
+    check_shape(_OP, "box", box, (2, 3))
+    check_integer(_OP, "samples", samples, 1)
+    check_dtype(_OP, "origins", origins, (torch.float32, torch.float64))
+    check_dtype(_OP, "occupied", occupied, (torch.bool,))
+    if contraction is not None:
+        sphere = isinstance(contraction, Tensor) and contraction.dim() == 1
+        check_shape(_OP, "contraction", contraction, (4,) if sphere else (5, 3))
+    if uniforms is not None:
+        check_shape(_OP, "uniforms", uniforms, ("r", "s"), {**sizes, "s": samples})
+    if seed is not None:
+        if uniforms is not None:
+            raise ValueError(f"{_OP}: seed must be None where uniforms are given, got both")
+        check_shape(_OP, "seed", seed, (1,))
+        check_dtype(_OP, "seed", seed, INDEX)
+    if start is not None:
+        check_shape(_OP, "start", start, ("r",), sizes)
+        check_dtype(_OP, "start", start, INDEX)
+    check_same_dtype(
+        _OP,
+        origins=origins,
+        directions=directions,
+        near=near,
+        far=far,
+        box=box,
+        uniforms=uniforms,
+        contraction=contraction,
+    )
+    check_same_device(
+        _OP,
+        origins=origins,
+        directions=directions,
+        near=near,
+        far=far,
+        occupied=occupied,
+        box=box,
+        uniforms=uniforms,
+        seed=seed,
+        start=start,
+        contraction=contraction,
+    )
+    check_choice(_OP, "spacing", spacing, _SPACINGS)
+    for name, value in (("most", most), ("capacity", capacity)):
+        if value is not None:
+            check_integer(_OP, name, value, 1)
+            check_count(_OP, name, value)
+    check_count(_OP, "occupied", occupied.numel())
+    check_count(_OP, "samples of all rays", sizes["r"] * samples)
+    if occupied.numel() < 1:
+        raise ValueError(f"{_OP}: occupied must have at least one cell, got {list(occupied.shape)}")
+    if samples > 65_535:
+        raise ValueError(f"{_OP}: samples must be at most 65535, got {samples}")
+    run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
+    tensors = (tensor.detach() for tensor in (origins, directions, near, far, occupied, box))
+    return March(
+        *run(
+            *tensors,
+            samples,
+            uniforms=None if uniforms is None else uniforms.detach(),
+            seed=seed,
+            disparity=spacing == "disparity",
+            start=start,
+            most=most,
+            capacity=capacity,
+            contraction=None if contraction is None else contraction.detach(),
+        )
+    )

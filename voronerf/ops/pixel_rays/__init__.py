@@ -1,0 +1,125 @@
+"""Rays through pixels of images, and what a loss needs of them. c images of h x w pixels, b rays."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
+from voronerf.checks import (
+    check_count,
+    check_dtype,
+    check_number,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+    check_tensor,
+)
+from voronerf.ops.camera_rays import check_lenses
+from voronerf.ops.pixel_rays.reference import PixelRays
+
+_OP = backends.declare(
+    "pixel_rays",
+    native=Implementation(EVERYWHERE, (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+)
+
+
+def pixel_rays(
+    poses: Tensor,
+    intrinsics: Tensor,
+    images: Tensor,
+    index: Tensor,
+    *,
+    near: float,
+    far: float,
+    box: Tensor | None = None,
+    distortion: Tensor | None = None,
+    models: Tensor | None = None,
+    background: Tensor | None = None,
+    backend: str = "auto",
+) -> PixelRays:
+    """The rays of a training step: through the centres of pixels, cut to a box, with the colours of the pixels.
+
+    `camera_rays` for the rays, the slab method (Kay and Kajiya 1986) for the box. Not differentiable.
+
+    Args:
+        poses: float32 [c, 4, 4], camera to world, OpenGL axes.
+        intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
+        images: uint8 [c, h, w, 3], or [c, h, w, 4] with an alpha channel that the colours are not multiplied by.
+        index: int64 [b], the pixels: image * h * w + row * w + column. Others are an error on the CPU, and undefined on
+            CUDA, where they are not checked.
+        near: nearest distance of interest, >= 0.
+        far: farthest.
+        box: float32 [2, 3], lowest and highest corner, or None for all of space.
+        distortion: float32 [c, 8] of the lenses, see `camera_rays`, or None.
+        models: int32 [c], the camera model of each, see `camera_rays`, or None.
+        background: float32 [3] or [b, 3], the colour behind images with an alpha channel; None leaves their
+            colours as they are.
+        backend: "auto", "reference", "native" or "warp".
+
+    Returns:
+        PixelRays(origins, directions, near, far, colour). A ray that misses the box has far == near.
+
+    Raises:
+        ValueError: shapes, devices, near and far, an unknown backend; on the CPU also pixels out of range.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import pixel_rays
+        >>> poses = torch.eye(4)[None]  # at the origin, looking along -z
+        >>> intrinsics = torch.tensor([[1.0, 1.0, 0.5, 0.5]])
+        >>> image = torch.tensor([[[[255, 0, 0, 51]]]], dtype=torch.uint8)  # a fifth of red
+        >>> box, white = torch.tensor([[-1.0, -1, -3], [1.0, 1, -2]]), torch.ones(3)
+        >>> index = torch.zeros(1, dtype=torch.int64)
+        >>> rays = pixel_rays(poses, intrinsics, image, index, near=0.0, far=9.0, box=box, background=white)
+        >>> rays.near, rays.far, rays.colour
+        (tensor([2.]), tensor([3.]), tensor([[1.0000, 0.8000, 0.8000]]))
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "poses", poses, ("c", 4, 4), sizes)
+    check_shape(_OP, "intrinsics", intrinsics, ("c", 4), sizes)
+    check_shape(_OP, "images", images, ("c", "h", "w", "channels"), sizes)
+    check_shape(_OP, "index", index, ("b",), sizes)
+    check_dtype(_OP, "poses", poses, (torch.float32,))
+    check_dtype(_OP, "images", images, (torch.uint8,))
+    check_dtype(_OP, "index", index, (torch.int64,))
+    if box is not None:
+        check_shape(_OP, "box", box, (2, 3))
+    check_lenses(_OP, distortion, models, sizes)
+    if background is not None:
+        check_tensor(_OP, "background", background)
+        check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("b", 3), sizes)
+    floats = {
+        "poses": poses,
+        "intrinsics": intrinsics,
+        "box": box,
+        "distortion": distortion,
+        "background": background,
+    }
+    check_same_dtype(_OP, **floats)
+    check_same_device(_OP, **floats, images=images, index=index, models=models)
+    check_count(_OP, "index", sizes["b"])
+    if sizes["channels"] not in (3, 4):
+        raise ValueError(f"{_OP}: images must have 3 or 4 channels, got {sizes['channels']}")
+    check_number(_OP, "near", near)
+    check_number(_OP, "far", far)
+    if not 0 <= near < far:
+        raise ValueError(f"{_OP}: near and far must satisfy 0 <= near < far, got {near} and {far}")
+    run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
+    found = run(
+        poses.detach(),
+        intrinsics.detach(),
+        images,
+        index,
+        near=float(near),
+        far=float(far),
+        box=None if box is None else box.detach(),
+        distortion=None if distortion is None else distortion.detach(),
+        models=models,
+        background=None if background is None else background.detach(),
+    )
+    return PixelRays(*found)

@@ -1,0 +1,85 @@
+"""Rays through pixels of images, and what a loss needs of them. c images of h x w pixels, b rays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.checks import check_range
+from voronerf.ops.camera_rays.reference import camera_rays
+
+
+class PixelRays(NamedTuple):
+    """The result of `pixel_rays`.
+
+    Attributes:
+        origins: [b, 3].
+        directions: [b, 3], of unit length.
+        near: [b], where each ray enters the box.
+        far: [b], where it leaves the box; `near` if it misses.
+        colour: [b, 3] of the pixels, 0..1.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import pixel_rays
+        >>> image = torch.full((1, 1, 1, 3), 51, dtype=torch.uint8)
+        >>> lens, index = torch.tensor([[1.0, 1.0, 0.5, 0.5]]), torch.zeros(2, dtype=torch.int64)
+        >>> pixel_rays(torch.eye(4)[None], lens, image, index, near=1.0, far=2.0).colour
+        tensor([[0.2000, 0.2000, 0.2000],
+                [0.2000, 0.2000, 0.2000]])
+    """
+
+    origins: Tensor
+    directions: Tensor
+    near: Tensor
+    far: Tensor
+    colour: Tensor
+
+
+@torch.no_grad()
+def pixel_rays(
+    poses: Tensor,
+    intrinsics: Tensor,
+    images: Tensor,
+    index: Tensor,
+    *,
+    near: float,
+    far: float,
+    box: Tensor | None,
+    distortion: Tensor | None,
+    models: Tensor | None,
+    background: Tensor | None,
+) -> PixelRays:
+    """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
+    c, h, w, channels = images.shape
+    check_range("pixel_rays", "index", index, c * h * w)
+    pixel = index % (h * w)
+    x, y = ((place + 0.5).to(poses.dtype) for place in (pixel % w, pixel // w))
+    camera = (index // (h * w)).to(torch.int32)
+    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion, models=models)
+    if box is None:
+        enter, leave = torch.full_like(x, near), torch.full_like(x, far)
+    else:
+        enter, leave = meet_box(origins, directions, box, near, far)
+    values = images.reshape(-1, channels)[index].to(poses.dtype) / 255
+    colour = values[:, :3]
+    if channels == 4 and background is not None:
+        alpha = values[:, 3:]
+        colour = colour * alpha + background * (1 - alpha)
+    return PixelRays(origins.contiguous(), directions, enter, leave, colour.contiguous())
+
+
+def meet_box(origins: Tensor, directions: Tensor, box: Tensor, near: float, far: float) -> tuple[Tensor, Tensor]:
+    """Where rays [b, 3] enter and leave a box [2, 3] between `near` and `far` (slab method); equal if they miss it."""
+    low, high = (box[0] - origins) / directions, (box[1] - origins) / directions
+    first, last = torch.minimum(low, high), torch.maximum(low, high)
+    # 0 / 0 and +-inf: a ray parallel to a slab is inside it at all distances or at none
+    parallel = directions == 0
+    inside = (origins >= box[0]) & (origins <= box[1])
+    infinity = torch.full_like(first, float("inf"))
+    first = torch.where(parallel, torch.where(inside, -infinity, infinity), first)
+    last = torch.where(parallel, torch.where(inside, infinity, -infinity), last)
+    enter = first.amax(-1).clamp(near, far)
+    return enter, torch.maximum(enter, last.amin(-1).clamp(near, far))

@@ -1,0 +1,1 @@
+"""Sums over the runs of samples that each cell adds to a ray."""

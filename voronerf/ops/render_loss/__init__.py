@@ -1,0 +1,116 @@
+"""The loss of rendered rays, from the outputs of the networks. r rays, m samples of all rays (packed)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.checks import (
+    INDEX,
+    check_count,
+    check_dtype,
+    check_no_inference,
+    check_number,
+    check_same_device,
+    check_shape,
+    check_tensor,
+)
+from voronerf.ops.render_loss.reference import RenderLoss
+
+_OP = backends.declare(
+    "render_loss",
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+)
+
+
+def render_loss(
+    raw: Tensor,
+    deltas: Tensor,
+    ray_offsets: Tensor,
+    target: Tensor,
+    *,
+    background: Tensor | None = None,
+    density_scale: float,
+    hidden: float = 0.0,
+    backend: str = "auto",
+) -> RenderLoss:
+    """The mean squared error of rendered rays, from what the networks put out for their samples.
+
+    The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. `composite`
+    makes the colours of the rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020,
+    equations 3 and 6). The native backend computes loss and gradient in one pass over each ray.
+
+    Args:
+        raw: [m, 4], colour and density before their activations: float16, bfloat16, float32 or float64.
+        deltas: [m], length of the part of its ray that a sample stands for, at least 0.
+        ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none.
+            Other samples have weight 0.
+        target: [r, 3], the colours to learn.
+        background: [3] or [r, 3], added with weight 1 - opacity, or None.
+        density_scale: factor on the density, > 0.
+        hidden: share of the light, in [0, 1). Samples that no more than it reaches have no gradient; they count as all
+            others in those of the samples in front of them.
+        backend: "auto", "reference", "native" or "warp".
+
+    ``deltas``, ``target`` and ``background`` are float32, or float64 where ``raw`` is; so are the results. The loss is
+    differentiable in ``raw``, any number of times. Nothing else has gradients.
+
+    Returns:
+        RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
+
+    Raises:
+        ValueError: shapes, devices, a density_scale that is not positive, an unknown backend; on the CPU also offsets
+            that fall or exceed m.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import render_loss
+        >>> raw = torch.tensor([[0.0, 0, 0, 50.0]], requires_grad=True)  # a grey wall
+        >>> offsets = torch.tensor([0, 1], dtype=torch.int32)
+        >>> result = render_loss(raw, torch.ones(1), offsets, torch.ones(1, 3), density_scale=1.0)
+        >>> result.colour, float(result.loss)
+        (tensor([[0.5000, 0.5000, 0.5000]]), 0.25)
+        >>> result.loss.backward()
+        >>> raw.grad[:, :3].round(decimals=4)  # lighter
+        tensor([[-0.0833, -0.0833, -0.0833]])
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "raw", raw, ("m", 4), sizes)
+    check_shape(_OP, "deltas", deltas, ("m",), sizes)
+    check_shape(_OP, "ray_offsets", ray_offsets, ("r+1",), sizes)
+    check_dtype(_OP, "raw", raw)
+    check_dtype(_OP, "ray_offsets", ray_offsets, INDEX)
+    wide = (torch.promote_types(raw.dtype, torch.float32),)
+    check_dtype(_OP, "deltas", deltas, wide)
+    check_targets(_OP, target, background, wide, sizes)
+    check_same_device(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
+    check_no_inference(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
+    check_count(_OP, "raw", raw.numel())
+    check_number(_OP, "density_scale", density_scale)
+    if not density_scale > 0:
+        raise ValueError(f"{_OP}: density_scale must be positive, got {density_scale}")
+    check_number(_OP, "hidden", hidden)
+    if not 0 <= hidden < 1:
+        raise ValueError(f"{_OP}: hidden must lie in [0, 1), got {hidden}")
+    run = backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)
+    constant = (deltas.detach(), ray_offsets, target.detach())
+    background = None if background is None else background.detach()
+    numbers = {"density_scale": float(density_scale), "hidden": float(hidden)}
+    return RenderLoss(*run(raw, *constant, background=background, **numbers))
+
+
+def check_targets(
+    op: str, target: Tensor, background: Tensor | None, dtypes: tuple[torch.dtype, ...], sizes: dict[str, int]
+) -> None:
+    """Checks what rays are compared with; ``sizes`` holds r."""
+    check_shape(op, "target", target, ("r", 3), sizes)
+    check_dtype(op, "target", target, dtypes)
+    if background is not None:
+        check_tensor(op, "background", background)
+        check_shape(op, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
+        check_dtype(op, "background", background, dtypes)

@@ -1,0 +1,62 @@
+"""The loss of rendered rays, from the outputs of the networks. r rays, m samples of all rays (packed)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from voronerf.ops.composite.reference import check_ray_offsets, composite
+
+
+class RenderLoss(NamedTuple):
+    """The result of `render_loss`. Only the loss has gradients.
+
+    Attributes:
+        loss: [], the mean squared error of the colours.
+        colour: [r, 3], background included.
+        weights: [m], the contribution of each sample.
+        density: [m].
+        error: [r], the squared error of the colour of each ray, summed over the channels.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import render_loss
+        >>> offsets = torch.tensor([0, 2, 4], dtype=torch.int32)  # two rays of two samples
+        >>> result = render_loss(torch.zeros(4, 4), torch.ones(4), offsets, torch.zeros(2, 3), density_scale=1.0)
+        >>> result.weights.shape, result.error.shape
+        (torch.Size([4]), torch.Size([2]))
+    """
+
+    loss: Tensor
+    colour: Tensor
+    weights: Tensor
+    density: Tensor
+    error: Tensor
+
+
+def render_loss(
+    raw: Tensor,
+    deltas: Tensor,
+    ray_offsets: Tensor,
+    target: Tensor,
+    *,
+    background: Tensor | None = None,
+    density_scale: float,
+    hidden: float = 0.0,
+) -> RenderLoss:
+    """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
+    raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
+    check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
+    given: dict[str, Any] = {"background": background, "density_scale": density_scale}
+    if hidden and raw.requires_grad:
+        found = render_loss(raw.detach(), deltas, ray_offsets, target, **given)
+        unseen = found.weights <= hidden * -torch.expm1(-found.density * deltas)
+        raw = torch.where(unseen[:, None], raw.detach(), raw)
+    colours, density = torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
+    seen = composite(density, colours, deltas, deltas, ray_offsets=ray_offsets, background=background)
+    error = (seen.colour - target).square().sum(-1)
+    rest = (seen.colour, seen.weights, density, error)
+    return RenderLoss(error.mean() / 3, *(part.detach() for part in rest))

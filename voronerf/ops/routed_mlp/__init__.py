@@ -1,0 +1,230 @@
+"""The whole route in one operation. n samples, r rays, k cells, m centres of all diagrams together, g diagrams, p and q
+features of a position and a direction."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.checks import (
+    INDEX,
+    check_count,
+    check_dtype,
+    check_integer,
+    check_no_inference,
+    check_same_device,
+    check_shape,
+)
+from voronerf.compiler import constant_result
+from voronerf.layers import MLP
+from voronerf.ops.grouped_mlp.checks import check_network
+from voronerf.ops.routed_mlp.reference import Operations
+from voronerf.ops.routed_mlp.reference import routed_mlp as compose
+
+_OP = backends.declare(
+    "routed_mlp",
+    native=Implementation(EVERYWHERE, FLOATS),
+)
+
+
+def routed_mlp(
+    positions: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    *,
+    layers: MLP,
+    centres: Tensor | None = None,
+    child_offsets: Tensor | None = None,
+    child: Tensor | None = None,
+    depth: int = 1,
+    centre_weights: Tensor | None = None,
+    cells: Tensor | None = None,
+    coords: Tensor | None = None,
+    directions: Tensor | None = None,
+    direction_index: Tensor | None = None,
+    features: Tensor | None = None,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Evaluates every sample by the network of the cell it lies in; results are in the order of the samples.
+
+    Equivalent to ``locate_cell``, ``cell_sort``, permuting the inputs, ``grouped_mlp``, and undoing the permutation.
+    The native CPU implementation gathers and scatters rows inside the tiles of the network: it makes no permuted copy,
+    and keeps only the order (int32) for the backward pass, and of hashed positions their features. Gradients of every
+    order to positions, directions, features, weights and biases; none through the choice of the cell. A sample whose
+    coordinates are not finite goes to the first cell, as in ``locate_cell``. A network of one cell (k = 1) needs no
+    tables, and is neither located nor sorted.
+
+    Args:
+        positions: [n, p] floating point, n < 2**31: the input of the layers, as in ``grouped_mlp``.
+        weights: one [k, o, i] for each layer, all of one dtype.
+        biases: one [k, o] or None for each layer.
+        layers: the layer table.
+        centres: [m, 3], the centres of the tree as in ``locate_cell``; without ``child_offsets`` and ``child``, the
+            centres of a flat diagram, [k, 3].
+        child_offsets: int32 [g + 1], or None for a flat diagram.
+        child: int32 [m], or None for a flat diagram. The leaves are the cells, 0 to k - 1.
+        depth: levels of the tree.
+        centre_weights: [m] or None: power diagrams.
+        cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables: a stochastic assignment, or one
+            that is reused.
+        coords: [n, 3] floating point, the locations of the samples; None uses the first three features of the
+            positions.
+        directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
+        direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
+        features: the table of the hash encoding, as in ``grouped_mlp``; None without a grid.
+        backend: "auto", "reference" or "native". If there is no fused implementation, "auto" calls the separate
+            operations, each on the backend it chooses.
+
+    Returns:
+        The output [n, layers.out_features] in the dtype of the weights (of autocast, where it is on), and cells int32
+        [n].
+
+    Raises:
+        ValueError: shapes, devices, directions that are missing, both or neither of tables and cells, an unknown
+            backend; on the CPU also tables that are not a tree, cells outside 0 to k - 1 and a direction_index outside
+            0 to r - 1.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import MLP, Layer, routed_mlp
+        >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))  # one linear layer, no encoding
+        >>> weights = [torch.tensor([[[1.0, 0, 0]], [[100.0, 0, 0]]])]
+        >>> positions = torch.tensor([[0.9, 0, 0], [0.1, 0, 0], [0.8, 0, 0]])
+        >>> centres = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
+        >>> out, cells = routed_mlp(positions, weights, [None], layers=table, centres=centres)
+        >>> cells
+        tensor([1, 0, 1], dtype=torch.int32)
+        >>> out.flatten().round(decimals=4)  # in the order of the positions
+        tensor([90.0000,  0.1000, 80.0000])
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OP, "positions", positions, ("n", "p"), sizes)
+    check_dtype(_OP, "positions", positions)
+    check_count(_OP, "positions", sizes["n"])
+    check_network(_OP, weights, biases, layers, directions, direction_index, features, sizes)
+    _check_tables(centres, child_offsets, child, depth, centre_weights, cells, sizes)
+    if coords is not None:
+        if centres is None:
+            raise ValueError(f"{_OP}: coords must come with centres, got none to compare them with")
+        check_shape(_OP, "coords", coords, ("n", 3), sizes)
+        check_dtype(_OP, "coords", coords)
+    elif centres is not None and sizes["p"] < 3:
+        raise ValueError(f"{_OP}: coords must be given for positions of less than 3 features, got {sizes['p']}")
+    tensors = {
+        "positions": positions,
+        "coords": coords,
+        "centres": centres,
+        "child_offsets": child_offsets,
+        "child": child,
+        "centre_weights": centre_weights,
+        "cells": cells,
+        "directions": directions,
+        "direction_index": direction_index,
+        "features": features,
+        **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
+        **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
+    }
+    check_same_device(_OP, **tensors)
+    check_no_inference(_OP, **tensors)
+    if centres is not None:
+        points = positions[:, :3] if coords is None else coords
+        coords, centres, centre_weights = of_one_dtype(points, centres, centre_weights)
+    device, dtype = positions.device, weights[0].dtype
+    run: Callable[..., tuple[Tensor, Tensor]]
+    if backend == "auto" and _is_composed(device.type, device.index, dtype):
+        run = functools.partial(compose, operations=_operations(device, dtype, coords))
+    else:
+        run = backends.resolve(_OP, backend=backend, device=device, dtype=dtype)
+    out, found = run(
+        positions,
+        weights,
+        biases,
+        layers=layers,
+        centres=centres,
+        child_offsets=child_offsets,
+        child=child,
+        depth=depth,
+        centre_weights=centre_weights,
+        cells=cells,
+        coords=coords,
+        directions=directions,
+        direction_index=direction_index,
+        features=features,
+    )
+    return out, found
+
+
+def _check_tables(
+    centres: Tensor | None,
+    child_offsets: Tensor | None,
+    child: Tensor | None,
+    depth: int,
+    centre_weights: Tensor | None,
+    cells: Tensor | None,
+    sizes: dict[str, int],
+) -> None:
+    if cells is not None:
+        if centres is not None:
+            raise ValueError(f"{_OP}: centres must be None where cells are given, got both")
+        check_shape(_OP, "cells", cells, ("n",), sizes)
+        check_dtype(_OP, "cells", cells, INDEX)
+    if centres is None:
+        others = {"child_offsets": child_offsets, "child": child, "centre_weights": centre_weights}
+        for name, value in others.items():
+            if value is not None:
+                raise ValueError(f"{_OP}: {name} must come with centres, got no centres")
+        if cells is None and sizes["k"] != 1:
+            raise ValueError(f"{_OP}: centres or cells must be given for {sizes['k']} cells, got neither")
+        return
+    if (child_offsets is None) != (child is None):
+        missing = "child_offsets" if child_offsets is None else "child"
+        raise ValueError(f"{_OP}: child_offsets and child must come together, got no {missing}")
+    check_shape(_OP, "centres", centres, ("k" if child is None else "m", 3), sizes)
+    check_dtype(_OP, "centres", centres)
+    if centre_weights is not None:
+        check_shape(_OP, "centre_weights", centre_weights, ("k" if child is None else "m",), sizes)
+        check_dtype(_OP, "centre_weights", centre_weights)
+    check_integer(_OP, "depth", depth, 1)
+    if child_offsets is None or child is None:
+        if depth != 1:
+            raise ValueError(f"{_OP}: depth must be 1 for a flat diagram, got {depth}")
+        return
+    check_shape(_OP, "child_offsets", child_offsets, ("g+1",), sizes)
+    check_dtype(_OP, "child_offsets", child_offsets, INDEX)
+    check_shape(_OP, "child", child, ("m",), sizes)
+    check_dtype(_OP, "child", child, INDEX)
+    if sizes["m"] < 1 or sizes["g"] < 1:
+        count = f"{sizes['m']} centres in {sizes['g']} diagrams"
+        raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
+
+
+def of_one_dtype(coords: Tensor, centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """What is compared, in one type: float64 where any is, float32 otherwise."""
+    dtype = torch.promote_types(torch.promote_types(coords.dtype, centres.dtype), torch.float32)
+    if weights is not None:
+        dtype = torch.promote_types(dtype, weights.dtype)
+        weights = weights.detach().to(dtype)
+    return coords.detach().to(dtype), centres.detach().to(dtype), weights
+
+
+def _operations(device: torch.device, weights: torch.dtype, coords: Tensor | None) -> Operations:
+    """Each operation on the backend that "auto" gives it."""
+    where = torch.float32 if coords is None else coords.dtype
+    dtypes = {"nearest_centre": where, "locate_cell": where, "cell_sort": torch.int32, "grouped_mlp": weights}
+    return Operations(
+        **{op: backends.resolve(op, backend="auto", device=device, dtype=dtype) for op, dtype in dtypes.items()}
+    )
+
+
+# torch.compile runs this while tracing and keeps the answer.
+@constant_result
+def _is_composed(device: str, index: int | None, dtype: torch.dtype) -> bool:
+    where = torch.device(device) if index is None else torch.device(device, index)
+    return all(backends.why_not(_OP, backend, where, dtype) is not None for backend in ("native", "warp"))

@@ -1,0 +1,94 @@
+"""The whole route: locate, sort, run every sample through the network of its cell, put the results back in order.
+
+n samples, r rays, k cells, m centres of all diagrams together, g diagrams, p and q features of a position and a
+direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.checks import check_range
+from voronerf.layers import MLP
+from voronerf.ops.cell_sort.reference import cell_sort
+from voronerf.ops.grouped_mlp.reference import check_direction_index, grouped_mlp
+from voronerf.ops.locate_cell.reference import locate_cell
+from voronerf.ops.nearest_centre.reference import nearest_centre
+
+
+@dataclass(frozen=True)
+class Operations:
+    """The operations that a route is made of."""
+
+    nearest_centre: Callable[..., Tensor] = nearest_centre
+    locate_cell: Callable[..., Tensor] = locate_cell
+    cell_sort: Callable[..., Any] = cell_sort
+    grouped_mlp: Callable[..., Tensor] = grouped_mlp
+
+
+REFERENCE = Operations()
+
+
+def routed_mlp(
+    positions: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    *,
+    layers: MLP,
+    centres: Tensor | None = None,
+    child_offsets: Tensor | None = None,
+    child: Tensor | None = None,
+    depth: int = 1,
+    centre_weights: Tensor | None = None,
+    cells: Tensor | None = None,
+    coords: Tensor | None = None,
+    directions: Tensor | None = None,
+    direction_index: Tensor | None = None,
+    features: Tensor | None = None,
+    operations: Operations = REFERENCE,
+) -> tuple[Tensor, Tensor]:
+    """Output [n, out] in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
+    k, n = weights[0].shape[0], positions.shape[0]
+    check_direction_index("routed_mlp", directions, direction_index)
+    if cells is None and k == 1:
+        offsets = torch.tensor([0, n], dtype=torch.int32, device=positions.device)
+        out = operations.grouped_mlp(
+            positions,
+            offsets,
+            weights,
+            biases,
+            layers=layers,
+            directions=directions,
+            direction_index=direction_index,
+            features=features,
+        )
+        return out, torch.zeros(n, dtype=torch.int32, device=positions.device)
+    if cells is None:
+        assert coords is not None and centres is not None
+        if child_offsets is None or child is None:
+            cells = operations.nearest_centre(coords, centres, weights=centre_weights)
+        else:
+            cells = operations.locate_cell(coords, centres, child_offsets, child, depth=depth, weights=centre_weights)
+    check_range("routed_mlp", "cells", cells, k)
+    order, offsets = operations.cell_sort(cells, k)
+    if direction_index is not None:
+        direction_index = direction_index[order]
+    elif directions is not None:
+        directions = directions[order]
+    out = operations.grouped_mlp(
+        positions[order],
+        offsets,
+        weights,
+        biases,
+        layers=layers,
+        directions=directions,
+        direction_index=direction_index,
+        features=features,
+    )
+    # The backward of index_copy is a gather, where that of an index would be a scatter that adds.
+    return torch.zeros_like(out).index_copy(0, order.long(), out), cells

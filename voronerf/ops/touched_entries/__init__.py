@@ -1,0 +1,1 @@
+"""Entries of tables that a step has touched, for the exchange among ranks."""
