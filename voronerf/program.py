@@ -24,7 +24,7 @@ import functools
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -137,6 +137,8 @@ class Program:
         steps: in their order.
         outputs: columns that are results, [n, w] each.
         sums: shape for one cell of each result that is a sum over its rows.
+        text: the program as a string, which ops take.
+        orders: the highest derivative of a function in it.
     """
 
     inputs: tuple[int, ...]
@@ -144,11 +146,14 @@ class Program:
     steps: tuple[Step, ...]
     outputs: tuple[Columns, ...]
     sums: tuple[tuple[int, ...], ...] = ()
+    text: str = field(init=False, compare=False)
+    orders: int = field(init=False, compare=False)
 
-    @functools.cached_property
-    def text(self) -> str:
-        """The program as a string, which ops take."""
-        return json.dumps([self.inputs, self.parameters, self.steps, self.outputs, self.sums])
+    def __post_init__(self) -> None:
+        parts = [self.inputs, self.parameters, self.steps, self.outputs, self.sums]
+        object.__setattr__(self, "text", json.dumps(parts))
+        orders = [int(step.numbers[0]) for step in self.steps if step.op == "function"]
+        object.__setattr__(self, "orders", max(orders, default=0))
 
     @staticmethod
     @functools.lru_cache(maxsize=1024)
@@ -161,11 +166,6 @@ class Program:
             for op, out, width, operands, numbers, name in steps
         ]
         return Program(tuple(inputs), shapes[0], tuple(known), tuple(Columns(*each) for each in outputs), shapes[1])
-
-    @property
-    def orders(self) -> int:
-        """The highest derivative of a function in it."""
-        return max((int(step.numbers[0]) for step in self.steps if step.op == "function"), default=0)
 
 
 class Builder:
@@ -387,7 +387,7 @@ def gradient(
             for columns, at_ in zip(step.operands, step.numbers, strict=True):
                 arriving.add(columns, g.part(int(at_), columns.width))
     results = [found.get(i) or b.move(program.inputs[i], []) for i, want in enumerate(inputs) if want]
-    return optimised(b.program(results))
+    return pruned(b.program(results))
 
 
 def _of_sum(b: Builder, arriving: _Arriving, step: Step, parameter: int) -> None:
@@ -448,20 +448,23 @@ def _of_binary(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
         arriving.add(x, b.binary("gate", g, y))
 
 
-def optimised(program: Program) -> Program:
-    """The same without steps whose values are not used, and with ReLU done on the way of the layer before it."""
+def pruned(program: Program) -> Program:
+    """The same without steps whose values are not used."""
     needed = {columns.index for columns in program.outputs if columns.of == VALUE}
-    uses: dict[int, int] = dict.fromkeys(needed, 1)
     kept: list[Step] = []
     for step in reversed(program.steps):
-        if not _sums(step) and step.out not in needed:
-            continue
-        kept.append(step)
-        for columns in step.operands:
-            if columns.of == VALUE:
-                needed.add(columns.index)
-                uses[columns.index] = uses.get(columns.index, 0) + 1
-    kept.reverse()
+        if _sums(step) or step.out in needed:
+            kept.append(step)
+            needed.update(columns.index for columns in step.operands if columns.of == VALUE)
+    return replace(program, steps=tuple(reversed(kept)))
+
+
+def merged(program: Program) -> Program:
+    """The same with ReLU done on the way of the layer before it: for running, not for :func:`gradient`."""
+    kept, uses = list(program.steps), dict[int, int]()
+    for columns in (*program.outputs, *(c for step in kept for c in step.operands)):
+        if columns.of == VALUE:
+            uses[columns.index] = uses.get(columns.index, 0) + 1
     made = {step.out: place for place, step in enumerate(kept) if not _sums(step)}
     dropped = set()
     for place, step in enumerate(kept):

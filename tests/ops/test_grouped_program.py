@@ -98,12 +98,12 @@ def derivatives(program: Program, rows: list, parameters: list, offsets: Tensor,
         parts = []
         for t in tensors:
             weights = torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t.dtype)
-            parts.append((t * weights).sum())
-        return torch.stack(parts).sum()
+            if t.requires_grad:
+                parts.append((t * weights).sum())
+        return torch.stack(parts).sum() if parts else 0 * leaves[0].sum()
 
     firsts = torch.autograd.grad(weighted(results), leaves, create_graph=True, allow_unused=True, materialize_grads=True)
-    total = weighted([f for f in firsts if f.requires_grad] or [leaves[0] * 0])
-    seconds = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+    seconds = torch.autograd.grad(weighted(firsts), leaves, allow_unused=True, materialize_grads=True)
     return [t.detach() for t in (*results, *firsts, *seconds)]
 
 
@@ -136,7 +136,7 @@ def test_derivative_of_every_function(name: str, order: int) -> None:
     offsets = offsets_of([40, 61])
     (exact,) = grouped_program([rows], [], offsets, program=program, backend="reference")
     (ours,) = grouped_program([rows.float()], [], offsets, program=program, backend="native")
-    torch.testing.assert_close(ours.double(), exact, rtol=3e-6, atol=3e-6)
+    torch.testing.assert_close(ours.double(), exact, rtol=3e-6, atol=3e-6 * max(1.0, float(exact.abs().max())))
 
 
 @pytest.mark.parametrize("sizes", SIZES)
@@ -157,7 +157,8 @@ def test_random_programs(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(12))
 def test_gradient_program_against_autograd(seed: int, order_of: int) -> None:
     """The program of a gradient, run in PyTorch, against autograd of the program; twice, too."""
-    program = random_program(100 + seed)
+    b = Builder()
+    program = b.program(every_step(b)) if seed == 0 else random_program(100 + seed)
     rows, parameters, offsets = arguments(program, [9, 0, 6], torch.float64)
     for _ in range(order_of):
         asked = (True,) * len(rows), (True,) * len(parameters)

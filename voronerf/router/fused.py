@@ -19,7 +19,7 @@ from torch import Tensor, fx
 from torch.fx.node import map_arg
 
 from voronerf.ops.grouped_program import grouped_program
-from voronerf.program import VALUE, Builder, Columns, Program, Step, optimised
+from voronerf.program import VALUE, Builder, Columns, Program, Step
 from voronerf.router.grouped import GroupedRun, PerCell, for_all_cells, name_of
 from voronerf.router.grouping import Grouping, owned_parameters
 from voronerf.router.layout import Call, Results, map_tensors, map_tree, tensors_of
@@ -324,7 +324,7 @@ def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outp
         if step.op == "linear":
             numbers = (parameter(int(numbers[0])), *numbers[1:])
         values[step.out] = b.emit(step.op, step.width, operands, numbers, step.name).index
-    run.program = optimised(b.program([columns(c) for c in kept]))
+    run.program = b.program([columns(c) for c in kept])
     return run
 
 

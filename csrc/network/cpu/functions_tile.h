@@ -72,6 +72,12 @@ VN_INLINE F32 hyperbolic_tangent(F32 x) {
   return x < splat(0.0f) ? splat(0.0f) - size : size;
 }
 
+// Its slope, 1 - tanh^2 without cancellation.
+VN_INLINE F32 tangent_slope(F32 x) {
+  const F32 e = exponential(splat(-2.0f) * abs(x)), sum = splat(1.0f) + e;
+  return splat(4.0f) * e / (sum * sum);
+}
+
 // The density of the normal distribution.
 VN_INLINE F32 density(F32 x) {
   return splat(0.39894228f) * exponential(splat(-0.5f) * x * x);
@@ -101,7 +107,7 @@ VN_INLINE F32 logistic(F32 x) {
 template <int Order>
 VN_INLINE F32 gelu_by_tanh(F32 x) {
   const F32 c = splat(0.79788456f), d = splat(0.044715f), half = splat(0.5f), one = splat(1.0f), xx = x * x;
-  const F32 t = hyperbolic_tangent(c * x * fma(d, xx, one)), s = one - t * t;
+  const F32 u = c * x * fma(d, xx, one), t = hyperbolic_tangent(u), s = tangent_slope(u);
   if (Order == 0) return half * x * (one + t);
   const F32 u1 = c * fma(splat(3.0f) * d, xx, one), u2 = splat(6.0f) * c * d * x, t1 = s * u1;
   if (Order == 1) return half * (one + t) + half * x * t1;
@@ -146,10 +152,8 @@ VN_FUNCTION(softplus, splat(a) * x > splat(b) ? x : softplus(splat(a) * x) * spl
             splat(a) * x > splat(b) ? zero : splat(a) * logistic<1>(splat(a) * x),
             splat(a) * x > splat(b) ? zero : splat(a * a) * logistic<2>(splat(a) * x))
 VN_FUNCTION(sigmoid, logistic<0>(x), logistic<1>(x), logistic<2>(x), logistic<3>(x))
-VN_FUNCTION(tanh, hyperbolic_tangent(x), one - hyperbolic_tangent(x) * hyperbolic_tangent(x),
-            splat(-2.0f) * hyperbolic_tangent(x) * (one - hyperbolic_tangent(x) * hyperbolic_tangent(x)),
-            (one - hyperbolic_tangent(x) * hyperbolic_tangent(x)) *
-                (splat(6.0f) * hyperbolic_tangent(x) * hyperbolic_tangent(x) - splat(2.0f)))
+VN_FUNCTION(tanh, hyperbolic_tangent(x), tangent_slope(x), splat(-2.0f) * hyperbolic_tangent(x) * tangent_slope(x),
+            tangent_slope(x) * (splat(4.0f) - splat(6.0f) * tangent_slope(x)))
 VN_FUNCTION(silu, x* logistic<0>(x), logistic<0>(x) + x * logistic<1>(x), logistic<1>(x) * splat(2.0f) + x * logistic<2>(x),
             logistic<2>(x) * splat(3.0f) + x * logistic<3>(x))
 VN_FUNCTION(gelu, x* distribution(x), distribution(x) + x * density(x), density(x) * (splat(2.0f) - x * x),

@@ -17,7 +17,7 @@ from torch import Tensor
 from voronerf import native
 from voronerf.derivatives import asked_for
 from voronerf.native.custom_op import custom_op, on_huge_pages
-from voronerf.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient
+from voronerf.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient, merged
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
 
 _OPS = ("input", "output", "linear", "function", "binary", "total", "move", "outer", "columns")
@@ -60,7 +60,7 @@ def _run(
         constants=plan.constants,
         inputs=inputs,
         parameters=parameters,
-        strides=torch.tensor([p[0].numel() if p.shape[0] > 1 or k == 1 else 0 for p in parameters]),
+        strides=torch.tensor([p[0].numel() if p.shape[0] > 1 else 0 for p in parameters], dtype=torch.int64),
         widths=plan.widths,
         outputs=len(results),
         offsets=offsets,
@@ -140,7 +140,7 @@ def _padded(width: int) -> int:
 
 @functools.lru_cache(maxsize=1024)
 def _plan(text: str) -> Plan:
-    program = Program.parse(text)
+    program = merged(Program.parse(text))
     writing = _Writing(program)
     outputs = [Step("output", i, c.width, (c,), (i,)) for i, c in enumerate(program.outputs)]
     steps = [*program.steps, *outputs]
