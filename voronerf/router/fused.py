@@ -91,7 +91,7 @@ class Fused:
 
     def _add(self, node: fx.Node) -> None:
         """Notes how a node is computed: by steps, or by PyTorch between runs."""
-        if node.meta["on"] != SAMPLES or node.op == "placeholder" or isinstance(node.meta["value"], int):
+        if node.meta["on"] != SAMPLES or node.op == "placeholder" or isinstance(node.meta.get("value"), int):
             self._ready[node] = 0
             return
         if "results" not in node.meta:  # a part of a result
@@ -162,9 +162,11 @@ class Fused:
             self._entries[value] = known_as
 
     def _needed(self) -> set[fx.Node]:
-        """The nodes that PyTorch computes; asks for what they and the results read of steps."""
+        """The nodes that PyTorch computes; notes what they and the results read of steps, and which steps that takes."""
         needed: set[fx.Node] = set()
+        lowering, steps = self._lowering, self._lowering.builder.steps
         self._made: dict[fx.Node, Columns] = {}
+        self._live: set[int] = set()
         waiting = list(self._outputs)
         while waiting:
             node = waiting.pop()
@@ -172,29 +174,33 @@ class Fused:
                 continue
             if node in self._ready or self._only_moves(node):
                 needed.add(node)
-                base = node.args[0] if node.target is operator.getitem and "results" not in node.meta else None
-                waiting += [base] if isinstance(base, fx.Node) else node.all_input_nodes
-                self._ready.setdefault(node, self._at(node))
+                self._ready.setdefault(node, self._at(node) if node.meta["on"] == SAMPLES else 0)
+                waiting += node.all_input_nodes
                 continue
-            codes = self._entries[node].codes
-            shape, at = codes.shape, _sample_dimension(codes.shape)
-            turned = codes.movedim(at, 0).reshape(ROWS, -1)
-            if not torch.equal(turned >> 32, torch.arange(ROWS)[:, None].expand_as(turned)):
-                raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} mixes samples")
-            node.meta["layout"] = [*shape[:at], *shape[at + 1 :]], at, shape[at] // ROWS
-            self._made[node] = self._lowering.operand(turned[0] & ((1 << 32) - 1))
-        for run_parameter, _ in self._lowering.parameters:
-            if isinstance(run_parameter, fx.Node):
-                waiting.append(run_parameter)
-        for source in self._lowering.sources.values():
-            waiting.append(source)
-        while waiting:
-            node = waiting.pop()
-            if node not in needed:
-                needed.add(node)
-                if node in self._ready:
-                    waiting += [s for s in node.all_input_nodes if s in self._ready or s.meta["on"] != SAMPLES]
+            self._made[node] = self._whole(node)
+            values = [self._made[node].index]
+            while values:
+                step = steps[values.pop()]
+                if step.out in self._live:
+                    continue
+                self._live.add(step.out)
+                values += [c.index for c in step.operands if c.of == VALUE]
+                used = [c.index for c in step.operands if c.of != VALUE]
+                used += [int(step.numbers[0])] if step.op == "linear" else []
+                sources = [lowering.parameters[index][0] for index in used]
+                sources += [lowering.sources[step.out]] if step.op == "input" else []
+                waiting += [source for source in sources if isinstance(source, fx.Node)]
         return needed
+
+    def _whole(self, node: fx.Node) -> Columns:
+        """The columns that make a node's value, and how they are laid out in it."""
+        codes = self._entries[node].codes
+        shape, at = codes.shape, _sample_dimension(codes.shape)
+        turned = codes.movedim(at, 0).reshape(ROWS, -1)
+        if not torch.equal(turned >> 32, torch.arange(ROWS)[:, None].expand_as(turned)):
+            raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} mixes samples")
+        node.meta["layout"] = [*shape[:at], *shape[at + 1 :]], at, shape[at] // ROWS
+        return self._lowering.operand(turned[0] & ((1 << 32) - 1))
 
     def _only_moves(self, node: fx.Node) -> bool:
         """Whether a value is made of what PyTorch makes without any step."""
@@ -208,13 +214,7 @@ class Fused:
     def _cut(self) -> dict[int, Run]:
         """The steps in runs, by their level."""
         lowering, steps = self._lowering, self._lowering.builder.steps
-        live: set[int] = set()
-        waiting = [columns.index for columns in self._made.values() if columns.of == VALUE]
-        while waiting:
-            value = waiting.pop()
-            if value not in live:
-                live.add(value)
-                waiting += [c.index for c in steps[value].operands if c.of == VALUE]
+        live = self._live
         level = {value: lowering.level(value) for value in live}
         runs: dict[int, Run] = {}
         for number in sorted({level[v] for v in live if v not in lowering.sources}):

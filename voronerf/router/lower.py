@@ -205,6 +205,7 @@ class Lowering:
                 copied = copied.float() if copied.is_floating_point() else copied
                 entries = known(value)
                 mode.keep(copied, entries)
+                mode.originals[id(copied)] = value
                 return copied
 
             args, kwargs = map_tensors((args, kwargs), own)
@@ -220,6 +221,7 @@ class _Recording(TorchDispatchMode):
         super().__init__()
         self.lowering, self.b = lowering, lowering.builder
         self._kept: dict[int, tuple[Tensor, Entries | None]] = {}
+        self.originals: dict[int, Tensor] = {}  # of the copies of arguments
 
     def keep(self, tensor: Tensor, entries: Entries | None) -> None:
         """Notes where the entries of a tensor come from; None for a constant."""
@@ -284,6 +286,12 @@ class _Recording(TorchDispatchMode):
         if entries is None or entries.of is not None:
             raise NotAStep("a product with a tensor that does not depend on samples")
         return entries
+
+    def _of_constant(self, tensor: Tensor) -> Entries:
+        """Entries of a tensor that depends on nothing."""
+        with torch.inference_mode(False):
+            of = self.originals[id(tensor)] if id(tensor) in self.originals else tensor.clone()
+        return Entries(torch.arange(tensor.numel()).reshape(tensor.shape), of)
 
     def _moved(self, func: Any, args: Any, kwargs: Any, rows: bool, name: str) -> list[Entries]:
         given = [t for t in tensors_of((args, kwargs))]
@@ -365,7 +373,7 @@ class _Recording(TorchDispatchMode):
                 found.append(self.lowering.operand(numbers))
                 continue
             if entries is None:
-                entries = Entries(torch.arange(tensor.numel()).reshape(tensor.shape), tensor)
+                entries = self._of_constant(tensor)
             by_sample = entries.codes.expand(list(shape)).flatten()[places]
             if not (by_sample == by_sample[:1]).all():
                 raise NotAStep("a constant with other numbers for each sample")
@@ -455,7 +463,7 @@ class _Recording(TorchDispatchMode):
         made = self.b.binary("mul", centred, inverse._replace(width=group, spread=True))
         for name, given in (("mul", weight), ("add", bias)):
             if given is not None:
-                entries = self.entries(given) or Entries(torch.arange(group).reshape(given.shape), given)
+                entries = self.entries(given) or self._of_constant(given)
                 made = self.b.binary(name, made, self.lowering.vector(entries, entries.codes.flatten()))
         whole, _ = self.lowering.order(self._known(tensor).codes)
         small = [self._placed(value, places, part.shape) for value, part in zip((mean, inverse), result[1:])]
@@ -496,7 +504,7 @@ class _Recording(TorchDispatchMode):
 
     def _matrix(self, tensor: Tensor, entries: Entries | None) -> Entries:
         if entries is None:
-            return Entries(torch.arange(tensor.numel()).reshape(tensor.shape), tensor)
+            return self._of_constant(tensor)
         if entries.of is None:
             raise NotAStep("a product of two tensors of samples")
         return entries
