@@ -18,7 +18,7 @@ SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
-.PHONY: demo test bench paper docs check cuda-check gpu-check emulate-cuda sanitize attack clean
+.PHONY: demo test bench paper docs check cuda-check arm-check isa-check gpu-check emulate-cuda sanitize attack clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -50,6 +50,16 @@ docs: $(VENV)/.built $(VENV)/.docs
 cuda-check:
 	@$(PYTHON) .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
 
+# The C++ of the CPU kernels on 64-bit Arm, in qemu: needs g++-aarch64-linux-gnu and qemu-user.
+arm-check:
+	@tests/cpp/arm.sh
+
+# The operations with the instruction sets that this processor would not choose.
+ISAS ?= portable avx2
+isa-check: $(VENV)/.built
+	@for isa in $(ISAS); do \
+	  VORONERF_ISA=$$isa OMP_NUM_THREADS=1 $(BIN)/pytest -q -n $(JOBS) tests/ops -k native-cpu || exit 1; done
+
 # Everything to be learnt from a machine with a GPU, in eight minutes; OUT is a folder for what it says.
 OUT ?= build/gpu-check
 gpu-check:
@@ -63,7 +73,6 @@ emulate-cuda: $(VENV)/.built
 # and random calls of the operations with the extension under AddressSanitizer.
 sanitize: $(VENV)/.built
 	@tests/cpp/sanitize.sh
-	@tests/cpp/sanitize_ops.sh
 	@tests/cpp/sanitize_calls.sh
 
 # Random calls of the operations, kills, damaged checkpoints and strangers' files, for about an hour. ATTACK_ARGS names

@@ -15,7 +15,7 @@ Environment:
 from __future__ import annotations
 
 import os
-import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -28,14 +28,18 @@ from setuptools.command.build_ext import build_ext
 
 ROOT = Path(__file__).resolve().parent
 SOURCES = ROOT / "csrc"
-X86_ISAS = {
-    "portable": ["-DVN_ISA=0"],
-    "avx2": ["-DVN_ISA=1", "-mavx2", "-mfma"],
-    "avx512": ["-DVN_ISA=2", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma"],
+ISAS = {
+    "x86_64": {
+        "avx2": ["-DVN_ISA=1", "-mavx2", "-mfma"],
+        "avx512": ["-DVN_ISA=2", "-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma"],
+    },
+    "aarch64": {"neon": ["-DVN_ISA=3"]},
 }
+"""Of an architecture, beside the portable path."""
 LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
-# Short, for the sake of build time: 8.x runs the code of 80, and what comes after 9.0 compiles the PTX of 90.
-DEFAULT_ARCHITECTURES = "75;80;90"
+# One of each major version, which runs on its minor ones. Without 100 and 120 a Blackwell GPU would compile the PTX of
+# 90 for minutes when a kernel is first used.
+DEFAULT_ARCHITECTURES = "75;80;90;100;120"
 BINDINGS = 2
 """Compilations that share the files of csrc/bindings."""
 
@@ -141,9 +145,10 @@ def ninja() -> list[str]:
 
 
 def isas() -> dict[str, list[str]]:
-    """Instruction sets of this architecture and their flags."""
-    x86 = platform.machine().lower() in ("x86_64", "amd64") and "aarch64" not in " ".join(compiler())
-    return X86_ISAS if x86 else {"portable": X86_ISAS["portable"]}
+    """Instruction sets of the compiler's architecture and their flags."""
+    target = subprocess.run([*compiler(), "-dumpmachine"], check=True, capture_output=True, text=True).stdout
+    architecture = target.split("-")[0].replace("arm64", "aarch64")
+    return {"portable": ["-DVN_ISA=0"], **ISAS.get(architecture, {})}
 
 
 def build_info(cuda: Cuda) -> str:
@@ -160,8 +165,18 @@ def build_info(cuda: Cuda) -> str:
         "VN_CUDA_BUILT": str(int(cuda.nvcc is not None)),
         "VN_CUDA_OUTCOME": f'"{cuda.outcome}"',
         "VN_CUDA_ARCHITECTURES": f'"{";".join(cuda.architectures)}"',
+        "VN_CUDA_MAJOR": str(0 if cuda.nvcc is None else toolkit_major(cuda.nvcc)),
     }
     return "#pragma once\n" + "".join(f"#define {name} {value}\n" for name, value in values.items())
+
+
+def toolkit_major(nvcc: Path) -> int:
+    """Major version of the CUDA toolkit, such as 13."""
+    said = subprocess.run([nvcc, "--version"], check=True, capture_output=True, text=True).stdout
+    found = re.search(r"release (\d+)", said)
+    if found is None:
+        raise SystemExit(f"voronerf: {nvcc} --version names no release")
+    return int(found[1])
 
 
 def bindings() -> dict[str, str]:

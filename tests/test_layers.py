@@ -33,7 +33,7 @@ OUTSIDE = {"kernels": {"warp", "torch"}}
 STANDARD_OF_KERNELS = {
     "__future__", "typing", "collections", "contextlib", "functools", "importlib", "os", "pkgutil", "tempfile", "time",
 }  # fmt: skip
-STANDARD_OF_ISA_FILES = {"cstdint", "cstddef", "immintrin.h"}
+STANDARD_OF_ISA_FILES = {"cstdint", "cstddef", "immintrin.h", "arm_neon.h"}
 
 SOURCES = sorted([*(ROOT / "voronerf").rglob("*.py"), *(ROOT / "kernels").rglob("*.py")])
 CORE = sorted(path for path in (ROOT / "csrc").rglob("*") if path.is_file())

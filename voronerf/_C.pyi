@@ -14,6 +14,7 @@ openmp: bool
 cuda: bool
 cuda_outcome: str
 cuda_architectures: str
+cuda_major: int
 
 def name_dtypes(names: dict[str, torch.dtype]) -> None: ...
 
@@ -138,7 +139,7 @@ class HashInputs(NamedTuple):
     tables: int  # int64
     entries: int  # int64
 
-Isa: tuple[str, ...]  # portable avx2 avx512
+Isa: tuple[str, ...]  # portable neon avx2 avx512 avx512_bf16
 
 class KnownSamples(NamedTuple):
     positions: Tensor | None  # const float32*
@@ -345,11 +346,10 @@ class SparseAdam(NamedTuple):
 TableType: tuple[str, ...]  # float32 bfloat16 float16
 
 # SparseAdam[], const float32**, float32**, float32**, float32**, int64[], Cpu
-@overload
 def adam(_0: Sequence[SparseAdam], _1: Sequence[Tensor | None] | None, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[int], _6: Cpu) -> None: ...
+
 # AdamRule[], AdamGuard, const float32**, float32**, float32**, float32**, int64[], float32*, Cuda
-@overload
-def adam(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Tensor | None, _8: Cuda) -> None: ...
+def adam_on_device(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Tensor | None, _8: Cuda) -> None: ...
 
 # const float32*, int64, int64, float32*, Cpu
 def add_touched(_0: Tensor | None, _1: int, _2: int, _3: Tensor | None, _4: Cpu) -> None: ...
@@ -362,6 +362,9 @@ def balance_centres(_0: BalanceInputs, _1: Tensor | None, _2: Tensor | None, _3:
 
 # int64
 def balance_centres_workspace(_0: int) -> int: ...
+
+# 
+def bfloat16_gain() -> float: ...
 
 # const int32*, int32*, int32*, int32*, int64, int64, Cpu
 @overload

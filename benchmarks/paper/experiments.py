@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from paper.claims import Claim, Rows, at_look, equal_claim, fewer_seams, gain_claim, growing_claim, order_claim
 from paper.runs import AS_PUBLISHED, Run, Settings, Variant, default_scenes, make_run, open_scene
+from paper.translucent import NAME as TRANSLUCENT
 from voronerf.training.config import TrainConfig
 from voronerf.training.networks import count_parameters, resolve_config
 
@@ -28,7 +29,7 @@ KILO_START, KILO_LATE = f"512 uniform cells after {KILO_FIRST_STEPS} steps", "51
 KILO_CELLS = "16 x 16 Voronoi cells"
 NEVER, TOO_EARLY, USUAL, LATE = "never split", "split at 2 %", "split at 20 %", "split at 50 %"
 EARLY = ("after", "at-25", "at-50")
-SOLID, TRANSLUCENT = "builtin", "builtin-translucent"
+SOLID = "builtin"
 SPLIT_TIMES, TYPICAL = (0.05, 0.1, 0.2, 0.4, 0.6), 0.2
 COUNTS = (4, 8, 12, 16, 32)
 

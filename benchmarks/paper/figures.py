@@ -15,8 +15,8 @@ from torch import Tensor
 
 from paper import looks as paper_looks
 from paper.claims import Rows
+from paper.slices import picture_of_density
 from voronerf.evaluation.panels import contact_sheet, picture_of_cells, picture_of_error, save_picture
-from voronerf.evaluation.slices import picture_of_density
 from voronerf.files import write_bytes
 
 matplotlib.use("Agg")

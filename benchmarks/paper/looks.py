@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from paper.slices import slice_density, slice_points
 from voronerf.data import Scene
 from voronerf.evaluation.metrics import psnr
 from voronerf.evaluation.scores import render_view
 from voronerf.evaluation.seams import seam
-from voronerf.evaluation.slices import slice_density, slice_points
 from voronerf.files import write_bytes
 from voronerf.training.trainer import Trainer
 
@@ -77,9 +77,7 @@ def picture(trainer: Trainer) -> dict[str, Any]:
         "truth": (scene.test.truth(view, scene.background_colour()) * 255).round().to(torch.uint8),
     }
     points = slice_points(scene, size=SLICE)
-    found["density"] = slice_density(
-        router, points, cones=trainer.renderer.cones, contraction=trainer.renderer.contraction
-    ).half()
+    found["density"] = slice_density(router, points, cones=trainer.renderer.cones).half()
     found["slice_cells"] = router.diagram.locate(points.reshape(-1, 3)).reshape(SLICE, SLICE).int()
     score = psnr(found["colour"].float() / 255, found["truth"].float() / 255)
     return {name: value.cpu().numpy() for name, value in found.items()} | {

@@ -11,6 +11,7 @@ VN_NAMES(Peak, "float32", "bfloat16", "copy");
 VN_BINDINGS(module) {
   module.plain("isa_supported", VN_CPU(isa_supported));
   module.cpu("measure_peak", VN_CPU(measure_peak));
+  module.plain("bfloat16_gain", VN_CPU(bfloat16_gain));
   module.plain("advise_huge_pages", VN_CPU(advise_huge_pages));
   module.plain("keep_freed_memory", VN_CPU(keep_freed_memory));
 }

@@ -10,5 +10,6 @@ PYBIND11_MODULE(_C, module) {
   module.attr("cuda") = static_cast<bool>(VN_CUDA_BUILT);
   module.attr("cuda_outcome") = VN_CUDA_OUTCOME;
   module.attr("cuda_architectures") = VN_CUDA_ARCHITECTURES;
+  module.attr("cuda_major") = VN_CUDA_MAJOR;
   voronerf::bind_all(module);
 }

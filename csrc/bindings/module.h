@@ -35,6 +35,7 @@ constexpr const char* kStub =
     "cuda: bool\n"
     "cuda_outcome: str\n"
     "cuda_architectures: str\n"
+    "cuda_major: int\n"
     "\n"
     "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n";
 

@@ -10,7 +10,7 @@ VN_STRUCT(AdamGuard, loss, limit, found, skipped, in_a_row, scale);
 VN_BINDINGS(module) {
   module.cpu("sparse_adam", VN_CPU(sparse_adam_cpu));
   module.cpu("adam", VN_CPU(adam_cpu));
-  module.cuda("adam", VN_CUDA(adam_cuda));
+  module.cuda("adam_on_device", VN_CUDA(adam_cuda));
   module.cuda("sparse_adam", VN_CUDA(sparse_adam_cuda));
 }
 

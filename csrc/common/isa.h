@@ -4,13 +4,11 @@
 
 namespace voronerf {
 
-enum class Isa : int { portable = 0, avx2 = 1, avx512 = 2 };
+// avx512_bf16 is avx512 whose networks multiply pairs of bfloat16 where they may; the others multiply floats.
+enum class Isa : int { portable = 0, neon, avx2, avx512, avx512_bf16 };
 
-// Whether this processor and its operating system can run it.
+// Whether this build has it, and this processor and its operating system can run it.
 bool isa_supported(Isa isa);
-
-// Whether the processor multiplies pairs of bfloat16, and the build has code for it.
-bool isa_multiplies_bfloat16(Isa isa);
 
 }  // namespace voronerf
 
@@ -22,11 +20,16 @@ bool isa_multiplies_bfloat16(Isa isa);
 #define VN_HAS_HALF 0
 #endif
 
-// The paths that exist in a build. x86-64 has all three, anything else the portable one.
+// The paths that exist in a build: those of its architecture, and the portable one.
+#define VN_DECLARE_IN(isa, declaration) \
+  namespace isa {                       \
+  declaration;                          \
+  }
 #if defined(__x86_64__)
 #define VN_FOR_ISA(isa, call)            \
   switch (isa) {                         \
     case ::voronerf::Isa::avx512:        \
+    case ::voronerf::Isa::avx512_bf16:   \
       return ::voronerf::avx512::call;   \
     case ::voronerf::Isa::avx2:          \
       return ::voronerf::avx2::call;     \
@@ -34,21 +37,19 @@ bool isa_multiplies_bfloat16(Isa isa);
       return ::voronerf::portable::call; \
   }
 #define VN_DECLARE_FOR_ISA(declaration) \
-  namespace portable {                  \
-  declaration;                          \
-  }                                     \
-  namespace avx2 {                      \
-  declaration;                          \
-  }                                     \
-  namespace avx512 {                    \
-  declaration;                          \
-  }
+  VN_DECLARE_IN(portable, declaration)  \
+  VN_DECLARE_IN(avx2, declaration)      \
+  VN_DECLARE_IN(avx512, declaration)
+#elif defined(__aarch64__)
+#define VN_FOR_ISA(isa, call)                                      \
+  if (isa == ::voronerf::Isa::neon) return ::voronerf::neon::call; \
+  return ::voronerf::portable::call;
+#define VN_DECLARE_FOR_ISA(declaration) \
+  VN_DECLARE_IN(portable, declaration)  \
+  VN_DECLARE_IN(neon, declaration)
 #else
 #define VN_FOR_ISA(isa, call) \
   (void)isa;                  \
   return ::voronerf::portable::call;
-#define VN_DECLARE_FOR_ISA(declaration) \
-  namespace portable {                  \
-  declaration;                          \
-  }
+#define VN_DECLARE_FOR_ISA(declaration) VN_DECLARE_IN(portable, declaration)
 #endif

@@ -8,7 +8,7 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 
 int64_t peak_float32(int64_t turns, float* sink) {
-  constexpr int kSums = VN_ISA == 2 ? 24 : VN_ISA == 1 ? 12 : 10;
+  constexpr int kSums = kRegisters == 32 ? 24 : VN_ISA == 1 ? 12 : 10;
   F32 sums[kSums];
 #pragma GCC unroll 24
   for (int i = 0; i < kSums; ++i) sums[i] = splat(static_cast<float>(i));

@@ -1,5 +1,6 @@
 // The one place that knows instruction sets: a vector of float32 and the operations the kernels need, for the
-// instruction set of the including file (VN_ISA: 0 portable, 1 AVX2 + FMA, 2 AVX-512; see isa.h).
+// instruction set of the including file (VN_ISA: 0 portable, 1 AVX2 + FMA, 2 AVX-512, 3 NEON; see isa.h). Kernels take
+// the size of a vector from kLanes and the size of the register file from kRegisters.
 //
 // Everything here has internal linkage. A file compiled for AVX-512 must not leave an inline function behind that the
 // linker could pick for a processor without it, so *_isa.cpp files include no standard header but <cstdint> and
@@ -10,7 +11,7 @@
 #include <cstdint>
 
 #ifndef VN_ISA
-#error "compile with VN_ISA=0, 1 or 2"
+#error "compile with VN_ISA=0, 1, 2 or 3"
 #endif
 
 #if VN_ISA == 2
@@ -19,6 +20,9 @@
 #elif VN_ISA == 1
 #include <immintrin.h>
 #define VN_ISA_NAMESPACE avx2
+#elif VN_ISA == 3
+#include <arm_neon.h>
+#define VN_ISA_NAMESPACE neon
 #else
 #define VN_ISA_NAMESPACE portable
 #endif
@@ -30,7 +34,7 @@ namespace VN_ISA_NAMESPACE {
 
 #if VN_ISA == 2
 
-constexpr int kLanes = 16;
+constexpr int kLanes = 16, kRegisters = 32;
 using F32 = __m512;
 using I32 = __m512i;
 using Mask = __mmask16;
@@ -63,6 +67,9 @@ VN_INLINE F32 max(F32 a, F32 b) {
 }
 VN_INLINE F32 abs(F32 a) {
   return _mm512_abs_ps(a);
+}
+VN_INLINE F32 square_root(F32 a) {
+  return _mm512_maskz_sqrt_ps(0xffff, a);
 }
 VN_INLINE Mask less(F32 a, F32 b) {
   return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ);
@@ -120,7 +127,7 @@ VN_INLINE F32 lane_sums(const F32* v) {
 
 #elif VN_ISA == 1
 
-constexpr int kLanes = 8;
+constexpr int kLanes = 8, kRegisters = 16;
 using F32 = __m256;
 using I32 = __m256i;
 using Mask = __m256;
@@ -151,6 +158,9 @@ VN_INLINE F32 max(F32 a, F32 b) {
 }
 VN_INLINE F32 abs(F32 a) {
   return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), a);
+}
+VN_INLINE F32 square_root(F32 a) {
+  return _mm256_sqrt_ps(a);
 }
 VN_INLINE Mask less(F32 a, F32 b) {
   return _mm256_cmp_ps(a, b, _CMP_LT_OQ);
@@ -202,8 +212,9 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
 
 #else
 
-// Four lanes of the compiler's own vectors: SSE2 on x86-64, NEON on arm64.
-constexpr int kLanes = 4;
+// Four lanes of the compiler's own vectors. They are those of NEON too, whose intrinsics are here what operators do not
+// say.
+constexpr int kLanes = 4, kRegisters = VN_ISA == 3 ? 32 : 16;
 typedef float F32 __attribute__((vector_size(16)));
 typedef int32_t I32 __attribute__((vector_size(16)));
 typedef I32 Mask;
@@ -223,9 +234,6 @@ VN_INLINE F32 mul(F32 a, F32 b) {
 VN_INLINE F32 add(F32 a, F32 b) {
   return a + b;
 }
-VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
-  return a * b + c;
-}
 VN_INLINE F32 min(F32 a, F32 b) {
   return a < b ? a : b;
 }
@@ -241,13 +249,47 @@ VN_INLINE Mask less(F32 a, F32 b) {
 VN_INLINE I32 select(Mask m, I32 a, I32 b) {
   return (m & a) | (~m & b);
 }
-VN_INLINE unsigned bits(Mask m) {
-  return (m[0] & 1u) | (m[1] & 2u) | (m[2] & 4u) | (m[3] & 8u);
-}
 VN_INLINE void store(int32_t* to, I32 a) {
   __builtin_memcpy(to, &a, sizeof a);
 }
 
+#if VN_ISA == 3
+
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
+  return vfmaq_f32(c, a, b);
+}
+VN_INLINE F32 square_root(F32 a) {
+  return vsqrtq_f32(a);
+}
+VN_INLINE unsigned bits(Mask m) {
+  return static_cast<unsigned>(vaddvq_s32(m & I32{1, 2, 4, 8}));
+}
+VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
+  low = vzip1q_f32(a, b);
+  high = vzip2q_f32(a, b);
+}
+VN_INLINE F32 lane_sums(const F32* v) {
+  return vpaddq_f32(vpaddq_f32(v[0], v[1]), vpaddq_f32(v[2], v[3]));
+}
+VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
+  const float32x4x3_t points = vld3q_f32(p);
+  x = points.val[0];
+  y = points.val[1];
+  z = points.val[2];
+}
+
+#else
+
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
+  return a * b + c;
+}
+VN_INLINE F32 square_root(F32 a) {
+  for (int i = 0; i < kLanes; ++i) a[i] = __builtin_sqrtf(a[i]);
+  return a;
+}
+VN_INLINE unsigned bits(Mask m) {
+  return (m[0] & 1u) | (m[1] & 2u) | (m[2] & 4u) | (m[3] & 8u);
+}
 VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
   low = F32{a[0], b[0], a[1], b[1]};
   high = F32{a[2], b[2], a[3], b[3]};
@@ -265,6 +307,7 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
   z = F32{p[2], p[5], p[8], p[11]};
 }
 
+#endif
 #endif
 
 // Vector i gets lane i of all kLanes vectors. A step turns the bits of an element's number, vector and lane together,

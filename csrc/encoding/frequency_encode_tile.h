@@ -20,6 +20,9 @@ VN_INLINE F32 permute(F32 x, Bits index) {
                                      x);  // maskz: gcc 12 warns of the other
 #elif VN_ISA == 1
   return _mm256_permutevar8x32_ps(x, reinterpret_cast<__m256i>(index));
+#elif VN_ISA == 3
+  const Bits bytes = index * 0x04040404 + 0x03020100;
+  return reinterpret_cast<F32>(vqtbl1q_u8(reinterpret_cast<uint8x16_t>(x), reinterpret_cast<uint8x16_t>(bytes)));
 #else
   return F32{x[index[0]], x[index[1]], x[index[2]], x[index[3]]};
 #endif
@@ -155,8 +158,8 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 #endif
     for (; column < stride; column += kLanes) {
       const Lanes one(table, stride, column, columns);
-      encode_strip<VN_ISA == 2 ? 4 : 2, 1>(x, x_stride, rows, &one, kept ? out + column : nullptr, stride,
-                                           pairs == nullptr ? nullptr : pairs + column / 2);
+      encode_strip<kRegisters / 8, 1>(x, x_stride, rows, &one, kept ? out + column : nullptr, stride,
+                                      pairs == nullptr ? nullptr : pairs + column / 2);
     }
     return;
   }

@@ -216,6 +216,8 @@ VN_INLINE void store_entry(float* to, const Features<kFeatures>& from) {
 VN_INLINE Four multiply_add(Four a, float b, Four c) {
 #if VN_ISA == 0
   return a * b + c;
+#elif VN_ISA == 3
+  return fma(a, splat(b), c);
 #else
   return _mm_fmadd_ps(a, _mm_set1_ps(b), c);
 #endif

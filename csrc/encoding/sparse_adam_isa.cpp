@@ -4,7 +4,7 @@
 // contraction off), so that all instruction sets give the same bits.
 #include "encoding/sparse_adam_isa.h"
 
-#include "common/simd.h"
+#include "common/memory_tile.h"
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
@@ -28,27 +28,6 @@ VN_INLINE int any(const float* gradient) {
   for (int i = 0; i < kLine; ++i) found |= bits[i];
   return (found & 0x7fffffffu) != 0;
 #endif
-}
-
-VN_INLINE F32 square_root(F32 a) {
-#if VN_ISA == 2
-  return _mm512_maskz_sqrt_ps(0xffff, a);
-#elif VN_ISA == 1
-  return _mm256_sqrt_ps(a);
-#else
-  for (int i = 0; i < kLanes; ++i) a[i] = __builtin_sqrtf(a[i]);
-  return a;
-#endif
-}
-
-VN_INLINE F32 load(const float* from) {
-  F32 a;
-  __builtin_memcpy(&a, from, sizeof(a));
-  return a;
-}
-
-VN_INLINE void store(float* to, F32 a) {
-  __builtin_memcpy(to, &a, sizeof(a));
 }
 
 // kLanes entries.

@@ -17,17 +17,6 @@ constexpr float kInfinity = __builtin_huge_valf();
 constexpr float kReach = 20.0f;          // temperatures beyond the nearest centre at which there is no mass left
 constexpr float kLeast = 5.9604645e-8f;  // 2^-24: 1 - u of the largest u below 1
 
-VN_INLINE F32 square_root(F32 a) {
-#if VN_ISA == 2
-  return _mm512_maskz_sqrt_ps(0xffff, a);
-#elif VN_ISA == 1
-  return _mm256_sqrt_ps(a);
-#else
-  for (int i = 0; i < kLanes; ++i) a[i] = __builtin_sqrtf(a[i]);
-  return a;
-#endif
-}
-
 // |x - c|^2, with weights + (heaviest - w): not negative, and of the order of the masses.
 template <bool Weighted>
 VN_INLINE F32 squared_distance(F32 x, F32 y, F32 z, const float* centres, const float* weights, float heaviest,

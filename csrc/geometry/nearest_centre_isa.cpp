@@ -16,9 +16,8 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-constexpr int kTile = VN_ISA == 2 ? 4 : 2;
+constexpr int kTile = kRegisters / 8;
 constexpr int64_t kChunk = 256;
-constexpr float kInfinity = __builtin_huge_valf();
 
 // Bits that number the centres of a chunk.
 VN_INLINE int index_bits(int64_t k) {

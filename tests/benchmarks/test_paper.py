@@ -3,20 +3,23 @@
 import contextlib
 import itertools
 import json
+import math
 import time
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 import turns
 from helpers import read_json, refuses
-from paper import balance, figures, nested, runs
+from paper import balance, figures, nested, runs, slices
 from paper import main as paper
 from paper.experiments import EXPERIMENTS
 from paper.report import ABOUT
 from PIL import Image
 
+from voronerf.data import builtin_scene
 from voronerf.training import networks, trainer
 from voronerf.training.config import ConfigError
 from voronerf.training.trainer import Trainer, TrainingError
@@ -173,7 +176,7 @@ def test_failures_of_a_training_are_told(settings):
 def test_runs_are_known_by_what_they_learn(settings):
     same = runs.make_run(runs.Variant("another name", {"cells": ()}), "builtin", 0, replace(settings, turn=3.0))
     others = [one(replace(settings, **change)) for change in ({"budget": 1.0}, {"samples": 9}, {"final_views": 2})]
-    others += [one(settings, 1), one(settings, scene="builtin-translucent"), one(settings, width=8)]
+    others += [one(settings, 1), one(settings, scene="translucent"), one(settings, width=8)]
     folders = {str(run.folder) for run in (one(settings), *others)}
     assert same.folder == one(settings).folder and len(folders) == 1 + len(others)
 
@@ -226,6 +229,27 @@ def test_a_nested_picture(settings):
     levels = rows[-1]["levels"]
     assert [level["cells"] for level in levels[:2]] == [1, 4] and len(levels) == 4
     assert (settings.out / "nested-2d.png").is_file() and (settings.out / "nested-2d-pictures.png").is_file()
+
+
+def test_a_slice_through_a_known_density():
+    class Field(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.thickness = torch.nn.Parameter(torch.tensor([20.0, 60.0]))
+
+        def forward(self, positions, directions, ray_index):
+            return positions[:, :3], torch.where(positions[:, 0] < 0, *self.thickness)
+
+    field, points = Field().train(), slices.slice_points(builtin_scene(4), size=31)
+    assert points.shape == (31, 31, 3) and (points[..., 2] - points[0, 0, 2]).abs().max() == 0
+    assert points[0, 0, 0] < points[0, 1, 0] and points[0, 0, 1] > points[1, 0, 1]
+    for cones in (False, True):
+        density = slices.slice_density(field, points, cones=cones)
+        assert field.training and torch.equal(density, torch.where(points[..., 0] < 0, 20.0, 60.0))
+    picture = slices.picture_of_density(torch.tensor([[0.0, 1.0, 10.0], [100.0, 1e6, math.nan]]))
+    light = picture.float().sum(-1).flatten().tolist()
+    assert picture.dtype == torch.uint8 and light[0] == light[5] < 10
+    assert light[0] < light[1] < light[2] < light[3] == light[4]
 
 
 def test_every_experiment_has_a_plot_or_a_sheet():

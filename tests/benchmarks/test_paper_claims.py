@@ -115,29 +115,29 @@ def test_limits_set_two_scenes_against_each_other_seed_by_seed(settings):
 
     def judged(hurt, helped, *without):
         rows = []
-        for scene in ("builtin-translucent", "builtin"):
+        for scene in ("translucent", "builtin"):
             scores = {experiments.NEVER: 30 - helped[scene], experiments.TOO_EARLY: 30 - hurt[scene]}
             for row in synthetic(experiment, settings, lambda i: 30.0, scene):
                 row["psnr"] = scores.get(row["variant"], 30.0) * (1 + row["seed"])
                 rows += [row] if (scene, row["seed"]) not in without else []
         return {claim.claim: claim for claim in experiment.claims(claims.Rows(rows), settings)}
 
-    hurt, helped = {"builtin-translucent": 3.0, "builtin": 1.0}, {"builtin-translucent": 1.0, "builtin": 1.5}
+    hurt, helped = {"translucent": 3.0, "builtin": 1.0}, {"translucent": 1.0, "builtin": 1.5}
     found = judged(hurt, helped)
     more, less = list(found)[-2:]
     assert "hurts more" in more and "help less" in less and len(found) == 4
     assert (found[more].here, found[more].verdict) == ("+3.00 dB (+2.00 to +4.00)", "holds for every seed")
     assert (found[less].here, found[less].verdict) == ("+0.75 dB (+0.50 to +1.00)", "holds for every seed")
-    other = judged({"builtin-translucent": 1.0, "builtin": 3.0}, {"builtin-translucent": 2.0, "builtin": 1.5})
+    other = judged({"translucent": 1.0, "builtin": 3.0}, {"translucent": 2.0, "builtin": 1.5})
     assert other[more].verdict == other[less].verdict == "does not hold"
     # seed 1 of one scene is not set against seed 0 of the other
     part = judged(hurt, helped, ("builtin", 0))
     assert (part[more].here, part[less].here) == ("+4.00 dB", "+1.00 dB")
-    none = ("builtin", 0), ("builtin-translucent", 1)
+    none = ("builtin", 0), ("translucent", 1)
     apart = judged(hurt, helped, *none)
     assert apart[more].verdict == apart[less].verdict == "not measured"
     published = {claim.claim.split(":")[0]: claim.published for claim in list(found.values())[:2]}
-    assert published == {"builtin-translucent": "in translucent scenes", "builtin, a control": "-"}
+    assert published == {"translucent": "in translucent scenes", "builtin, a control": "-"}
 
 
 def test_seams_are_compared_at_the_looks_that_both_have():

@@ -343,6 +343,12 @@ void* dynamic_shared() {
   return launching->block->dynamic;
 }
 
+// All that there were, for tests.
+static int64_t launched = 0;
+int64_t launches() {
+  return launched;
+}
+
 void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t dynamic_bytes) {
   const size_t threads = size_t{block_of.x} * block_of.y * block_of.z;
   if (grid.x == 0 || grid.y == 0 || grid.z == 0) fail("a grid without blocks");
@@ -352,6 +358,7 @@ void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t 
   // 48 KiB are there without being asked for, on every device.
   if (dynamic_bytes > std::max<size_t>(kStaticShared, settings().shared))
     fail("more shared memory than a block may have");
+  ++launched;
   Launch it;
   it.run = run;
   it.context = context;

@@ -10,6 +10,9 @@
 
 namespace py = pybind11;
 
+namespace vn_emulation {
+int64_t launches();
+}
 void bind_groups(py::module_& module);
 void bind_index_maps(py::module_& module);
 void bind_plans(py::module_& module);
@@ -74,6 +77,7 @@ PYBIND11_MODULE(voronerf_emulation, module) {
     plan["bytes"] = found.bytes;
     return plan;
   });
+  module.def("launches", &vn_emulation::launches);
   module.def("seed", [](uint64_t seed) { vn_emulation::settings().seed = seed; });
   module.def("device", [](int capability, int compiled, int shared_bytes) {
     vn_emulation::settings().capability = capability;

@@ -151,7 +151,7 @@ def step(module):
     rules = [module.AdamRule(at(floats(1)), at(floats(1)), 0.9, 0.99, 1e-8, dense) for dense in (True, False)] * 21
     tensors = [[floats(n) for n in (1100, 33) * 21] for _ in range(4)]
     guard = module.AdamGuard(*every((floats(1),)), 9.0, *every([floats(1) for _ in range(4)]))
-    module.adam(rules, guard, *map(every, tensors), [1100, 33] * 21, at(unwritten(84)), gpu)
+    module.adam_on_device(rules, guard, *map(every, tensors), [1100, 33] * 21, at(unwritten(84)), gpu)
     marched(module, 7, 70)
     ends, first = np.cumsum(RANDOM.integers(1, 9, 40)), RANDOM.integers(0, 1, 99).astype(np.int32)
     drawn, uniforms = np.full(300, -7777), unwritten(300, 3)

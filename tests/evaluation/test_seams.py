@@ -1,4 +1,4 @@
-"""The seam measure on a ball whose cells are painted differently, and slices through a known density."""
+"""The seam measure on a ball whose cells are painted differently."""
 
 import math
 from functools import partial
@@ -12,9 +12,6 @@ from voronerf import VoronoiRouter
 from voronerf.data import builtin_scene
 from voronerf.evaluation.scores import render_view
 from voronerf.evaluation.seams import seam
-from voronerf.evaluation.slices import picture_of_density, slice_density, slice_points
-from voronerf.fields import MipNeRF, NeRF
-from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.renderer import Renderer
 
 RADIUS, THICK = 0.6, 800.0
@@ -86,49 +83,3 @@ def test_what_was_set_stays_set(scene):
     assert router.blend == 0.07
     for margin in (0.0, -1.0, math.inf):
         refuses("seam: margin must be positive and finite, got", measure, router, scene, margin=margin)
-
-
-def test_a_slice(scene):
-    router = painted((0.0,) * 3, (0.1,) * 3)
-    with torch.no_grad():
-        router.module.thickness.copy_(torch.tensor([20.0, 60.0]))
-    points = slice_points(scene, axis=1, at=0.5, size=31)
-    assert points.shape == (31, 31, 3) and (points[..., 1] - points[0, 0, 1]).abs().max() == 0
-    assert points[0, 0, 0] < points[0, 1, 0] and points[0, 0, 2] > points[1, 0, 2]
-    assert (points >= scene.box[0]).all() and (points <= scene.box[1]).all()
-    density = slice_density(router.train(), points)
-    assert router.training
-    expected = torch.where(points[..., 0] < 0, 20.0, 60.0) * (points.norm(dim=-1) < RADIUS)
-    off_border = points[..., 0].abs() > 1e-5
-    assert torch.equal(density[off_border], expected[off_border])
-    router.blend = 0.2
-    mixed = slice_density(router, points)
-    assert ((mixed != density) <= (points[..., 0].abs() < 0.2)).all() and (mixed != density).any()
-    refuses("axis must be 0, 1 or 2, got 3", slice_points, scene, axis=3)
-    refuses("size must be at least 1, got 0", slice_points, scene, size=0)
-
-
-def test_the_picture_of_a_slice():
-    density = torch.tensor([[0.0, 1.0, 10.0], [100.0, 1e6, math.nan]])
-    picture = picture_of_density(density)
-    light = picture.float().sum(-1).flatten().tolist()
-    assert picture.dtype == torch.uint8 and picture.shape == (2, 3, 3)
-    assert light[0] == light[5] < 10 and light[0] < light[1] < light[2] < light[3] == light[4]
-
-
-@pytest.mark.parametrize("cones", [False, True])
-def test_a_slice_through_a_layer_table_and_contracted_space(scene, cones):
-    field = (MipNeRF if cones else NeRF)(width=8, depth=2, position_octaves=2)
-    router, points = VoronoiRouter(field, torch.randn(4, 3)), slice_points(scene, size=8)
-    router.blend = 0.1
-    density = slice_density(router, points, cones=cones)
-    assert density.shape == (8, 8) and (density > 0).all()
-    router.blend = 0.0
-    density = slice_density(router, points, cones=cones)
-    within, across = Contraction(torch.zeros(3), 10.0), Contraction(torch.zeros(3), 0.5)
-    torch.testing.assert_close(slice_density(router, points, cones=cones, contraction=within), density)
-    contracted = slice_density(router, points, cones=cones, contraction=across)
-    if cones:
-        assert not torch.equal(contracted, density)
-    else:
-        torch.testing.assert_close(contracted, slice_density(router, across.points(points)))

@@ -22,7 +22,7 @@ def test_the_stub_is_what_the_build_bound() -> None:
 
 def test_enumerations_have_the_names_that_users_write() -> None:
     assert native.compiled.Activation == ACTIVATIONS
-    assert set(native.SUPPORTED_ISAS) <= set(native.ISAS) == {"portable", "avx2", "avx512"}
+    assert set(native.SUPPORTED_ISAS) <= set(native.ISAS) == {"portable", "neon", "avx2", "avx512", "avx512_bf16"}
 
 
 def test_what_does_not_fit_a_signature_is_refused() -> None:

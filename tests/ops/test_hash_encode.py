@@ -228,7 +228,7 @@ def derivatives(encode, grid, x, table, cells, dtype):
 
 
 FEATURES = ["both", "one feature", "four features", "eight features"]
-KINDS = {"name": FEATURES, "dtype": [torch.float32, *HALVES], "isa": ["portable", "avx2", "avx512"]}
+KINDS = {"name": FEATURES, "dtype": [torch.float32, *HALVES], "isa": ["portable", "neon", "avx2", "avx512"]}
 
 
 @pytest.mark.native

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import socket
 import sys
 import threading
+import time
 from contextlib import closing
 from dataclasses import replace
 from http.client import HTTPConnection
@@ -20,6 +22,7 @@ pytest.importorskip("viser", reason="viser is not installed")
 
 import viser
 from tab import Tab
+from websockets.exceptions import ConnectionClosed
 
 from voronerf import open_run
 from voronerf.cli import main
@@ -301,8 +304,13 @@ def test_bad_addresses(run, address, message) -> None:
         ("127.0.0.1", "127.0.0.1:{}", "http://127.0.0.1:9", 403),
         ("127.0.0.1", "127.0.0.1:{}", "null", 403),
         ("127.0.0.1", "example.org:{}", "http://example.org:{}", 403),  # a name that leads here
-        ("0.0.0.0", "example.org:{}", "http://example.org:{}", 101),
-        ("0.0.0.0", "example.org:{}", "https://example.com", 403),
+        ("127.1", "127.0.0.1:{}", "http://127.0.0.1:{}", 101),
+        ("127.1", "example.org:{}", "http://example.org:{}", 403),
+        ("0.0.0.0", "192.0.2.7:{}", "http://192.0.2.7:{}", 101),  # by whatever address this machine has
+        ("0.0.0.0", f"{socket.gethostname()}:{{}}", f"http://{socket.gethostname()}:{{}}", 101),
+        ("0.0.0.0", "example.org:{}", "http://example.org:{}", 403),
+        ("0.0.0.0", "192.0.2.7:{}", "https://example.com", 403),
+        ("0.0.0.0", "[::1:{}", None, 403),  # no address
     ],
 )
 def test_pages_of_other_sites_are_refused(run, host, asked, origin, status) -> None:
@@ -313,6 +321,58 @@ def test_pages_of_other_sites_are_refused(run, host, asked, origin, status) -> N
         with closing(HTTPConnection("127.0.0.1", viewer.port)) as browser:
             browser.request("GET", "/", headers={name: text.format(viewer.port) for name, text in headers.items()})
             assert browser.getresponse().status == status
+
+
+BAD = {
+    "a slider of one end": lambda tab: (tab.set("Crop", True), tab.set("x", [1.0])),
+    "a slider of no number": lambda tab: (tab.set("Crop", True), tab.set("x", [float("nan"), 1.0])),
+    "a long path": lambda tab: (tab.set("Keyframes", "add"), tab.set("Seconds", 1e9), tab.set("Save path", True)),
+    "a large picture": lambda tab: tab.set("Pixels", 10**6),
+    "another pane": lambda tab: tab.set("Show", "x" * 1000),
+    "a click at no place": lambda tab: tab.click(0.5, None),
+    "a camera of texts": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "position": ["a", "b", "c"]}),
+    "half a camera": lambda tab: tab.send("ViewerCameraMessage", fov=1.0),
+    "no message": lambda tab: tab.socket.send(b"\x93\x01"),
+    "text": lambda tab: tab.socket.send("text"),
+    "a large message": lambda tab: tab.socket.send(bytes(2**20)),
+}
+#: What leaves a client where it is.
+ODD = {
+    "a text for a number": lambda tab: tab.set("Pixels", "many"),
+    "a property": lambda tab: tab.send("GuiUpdateMessage", uuid=tab.gui["Pixels"]["uuid"], updates={"update_cb": 3}),
+    "a public address": lambda tab: tab.send("ShareUrlRequest"),
+    "a camera anywhere": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "position": [1e300, 0.0, 0.0]}),
+    "a turn of no length": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "wxyz": [0.0] * 4}),
+    "no angle": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "fov": 1e-300}),
+    "a thin canvas": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "image_width": 10**9}),
+    "a click far away": lambda tab: tab.click(1e300, float("inf")),
+}
+CAMERA = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0] * 3, "fov": 1.0, "near": 0.01, "far": 1000.0}
+CAMERA |= {"image_height": 48, "image_width": 48, "look_at": [0.0, 0.0, 1.0], "up_direction": [0.0, 0.0, 1.0]}
+
+
+def test_a_client_harms_itself_at_most(viewer, scene, caplog, capfd) -> None:
+    other = Tab(viewer, scene.test.cameras)
+    other.rest()
+    for number, (name, send) in enumerate({**BAD, **ODD}.items(), 1):
+        caplog.clear()
+        bad = Tab(viewer, scene.test.cameras, number=number)
+        bad.rest()
+        send(bad)
+        end = time.monotonic() + (20.0 if name in BAD else 0.5)
+        while number in viewer.clients and time.monotonic() < end:
+            viewer.render_next()
+            with contextlib.suppress(ConnectionClosed):
+                bad.read()
+        assert (number in viewer.clients) == (name in ODD), name
+        lines = [record.getMessage() for record in caplog.records if record.name.startswith("voronerf")]
+        assert len(lines) == 1 or name in ODD, (name, lines)
+        assert all("\n" not in line and len(line) < 300 for line in lines)
+        bad.close()
+    other.set("Show", "depth")
+    other.rest()
+    other.close()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_port_in_use_is_one_line(run, tmp_path, capsys) -> None:

@@ -122,7 +122,7 @@ def _train_and_draw(
             if view is not None:
                 viewer = import_viewer().TrainingViewer(trainer, host=view[0], port=view[1])
                 stack.callback(viewer.close)
-                display.on_event(f"open {viewer.address} in a browser")
+                display.on_event(viewer.audience)
 
             def on_step(now: Progress) -> None:
                 display.on_step(now)

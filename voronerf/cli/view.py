@@ -35,7 +35,7 @@ def view(
     scene = read_scene(record) if record.is_file() else None
     opened = opening.open(run, scene=scene)
     viewer = viewers.view_run(opened, host=host, port=port)
-    say(f"open {viewer.address} in a browser; Ctrl-C ends")
+    say(f"{viewer.audience}; Ctrl-C ends")
 
     def read_images() -> None:
         try:

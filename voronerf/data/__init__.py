@@ -1,4 +1,4 @@
-"""Scenes: loaders of Blender synthetic scenes and of photographs, and four scenes computed from formulas."""
+"""Scenes: loaders of Blender synthetic scenes and of photographs, and scenes computed from formulas."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from voronerf.data.blender import load_blender
-from voronerf.data.builtin import builtin_scene, city_scene, rich_scene, translucent_scene
+from voronerf.data.builtin import builtin_scene, city_scene, rich_scene
 from voronerf.data.builtin.city import city_of
 from voronerf.data.capture import load_capture
 from voronerf.data.colmap import find_model, load_colmap
@@ -22,11 +22,10 @@ __all__ = [
     "city_scene",
     "load_scene",
     "rich_scene",
-    "translucent_scene",
 ]
 
 BUILTIN_SIZE = 100
-BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene, "builtin-translucent": translucent_scene}
+BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene}
 CITY = "builtin-city"  # of one block, or with their number: builtin-city:4x4
 #: In the order in which a folder is tried, with what shows each.
 FORMATS = {
@@ -55,7 +54,7 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", "builtin-rich", "builtin-translucent", "builtin-city" of one block or "builtin-city:4x4" of
+        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of
             16, or a folder with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp,
             nerfstudio), a COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,

@@ -37,7 +37,7 @@ from voronerf.data.lenses import COEFFICIENTS, MODELS
 from voronerf.data.scene import SceneError
 from voronerf.data.soundness import camera_faults, lost_cameras
 from voronerf.files import write_text
-from voronerf.reference.camera_rays import FISHEYE, FOV
+from voronerf.ops.camera_rays.reference import FISHEYE, FOV
 
 #: Of a video. A playlist would name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"

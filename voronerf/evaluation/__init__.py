@@ -1,6 +1,6 @@
-"""Scores and pictures of a trained scene: PSNR, SSIM, LPIPS, panels, videos, seams, slices, curves.
+"""Scores and pictures of a trained scene: PSNR, SSIM, LPIPS, panels, videos, seams, curves.
 
-Pictures are in ``panels``, ``plots``, ``slices`` and ``video``, which import matplotlib, Pillow or ffmpeg.
+Pictures are in ``panels``, ``plots`` and ``video``, which import matplotlib, Pillow or ffmpeg.
 """
 
 from voronerf.evaluation.lpips import Lpips, LpipsError, find_lpips

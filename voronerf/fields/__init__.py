@@ -1,10 +1,8 @@
 """Networks from positions and directions to colours and densities. They do not depend on rays or images."""
 
-from voronerf.fields.density import DensityField, density_table
+from voronerf.fields.density import DensityField
 from voronerf.fields.hashgrid import HashGridField
-from voronerf.fields.kilonerf import KiloNeRF
-from voronerf.fields.mipnerf import MipNeRF
-from voronerf.fields.nerf import NeRF, nerf_table
+from voronerf.fields.nerf import KiloNeRF, MipNeRF, NeRF
 from voronerf.fields.registry import FIELDS, FieldType, register_field
 
 register_field("nerf")(NeRF)
@@ -20,7 +18,5 @@ __all__ = [
     "KiloNeRF",
     "MipNeRF",
     "NeRF",
-    "density_table",
-    "nerf_table",
     "register_field",
 ]

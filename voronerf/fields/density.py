@@ -6,26 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from voronerf.fields.radiance import reset_layers
-from voronerf.fields.single import run_network
+from voronerf.fields.radiance import reset_layers, run_network
 from voronerf.layers import MLP, Layer
-
-
-def density_table(width: int, depth: int, position_octaves: int = 6, position_encoding: str = "frequency") -> MLP:
-    """The layer table of a :class:`DensityField` with the same arguments.
-
-    Examples:
-        >>> from voronerf.fields import density_table
-        >>> density_table(width=32, depth=2).out_features
-        1
-    """
-    trunk = [Layer(("positions",) if i == 0 else (i - 1,), width, "relu") for i in range(depth)]
-    return MLP(
-        (*trunk, Layer((depth - 1,), 1)),
-        (depth,),
-        position_octaves=position_octaves,
-        position_encoding=position_encoding,
-    )
 
 
 class DensityField(nn.Module):
@@ -41,7 +23,7 @@ class DensityField(nn.Module):
         density_scale: Factor on the density, per scene unit.
 
     Raises:
-        ValueError: For a width or depth below 1.
+        ValueError: A width or depth below 1.
 
     Examples:
         >>> import torch
@@ -62,7 +44,13 @@ class DensityField(nn.Module):
         super().__init__()
         if min(width, depth) < 1:
             raise ValueError(f"DensityField: width and depth must be at least 1, got {width} and {depth}")
-        self.layers = density_table(width, depth, position_octaves, position_encoding)
+        trunk = [Layer(("positions",) if i == 0 else (i - 1,), width, "relu") for i in range(depth)]
+        self.layers = MLP(
+            (*trunk, Layer((depth - 1,), 1)),
+            (depth,),
+            position_octaves=position_octaves,
+            position_encoding=position_encoding,
+        )
         self.density_scale = density_scale
         shapes = self.layers.weight_shapes(6 if self.layers.integrated else 3)
         self.trunk = nn.ModuleList(nn.Linear(i, o) for o, i in shapes)
@@ -88,8 +76,8 @@ class DensityField(nn.Module):
 
         Args:
             positions: [n, 3] in scene units, or Gaussians [n, 6] for the integrated encoding.
-            directions: Ignored; accepted because renderers pass them.
-            ray_index: Ignored.
+            directions: [n, 3] or [r, 3], ignored; accepted because renderers pass them.
+            ray_index: int32 [n], ignored.
 
         Returns:
             (black [n, 3], density [n] per scene unit).

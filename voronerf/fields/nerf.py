@@ -1,4 +1,4 @@
-"""The NeRF field: an MLP from a point and a view direction to a colour and a density.
+"""NeRF, an MLP from a point and a view direction to a colour and a density; mip-NeRF; and KiloNeRF's size of it.
 
 Letters: n samples, r rays. Positions are in scene units, directions are unit vectors, densities are per scene unit.
 """
@@ -12,59 +12,8 @@ from torch import nn
 from voronerf.fields.radiance import RadianceField, reset_layers
 from voronerf.layers import MLP, Layer
 
-
-def nerf_table(
-    width: int,
-    depth: int,
-    *,
-    skips: tuple[int, ...] | None = None,
-    position_octaves: int = 10,
-    direction_octaves: int = 4,
-    view_directions: bool = True,
-    view_width: int | None = None,
-    position_encoding: str = "frequency",
-) -> MLP:
-    """The layer table of a :class:`NeRF` with the same arguments.
-
-    Raises:
-        ValueError: For a width, depth or skip out of range.
-
-    Examples:
-        >>> from voronerf.fields import nerf_table
-        >>> table = nerf_table(width=64, depth=8)
-        >>> table.weight_shapes(3, 3)[0]  # 3 features and 10 octaves: 63 inputs
-        (64, 63)
-        >>> table.out_features  # colour and density
-        4
-    """
-    if width < 2:
-        raise ValueError(f"NeRF: width must be at least 2, got {width}")
-    if depth < 1:
-        raise ValueError(f"NeRF: depth must be at least 1, got {depth}")
-    if min(position_octaves, direction_octaves) < 0:
-        raise ValueError(f"NeRF: octaves must not be negative, got {position_octaves} and {direction_octaves}")
-    if skips is None:
-        skips = (4,) if depth > 5 else ()
-    if any(not 0 <= s < depth - 1 for s in skips):
-        raise ValueError(f"NeRF: skips must be trunk layers with another behind, 0..{depth - 2}, got {skips}")
-    table = [Layer(("positions",), width, "relu")]
-    for i in range(1, depth):
-        table.append(Layer(("positions", i - 1) if i - 1 in skips else (i - 1,), width, "relu"))
-    trunk = depth - 1
-    table.append(Layer((trunk,), 1))
-    if view_directions:
-        table.append(Layer((trunk,), width))
-        table.append(Layer((depth + 1, "directions"), view_width or max(width // 2, 1), "relu"))
-        table.append(Layer((depth + 2,), 3))
-    else:
-        table.append(Layer((trunk,), 3))
-    return MLP(
-        layers=tuple(table),
-        outputs=(len(table) - 1, depth),
-        position_octaves=position_octaves,
-        direction_octaves=direction_octaves if view_directions else None,
-        position_encoding=position_encoding,
-    )
+#: Octaves of mip-NeRF's encoding, as published; the encoding fades out waves that a Gaussian cannot resolve.
+MIP_OCTAVES = 16
 
 
 class NeRF(RadianceField):
@@ -97,7 +46,7 @@ class NeRF(RadianceField):
         position_encoding: "frequency", or "integrated" for Gaussians [n, 6] instead of positions (mip-NeRF).
 
     Raises:
-        ValueError: For a width, depth, skip or scale out of range.
+        ValueError: A width, depth, skip or scale out of range.
 
     Examples:
         >>> import torch
@@ -128,22 +77,37 @@ class NeRF(RadianceField):
         position_encoding: str = "frequency",
     ) -> None:
         super().__init__()
+        if width < 2:
+            raise ValueError(f"NeRF: width must be at least 2, got {width}")
+        if depth < 1:
+            raise ValueError(f"NeRF: depth must be at least 1, got {depth}")
+        if min(position_octaves, direction_octaves) < 0:
+            raise ValueError(f"NeRF: octaves must not be negative, got {position_octaves} and {direction_octaves}")
+        if skips is None:
+            skips = (4,) if depth > 5 else ()
+        if any(not 0 <= s < depth - 1 for s in skips):
+            raise ValueError(f"NeRF: skips must be trunk layers with another behind, 0..{depth - 2}, got {skips}")
         if not density_scale > 0:
             raise ValueError(f"NeRF: density_scale must be positive, got {density_scale}")
         self.width = width
         self.view_directions = view_directions
         self.density_scale = density_scale
-        self.layers = nerf_table(
-            width,
-            depth,
-            skips=skips,
+        table = [Layer(("positions",), width, "relu")]
+        for i in range(1, depth):
+            table.append(Layer(("positions", i - 1) if i - 1 in skips else (i - 1,), width, "relu"))
+        table.append(Layer((depth - 1,), 1))
+        if view_directions:
+            view = Layer((depth + 1, "directions"), view_width or max(width // 2, 1), "relu")
+            table += [Layer((depth - 1,), width), view, Layer((depth + 2,), 3)]
+        else:
+            table.append(Layer((depth - 1,), 3))
+        self.layers = MLP(
+            layers=tuple(table),
+            outputs=(len(table) - 1, depth),
             position_octaves=position_octaves,
-            direction_octaves=direction_octaves,
-            view_directions=view_directions,
-            view_width=view_width,
+            direction_octaves=direction_octaves if view_directions else None,
             position_encoding=position_encoding,
         )
-
         shapes = self.layers.weight_shapes(6 if self.layers.integrated else 3, 3)
         linears = [nn.Linear(i, o) for o, i in shapes]
         self.trunk = nn.ModuleList(linears[:depth])
@@ -166,3 +130,67 @@ class NeRF(RadianceField):
         """The linear layers in the order of ``layers``."""
         linears = [*self.trunk, self.density, self.feature, self.view, self.colour]
         return [layer for layer in linears if isinstance(layer, nn.Linear)]
+
+
+class MipNeRF(NeRF):
+    """The architecture of NeRF with the integrated encoding (Barron et al. 2021, "Mip-NeRF", section 3.1).
+
+    Its input is Gaussians [n, 6], mean and diagonal variance, instead of positions;
+    `voronerf.rendering.cones.frustum_gaussians` makes them from cones.
+
+    Args:
+        width: Channels of the hidden layers.
+        depth: Hidden layers before the heads.
+        position_octaves: Frequencies of the integrated encoding, at least 1.
+        **options: The further arguments of :class:`NeRF`.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.fields import MipNeRF
+        >>> field = MipNeRF(width=32, depth=2)
+        >>> gaussians = torch.cat([torch.rand(10, 3), torch.full((10, 3), 1e-4)], dim=1)  # mean and diagonal variance
+        >>> colour, density = field(gaussians, torch.tensor([[0.0, 0, 1]]).expand(10, 3))
+        >>> colour.shape, density.shape
+        (torch.Size([10, 3]), torch.Size([10]))
+    """
+
+    inputs = "gaussians"
+
+    def __init__(
+        self, width: int = 64, depth: int = 8, *, position_octaves: int = MIP_OCTAVES, **options: object
+    ) -> None:
+        options = {"position_octaves": position_octaves, "position_encoding": "integrated", **options}
+        super().__init__(width, depth, **options)  # type: ignore[arg-type]
+
+    @staticmethod
+    def octaves(finest: int) -> int:
+        """Two beyond the finest that the images show, where a pixel's cone leaves a thousandth of the wave.
+
+        Of the next it leaves 1e-11: the published 16 would feed zeros to the network.
+        """
+        return min(finest + 2, MIP_OCTAVES)
+
+
+class KiloNeRF(NeRF):
+    """The network of one cell in KiloNeRF (Reiser et al. 2021, figure 3): two trunk layers of 32 channels, a feature
+    layer, and a layer of the same 32 channels that also sees the view direction.
+
+    Args:
+        width: Channels of every hidden layer.
+        depth: Trunk layers.
+        **options: The further arguments of :class:`NeRF`.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import VoronoiRouter
+        >>> from voronerf.fields import KiloNeRF
+        >>> router = VoronoiRouter(KiloNeRF(), torch.rand(512, 3))  # 512 networks of width 32
+        >>> colour, density = router(torch.rand(1000, 3), torch.tensor([[0.0, 0, 1]]).expand(1000, 3))
+        >>> colour.shape, density.shape
+        (torch.Size([1000, 3]), torch.Size([1000]))
+    """
+
+    training_defaults: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, width: int = 32, depth: int = 2, **options: object) -> None:
+        super().__init__(width, depth, **{"view_width": width, **options})  # type: ignore[arg-type]

@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from voronerf.fields.single import run_network
 from voronerf.layers import MLP
+from voronerf.ops.grouped_mlp import grouped_mlp
 
 #: Density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2:
 #: translucent enough that every sample of a ray receives a gradient, opaque enough that the colours do as well.
@@ -58,6 +58,40 @@ def reset_layers(layers: Sequence[nn.Linear], heads: Sequence[nn.Linear], densit
         nn.init.xavier_uniform_(head.weight, gain=0.1)
     # The inverse of softplus, so that the untrained density is INITIAL_DENSITY wherever the head's weights say 0.
     nn.init.constant_(heads[0].bias, math.log(math.expm1(INITIAL_DENSITY / density_scale)))
+
+
+def run_network(
+    layers: MLP,
+    linears: Sequence[nn.Linear],
+    positions: Tensor,
+    directions: Tensor | None = None,
+    ray_index: Tensor | None = None,
+    features: Tensor | None = None,
+) -> Tensor:
+    """The raw outputs [n, layers.out_features] of one network that a layer table describes.
+
+    Args:
+        layers: the table.
+        linears: the layers, in the table's order.
+        positions: [n, 3], or Gaussians [n, 6] for the integrated encoding.
+        directions: [n, 3], or [r, 3] together with `ray_index`; None if no layer reads them.
+        ray_index: int32 [n], the row of `directions` of each sample.
+        features: the table of the hash encoding, if `layers` have a grid.
+
+    Raises:
+        ValueError: shapes that disagree.
+    """
+    offsets = torch.tensor([0, positions.shape[0]], dtype=torch.int32, device=positions.device)
+    return grouped_mlp(
+        positions,
+        offsets,
+        [layer.weight[None] for layer in linears],
+        [layer.bias[None] for layer in linears],
+        layers=layers,
+        directions=directions,
+        direction_index=ray_index,
+        features=features,
+    )
 
 
 class RadianceField(nn.Module):

@@ -33,7 +33,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 from torch import nn
 
@@ -68,6 +68,9 @@ class FieldType:
     inputs: Inputs
     options: Mapping[str, Any]
 
+    def _declared(self, name: str, default: Any) -> Any:
+        return getattr(self.network, name, default)
+
     @property
     def cones(self) -> bool:
         """Whether its rays are cones, which are cut into Gaussians."""
@@ -76,24 +79,36 @@ class FieldType:
     @property
     def router_options(self) -> Mapping[str, Any]:
         """Further arguments of the router around it."""
-        options: Mapping[str, Any] = getattr(self.network, "router_options", {})
-        return options
+        return cast("Mapping[str, Any]", self._declared("router_options", {}))
 
     @property
     def sparse_parameters(self) -> Sequence[str]:
         """Names of tables, as patterns, of which a step of training reads few entries."""
-        names: Sequence[str] = getattr(self.network, "sparse_parameters", ())
-        return names
+        return cast("Sequence[str]", self._declared("sparse_parameters", ()))
 
     @property
     def ray_growth(self) -> float:
         """The most rays of a training step, as a multiple of those of the first, where empty space is skipped."""
-        return float(getattr(self.network, "ray_growth", 1.0))
+        return float(self._declared("ray_growth", 1.0))
 
     @property
     def lr_hold(self) -> float:
         """Fraction of a training for which the learning rate stays before it falls."""
-        return float(getattr(self.network, "lr_hold", 0.0))
+        return float(self._declared("lr_hold", 0.0))
+
+    @property
+    def scene_options(self) -> Callable[..., dict[str, Any]] | None:
+        """The rule for options that come from the scene, if the field has one."""
+        return cast("Callable[..., dict[str, Any]] | None", self._declared("scene_options", None))
+
+    def learning_rate(self, options: Mapping[str, Any]) -> float:
+        """Adam's rate at the start of a training with these options."""
+        rule = self._declared("learning_rate", lambda **_: LEARNING_RATE)
+        return float(rule(**{**self.options, **options}))
+
+    def octaves(self, finest: int) -> int:
+        """Octaves of the position's encoding for images that show ``finest`` octaves of detail."""
+        return int(self._declared("octaves", lambda octaves: octaves)(finest))
 
     def build(self, options: Mapping[str, Any]) -> nn.Module:
         """A field with these options and the defaults of the others.
@@ -109,22 +124,6 @@ class FieldType:
             return self.network(**given)
         except TypeError as error:
             raise ValueError(f"field {self.name}: {error}") from error
-
-    def learning_rate(self, options: Mapping[str, Any]) -> float:
-        """Adam's rate at the start of a training with these options."""
-        rule: Callable[..., float] | None = getattr(self.network, "learning_rate", None)
-        return LEARNING_RATE if rule is None else rule(**{**self.options, **options})
-
-    def octaves(self, finest: int) -> int:
-        """Octaves of the position's encoding for images that show ``finest`` octaves of detail."""
-        rule: Callable[[int], int] | None = getattr(self.network, "octaves", None)
-        return finest if rule is None else rule(finest)
-
-    @property
-    def scene_options(self) -> Callable[..., dict[str, Any]] | None:
-        """The rule for options that come from the scene, if the field has one."""
-        rule: Callable[..., dict[str, Any]] | None = getattr(self.network, "scene_options", None)
-        return rule
 
 
 FIELDS: dict[str, FieldType] = {}

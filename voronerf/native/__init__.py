@@ -72,11 +72,19 @@ compiled.name_dtypes(DTYPES)
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
+LEAST_GAIN = 1.25
+"""Of bfloat16 products over float32 ones, for networks to use them: rounding and pairing operands costs some."""
+_bfloat16_gain = compiled.bfloat16_gain()
 
 
 def _choose_isa() -> str:
-    """Best instruction set of this processor, or the one of VORONERF_ISA."""
-    wanted = os.environ.get("VORONERF_ISA") or SUPPORTED_ISAS[-1]
+    """Best instruction set of this processor, or the one of VORONERF_ISA.
+
+    One whose bfloat16 products are slower than float32 ones is not the best. The gain is far from `LEAST_GAIN` on all
+    known processors, so that every process on a machine chooses the same.
+    """
+    best = [isa for isa in SUPPORTED_ISAS if isa != "avx512_bf16" or _bfloat16_gain >= LEAST_GAIN]
+    wanted = os.environ.get("VORONERF_ISA") or best[-1]
     if wanted not in SUPPORTED_ISAS:
         here = ", ".join(SUPPORTED_ISAS)
         # Not BackendUnavailable, which backend="auto" would skip silently.
@@ -132,6 +140,12 @@ def missing(device: torch.device) -> str | None:
         return None
     if not compiled.cuda:
         return f"{compiled.cuda_outcome}; install the CUDA toolkit and rebuild with VORONERF_CUDA=1 `pip install -e .`"
+    driver = _driver_major()
+    if driver < compiled.cuda_major:
+        return (
+            f"built with CUDA {compiled.cuda_major}, the driver has CUDA {driver}; update the driver, "
+            f"or rebuild with a toolkit of CUDA {driver}"
+        )
     major, minor = torch.cuda.get_device_capability(device)
     if _runs_on(compiled.cuda_architectures.split(";"), 10 * major + minor):
         return None
@@ -139,6 +153,17 @@ def missing(device: torch.device) -> str | None:
         f"built with CUDA for {compiled.cuda_architectures}, the device is {major}{minor}; "
         f"rebuild with VORONERF_CUDA_ARCHITECTURES={major}{minor} `pip install -e .`"
     )
+
+
+@functools.cache
+def _driver_major() -> int:
+    """Major version of CUDA that the driver has; its minor version may be older than that of the toolkit."""
+    version = ctypes.c_int()
+    library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    status = library.cuDriverGetVersion(ctypes.byref(version))
+    if status != 0:
+        raise RuntimeError(f"cuDriverGetVersion failed with error {status}")
+    return version.value // 1000
 
 
 def _runs_on(architectures: list[str], capability: int) -> bool:
@@ -161,11 +186,20 @@ def describe() -> dict[str, Any]:
     """How the module was built and what it uses."""
     return {
         "instruction set": _isa,
+        "bfloat16 products": _bfloat16_products(),
         "compiler": compiled.compiler,
         "openmp": compiled.openmp,
         "cuda": compiled.cuda_outcome,
         "cuda architectures": compiled.cuda_architectures.split(";") if compiled.cuda else [],
     }
+
+
+def _bfloat16_products() -> str:
+    """What bfloat16 is multiplied in on the CPU, and why."""
+    if _bfloat16_gain == 0:
+        return "in float32: this processor, or this build, has none"
+    used = "in bfloat16" if _isa == "avx512_bf16" else "in float32"
+    return f"{used}: bfloat16 makes {_bfloat16_gain:.2g} x the operations of float32"
 
 
 def measure_peak(kind: str, *, isa: str | None = None, threads: int | None = None) -> float:

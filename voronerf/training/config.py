@@ -32,7 +32,7 @@ class TrainConfig:
 
     data: str = "builtin"
     """Scene folder (Blender synthetic, transforms.json, COLMAP or LLFF), or a built-in scene: "builtin", "builtin-rich"
-    with hundreds of solids, "builtin-translucent" with fog and glass, or "builtin-city:4x4", a city of so many
+    with hundreds of solids, or "builtin-city:4x4", a city of so many
     blocks."""
     format: Literal["auto", "blender", "transforms", "colmap", "llff"] = "auto"
     """What is read of a scene folder; auto is the first of them that it holds, in this order."""

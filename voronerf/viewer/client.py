@@ -21,6 +21,7 @@ from voronerf.evaluation.panels import palette
 from voronerf.rendering.cameras import Cameras
 from voronerf.viewer.cameras import FLIP, look_point, make_camera, scene_bounds
 from voronerf.viewer.cells import describe_cell
+from voronerf.viewer.door import chosen
 from voronerf.viewer.path import Keyframes
 from voronerf.viewer.pictures import PANES, Look, cell_at, cells_of, groups_of
 
@@ -72,14 +73,15 @@ class Client:
         return any(self.nodes.values())
 
     async def _moved(self, _: object) -> None:
-        self._look_around()
+        self.viewer.serve_client(self, self._look_around)
         self.change()
 
     def _look_around(self) -> None:
         """Takes the browser's camera, unless its canvas has no pixels or its numbers are none."""
         now = self.handle.camera
         numbers = (*now.wxyz, *now.position, now.fov)
-        if min(now.image_width, now.image_height) > 0 and np.isfinite(numbers).all() and 0 < now.fov < math.pi:
+        there = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
+        if there and np.isfinite(numbers).all() and 0 < now.fov < math.pi:
             self.camera = partial(make_camera, SO3(now.wxyz).as_matrix(), now.position, now.fov, now.aspect)
 
     def change(self, **look: Any) -> None:
@@ -112,20 +114,20 @@ class Client:
     def _build(self) -> None:
         gui, depth = self.handle.gui, self.viewer.subject.diagram.depth
         pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
-        pane.on_update(lambda _: self.change(pane=pane.value))
+        self.on(pane.on_update, lambda: self.change(pane=chosen(pane)))
         size = gui.add_slider("Pixels", 128, LARGEST, 64, SHARP, hint="Along the longer side of a picture at rest.")
-        size.on_update(lambda _: self._resize(size.value))
+        self.on(size.on_update, lambda: self._resize(chosen(size)))
         with gui.add_folder("Cells", expand_by_default=False):
             self.level = gui.add_slider("Level", 1, max(depth, 2), 1, depth, visible=depth > 1)
-            self.level.on_update(lambda _: self.change(level=self.level.value))
+            self.on(self.level.on_update, lambda: self.change(level=chosen(self.level)))
             self.info = gui.add_markdown(NO_CELL)
             hide = gui.add_button_group("Cell", ("hide", "only this", "show all"))
-            hide.on_click(lambda _: self._hide(hide.value))
+            self.on(hide.on_click, lambda: self._hide(hide.value))
         with gui.add_folder("Scene", expand_by_default=False):
             centres = gui.add_checkbox("Centres", False)
-            centres.on_update(lambda _: self._show_centres(centres.value))
+            self.on(centres.on_update, lambda: self._show_centres(centres.value))
             cameras = gui.add_checkbox("Cameras", False, hint="The training views; click on one to stand there.")
-            cameras.on_update(lambda _: self._show_cameras(cameras.value))
+            self.on(cameras.on_update, lambda: self._show_cameras(cameras.value))
             crop = gui.add_checkbox("Crop", False, hint="Render the space inside of a box only.")
             low, high = scene_bounds(self.viewer.subject.scene).tolist()
             sides = [
@@ -133,22 +135,26 @@ class Client:
                 for axis, a, b in zip("xyz", low, high)
             ]
 
-            def cut(_: object) -> None:
+            def cut() -> None:
                 for side in sides:
                     side.visible = crop.value
-                corners = tuple(zip(*(side.value for side in sides)))
+                corners = tuple(zip(*map(chosen, sides)))
                 self.change(crop=corners if crop.value else None)
 
-            crop.on_update(cut)
+            self.on(crop.on_update, cut)
             for side in sides:
-                side.on_update(cut)
+                self.on(side.on_update, cut)
         with gui.add_folder("Camera", expand_by_default=False):
             self.keyframes = Keyframes(self, self.viewer.subject.folder)
             shot = gui.add_button("Screenshot", icon=viser.Icon.CAMERA)
-            shot.on_click(lambda _: self._ask_screenshot())
+            self.on(shot.on_click, self._ask_screenshot)
+
+    def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:
+        """Has something done when a part of the panel is used; where that fails, the client is disconnected."""
+        register(lambda _: self.viewer.serve_client(self, work))
 
     def _resize(self, longest: int) -> None:
-        self.longest = max(1, min(longest, LARGEST))
+        self.longest = longest
         self.change()
 
     def _ask_screenshot(self) -> None:
@@ -167,8 +173,7 @@ class Client:
     # --- cells -----------------------------------------------------------------------------------------------------
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
-        x, y = event.screen_pos
-        self.viewer.do(lambda: self.pick(x, y))
+        self.viewer.do(lambda: self.viewer.serve_client(self, lambda: self.pick(*event.screen_pos)))
 
     def pick(self, x: float, y: float) -> None:
         """Describes the cell that is at a place of the picture, 0..1 from the left and from the top."""

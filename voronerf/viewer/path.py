@@ -10,6 +10,7 @@ import torch
 
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.paths import CameraPath, smooth_path, write_camera_path
+from voronerf.viewer.door import chosen
 
 if TYPE_CHECKING:
     from voronerf.viewer.client import Client
@@ -30,12 +31,12 @@ class Keyframes:
         self.cameras: list[Cameras] = []
         gui = client.handle.gui
         keys = gui.add_button_group("Keyframes", ("add", "undo", "clear"))
-        keys.on_click(lambda _: self.edit(keys.value))
+        client.on(keys.on_click, lambda: self.edit(keys.value))
         self.state = gui.add_markdown("No keyframes.")
         self.seconds = gui.add_slider("Seconds", 1.0, 60.0, 1.0, 10.0)
         self.closed = gui.add_checkbox("Closed", False, hint="Go back to the first keyframe.")
         self.button = gui.add_button("Save path", disabled=True)
-        self.button.on_click(lambda _: self.save())
+        client.on(self.button.on_click, self.save)
 
     def edit(self, what: str) -> None:
         """Adds the present camera ("add"), or takes the last keyframe ("undo") or all of them ("clear") away."""
@@ -50,7 +51,7 @@ class Keyframes:
     def save(self) -> None:
         """Writes the path as ``camera_paths/path-N.json`` of the run directory, in the size of the sharp picture."""
         keyframes = same_size(self.cameras)
-        count = round(self.seconds.value * FPS)
+        count = round(chosen(self.seconds) * FPS)
         frames = smooth_path(keyframes, count, closed=self.closed.value)
         folder = self.folder / "camera_paths"
         number = 1

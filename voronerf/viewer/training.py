@@ -54,7 +54,7 @@ class TrainingViewer(Viewer):
         if now.cells != self.cells:  # after a split, or back at a checkpoint from before one
             self.cells = now.cells
             for client in self.list_clients():
-                client.on_diagram()
+                self.serve_client(client, client.on_diagram)
         if time.perf_counter() - self.told_at > TELL:
             self.tell()
         self.refresh()

@@ -6,14 +6,17 @@ the thread of the steps, so that a picture is never of half a step. The threads 
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
+import logging
 import math
 import queue
 import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -29,9 +32,11 @@ from voronerf.training.config import ConfigError
 from voronerf.training.run_directory import read_curve
 from voronerf.viewer.cameras import axial_depth, look_point
 from voronerf.viewer.client import Client
+from voronerf.viewer.door import guarded
 from voronerf.viewer.errors import ViewErrors
-from voronerf.viewer.origins import only_own_pages
 from voronerf.viewer.pictures import Look, Subject, picture_of, render_bands, render_look, stack_bands
+
+log = logging.getLogger(__name__)
 
 #: Seconds without a movement after which the sharp picture is begun.
 REST = 0.15
@@ -41,6 +46,8 @@ COARSE, BAND = 0.06, 0.1
 SMALLEST = 48
 #: Share of a training's time that goes into new pictures while nobody moves.
 REFRESH = 0.05
+#: Hosts that stand for all addresses of this machine.
+EVERYWHERE = ("0.0.0.0", "::", "")
 #: Depth of empty pixels in scene units, the largest that viser takes.
 NOWHERE = 160.0
 
@@ -66,7 +73,7 @@ class Viewer:
         self.rate = 100_000.0  # pixels a second
         self.errors = ViewErrors(subject.scene, self._render_view)
         # viser draws a box around its address
-        with contextlib.redirect_stdout(io.StringIO()), only_own_pages(host):
+        with contextlib.redirect_stdout(io.StringIO()), guarded(host):
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
         self.host, self.port = host, self.server.get_port()
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
@@ -81,8 +88,14 @@ class Viewer:
     @property
     def address(self) -> str:
         """What to open in a browser."""
-        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        host = socket.gethostname() if self.host in EVERYWHERE else self.host
         return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
+
+    @property
+    def audience(self) -> str:
+        """A line about where the viewer is, and for whom."""
+        others = self.host in EVERYWHERE
+        return f"open {self.address} in a browser" + "; whoever can reach this machine can use the viewer" * others
 
     def show_curve(self, points: Sequence[tuple[float, float]]) -> None:
         """Draws PSNR in dB over training seconds, from the second evaluation on.
@@ -106,7 +119,7 @@ class Viewer:
         self.subject.scene = self.errors.scene = scene
         self.errors.forget()
         for client in self.list_clients():
-            client.on_images()
+            self.serve_client(client, client.on_images)
 
     def close(self) -> None:
         """Ends the server; its clients see that it is gone."""
@@ -126,6 +139,18 @@ class Viewer:
         """Has something done by the thread that renders."""
         self.tasks.put(task)
         self.wake.set()
+
+    def serve_client(self, client: Client, work: Callable[[], object]) -> None:
+        """Does something that a client asked for; where that fails, the client is disconnected, with a line."""
+        try:
+            work()
+        except Exception as error:  # whatever it asked for, the others and the training go on
+            if self.clients.pop(client.handle.client_id, None) is None:  # as other threads have found
+                return
+            log.warning("a browser is disconnected: %s: %.200s", type(error).__name__, error)
+            connections = getattr(self.server._websock_server, "_live_connections", {})
+            if (connection := connections.get(client.handle.client_id)) is not None:
+                asyncio.run_coroutine_threadsafe(connection.close(1008), connection.loop)
 
     # --- rendering -------------------------------------------------------------------------------------------------
 
@@ -156,11 +181,11 @@ class Viewer:
         clients = self.list_clients()
         for client in clients:
             if client.wants_coarse:
-                self._draw_coarse(client)
+                self.serve_client(client, partial(self._draw_coarse, client))
                 return True
         for client in clients:
             if client.wants_sharp and time.perf_counter() - client.moved_at >= REST:
-                self._draw_sharp(client)
+                self.serve_client(client, partial(self._draw_sharp, client))
                 return True
         return False
 
@@ -190,7 +215,7 @@ class Viewer:
             bands.append(band)
             for other in self.list_clients():
                 if other is not client and other.wants_coarse:
-                    self._draw_coarse(other)
+                    self.serve_client(other, partial(self._draw_coarse, other))
             if client.version != version or client.handle.client_id not in self.clients:
                 return
         client.wants_sharp = False

@@ -1,9 +1,9 @@
 // Small dense products on tiles that stay in cache: C[r][:] = init + sum_k A(r, k) B[k][:], the outputs in vector
 // lanes.
 //
-// A block of R rows by V vectors lives in registers, its A values are broadcast from memory: with 32 registers 6 x 64,
-// 8 x 48, 12 x 32 and 12 x 16 outputs, with 16 registers 6 x 2 vectors. That is 1.7 to 2.4 multiply-adds a load, so the
-// multiply-add units are the limit, not the cache. All three products of a layer have this form:
+// A block of R rows by V vectors lives in registers, its A values are broadcast from memory: with AVX-512 6 x 64, 8 x
+// 48, 12 x 32 and 12 x 16 outputs, with NEON 6 x 16, with 16 registers 6 x 2 vectors. That is 1.7 to 2.4 multiply-adds
+// a load, so the multiply-add units are the limit, not the cache. All three products of a layer have this form:
 //
 //   forward          rows are samples, k the inputs,  A = activations [rows][k],  B = packed weights [k][outputs]
 //   input gradient   rows are samples, k the outputs, A = gradients [rows][k],    B = weights [k][inputs]
@@ -190,7 +190,8 @@ void multiply(const Product& p, int64_t rows, int64_t columns) {
       return strip<1, Transposed>(p, rows, 0);
   }
 #else
-  for (int64_t column = 0; column < columns; column += 2 * kLanes) strip<2, Transposed>(p, rows, column);
+  constexpr int kVectors = kRegisters / 8;
+  for (int64_t column = 0; column < columns; column += kVectors * kLanes) strip<kVectors, Transposed>(p, rows, column);
 #endif
 }
 

@@ -30,7 +30,7 @@ LinearCall describe(const LinearInputs& in, const LinearGradients* gradients, Is
   call.weight = in.weight;
   call.bias = in.bias;
   call.bfloat16 = in.bfloat16;
-  call.half = in.bfloat16 && isa_multiplies_bfloat16(isa);
+  call.half = in.bfloat16 && isa == Isa::avx512_bf16;
   const int64_t unit = call.half ? 2 : 1;
   MlpPlanLayer& layer = call.layer;
   layer.activation = static_cast<int>(in.activation);

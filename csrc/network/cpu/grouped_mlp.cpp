@@ -50,7 +50,7 @@ void zero_strays(const MlpInputs& in, int64_t width, float* out) {
 }
 
 bool use_half(const MlpTable& table, Isa isa) {
-  return table.half && isa_multiplies_bfloat16(isa);
+  return table.half && isa == Isa::avx512_bf16;
 }
 
 void prepare(Isa isa, const MlpPlan& plan, float* own) {

@@ -21,7 +21,7 @@ VN_INLINE int64_t padded_width(const MlpPlanSource& source) {
 // Four rows of `from` become the four columns of `to`; by fours, since weights of small networks are packed often.
 VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t count, float* to, int64_t to_stride) {
   int64_t i = 0;
-#if VN_ISA > 0
+#if VN_ISA == 1 || VN_ISA == 2
   for (; i + 4 <= count; i += 4) {
     __m128 a = _mm_loadu_ps(from + i), b = _mm_loadu_ps(from + from_stride + i);
     __m128 c = _mm_loadu_ps(from + 2 * from_stride + i), d = _mm_loadu_ps(from + 3 * from_stride + i);
@@ -30,6 +30,13 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
     _mm_storeu_ps(to + (i + 1) * to_stride, b);
     _mm_storeu_ps(to + (i + 2) * to_stride, c);
     _mm_storeu_ps(to + (i + 3) * to_stride, d);
+  }
+#elif VN_ISA == 3
+  for (; i + 4 <= count; i += 4) {
+    F32 rows[4];
+    for (int row = 0; row < 4; ++row) rows[row] = load(from + row * from_stride + i);
+    transpose(rows);
+    for (int column = 0; column < 4; ++column) store(to + (i + column) * to_stride, rows[column]);
   }
 #endif
   for (; i < count; ++i) {

@@ -3,6 +3,5 @@
 from voronerf.data.builtin.city import city_scene
 from voronerf.data.builtin.opaque import builtin_scene
 from voronerf.data.builtin.rich import rich_scene
-from voronerf.data.builtin.translucent import translucent_scene
 
-__all__ = ["builtin_scene", "city_scene", "rich_scene", "translucent_scene"]
+__all__ = ["builtin_scene", "city_scene", "rich_scene"]

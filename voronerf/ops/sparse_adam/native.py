@@ -118,4 +118,4 @@ def adam_on_device(
     sizes = [parameter.numel() for parameter in parameters]
     corrected = parameters[0].new_empty(2 * len(rules))
     machine = compiled.Cuda(*native.stream(parameters[0]))
-    compiled.adam(given, guard, gradients, parameters, means, squares, sizes, corrected, machine)
+    compiled.adam_on_device(given, guard, gradients, parameters, means, squares, sizes, corrected, machine)

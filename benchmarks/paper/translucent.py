@@ -1,4 +1,4 @@
-"""The built-in translucent scene: fog, coloured glass and stained shells, integrated exactly.
+"""The translucent scene of the experiment on limits: fog, coloured glass and stained shells, integrated exactly.
 
 A ball of thin fog holds small opaque seeds, two striped shells that overlap, a block of layered glass and a lens.
 Hardly any ray ends at its first surface, so what a pixel shows is spread along its ray. All media have constant density
@@ -23,6 +23,7 @@ from voronerf.data.scene import Scene
 Vector = tuple[float, float, float]
 Doubles = NDArray[np.float64]
 
+NAME = "translucent"
 NOWHERE: Vector = (-math.inf,) * 3
 SUPERSAMPLES = 2  # on each side of a pixel; translucent media have few hard edges
 EMPTY = 1e-9  # sums of densities and their negatives below this are rounding
@@ -136,21 +137,15 @@ def translucent_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_v
     """Computes the scene.
 
     Args:
-        size: of the square images, pixels.
+        size: pixels on each side of an image.
         train_views: number of training views, placed as those of the built-in scene.
-        test_views: number of test views, likewise.
+        test_views: number of test views, placed as those of the built-in scene.
 
     Raises:
         ValueError: a size or number of views below 1.
-
-    Examples:
-        >>> from voronerf.data import translucent_scene
-        >>> scene = translucent_scene(4)
-        >>> scene.train.images.shape[1:3]
-        torch.Size([4, 4])
     """
     cameras = builtin_cameras("translucent_scene", size, train_views, test_views)
-    return render_scene("builtin-translucent", cameras, integrate, bounds(), SUPERSAMPLES)
+    return render_scene(NAME, cameras, integrate, bounds(), SUPERSAMPLES)
 
 
 def bounds(media: tuple[Medium, ...] = MEDIA) -> Array:

@@ -1,4 +1,4 @@
-// Random inputs of the programs for sanitizers, and what each of their results must hold.
+// Random inputs of the C++ tests, and what each of their results must hold.
 #pragma once
 
 #include <cmath>
@@ -9,6 +9,7 @@
 #include <limits>
 #include <random>
 #include <string>
+#include <type_traits>
 #include <vector>
 
 template <typename T>
@@ -58,6 +59,35 @@ template <typename T>
 void same(const Array<T>& a, const Array<T>& b, const char* what) {
   if (a.size() != b.size() || (!a.empty() && std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) != 0)) {
     fail(std::string(what) + ": results depend on the number of threads");
+  }
+}
+
+// What the portable path gave in a case. The other instruction sets repeat its calls on the same random numbers: the
+// same integers, and floats whose difference is small beside the whole result, since single ones may fall to the other
+// side of a kink.
+inline std::vector<Array<double>> portable;
+inline size_t compared = 0;
+
+inline void start_case(int number, bool is_portable) {
+  generator.seed(static_cast<uint32_t>(number));
+  if (is_portable) portable.clear();
+  compared = 0;
+}
+
+template <typename T>
+void like_portable(const Array<T>& found, const char* what, double tolerance = 1e-5) {
+  if (compared == portable.size()) portable.emplace_back(found.begin(), found.end());
+  const Array<double>& expected = portable[compared++];
+  if (found.size() != expected.size()) fail(std::string(what) + ": instruction sets differ in size");
+  double difference = 0, size = 0;
+  for (size_t i = 0; i < found.size(); ++i) {
+    difference += (found[i] - expected[i]) * (found[i] - expected[i]);
+    size += expected[i] * expected[i];
+  }
+  const double most = std::is_integral_v<T> ? 0 : tolerance * (std::sqrt(size) + 1e-3);
+  if (!wild && !(std::sqrt(difference) <= most)) {
+    fail(std::string(what) + ": differs from the portable path by " + std::to_string(std::sqrt(difference)) + " of " +
+         std::to_string(std::sqrt(size)));
   }
 }
 

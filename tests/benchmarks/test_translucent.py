@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 from helpers import refuses
+from paper.translucent import MEDIA, Medium, bounds, integrate, layered_block, striped_shell, translucent_scene
 
-from voronerf.data import load_scene, translucent_scene
-from voronerf.data.builtin.translucent import MEDIA, Medium, bounds, integrate, layered_block, striped_shell
+from voronerf.data import load_scene
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +94,5 @@ def test_most_of_what_is_seen_is_translucent(scene):
 
 def test_shape_and_name(scene):
     assert scene.train.images.shape == (100, 25, 25, 4) and scene.test.images.shape == (25, 25, 25, 4)
-    assert (scene.name, scene.near, scene.far, scene.background) == ("builtin-translucent", 2, 6, "white")
-    loaded = load_scene("builtin-translucent", downscale=4)
-    assert torch.equal(loaded.train.images, scene.train.images)
+    assert (scene.name, scene.near, scene.far, scene.background) == ("translucent", 2, 6, "white")
     refuses("translucent_scene: size must be >= 1, got 0", translucent_scene, 0)

@@ -1,0 +1,11 @@
+#!/usr/bin/env bash
+# The C++ tests for 64-bit Arm, cross-compiled and run by qemu: every kernel with NEON against its portable path.
+# arm.sh [cases]; needs g++-aarch64-linux-gnu and qemu-user (Debian's names).
+set -euo pipefail
+build=$(mktemp -d)
+trap 'rm -rf "$build"' EXIT
+CXX=${CXX:-aarch64-linux-gnu-g++} "$(dirname "$0")/build.sh" "$build" -O2 -DVN_STD_THREADS -pthread -static
+for test in ops networks; do
+  echo -n "$test, aarch64: "
+  qemu-aarch64 "$build/$test" "${1:-12}"
+done

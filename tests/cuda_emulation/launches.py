@@ -1,0 +1,98 @@
+"""What a piece of work would ask of a GPU, counted without one: launches of kernels and reads of the host.
+
+Kernels of this project are counted by the emulation, torch's by its operations: one that computes is one launch.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest import mock
+
+import torch
+from emulated import emulated
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from voronerf import native as _native
+
+aten = torch.ops.aten
+READING = {
+    *(aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default, aten.equal.default),
+    *(aten.is_nonzero.default, aten._unique2.default, aten.repeat_interleave.Tensor),
+}
+"""Operations after which the host knows something of the device's: a number, or a size."""
+FREE = {
+    *("empty", "empty_like", "new_empty", "empty_strided", "new_empty_strided", "_unsafe_view", "detach"),
+    *("promote_types", "_record_function_enter_new", "_record_function_exit"),
+}
+"""Operations that only allocate, or only name what is there."""
+
+
+class Asked(TorchDispatchMode):
+    """Counts torch's operations while it lasts.
+
+    Attributes:
+        operations: how often each operation that computes was called, by name.
+        reads: how often each that the host waits for.
+        kernels: launches of each compiled function.
+        on_cpu: how often each compiled function was called that has no CUDA kernel.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations: Counter[str] = Counter()
+        self.reads: Counter[str] = Counter()
+        self.kernels: Counter[str] = Counter()
+        self.on_cpu: Counter[str] = Counter()
+
+    @property
+    def launches(self) -> int:
+        """Kernels of this project and of torch."""
+        return self.kernels.total() + self.operations.total()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        name = function.overloadpacket.__name__
+        by_bool = function is aten.index.Tensor and any(
+            index is not None and index.dtype == torch.bool for index in args[1]
+        )
+        # torch.tensor of a number: a copy from memory of the host, which waits for it.
+        if function in READING or by_bool or function is aten.lift_fresh.default:
+            self.reads[name] += 1
+        elif not function.is_view and name not in FREE:
+            self.operations[name] += 1
+        return function(*args, **(kwargs or {}))
+
+
+class Watched:
+    """The compiled module, whose functions are counted."""
+
+    def __init__(self, compiled: Any, module: Any, counted: Asked) -> None:
+        self._compiled, self._module, self._counted = compiled, module, counted
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._compiled, name)
+        if isinstance(found, type) or not callable(found):
+            return found
+
+        def call(*arguments: Any) -> Any:
+            before = self._module.launches()
+            result = found(*arguments)
+            launched = self._module.launches() - before
+            if launched:
+                self._counted.kernels[name] += launched
+            elif any(isinstance(argument, _native.compiled.Cpu) for argument in arguments):
+                self._counted.on_cpu[name] += 1
+            return result
+
+        return call
+
+
+@contextmanager
+def asked() -> Iterator[Asked]:
+    """Counts what is asked of the emulated GPU; custom ops run as without a mode, so that what is in them counts."""
+    with emulated() as module, mock.patch("voronerf.native.custom_op._LISTENERS", []):
+        counted = Asked()
+        with mock.patch.object(_native, "compiled", Watched(_native.compiled, module, counted)), counted:
+            yield counted
