@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -73,7 +72,7 @@ FUNCTIONS = {
 }
 """By their names in the compiled module."""
 
-BINARY = {
+BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "add": torch.add,
     "sub": torch.sub,
     "mul": torch.mul,
@@ -95,7 +94,7 @@ class Columns(NamedTuple):
     """
 
     of: str
-    index: int
+    index: int  # type: ignore[assignment]  # a tuple's method
     start: int
     width: int
     spread: bool = False
@@ -185,9 +184,7 @@ class Builder:
 
     def program(self, outputs: Iterable[Columns]) -> Program:
         """What has been made."""
-        return Program(
-            tuple(self.inputs), tuple(self.parameters), tuple(self.steps), tuple(outputs), tuple(self.sums)
-        )
+        return Program(tuple(self.inputs), tuple(self.parameters), tuple(self.steps), tuple(outputs), tuple(self.sums))
 
     def emit(
         self,
@@ -493,8 +490,3 @@ def merged(program: Program) -> Program:
         dropped.add(place)
     steps = tuple(step for place, step in enumerate(kept) if place not in dropped)
     return replace(program, steps=steps)
-
-
-def is_number(value: float) -> bool:
-    """Whether a number can be one of a program's."""
-    return isinstance(value, (int, float)) and math.isfinite(value)

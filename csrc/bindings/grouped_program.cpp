@@ -1,6 +1,5 @@
-#include "network/program.h"
-
 #include "bindings/bind.h"
+#include "network/program.h"
 
 namespace voronerf {
 

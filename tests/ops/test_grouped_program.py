@@ -31,7 +31,9 @@ def every_step(b: Builder) -> list[Columns]:
     back = b.linear(shifted, weight, 6, 1, transposed=True)
     total = b.total(back, 3)
     one = b.total(back, 6)
-    share = b.binary("div", back, b.apply("affine", b.apply("power", one._replace(width=6, spread=True), 2.0), 1.0, 3.0))
+    share = b.binary(
+        "div", back, b.apply("affine", b.apply("power", one._replace(width=6, spread=True), 2.0), 1.0, 3.0)
+    )
     moved = b.move(12, [(share.part(1, 4), 0), (y, 5), (total, 8), (one, 11)])
     added = b.move(4, [(moved.part(0, 3), 1), (share.part(2, 3), 0)])
     gated = b.binary("gate", added, b.apply("step", share.part(0, 4)))
@@ -75,7 +77,9 @@ def random_program(seed: int) -> Program:
     return b.program(values[-2:])
 
 
-def arguments(program: Program, sizes: list[int], dtype: torch.dtype, shared: bool = False) -> tuple[list, list, Tensor]:
+def arguments(
+    program: Program, sizes: list[int], dtype: torch.dtype, shared: bool = False
+) -> tuple[list, list, Tensor]:
     generator = torch.Generator().manual_seed(3)
     k, n = len(sizes), sum(sizes)
     rows = [torch.randn(n, w, generator=generator, dtype=torch.float64) for w in program.inputs]
@@ -102,7 +106,9 @@ def derivatives(program: Program, rows: list, parameters: list, offsets: Tensor,
                 parts.append((t * weights).sum())
         return torch.stack(parts).sum() if parts else 0 * leaves[0].sum()
 
-    firsts = torch.autograd.grad(weighted(results), leaves, create_graph=True, allow_unused=True, materialize_grads=True)
+    firsts = torch.autograd.grad(
+        weighted(results), leaves, create_graph=True, allow_unused=True, materialize_grads=True
+    )
     seconds = torch.autograd.grad(weighted(firsts), leaves, allow_unused=True, materialize_grads=True)
     return [t.detach() for t in (*results, *firsts, *seconds)]
 

@@ -146,7 +146,8 @@ class Fused:
         def known(value: Tensor) -> Entries | None:
             return self._known(values[id(value)]) if id(value) in values else None
 
-        result, args, entries = self._lowering.run(node.target, args, kwargs, known)
+        function: Any = node.target
+        result, args, entries = self._lowering.run(function, args, kwargs, known)
         found = [args[0]] if node.meta["inplace"] else tensors_of(result)
         made = [entries(tensor) for tensor in found]
         for value, known_as in zip(node.meta["results"], made, strict=True):
@@ -162,7 +163,7 @@ class Fused:
             self._entries[value] = known_as
 
     def _needed(self) -> set[fx.Node]:
-        """The nodes that PyTorch computes; notes what they and the results read of steps, and which steps that takes."""
+        """The nodes that PyTorch computes; notes what they and the results read of steps, and the steps for that."""
         needed: set[fx.Node] = set()
         lowering, steps = self._lowering, self._lowering.builder.steps
         self._made: dict[fx.Node, Columns] = {}
@@ -219,9 +220,7 @@ class Fused:
         runs: dict[int, Run] = {}
         for number in sorted({level[v] for v in live if v not in lowering.sources}):
             own = [steps[v] for v in sorted(live) if level[v] == number and v not in lowering.sources]
-            later = {
-                c.index for v in live if level[v] > number for c in steps[v].operands if c.of == VALUE
-            }
+            later = {c.index for v in live if level[v] > number for c in steps[v].operands if c.of == VALUE}
             outputs: list[Any] = [step.out for step in own if step.out in later]
             kept = [Columns(VALUE, v, 0, steps[v].width) for v in outputs]
             for node, columns in self._made.items():

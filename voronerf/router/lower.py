@@ -23,11 +23,11 @@ ROWS = 37  # samples of a trace: no other size is a multiple
 _LOW = (1 << 32) - 1
 _FEW, _PRODUCTS = 3, 16  # parts of an input that a layer reads one by one; layers that one function makes
 
-_MOVERS = set(
+_MOVERS = frozenset(
     """
     view _unsafe_view reshape expand permute transpose t unsqueeze squeeze slice select cat stack split split_with_sizes
     unbind clone contiguous alias repeat flip roll lift_fresh index index_select narrow expand_copy detach unfold
-    """.split()
+    """.split()  # noqa: SIM905
 )
 _FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
     **{
@@ -65,7 +65,7 @@ _FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
 """Functions of one tensor and numbers, as functions of programs in turn."""
 _BINARY = {
     **{name: name for name in ("add", "sub", "mul", "div")},
-    **{name: "mul" for name in ("bitwise_and", "logical_and")},
+    **dict.fromkeys(("bitwise_and", "logical_and"), "mul"),
     **{name: name for name in ("gt", "ge", "lt", "le", "rsub")},
 }
 _CONSTANT = {"zeros_like": 0.0, "ones_like": 1.0, "new_zeros": 0.0, "new_ones": 1.0}
@@ -133,7 +133,9 @@ class Lowering:
     def level(self, value: int) -> int:
         """The number of the run that makes a value."""
         for step in self.builder.steps[self._leveled :]:
-            self.levels.setdefault(step.out, max((self.levels[c.index] for c in step.operands if c.of == VALUE), default=0))
+            self.levels.setdefault(
+                step.out, max((self.levels[c.index] for c in step.operands if c.of == VALUE), default=0)
+            )
         self._leveled = len(self.builder.steps)
         return self.levels[value]
 
@@ -231,7 +233,7 @@ class _Recording(TorchDispatchMode):
         """Where the entries of a tensor come from; None for a constant."""
         return self._kept.get(id(tensor), (None, None))[1]
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # noqa: D105
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         name = func.overloadpacket.__name__
         found = [self.entries(tensor) for tensor in tensors_of((args, kwargs))]
@@ -294,7 +296,7 @@ class _Recording(TorchDispatchMode):
         return Entries(torch.arange(tensor.numel()).reshape(tensor.shape), of)
 
     def _moved(self, func: Any, args: Any, kwargs: Any, rows: bool, name: str) -> list[Entries]:
-        given = [t for t in tensors_of((args, kwargs))]
+        given = tensors_of((args, kwargs))
         sources = {id(e.of) for t in given if (e := self.entries(t)) is not None}
         if len(sources) > 1:
             raise NotAStep("parameters beside samples in one tensor")
@@ -381,7 +383,7 @@ class _Recording(TorchDispatchMode):
         return found, places
 
     def _binary(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
-        if not result.is_floating_point() and result.dtype != torch.bool or kwargs.get("rounding_mode"):
+        if (not result.is_floating_point() and result.dtype != torch.bool) or kwargs.get("rounding_mode"):
             raise NotAStep(f"{name} that gives {result.dtype}")
         x, y = args[:2]
         alpha = kwargs.get("alpha", args[2] if len(args) > 2 else 1)
@@ -397,7 +399,9 @@ class _Recording(TorchDispatchMode):
                 "add": lambda: [("affine", 1, alpha * y)] if isinstance(x, Tensor) else [("affine", alpha, x)],
                 "sub": lambda: [("affine", 1, -alpha * y)] if isinstance(x, Tensor) else [("affine", -alpha, x)],
                 "mul": lambda: [("affine", y if isinstance(x, Tensor) else x, 0)],
-                "div": lambda: [("affine", 1 / y, 0)] if isinstance(x, Tensor) else [("power", -1, 0), ("affine", x, 0)],
+                "div": lambda: (
+                    [("affine", 1 / y, 0)] if isinstance(x, Tensor) else [("power", -1, 0), ("affine", x, 0)]
+                ),
             }
             return self._chain(operand, steps[kind](), places, result)
         (a, b), places = self._operands((x, y), result.shape)
@@ -484,7 +488,9 @@ class _Recording(TorchDispatchMode):
         if of_x is None or of_x.of is not None:  # W x^T
             if name != "mm" or of_weight is None or of_weight.of is not None:
                 raise NotAStep("a product of parameters with samples")
-            turned = self._rows_times(of_weight.codes.t(), self._matrix(x, of_x), None, (result.shape[1], result.shape[0]))
+            turned = self._rows_times(
+                of_weight.codes.t(), self._matrix(x, of_x), None, (result.shape[1], result.shape[0])
+            )
             return Entries(turned.codes.t().clone())
         matrix = self._matrix(weight, of_weight)
         if name in ("mm", "addmm", "bmm", "baddbmm"):

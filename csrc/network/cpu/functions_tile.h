@@ -86,8 +86,8 @@ VN_INLINE F32 density(F32 x) {
 // Its distribution function, erfc(-x / sqrt 2) / 2; erfc by Numerical Recipes' erfcc, relative error 1.2e-7.
 VN_INLINE F32 distribution(F32 x) {
   const F32 z = abs(x) * splat(0.70710678f), t = splat(1.0f) / fma(z, splat(0.5f), splat(1.0f));
-  constexpr float kSeries[] = {0.17087277f, -0.82215223f, 1.48851587f, -1.13520398f, 0.27886807f,
-                               -0.18628806f, 0.09678418f, 0.37409196f, 1.00002368f, -1.26551223f};
+  constexpr float kSeries[] = {0.17087277f,  -0.82215223f, 1.48851587f, -1.13520398f, 0.27886807f,
+                               -0.18628806f, 0.09678418f,  0.37409196f, 1.00002368f,  -1.26551223f};
   F32 p = splat(kSeries[0]);
   for (int i = 1; i < 10; ++i) p = fma(p, t, splat(kSeries[i]));
   const F32 tail = splat(0.5f) * t * exponential(p - z * z);
@@ -117,21 +117,21 @@ VN_INLINE F32 gelu_by_tanh(F32 x) {
   return splat(1.5f) * t2 + half * x * s * t3;
 }
 
-#define VN_FUNCTION(NAME, F0, F1, F2, F3)                                   \
-  struct NAME##_function {                                                  \
-    template <int Order>                                                    \
+#define VN_FUNCTION(NAME, F0, F1, F2, F3)                                                          \
+  struct NAME##_function {                                                                         \
+    template <int Order>                                                                           \
     VN_INLINE F32 at([[maybe_unused]] F32 x, [[maybe_unused]] float a, [[maybe_unused]] float b) { \
-      [[maybe_unused]] const F32 zero = splat(0.0f), one = splat(1.0f);     \
-      if constexpr (Order == 0) {                                           \
-        return F0;                                                          \
-      } else if constexpr (Order == 1) {                                    \
-        return F1;                                                          \
-      } else if constexpr (Order == 2) {                                    \
-        return F2;                                                          \
-      } else {                                                              \
-        return F3;                                                          \
-      }                                                                     \
-    }                                                                       \
+      [[maybe_unused]] const F32 zero = splat(0.0f), one = splat(1.0f);                            \
+      if constexpr (Order == 0) {                                                                  \
+        return F0;                                                                                 \
+      } else if constexpr (Order == 1) {                                                           \
+        return F1;                                                                                 \
+      } else if constexpr (Order == 2) {                                                           \
+        return F2;                                                                                 \
+      } else {                                                                                     \
+        return F3;                                                                                 \
+      }                                                                                            \
+    }                                                                                              \
   };
 
 VN_FUNCTION(copy, x, one, zero, zero)
@@ -143,8 +143,8 @@ VN_FUNCTION(affine, fma(splat(a), x, splat(b)), splat(a), zero, zero)
 VN_FUNCTION(relu, x < zero ? zero : x, x <= zero ? zero : one, zero, zero)
 VN_FUNCTION(leaky_relu, positive(x, x, splat(a) * x), positive(x, one, splat(a)), zero, zero)
 VN_FUNCTION(abs, abs(x), positive(x, one, x < zero ? zero - one : zero), zero, zero)
-VN_FUNCTION(clamp, x < splat(a) ? splat(a) : x > splat(b) ? splat(b) : x,
-            x < splat(a) ? zero : x > splat(b) ? zero : one, zero, zero)
+VN_FUNCTION(clamp, x<splat(a) ? splat(a) : x> splat(b) ? splat(b) : x, x<splat(a) ? zero : x> splat(b) ? zero : one,
+            zero, zero)
 VN_FUNCTION(elu, positive(x, x, splat(a) * exponential_minus_one(x)), positive(x, one, splat(a) * exponential(x)),
             positive(x, zero, splat(a) * exponential(x)), positive(x, zero, splat(a) * exponential(x)))
 VN_FUNCTION(softplus, splat(a) * x > splat(b) ? x : softplus(splat(a) * x) * splat(1.0f / a),
@@ -154,23 +154,24 @@ VN_FUNCTION(softplus, splat(a) * x > splat(b) ? x : softplus(splat(a) * x) * spl
 VN_FUNCTION(sigmoid, logistic<0>(x), logistic<1>(x), logistic<2>(x), logistic<3>(x))
 VN_FUNCTION(tanh, hyperbolic_tangent(x), tangent_slope(x), splat(-2.0f) * hyperbolic_tangent(x) * tangent_slope(x),
             tangent_slope(x) * (splat(4.0f) - splat(6.0f) * tangent_slope(x)))
-VN_FUNCTION(silu, x* logistic<0>(x), logistic<0>(x) + x * logistic<1>(x), logistic<1>(x) * splat(2.0f) + x * logistic<2>(x),
-            logistic<2>(x) * splat(3.0f) + x * logistic<3>(x))
+VN_FUNCTION(silu, x* logistic<0>(x), logistic<0>(x) + x * logistic<1>(x),
+            logistic<1>(x) * splat(2.0f) + x * logistic<2>(x), logistic<2>(x) * splat(3.0f) + x * logistic<3>(x))
 VN_FUNCTION(gelu, x* distribution(x), distribution(x) + x * density(x), density(x) * (splat(2.0f) - x * x),
             density(x) * x * (x * x - splat(4.0f)))
 VN_FUNCTION(gelu_tanh, gelu_by_tanh<0>(x), gelu_by_tanh<1>(x), gelu_by_tanh<2>(x), gelu_by_tanh<3>(x))
 VN_FUNCTION(sine, any_sine(fma(splat(a), x, splat(b)), false), splat(a) * any_sine(fma(splat(a), x, splat(b)), true),
-            splat(-a * a) * any_sine(fma(splat(a), x, splat(b)), false),
+            splat(-a* a) * any_sine(fma(splat(a), x, splat(b)), false),
             splat(-a * a * a) * any_sine(fma(splat(a), x, splat(b)), true))
 VN_FUNCTION(exp, exponential(x), exponential(x), exponential(x), exponential(x))
 VN_FUNCTION(log, logarithm(x), one / x, zero - one / (x * x), splat(2.0f) / (x * x * x))
 VN_FUNCTION(power, raised(x, a, 0), raised(x, a - 1.0f, 1), raised(x, a - 2.0f, 2), raised(x, a - 3.0f, 3))
 
 // In the order of FUNCTIONS in voronerf/program.py.
-#define VN_FUNCTIONS(DO)                                                                                             \
-  DO(0, copy) DO(1, stop) DO(2, step) DO(3, at_least) DO(4, floor) DO(5, affine) DO(6, relu) DO(7, leaky_relu)       \
-  DO(8, abs) DO(9, clamp) DO(10, elu) DO(11, softplus) DO(12, sigmoid) DO(13, tanh) DO(14, silu) DO(15, gelu)        \
-  DO(16, gelu_tanh) DO(17, sine) DO(18, exp) DO(19, log) DO(20, power)
+#define VN_FUNCTIONS(DO)                                                                                      \
+  DO(0, copy)                                                                                                 \
+  DO(1, stop) DO(2, step) DO(3, at_least) DO(4, floor) DO(5, affine) DO(6, relu) DO(7, leaky_relu) DO(8, abs) \
+      DO(9, clamp) DO(10, elu) DO(11, softplus) DO(12, sigmoid) DO(13, tanh) DO(14, silu) DO(15, gelu)        \
+          DO(16, gelu_tanh) DO(17, sine) DO(18, exp) DO(19, log) DO(20, power)
 
 }  // namespace
 }  // namespace VN_ISA_NAMESPACE

@@ -48,8 +48,8 @@ void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* 
   const Workspace workspace(stride * threads + partials * header.partial);
   float* partial = workspace.data() + stride * threads;
   for_each_task(
-      tasks, workspace.data(), stride, threads,
-      [&](int64_t cell, float* own, bool) { pack(isa, call, cell, own); }, [](int64_t) {},
+      tasks, workspace.data(), stride, threads, [&](int64_t cell, float* own, bool) { pack(isa, call, cell, own); },
+      [](int64_t) {},
       [&](const RowTask& task, float* own) {
         const bool alone = task.partial < 0;
         float* to = alone ? own + own_partial : partial + task.partial * header.partial;

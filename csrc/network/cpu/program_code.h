@@ -26,9 +26,9 @@ struct ProgramOperand {
 
 struct ProgramStep {
   int32_t op, name, order, width, slot, stride;
-  int32_t number;           // input, output: which; linear: its panels; total: columns of a group; sums: their partial
-  int32_t depth;            // linear: of the product; sums: 1 where the inputs are next to each other
-  int32_t finish;           // linear: 0, 1 ReLU, 2 where ReLU is 0
+  int32_t number;            // input, output: which; linear: its panels; total: columns of a group; sums: their partial
+  int32_t depth;             // linear: of the product; sums: 1 where the inputs are next to each other
+  int32_t finish;            // linear: 0, 1 ReLU, 2 where ReLU is 0
   int32_t constants, count;  // of the function; operands, which follow
 };
 

@@ -1,8 +1,8 @@
 // The CPU kernels of programs, once for each instruction set.
 //
-// A tile of rows goes through all steps while its values stay in the first two cache levels. A cell's matrices are packed
-// once by each thread that works on it, as the products (gemm_tile.h) read them. Sums over rows are added up in one
-// partial over all tiles of a task.
+// A tile of rows goes through all steps while its values stay in the first two cache levels. A cell's matrices are
+// packed once by each thread that works on it, as the products (gemm_tile.h) read them. Sums over rows are added up in
+// one partial over all tiles of a task.
 #define VN_HALF 0
 #include "network/cpu/program_tile.h"
 

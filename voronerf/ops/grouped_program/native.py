@@ -17,8 +17,8 @@ from torch import Tensor
 from voronerf import native
 from voronerf.derivatives import asked_for
 from voronerf.native.custom_op import custom_op, on_huge_pages
-from voronerf.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient, merged
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
+from voronerf.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient, merged
 
 _OPS = ("input", "output", "linear", "function", "binary", "total", "move", "outer", "columns")
 _ORDERS = 3  # of derivatives that the compiled module has

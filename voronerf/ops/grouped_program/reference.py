@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from voronerf.program import BINARY, FUNCTIONS, VALUE, Columns, Program, Step
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.grouped_mlp.reference import cells_of
+from voronerf.program import BINARY, FUNCTIONS, VALUE, Columns, Program, Step
 
 
 def grouped_program(
@@ -78,8 +78,7 @@ class _Run:
             found = derivative(step.name, operands[0], a, b, int(order))
             return found * operands[1] if len(operands) > 1 else found
         if step.op == "binary":
-            made: Tensor = BINARY[step.name](operands[0], operands[1])
-            return made
+            return BINARY[step.name](operands[0], operands[1])
         if step.op == "total":
             return operands[0].unflatten(1, (step.width, int(step.numbers[0]))).sum(2)
         result = self.inputs[0].new_zeros(len(self.inputs[0]), step.width)
