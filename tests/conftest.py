@@ -44,6 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "op(name): run on the backends that implement this op")
+    config.addinivalue_line("markers", "measures: a router of this test measures its ways")
     unknown = _required(config) - set(PARTS)
     if unknown:
         raise pytest.UsageError(f"--require takes {','.join(PARTS)}, got {','.join(sorted(unknown))}")

@@ -23,6 +23,23 @@ def test_nothing_is_printed(backend: str) -> None:
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
 
+FIRST = """
+import sys, torch, voronerf
+torch.set_num_threads(1)
+for fuse in (False, True):
+    field = torch.nn.Sequential(torch.nn.Linear(3, 16), torch.nn.ReLU(), torch.nn.Linear(16, 4))
+    router = voronerf.VoronoiRouter(field, torch.rand(8, 3), coords="first3", fuse=fuse)
+    router(torch.rand(1024, 3)).sum().backward()
+print(sorted({"torch._dynamo", "sympy"} & sys.modules.keys()))
+"""
+
+
+def test_a_first_call_imports_no_compiler() -> None:
+    """It takes as long as importing torch."""
+    run = subprocess.run([sys.executable, "-c", FIRST], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "[]\n", "")
+
+
 def test_a_missing_torch_is_one_line(tmp_path) -> None:
     line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch\n"
     without = "import sys; sys.modules['torch'] = None; sys.argv[0] = {!r}; import voronerf"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import stat
 import threading
 from pathlib import Path
 from typing import Any
@@ -55,6 +57,19 @@ def cache_folder() -> Path:
     return Path(
         os.environ.get("VORONERF_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "voronerf"
     ).expanduser()
+
+
+def private_folder(path: Path) -> Path:
+    """Makes a folder that its user alone may enter, and returns it; the folders above are made too.
+
+    Raises:
+        OSError: When it cannot be made, or when what lies there is another user's, or a link that others may have laid.
+    """
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    there = path.lstat()
+    if hasattr(os, "getuid") and (there.st_uid != os.getuid() or not stat.S_ISDIR(there.st_mode)):
+        raise PermissionError(errno.EPERM, "must be a folder of your own; set VORONERF_CACHE to another", str(path))
+    return path
 
 
 def remove_partial(folder: Path) -> None:

@@ -16,6 +16,7 @@ import run_attacks
 import scene_attacks
 import torch
 import training_attacks
+import viewer_attacks
 from attempts import FAILED, REFUSED, RIGHT, Part, Tally, run_part
 
 #: Each part with its attempts in the long form and in the short one.
@@ -29,6 +30,7 @@ PARTS = {
         (Part("bits", run_attacks.flipped_bit, 60, 20, given.prepare_runs), 500, 15),
         (Part("scenes", scene_attacks.stranger_scene, 60, 1, given.prepare_photographs), 150, 6),
         (Part("runs", run_attacks.stranger_run, 60, 1, given.prepare_runs), 150, 6),
+        (Part("clients", viewer_attacks.hostile_client, 60, 1, given.prepare_runs), 150, 3),
         (Part("stress", training_attacks.stressed_command, 60, 1, given.prepare_scenes), 150, 6),
     )
 }

@@ -310,10 +310,23 @@ def test_broken_colmap_folders_are_one_line(tmp_path, damage, reason):
     refuses(reason, load_scene, tmp_path, error=SceneError)
 
 
+def test_numbers_of_points_that_are_none_are_passed_over(tmp_path):
+    """COLMAP writes 2^64 - 1 for a sighting of no point."""
+    write_both(tmp_path, binary=False)
+    model, before = tmp_path / "sparse/0", load_scene(tmp_path)
+    (model / "points3D.txt").write_text((model / "points3D.txt").read_text() + f"{2**63} 1 2 3 0 0 0 1 1 0 2 0 3 0\n")
+    lines = (model / "images.txt").read_text().splitlines()
+    at = next(number for number, line in enumerate(lines) if len(line.split()) >= 30)
+    (model / "images.txt").write_text("\n".join([*lines[:at], f"{lines[at]} 1 2 {2**64 - 1}", *lines[at + 1 :]]) + "\n")
+    after = load_scene(tmp_path)
+    assert torch.equal(before.train.cameras.poses, after.train.cameras.poses)
+
+
 @pytest.mark.parametrize(
     ("file", "text", "reason"),
     [
         ("cameras", "1 PINHOLE 12 ten 20 20 6 5", "cameras.txt: line 1 is not that of a camera"),
+        ("cameras", f"1 PINHOLE {10**400} 10 20 20 6 5", "camera 1 must have a size, finite parameters"),
         ("cameras", "1 PINHOLE 12 10 20 20 6", "camera 1: PINHOLE must have 4 parameters, got 3"),
         ("images", "1 1 0 0 0 0 0", "images.txt: line 1 is not that of an image"),
         ("points3D", "7 one 2 3", "points3D.txt: line 1 is not that of a point"),
@@ -340,10 +353,12 @@ def test_broken_llff_is_one_line(tmp_path, rows, reason):
     refuses(reason, load_scene, tmp_path, format="llff", error=SceneError)
 
 
-def test_an_array_with_a_broken_header_is_one_line(tmp_path):
+@pytest.mark.parametrize("header", [(b"}", b" "), (b"(9, 17)", b"(-9,17)"), (b"(9, 17), ", b"(True,17)")])
+def test_an_array_with_a_broken_header_is_one_line(tmp_path, header):
     write_both(tmp_path)
     path = tmp_path / "poses_bounds.npy"
-    path.write_bytes(path.read_bytes().replace(b"}", b" ", 1))
+    assert header[0] in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(*header, 1))
     refuses("is no array of NumPy that can be read", load_scene, tmp_path, format="llff", error=SceneError)
 
 

@@ -1,7 +1,11 @@
 """Images on disk: the same pixels and batches as in memory, a build that goes on, a store of other images."""
 
 import errno
+import fcntl
+import json
 import os
+import shutil
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +15,11 @@ from helpers import refuses
 from PIL import Image
 from scene_files import write_blender, write_images
 
+from voronerf.cli import main
 from voronerf.data import SceneError, builtin_scene, city_scene, images, load_scene, store
 from voronerf.data.images import read_images, read_masks
 from voronerf.training.batches import RayBatches
+from voronerf.training.checkpoint import last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.networks import resolve_config
 from voronerf.training.trainer import Trainer
@@ -108,7 +114,87 @@ def test_a_build_goes_on_and_other_images_are_built_again(folder, cache, monkeyp
     del again, other
     assert torch.equal(*load_scene(folder, images="disk").train.images[:2])
     lines = [record.getMessage() for record in caplog.records]
-    assert len(lines) == 2 and all("holds other images than those of the scene now" in line for line in lines)
+    assert len(lines) == 2 and "holds other images than those of the scene now" in lines[0]
+    assert "image 0 is damaged, it and those behind it are made again" in lines[1]
+
+
+def test_what_is_damaged_is_made_again(folder, cache, caplog):
+    right = load_scene(folder, images="disk").train.images.clone()
+    (place,) = cache.iterdir()
+    data = bytearray((place / "pixels").read_bytes())
+    for at in (range(len(data)), range(len(data) // 2, len(data) // 2 + 1)):
+        for byte in at:
+            data[byte] ^= 255
+        (place / "pixels").write_bytes(data)
+        assert torch.equal(load_scene(folder, images="disk").train.images, right)
+        data = bytearray((place / "pixels").read_bytes())
+    assert [record.getMessage().split(": ")[1][:18] for record in caplog.records] == [
+        "image 0 is damaged",
+        "image 4 is damaged",
+    ]
+    record = json.loads((place / "store.json").read_text())
+    for other in ({"checksums": [float("inf")]}, {"checksums": -5}, {"checksums": [-5] * 100}, {"version": 10**400}):
+        (place / "store.json").write_text(json.dumps({**record, **other}))
+        assert torch.equal(load_scene(folder, images="disk").train.images, right)
+
+
+def test_an_image_replaced_at_equal_size_and_time_is_noticed(folder, cache):
+    first = folder / "train" / "r_0.png"
+    load_scene(folder, images="disk")
+    stat, data = first.stat(), bytearray((folder / "train" / "r_1.png").read_bytes())
+    data += bytes(stat.st_size - len(data)) if stat.st_size > len(data) else b""
+    first.write_bytes(data)
+    os.utime(first, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert torch.equal(*load_scene(folder, images="disk").train.images[:2])
+
+
+def test_a_file_that_is_cut_short_ends_a_training_with_a_line_and_a_checkpoint(
+    folder, cache, tmp_path, monkeypatch, capsys
+):
+    draw = RayBatches.draw
+
+    def cut(self, *args, **options):
+        if len(drawn := cut.__dict__.setdefault("drawn", [])) == 3:
+            os.truncate(next(cache.iterdir()) / "pixels", 100)
+        drawn.append(1)
+        return draw(self, *args, **options)
+
+    monkeypatch.setattr(RayBatches, "draw", cut)
+    options = "--images disk --steps 20 --width 8 --cells 2 --rays 64 --lpips off --evaluations 1 --no-occupancy"
+    assert main(["train", "--data", str(folder), "--out", str(tmp_path / "run"), *options.split()]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].endswith("was cut short while it was read")
+    assert last_checkpoint(tmp_path / "run").values["step"] == 3
+
+
+@pytest.mark.skipif(os.name != "posix", reason="has no owners")
+def test_links_in_a_shared_cache_are_not_followed(folder, cache, tmp_path):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "pixels").write_text("precious")
+    load_scene(folder, images="disk")
+    (place,) = cache.iterdir()
+    assert {path.stat().st_mode & 0o777 for path in (cache, place)} == {0o700}
+    (place / "pixels").unlink()
+    (place / "pixels").symlink_to(mine / "pixels")
+    with pytest.raises(SceneError, match="cannot hold"):
+        load_scene(folder, images="disk")
+    shutil.rmtree(place)
+    place.symlink_to(mine)
+    with pytest.raises(SceneError, match="must be a folder of your own"):
+        load_scene(folder, images="disk")
+    assert (mine / "pixels").read_text() == "precious" and len(list(mine.iterdir())) == 1
+
+
+def test_a_wait_for_another_process_is_said(folder, cache, caplog):
+    load_scene(folder, images="disk")
+    (place,) = cache.iterdir()
+    number = os.open(place, os.O_RDONLY)
+    fcntl.flock(number, fcntl.LOCK_EX)
+    threading.Timer(0.5, os.close, (number,)).start()
+    load_scene(folder, images="disk")
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{place}: another process makes these images, this one waits for it"
+    ]
 
 
 def test_a_full_disk_is_one_line(folder, monkeypatch):

@@ -108,7 +108,7 @@ def test_a_video_that_ffmpeg_did_not_finish(tmp_path, monkeypatch):
 
 def test_what_no_video_can_be_written_to(tmp_path, monkeypatch):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    refuses("turn: a video must end in .mp4, .m4v", check_video, tmp_path / "turn")
+    refuses("turn.avi: a video must end in .mp4", check_video, tmp_path / "turn.avi")
     (tmp_path / "file").write_text("")
     refuses("file", check_video, tmp_path / "file" / "turn.mp4", error=OSError)
 

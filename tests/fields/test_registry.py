@@ -180,6 +180,13 @@ def test_options_reach_the_field(scene: Scene) -> None:
         ({"field": "table", "depth": 3}, "--depth must not come with --field table, got 3"),
         ({"field": "table", "view_directions": False}, "--view-directions must not come with --field table, got False"),
         ({"field_options": ("gain",)}, "--field-options must be NAME=VALUE, got 'gain'"),
+        *(
+            (
+                {"field": "nerf", "field_options": (f"density_scale={value}",)},
+                f"--field-options must give density_scale a finite number, got 'density_scale={value}'",
+            )
+            for value in ("nan", "1e999", "x")
+        ),
         (
             {"field": "nerf", "field_options": ("gain=2",)},
             "--field-options of nerf are density_scale, .*; got 'gain=2'",

@@ -25,7 +25,7 @@ from voronerf.cli.board import Board
 from voronerf.cli.display import StageDisplay, TrainingDisplay, printable
 from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.cli.ranks import train_on_ranks
-from voronerf.data import Scene, load_scene
+from voronerf.data import Scene, SceneError, load_scene
 from voronerf.data.process import process as make_scene
 from voronerf.distributed.group import Group, world_size
 from voronerf.distributed.trainer import RankTrainer
@@ -170,6 +170,10 @@ def _train(trainer: Trainer) -> dict[str, Any]:
         signal.signal(number, stop)
     try:
         return trainer.run()
+    except SceneError:  # of images on disk that were cut short: what was learnt stays
+        if type(trainer) is Trainer:
+            trainer.save()
+        raise
     finally:
         restore()
 

@@ -32,6 +32,8 @@ FILES = ("cameras", "images", "points3D")
 MOST_BYTES = 2**31
 #: Points that fewer images than this have seen are too uncertain to tell where the scene is.
 LEAST_SEEN = 3
+#: Numbers of points from here on are none: COLMAP writes the largest, 2^64 - 1, where a sighting is of no point.
+NO_POINT = 2**63
 #: Share of the points of a view that may be wrong, at either end, and how many it needs.
 OUTLIERS, LEAST_POINTS = 0.01, 20
 
@@ -99,7 +101,9 @@ def read_model(folder: Path) -> ColmapModel:
         numbers, points = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         if points_path.is_file():
             rows = list((_points if binary else _text_points)(points_path))
-            kept = sorted((number, x, y, z) for number, x, y, z, seen in rows if seen >= LEAST_SEEN)
+            kept = sorted(
+                (number, x, y, z) for number, x, y, z, seen in rows if seen >= LEAST_SEEN and number < NO_POINT
+            )
             numbers = np.array([row[0] for row in kept], dtype=np.int64)
             points = np.array([row[1:] for row in kept], dtype=np.float64).reshape(-1, 3)
             if not (np.abs(points) <= LARGEST).all():
@@ -221,8 +225,8 @@ def _text_images(path: Path) -> Iterator[RawImage]:
             values, camera, name = tuple(map(float, words[1:8])), int(words[8]), " ".join(words[9:])
         line, seen = next(lines, (line + 1, []))  # of its points, and empty without any
         with _line_of("the points of an image", path, line):
-            points = np.array(seen[2::3]).astype(np.int64)
-        yield name, camera, values, points[points >= 0]
+            numbers = [int(number) for number in seen[2::3]]
+        yield name, camera, values, np.array([number for number in numbers if 0 <= number < NO_POINT], dtype=np.int64)
 
 
 def _text_points(path: Path) -> Iterator[tuple[int, float, float, float, int]]:
@@ -239,7 +243,9 @@ def _camera(path: Path, number: int, model: str, width: int, height: int, parame
         lens = colmap_lens(model, parameters)
     except ValueError as error:
         raise SceneError(f"{path}: camera {number}: {error}") from None
-    finite = np.isfinite((*lens.intrinsics, *lens.coefficients)).all() and min(width, height) > 0
+    finite = np.isfinite((*lens.intrinsics, *lens.coefficients)).all() and all(
+        0 < side <= LARGEST for side in (width, height)
+    )
     if not finite or not all(1 / LONGEST <= f / side <= LONGEST for f, side in zip(lens.intrinsics, (width, height))):
         raise SceneError(
             f"{path}: camera {number} must have a size, finite parameters, and a focal length of {1 / LONGEST:g} to "

@@ -186,10 +186,10 @@ def read_images(
     return Decoded(torch.from_numpy(images), sizes, False)
 
 
-def _times(paths: Sequence[Path | None]) -> list[tuple[int, int] | None]:
-    """Size and time of each file."""
+def _times(paths: Sequence[Path | None]) -> list[tuple[int, int, int] | None]:
+    """Size and times of each file: that of its content, which can be set, and that of its last change in any way."""
     found = [None if path is None else path.stat() for path in paths]
-    return [None if stat is None else (stat.st_size, stat.st_mtime_ns) for stat in found]
+    return [None if stat is None else (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for stat in found]
 
 
 def read_masks(

@@ -67,6 +67,10 @@ class Split:
 
     def truth(self, index: int, background: Tensor | None) -> Tensor:
         """One image in 0..1 over `background` ([3]; None is black, as in rendering), float32 [h, w, 3]."""
+        if self.on_disk:
+            from voronerf.data.store import check_mapped  # here, since the store raises what this file has
+
+            check_mapped()
         width, height = self.cameras.size(index)
         image = self.images[index, :height, :width].float() / 255
         if image.shape[-1] == 3:

@@ -1,7 +1,9 @@
 """Images on disk: decoded once into a file that is mapped into memory, so that a scene need not fit into it.
 
 A store is a folder of the cache with `pixels`, the bytes of all images one after another, and `store.json`, which says
-of which files they are and how many are there. A build that is ended at any moment goes on where the record says.
+of which files they are, and the checksum of each image that is there. A build that is ended at any moment goes on where
+the record says. Where a store is opened, all of it is read and compared with the checksums: what was damaged is built
+again.
 
 c images of h x w pixels.
 """
@@ -17,6 +19,8 @@ import os
 import sys
 import time
 import warnings
+import weakref
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -28,16 +32,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from voronerf.data.scene import SceneError
-from voronerf.files import cache_folder, json_text, read_json, write_text
+from voronerf.files import cache_folder, json_text, private_folder, read_json, write_text
 
 log = logging.getLogger(__name__)
 
-VERSION = 1  # of the files
+VERSION = 2  # of the files
 RECORD_EVERY = 2.0  # seconds of a build
 RANDOM, WILL_NEED = 1, 3  # of madvise, on Linux and macOS
 
 # from the number of an image to its pixels, [h, w, channels]
 Make = Callable[[int], NDArray[np.uint8]]
+
+# The files of this process that are mapped and in use.
+_mapped: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
 
 def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int], make: Make, threads: int) -> Tensor:
@@ -60,68 +67,103 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
         What `make` raises.
     """
     folder = cache_folder() / "images" / f"{name[:100]}-{_digest([sources, list(shape)])[:12]}"
-    pixels, size = folder / "pixels", int(np.prod(shape))
+    each = int(np.prod(shape[1:]))
+    size = each * shape[0]
     wanted = {"version": VERSION, "shape": list(shape), "made_of": _digest(made_of)}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with _locked(folder):
-            done = _there(folder, wanted, size)
-            if done < shape[0]:
-                _build(folder, wanted, done, shape, make, threads)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of torch, that the array is read-only
-            return torch.from_numpy(np.memmap(pixels, np.uint8, "r", shape=tuple(shape)))
+        private_folder(folder.parent)
+        with _locked(private_folder(folder)):
+            sums = _recorded(folder, wanted, shape[0])
+            # who has mapped a file that holds other images keeps it
+            if not sums:
+                (folder / "store.json").unlink(missing_ok=True)
+                (folder / "pixels").unlink(missing_ok=True)
+            file = os.open(folder / "pixels", os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o600)
+            try:
+                _allocate(file, size)
+                mapped = mmap.mmap(file, size, access=mmap.ACCESS_READ)
+                sums = _undamaged(folder, mapped, sums, each, threads)
+                if len(sums) < shape[0]:
+                    _build(folder, file, wanted, sums, shape, make, threads)
+            finally:
+                os.close(file)
     except OSError as error:
         raise SceneError(f"{folder}: cannot hold the {size / 2**30:.2f} GiB of images: {error.strerror}") from None
+    _mapped.add(mapped)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch, that the array is read-only
+        return torch.from_numpy(np.frombuffer(mapped, np.uint8).reshape(tuple(shape)))
 
 
-def _there(folder: Path, wanted: dict[str, Any], size: int) -> int:
-    """How many images a store holds already; says where it is of others."""
+def check_mapped() -> None:
+    """Raises SceneError where a mapped file has become shorter: who reads what is missing is ended by SIGBUS."""
+    for mapped in _mapped:
+        if mapped.size() < len(mapped):
+            raise SceneError(
+                f"images on disk: their file in {cache_folder() / 'images'} was cut short while it was read"
+            )
+
+
+def _recorded(folder: Path, wanted: dict[str, Any], count: int) -> list[int]:
+    """The checksums of the images that a store holds already; says where it is of others."""
     try:
         record = read_json(folder / "store.json")
-        done = int(record.pop("done"))
     except FileNotFoundError:
-        return 0
-    except (ValueError, KeyError, TypeError, AttributeError):
-        record, done = None, 0
-    pixels = folder / "pixels"
-    if record != wanted or not pixels.is_file() or pixels.stat().st_size != size:
+        return []
+    except ValueError:
+        record = None
+    sums = record.pop("checksums", None) if isinstance(record, dict) else None
+    if record != wanted or not isinstance(sums, list) or len(sums) > count:
         log.warning("%s: holds other images than those of the scene now, it is built again", folder)
-        return 0
-    return done
+        return []
+    return sums
 
 
-def _build(folder: Path, wanted: dict[str, Any], done: int, shape: Sequence[int], make: Make, threads: int) -> None:
-    pixels, each = folder / "pixels", int(np.prod(shape[1:]))
-    if done == 0:
-        (folder / "store.json").unlink(missing_ok=True)
-        pixels.unlink(missing_ok=True)  # who has mapped it keeps it
+def _allocate(file: int, size: int) -> None:
+    if hasattr(os, "posix_fallocate"):  # a full disk is an error now, and none while the file is mapped
+        os.posix_fallocate(file, 0, size)
+    else:
+        os.truncate(file, size)
+
+
+def _undamaged(folder: Path, mapped: mmap.mmap, sums: list[int], each: int, threads: int) -> list[int]:
+    """The checksums up to the first image that is not as it was written; says which that is."""
+    view = memoryview(mapped)
+
+    def is_damaged(number: int) -> bool:
+        return zlib.crc32(view[number * each : (number + 1) * each]) != sums[number]
+
+    with ThreadPoolExecutor(threads) as pool:
+        for number, damaged in enumerate(pool.map(is_damaged, range(len(sums)))):
+            if damaged:
+                log.warning("%s: image %d is damaged, it and those behind it are made again", folder, number)
+                return sums[:number]
+    return sums
+
+
+def _build(
+    folder: Path, file: int, wanted: dict[str, Any], sums: list[int], shape: Sequence[int], make: Make, threads: int
+) -> None:
     from rich.console import Console  # here, since importing it takes long
     from rich.progress import Progress
 
-    file = os.open(pixels, os.O_RDWR | os.O_CREAT, 0o644)
+    each = int(np.prod(shape[1:]))
     console = Console(stderr=True)
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
-    try:
-        if hasattr(os, "posix_fallocate"):  # a full disk is an error now, and none while the file is mapped
-            os.posix_fallocate(file, 0, each * shape[0])
-        else:
-            os.truncate(file, each * shape[0])
-        recorded = time.monotonic()
-        with bar, ThreadPoolExecutor(threads) as pool:
-            task = bar.add_task(f"images into {folder}", total=shape[0], completed=done)
-            while done < shape[0]:
-                numbers = range(done, min(done + 4 * threads, shape[0]))
-                for number, image in zip(numbers, pool.map(make, numbers)):
-                    _write(file, np.ascontiguousarray(image).data.cast("B"), number * each)
-                done = numbers.stop
-                bar.update(task, completed=done)
-                if done == shape[0] or time.monotonic() - recorded > RECORD_EVERY:
-                    os.fsync(file)
-                    write_text(folder / "store.json", json_text({**wanted, "done": done}) + "\n")
-                    recorded = time.monotonic()
-    finally:
-        os.close(file)
+    recorded = time.monotonic()
+    with bar, ThreadPoolExecutor(threads) as pool:
+        task = bar.add_task(f"images into {folder}", total=shape[0], completed=len(sums))
+        while len(sums) < shape[0]:
+            numbers = range(len(sums), min(len(sums) + 4 * threads, shape[0]))
+            for number, image in zip(numbers, pool.map(make, numbers)):
+                data = np.ascontiguousarray(image).data.cast("B")
+                _write(file, data, number * each)
+                sums.append(zlib.crc32(data))
+            bar.update(task, completed=len(sums))
+            if len(sums) == shape[0] or time.monotonic() - recorded > RECORD_EVERY:
+                os.fsync(file)
+                write_text(folder / "store.json", json_text({**wanted, "checksums": sums}) + "\n")
+                recorded = time.monotonic()
 
 
 def _write(file: int, data: memoryview, place: int) -> None:
@@ -140,7 +182,11 @@ def _locked(folder: Path) -> Iterator[None]:
 
     number = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(number, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            log.warning("%s: another process makes these images, this one waits for it", folder)
+            fcntl.flock(number, fcntl.LOCK_EX)
         yield
     finally:
         os.close(number)
@@ -169,7 +215,12 @@ class Pages:
             self.advise(first, self.start + images.numel() - first, RANDOM)
 
     def fetch(self, index: Tensor) -> None:
-        """Begins to read the pages of pixels [b], numbered through all images."""
+        """Begins to read the pages of pixels [b], numbered through all images.
+
+        Raises:
+            SceneError: the file was cut short.
+        """
+        check_mapped()
         if self.advise is None:
             return
         for page in torch.unique((self.start + index * self.channels) // mmap.PAGESIZE).tolist():

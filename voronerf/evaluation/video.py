@@ -10,19 +10,17 @@ from pathlib import Path
 from torch import Tensor
 from torch.nn.functional import pad
 
-SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".avi")
-
 
 def check_video(path: Path) -> None:
     """Finds out before the frames are there whether :func:`write_video` can write them; makes the folder.
 
     Raises:
-        ValueError: an unknown suffix; it must be that of a container of H.264.
+        ValueError: another suffix than .mp4.
         ImportError: imageio-ffmpeg, or the ffmpeg that it brings, is not installed.
         OSError: the folder cannot be written.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{path}: a video must end in {', '.join(SUFFIXES)}")
+    if path.suffix.lower() != ".mp4":
+        raise ValueError(f"{path}: a video must end in .mp4")
     try:
         import imageio_ffmpeg
 
@@ -44,7 +42,7 @@ def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:
     """Writes an H.264 video that players everywhere show; makes its folder. The file appears when it is complete.
 
     Args:
-        path: the file, .mp4, .m4v, .mov, .mkv or .avi.
+        path: the file, .mp4.
         frames: uint8 [h, w, 3] each, at least one; they are taken one by one. An odd size is padded by a copy of its
             last row or column, since the format stores colour for pairs of pixels.
         fps: frames a second.
@@ -73,7 +71,7 @@ def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:
             fps=fps,
             macro_block_size=2,
             quality=8,
-            ffmpeg_log_level="error",
+            ffmpeg_log_level="quiet",
         )
         writer.send(None)
         count = 0
@@ -82,6 +80,8 @@ def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:
                 even = pad(frame.permute(2, 0, 1)[None], (0, width % 2, 0, height % 2), mode="replicate")[0]
                 writer.send(even.permute(1, 2, 0).cpu().contiguous().numpy())
                 count += 1
+        except OSError:  # whose message is ffmpeg's command and all that it says
+            raise OSError(f"{path}: ffmpeg could not write it, it ended after {count} frames") from None
         finally:
             writer.close()
         try:  # imageio does not return the exit status of ffmpeg

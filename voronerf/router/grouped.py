@@ -15,15 +15,15 @@ import inspect
 import linecache
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.cells import clone_module
-from voronerf.router.grouping import Grouping, cell_parameters, cells_of, in_place_of_parameters
+from voronerf.router.double import Double
+from voronerf.router.grouping import Grouping, cell_parameters, cells_of
 from voronerf.router.layout import Call, Results, map_tensors, split_rows, tensors_of
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
@@ -73,12 +73,16 @@ class NoRandomness(TorchFunctionMode):
     """Random numbers are 0 and dropout does nothing, so that two calls can be compared."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        kwargs = kwargs or {}
-        if func not in RANDOM:
-            return func(*args, **kwargs)
-        if "dropout" in getattr(func, "__name__", ""):
-            return args[0] if args else kwargs["input"]
-        return func(*args, **kwargs).zero_()
+        return without_randomness(func, args, kwargs or {})
+
+
+def without_randomness(func: Any, args: Any, kwargs: Any) -> Any:
+    """What a function returns where random numbers are 0."""
+    if func not in RANDOM:
+        return func(*args, **kwargs)
+    if "dropout" in getattr(func, "__name__", ""):
+        return args[0] if args else kwargs["input"]
+    return func(*args, **kwargs).zero_()
 
 
 def register(function: Any, rule: Rule) -> None:
@@ -107,7 +111,7 @@ def register(function: Any, rule: Rule) -> None:
         >>> class Field(torch.nn.Linear):
         ...     def forward(self, x):
         ...         return shift(x @ self.weight.T, self.bias)
-        >>> router = VoronoiRouter(Field(3, 2), torch.randn(4, 3), coords="first3")
+        >>> router = VoronoiRouter(Field(3, 2), torch.randn(4, 3), coords="first3", way="grouped")
         >>> router(torch.randn(64, 3)).shape
         torch.Size([64, 2])
         >>> print(router.explain())
@@ -222,8 +226,9 @@ class GroupedRun(TorchFunctionMode):
         widest: Bytes of the largest tensor of rows that was made.
     """
 
-    def __init__(self, grouping: Grouping, tables: dict[Any, Any]) -> None:
+    def __init__(self, grouping: Grouping, tables: dict[Any, Any], quiet: bool = False) -> None:
         super().__init__()
+        self.quiet = quiet  # random numbers are 0
         self.grouping, self.n, self.tables = grouping, grouping.n, tables
         self.failed: Ungroupable | None = None
         self.widest = 1
@@ -271,7 +276,7 @@ class GroupedRun(TorchFunctionMode):
         marked = [tensor for tensor in operands if self.is_rows(tensor)]
         if any(type(tensor) is PerCell for tensor in operands):
             return self._with_parameters(func, args, kwargs, operands, marked)
-        result = func(*args, **kwargs)
+        result = without_randomness(func, args, kwargs) if self.quiet else func(*args, **kwargs)
         found = tensors_of(result)
         if marked:
             if writes_in_place(func):
@@ -339,6 +344,7 @@ class Grouped:
     piece: int = 1 << 16  # rows
     name: str = "grouped"
     why: str = ""
+    quiet: bool = False  # random numbers are 0, so that two runs can be compared
     widest: int = 1  # bytes of the largest tensor of rows that the last call made
 
     def run(self, call: Call, grouping: Grouping) -> Results:
@@ -350,15 +356,15 @@ class Grouped:
         sizes, pieces = {part.start: part.k for part in parts}, []
         for p in cell_parameters(call.module):
             pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
-        values, widest, tables = [], 1, dict[Any, Any]()
+        values, widest, tables, double = [], 1, dict[Any, Any](), Double(call.module)
         for part, rows in zip(parts, split_rows(given, [part.n for part in parts]), strict=True):
-            run = GroupedRun(part, tables)
+            run = GroupedRun(part, tables, self.quiet)
             for tensor in rows:
                 run.mark(tensor)
             origin = part.start
             stand_ins = {id(p): PerCell(own[origin], (p, origin)) for p, own in pieces}
-            with in_place_of_parameters(call.module, stand_ins), run:
-                values.append(call.run(rows))
+            with run:
+                values.append(double.run(call, rows, stand_ins))
             if run.failed is not None:
                 raise run.failed
             if any(isinstance(tensor, PerCell) for tensor in tensors_of(values[-1])):
@@ -372,13 +378,14 @@ class Grouped:
 class Loop:
     """The module once for each cell that has samples: the definition of a routed call.
 
-    Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a copy of the
+    Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a double of the
     module, which keeps the cell's parameters.
     """
 
     why: str = ""
     again: bool = False
     open: bool = False  # another batch may be carried out in a faster way
+    keeps: str = ""  # the attribute that the module kept a parameter as in the last call
     name: str = "cell by cell"
 
     def run(self, call: Call, grouping: Grouping) -> Results:
@@ -389,13 +396,11 @@ class Loop:
         """The same with one call of the module for each (cell, first row, row behind the last)."""
         module, counts = call.module, [last - first for _, first, last in bounds]
         pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
-        values = []
+        values, double = [], Double(module)
         for (cell, _, _), part in zip(bounds, split_rows(call.arranged(grouping), counts), strict=True):
-            own: dict[int, Any] = {key: piece[cell] for key, piece in pieces.items()}
-            if self.again:
-                kept = {id(tensor): tensor for tensor in (*module.buffers(), *module.parameters())}
-                values.append(replace(call, module=clone_module(module, kept | own)).run(part))
-                continue
-            with in_place_of_parameters(module, own):
-                values.append(call.run(part))
+            double = Double(module) if self.again else double
+            values.append(double.run(call, part, {key: piece[cell] for key, piece in pieces.items()}))
+        if not self.again:
+            double.end()
+        self.keeps = double.keeps
         return Results.joined(values, counts, grouping)

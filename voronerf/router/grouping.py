@@ -6,10 +6,9 @@ n * m, sample after sample.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -46,9 +45,14 @@ class Grouping:
         locate: Callable[[], Tensor] | None = None,
         rows: Tensor | None = None,
     ) -> None:
+        self._where = where
         self.where, self.n, self.k, self.device, self.backend, self.rows = where, n, k, device, backend, rows
         self.start = 0  # of the cells of a part
         self._locate = locate
+
+    def anew(self) -> Grouping:
+        """The same entries, not sorted yet."""
+        return Grouping(self._where, self.n, self.k, self.device, self.backend, self._locate, self.rows)
 
     @property
     def cells(self) -> Tensor | None:
@@ -209,26 +213,6 @@ def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
     """The parameters that are stacked, [k, ...]; not those that all cells share."""
     owned = [p for owner, name, p in owned_parameters(module) if name not in vars(owner).get(SHARED, ())]
     return list({id(parameter): parameter for parameter in owned}.values())
-
-
-@contextlib.contextmanager
-def in_place_of_parameters(module: nn.Module, values: Mapping[int, Any]) -> Iterator[None]:
-    """Lets a module find other tensors where its parameters are; ``values`` by the id of the parameter."""
-    parts = list(module.modules())
-    owned = [(part, name, p) for part in parts for name, p in part._parameters.items() if id(p) in values]
-    # Hooks such as that of torch.nn.utils.weight_norm leave tensors made of parameters behind.
-    attributes = [(part, dict(vars(part))) for part in parts if part._forward_pre_hooks]
-    for owner, name, parameter in owned:
-        owner._parameters[name] = values[id(parameter)]
-    try:
-        yield
-    finally:
-        for owner, name, parameter in owned:
-            owner._parameters[name] = parameter
-        for owner, before in attributes:
-            for name, value in list(vars(owner).items()):
-                if isinstance(value, Tensor) and value is not before.get(name):
-                    vars(owner)[name] = before.get(name)
 
 
 @functools.cache

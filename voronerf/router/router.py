@@ -34,7 +34,7 @@ from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.optimizers import check_optimizer, drop_state, move_state, watch_optimizers
 from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
-from voronerf.router.ways import Choices, evaluate
+from voronerf.router.ways import Choices, Wish, evaluate
 
 # Centres of a flat diagram beyond which it may look cells up by a grid of its own.
 _MANY = 256
@@ -52,7 +52,7 @@ class VoronoiRouter(nn.Module):
     optimiser sees as many tensors as for one module. Buffers are shared by all cells.
 
     The loop over cells defines the result. A call runs in the fastest of these ways, after one comparison with the loop
-    for each kind of call; :meth:`explain` says which, and why:
+    for each kind of call; :meth:`explain` says which, why, and what was measured:
 
     - fused: one operation for the whole network. This needs a field with a layer table (:class:`LayeredField`), or
       ``fuse=True``.
@@ -83,6 +83,9 @@ class VoronoiRouter(nn.Module):
             samples, also with ``fuse``.
         fuse: Promises that ``forward`` does the same in every call. Its network is traced once and runs as one
             operation, or is refused with the line that stands in the way.
+        way: "fastest" measures the ways of a call on the first batch of its kind and, within a factor of four, its
+            size. "fused", "grouped" and "loop" take that way, or the next in this order where it is not possible, and
+            do not depend on timings.
         layout: How the module sees samples ``[rays, samples, f]``: "rays" as ``[n, 1, f]``, with what is per ray as
             ``[n, f]``; "flat" as ``[n, f]``, for modules that squeeze or flatten.
         assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell by the distances
@@ -103,7 +106,7 @@ class VoronoiRouter(nn.Module):
         >>> import torch
         >>> from voronerf import VoronoiRouter
         >>> field = torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.ReLU(), torch.nn.Linear(64, 4))
-        >>> router = VoronoiRouter(field, torch.rand(16, 3), coords="first3", fuse=True)
+        >>> router = VoronoiRouter(field, torch.rand(16, 3), coords="first3", fuse=True, way="fused")
         >>> points = torch.rand(1000, 3)
         >>> router(points).shape
         torch.Size([1000, 4])
@@ -126,6 +129,7 @@ class VoronoiRouter(nn.Module):
         methods: Sequence[str] = (),
         share: Sequence[str] = (),
         fuse: bool = False,
+        way: Literal["fastest", "fused", "grouped", "loop"] = "fastest",
         layout: Literal["rays", "flat"] = "rays",
         assignment: Assignment = "nearest",
         temperature: float = 0.05,
@@ -134,7 +138,7 @@ class VoronoiRouter(nn.Module):
     ) -> None:
         module = getattr(module, "_orig_mod", module)  # of torch.compile, which would not see the parameters of cells
         check_module(module)
-        options = {"coords": coords, "assignment": assignment, "temperature": temperature, "layout": layout}
+        options = {"coords": coords, "assignment": assignment, "temperature": temperature, "layout": layout, "way": way}
         lists = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
         _check_options(module, lists, **options, backend=backend, blend=blend)
         super().__init__()
@@ -146,7 +150,7 @@ class VoronoiRouter(nn.Module):
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature, self.blend = assignment, temperature, blend
-        self.backend, self.coords, self.fuse, self.layout = backend, coords, fuse, layout
+        self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
@@ -494,9 +498,9 @@ class VoronoiRouter(nn.Module):
             self.layout == "flat",
         )
         call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
-        with self._choices.lock:  # what stands in for the module's parameters does so for one call at a time
-            mixture, grouping = self._mixture(positions), self._group(method, positions)
-            return evaluate(call, grouping, mixture, self._choices, fused=self.fuse)
+        mixture, grouping = self._mixture(positions), self._group(method, positions)
+        wish = Wish(self.fuse, self.way, bool(self.methods))
+        return evaluate(call, grouping, mixture, self._choices, wish)
 
     def _mixture(self, positions: Tensor) -> Mixture | None:
         """The other cells that samples near borders are evaluated in too."""
@@ -562,6 +566,7 @@ def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> 
         "temperature": (options["temperature"] > 0, "positive"),
         "blend": (0 <= options["blend"] < float("inf"), "finite and at least 0"),
         "layout": (options["layout"] in ("rays", "flat"), "'rays' or 'flat'"),
+        "way": (options["way"] in ("fastest", "fused", "grouped", "loop"), "'fastest', 'fused', 'grouped' or 'loop'"),
         "backend": (options["backend"] in ("auto", *BACKENDS), f"auto, {', '.join(BACKENDS)}"),
         "coords": (
             coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords),

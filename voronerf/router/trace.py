@@ -20,8 +20,9 @@ from torch import Tensor, fx
 from torch.fx.node import map_aggregate
 from torch.overrides import TorchFunctionMode
 
+from voronerf.router.double import Double
 from voronerf.router.grouped import METADATA, RANDOM, find, name_of, user_line, writes_in_place
-from voronerf.router.grouping import cell_parameters, in_place_of_parameters, owned_parameters
+from voronerf.router.grouping import cell_parameters, owned_parameters
 from voronerf.router.layout import Call, rebuild, tensors_of
 from voronerf.router.lower import ROWS
 
@@ -63,8 +64,9 @@ class Trace(TorchFunctionMode):
         self._nodes: dict[int, fx.Node] = {}  # by the id of their tensor, which ``meta`` keeps
         self.n = self._new(ROWS)
         self.inputs = [self._new(tensor) for tensor in given]
-        with in_place_of_parameters(module, single), _custom_functions(self), self:
-            result = call.run(given)
+        double = Double(module)
+        with _custom_functions(self), self:
+            result = double.run(call, given, single)
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self._argument(tensor) for tensor in tensors_of(result)]
 

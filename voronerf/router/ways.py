@@ -8,11 +8,13 @@ module whose cells have parameters of their own, and results and gradients are c
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import os
 import threading
+import time
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +25,10 @@ from voronerf.backends import BackendUnavailable
 from voronerf.diagram.blending import Mixture
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.cells import clone_module
+from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import fuse
 from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
-from voronerf.router.grouping import Grouping, cell_parameters, in_place_of_parameters, keep_freed_memory
+from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
 from voronerf.router.layout import RAY, Call, Results, map_tensors, rebuild, tensors_of
 from voronerf.router.trace import ROWS, Unfusable
 from voronerf.tolerances import agree, agree_gradients
@@ -35,19 +38,44 @@ _FEWEST = 8  # samples below which nothing is found out about a kind of call, an
 _TRIED, _CELLS = 41, 3  # samples of a comparison, unlike any number of features, and their cells
 _PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
 _KINDS = 256  # kinds of calls that are remembered
+_EQUAL = 1.02  # of the least time: what is not slower by more, and more promising, is taken
+_TURNS, _ENOUGH = 8, 0.15  # most measurements of a way, and seconds after which there are no more than two
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
+
+
+@dataclass
+class Kind:
+    """What is known about the calls of a kind.
+
+    Attributes:
+        ways: Those that give what the loop gives, the most promising first and the loop last.
+        chosen: The fastest and what was measured, by the size of a batch and the number of cells.
+        open: Whether another batch may run grouped, where the first did not.
+        skip: Calls that run cell by cell before another way is tried again.
+        wait: ``skip`` after the next batch that cannot be grouped.
+    """
+
+    ways: list[Way]
+    open: bool = False
+    chosen: dict[tuple[int, int], tuple[Way, str]] = field(default_factory=dict)
+    skip: int = 0
+    wait: int = 0
+
+    def put_off(self) -> None:
+        """Has the next calls run cell by cell, twice as many each time."""
+        self.skip, self.wait = self.wait, 2 * self.wait or 1
 
 
 class Choices:
     """What a router has found out about its module. Copies of a router begin anew."""
 
     def __init__(self) -> None:
-        self.lock = threading.RLock()  # held during a call: stand-ins are in the place of the module's parameters
+        self.lock = threading.RLock()  # held while something is found out
         self.forget()
 
     def forget(self) -> None:
         """Begins anew, after a change of dtype, device or parameters' names."""
-        self.kinds: dict[Any, Way] = {}
+        self.kinds: dict[Any, Kind] = {}
         self._said: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
@@ -57,8 +85,9 @@ class Choices:
 
     def explain(self, methods: tuple[str, ...]) -> str:
         """How each method has been carried out so far, and why."""
-        ways = [(method, way) for method in methods for way in self._latest.get(method, {"not called yet": ""}).items()]
-        return "\n".join(f"{method}: {way}{f': {why}' if why else ''}" for method, (way, why) in ways)
+        latest = [(method, self._latest.get(method, {"not called yet": ""})) for method in methods]
+        ways = [(method, *way) for method, ways in latest for way in list(ways.items())]
+        return "\n".join(f"{method}: {name}{f': {why}' if why else ''}" for method, name, why in ways)
 
     def say_once(self, topic: str, message: str) -> None:
         """Warns, the first time that a topic comes up, at the line that called the router."""
@@ -70,6 +99,21 @@ class Choices:
 
     def __reduce__(self) -> tuple[type[Choices], tuple[()]]:
         return Choices, ()
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the user asked for.
+
+    Attributes:
+        fuse: Whether ``forward`` does the same in every call.
+        way: "fastest", or the way that is taken without measuring: "fused", "grouped" or "loop".
+        several: Whether methods besides ``forward`` are routed; then one that cannot be fused leaves the others fused.
+    """
+
+    fuse: bool
+    way: str
+    several: bool
 
 
 def kind_of(call: Call, device: torch.device, fused: bool) -> Any:
@@ -93,68 +137,139 @@ def kind_of(call: Call, device: torch.device, fused: bool) -> Any:
 # Carrying out ---------------------------------------------------------------------------------------------------------
 
 
-def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, *, fused: bool) -> Any:
+def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, wish: Wish) -> Any:
     """What a method returns for the samples of all cells (or two placeholders), some mixed with those of others."""
     if grouping.device.type == "cpu":
         keep_freed_memory()
-    way = choose(call, grouping, choices, fused)
-    own = carry_out(way, call, grouping, choices).restored(call.layout)
+    kind = find_out(call, grouping, choices, wish)
+    way, why = choose(kind, call, grouping, choices, wish)
+    own = carry_out(way, why, kind, call, grouping, choices).restored(call.layout)
     if mixture is None:
         return own
     entries, tensors = grouping.of_entries(mixture.rows, mixture.cells), tensors_of(own)
-    for i, tensor in enumerate(carry_out(way, call, entries, choices).unsorted):
+    for i, tensor in enumerate(carry_out(way, why, kind, call, entries, choices).unsorted):
         tensors[i] = mixture.mix(tensors[i], tensor.reshape(entries.n, -1))
     return rebuild(own, tensors)
 
 
-def carry_out(way: Way, call: Call, grouping: Grouping, choices: Choices) -> Results:
+def find_out(call: Call, grouping: Grouping, choices: Choices, wish: Wish) -> Kind:
+    """What is known about calls of this kind, found out if it is the first."""
+    layout, key = call.layout, kind_of(call, grouping.device, wish.fuse)
+    kind = choices.kinds.get(key)
+    if kind is not None and not (kind.open and kind.skip == 0 and layout.n >= _FEWEST):
+        return kind
+    call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is found out
+    with choices.lock, torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else []):
+        if layout.n < _FEWEST:
+            if layout.n:
+                Trial(call, grouping).check_parameters()
+            return Kind([Loop(f"for fewer than {_FEWEST} samples")])
+        trial = Trial(call, grouping)
+        if kind is not None and not trial.is_groupable():
+            kind.put_off()
+            return kind
+        if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
+            check_rays(call)
+        found = admitted(trial, choices, wish)
+    if len(choices.kinds) >= _KINDS:
+        choices.kinds.clear()
+    choices.kinds[key] = found
+    return found
+
+
+def choose(kind: Kind, call: Call, grouping: Grouping, choices: Choices, wish: Wish) -> tuple[Way, str]:
+    """The way of a call, the fastest on the first batch of about its size, and what there is to say about it."""
+    n, k = call.layout.n, grouping.k
+    ways = [way for way in kind.ways if k > 1 or not isinstance(way, Grouped)]
+    if kind.skip:
+        kind.skip -= 1
+        ways = ways[-1:]
+    if wish.way != "fastest" or len(ways) == 1 or n < _FEWEST:
+        return ways[0], ways[0].why
+    size = n.bit_length() // 2, k  # batches of up to four times as many samples
+    if size not in kind.chosen:
+        with choices.lock:
+            times = measured(ways, call, grouping)
+        chosen = next(i for i, time in enumerate(times) if time <= _EQUAL * min(times))
+        texts = [f"{way.name} {1e3 * time:.3g} ms" for way, time in zip(ways, times, strict=True)]
+        others = ", ".join(texts[:chosen] + texts[chosen + 1 :])
+        way, own = ways[chosen], f"{1e3 * times[chosen]:.3g} ms for {n} samples, {others}" if min(times) else ""
+        kind.chosen[size] = way, "; ".join(filter(None, (way.why, own)))
+    return kind.chosen[size]
+
+
+def carry_out(way: Way, why: str, kind: Kind, call: Call, grouping: Grouping, choices: Choices) -> Results:
     """The results of a way, or of the loop where a batch cannot be grouped."""
+    layout, alone, warns = call.layout, grouping.k == 1, len(kind.ways) == 1
     if isinstance(way, Grouped):
-        if grouping.k == 1:
-            choices.note(call, "the module itself", "there is one cell")
-            return Loop().run(call, grouping)
         try:
-            results = way.run(call, grouping)
-            choices.note(call, way.name, way.why)
+            results, kind.wait = way.run(call, grouping), 0
+            choices.note(call, way.name, why)
             return results
         except Exception as error:
             lacking = (BackendUnavailable, MemoryError, torch.OutOfMemoryError)
             if isinstance(error, lacking) or "can't allocate memory" in str(error):
                 raise
-            why = error if isinstance(error, Ungroupable) else f"its forward fails ({error})"
-            way = Loop(f"for some batches, since {why}")
+            kind.put_off()
+            reason = error if isinstance(error, Ungroupable) else f"its forward fails ({error})"
+            way, why, warns = kind.ways[-1], f"for some batches, since {reason}", True
     try:
         results = way.run(call, grouping)
     except Exception as error:
-        if hasattr(error, "add_note") and len(call.layout.lead) > 1 and not call.layout.flat:  # since Python 3.11
-            error.add_note(f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]")
+        if len(layout.lead) > 1 and not layout.flat and len(error.args) == 1 and isinstance(error.args[0], str):
+            hint = f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]"
+            error.args = (f"{error.args[0]}\n{hint}",)
         raise
-    choices.note(call, way.name, way.why)
-    if isinstance(way, Loop) and grouping.k > 1 and way.why and call.layout.n >= _FEWEST:
-        choices.say_once(f"cells {call.method}", f"{call.name} runs cell by cell: {way.why}")
+    itself = alone and isinstance(way, Loop)
+    choices.note(call, *(("the module itself", "there is one cell") if itself else (way.name, why)))
+    if why and warns and not alone and layout.n >= _FEWEST:
+        choices.say_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
     return results
 
 
-def choose(call: Call, grouping: Grouping, choices: Choices, fused: bool) -> Way:
-    """How to carry out a call of this kind, found out if it is the first."""
-    layout, kind = call.layout, kind_of(call, grouping.device, fused)
-    way = choices.kinds.get(kind)
-    if way is not None and not getattr(way, "open", False):
-        return way
-    if layout.n < _FEWEST:
-        return Loop(f"for fewer than {_FEWEST} samples") if way is None else way
-    call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is found out
-    with torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else []):
-        trial = Trial(call, grouping)
-        if way is not None and not trial.is_groupable():
-            return way
-        if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
-            check_rays(call)
-        found = admitted(trial, fused)
-    if len(choices.kinds) >= _KINDS:
-        choices.kinds.clear()
-    choices.kinds[kind] = found
-    return found
+def measured(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
+    """Seconds that each way takes for the batch of a call, forward and, where there are gradients, backward.
+
+    The ways take turns, and the least time of each counts. A double of the module takes what they write and the
+    gradients; random numbers go on as if nothing had run.
+    """
+    double, leaves = Double(call.module), list[Tensor]()
+
+    def leaf(value: Tensor) -> Tensor:
+        taken = value.detach().requires_grad_(value.requires_grad and torch.is_grad_enabled())
+        leaves.extend([taken] * taken.requires_grad)
+        return taken
+
+    double.fill({id(p): leaf(p) for _, _, p in owned_parameters(call.module)})
+    double.own_buffers()
+    args, kwargs = map_tensors((call.args, call.kwargs), leaf)
+    again, cuda = replace(call, module=double.module, args=args, kwargs=kwargs), grouping.device.type == "cuda"
+
+    # Beside other work the processor's time says more, but it leaves out what other threads do.
+    clock = time.perf_counter if cuda or torch.get_num_threads() > 1 else time.thread_time
+
+    def seconds(way: Way) -> float:
+        if cuda:
+            torch.cuda.synchronize(grouping.device)
+        start = clock()
+        outputs = [t for t in way.run(again, grouping.anew()).unsorted if t.requires_grad and t.is_floating_point()]
+        if outputs and leaves:
+            # Of a sum: with gradients of their own for the outputs torch imports sympy.
+            total = torch.stack([(t * torch.ones_like(t)).sum().float() for t in outputs]).sum()
+            torch.autograd.grad(total, leaves, allow_unused=True)
+        if cuda:
+            torch.cuda.synchronize(grouping.device)
+        return clock() - start
+
+    best, began = [float("inf")] * len(ways), clock()
+    with torch.random.fork_rng([grouping.device] if cuda else []):
+        for turn in range(_TURNS):
+            for i, way in enumerate(ways):
+                if turn < 2 or best[i] <= 1.5 * min(best):
+                    best[i] = min(best[i], seconds(way))
+            if turn and clock() - began > _ENOUGH:
+                break
+    return best
 
 
 # Comparison -----------------------------------------------------------------------------------------------------------
@@ -172,6 +287,7 @@ class Trial:
         picked = torch.arange(_TRIED, device=device) * call.layout.n // _TRIED
         cells = (torch.arange(_TRIED, device=device) * 7 % 5 // 2).int()
         self.entries = Grouping({"cells": cells}, _TRIED, _CELLS, device, grouping.backend, rows=picked)
+        self.entries.source, self.entries.occupied  # noqa: B018  sorted here: under a mode torch imports its compiler
         generator = torch.Generator().manual_seed(0)
         memo: dict[int, Any] = {id(p): _made_different(p, generator) for p in cell_parameters(call.module)}
         module = clone_module(call.module, memo).to(dtype)
@@ -188,8 +304,8 @@ class Trial:
         self.call = replace(call, module=module, args=args, kwargs=kwargs)
 
     def run(self, way: Way) -> Results:
-        """The results of a way."""
-        with NoRandomness():
+        """The results of a way, with random numbers of 0."""
+        with NoRandomness() if isinstance(way, Loop) else contextlib.nullcontext():  # a fused network draws none
             return way.run(self.call, self.entries)
 
     def outcome(self, way: Way) -> Outcome:
@@ -221,11 +337,21 @@ class Trial:
         except Exception:
             return False
 
+    def check_parameters(self) -> None:
+        """Raises TypeError where the module changes its parameters."""
+        try:
+            with torch.no_grad():
+                self.run(Loop())
+        except Forbidden:
+            raise
+        except Exception:
+            return  # the call itself says so
+
     def is_groupable(self) -> bool:
         """Whether the module runs for all cells at once on this batch, right or wrong."""
         try:
             with torch.no_grad():
-                self.run(Grouped())
+                self.run(Grouped(quiet=True))
         except Exception:
             return False
         return True
@@ -271,39 +397,50 @@ def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Paramet
         return nn.Parameter(values, requires_grad=parameter.requires_grad)
 
 
-def admitted(trial: Trial, fused: bool) -> Way:
-    """The fastest way that gives what the loop gives, or an error where that must be the fused one."""
+def admitted(trial: Trial, choices: Choices, wish: Wish) -> Kind:
+    """The ways that give what the loop gives, or an error where the fused one must be among them."""
     for loop in (Loop(), Loop(again=True)):
         try:
             expected = trial.outcome(loop)
             break
+        except Forbidden:
+            raise
         except Exception as error:  # perhaps its code runs again in the backward pass
             why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
     else:
-        return Loop(why)
-    if fused:
+        return Kind([Loop(why)])
+    if loop.keeps:
+        says = f"{trial.call.name} keeps a parameter as `{loop.keeps}`, which is of that call alone"
+        choices.say_once(f"keeps {trial.call.method}", says)
+    ways, is_open = list[Way](), False
+    if wish.fuse and wish.way in ("fastest", "fused"):
         try:
-            return trial.fused(loop, expected)
+            ways.append(trial.fused(loop, expected))
         except Exception as error:
             trial.check_rows(loop)
             why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
-        raise ValueError(
-            f"{_OP}: fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
-        )
-    try:
-        way = Grouped()
-        if trial.agrees(way, loop, expected):
-            way.piece = min(max(_PIECE * _TRIED // way.widest, 1 << 10), 1 << 16)
-            return way
-        loop.why = "its forward on the samples of all cells gives other results than on those of one cell"
-    except BackendUnavailable:
-        raise
-    except Ungroupable as error:
-        loop.why, loop.open = str(error), error.of_batch
-    except Exception as error:
-        loop.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
-    trial.check_rows(loop)
-    return loop
+            says = f"fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
+            if not wish.several:
+                raise ValueError(f"{_OP}: {says}") from error
+            choices.say_once(f"fuse {trial.call.method}", says)
+    if wish.way in ("fastest", "grouped") or (wish.way == "fused" and not ways):
+        try:
+            tried = Grouped(quiet=True)
+            if trial.agrees(tried, loop, expected):
+                ways.append(Grouped(min(max(_PIECE * _TRIED // tried.widest, 1 << 10), 1 << 16)))
+            else:
+                loop.why = "its forward on the samples of all cells gives other results than on those of one cell"
+        except BackendUnavailable:
+            raise
+        except Ungroupable as error:
+            loop.why, is_open = str(error), error.of_batch
+        except Exception as error:
+            loop.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
+    if not ways:
+        trial.check_rows(loop)
+    elif loop.again:
+        ways = ways[:1]  # cannot be measured, since some checkpoints refuse torch.autograd.grad
+    return Kind([*ways, loop], is_open and not ways)
 
 
 # Rays -----------------------------------------------------------------------------------------------------------------
@@ -337,5 +474,5 @@ def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
     args, kwargs = call.changed(first)
     small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
     cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
-    with torch.no_grad(), NoRandomness(), in_place_of_parameters(call.module, cell):
-        return [tensors_of(small.run(rows)) for rows in (found, small.arranged(None))]
+    with torch.no_grad(), NoRandomness():
+        return [tensors_of(Double(call.module).run(small, rows, cell)) for rows in (found, small.arranged(None))]

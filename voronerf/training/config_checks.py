@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import itertools
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -40,11 +41,14 @@ def check_field(config: TrainConfig) -> None:
     for text in config.field_options:
         if "=" not in text:
             raise ConfigError(f"--field-options must be NAME=VALUE, got {text!r}")
-        name, _ = parse_option(text)
+        name, value = parse_option(text)
         if name in NETWORK_SETTINGS:
             raise ConfigError(f"--field-options must not hold {name}, use --{name.replace('_', '-')}; got {text!r}")
         if name not in own:
             raise ConfigError(f"--field-options of {config.field} are {', '.join(own) or 'none'}; got {text!r}")
+        is_number = isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
+        if isinstance(options[name], (int, float)) and not (is_number or value is None):
+            raise ConfigError(f"--field-options must give {name} a finite number, got {text!r:.60}")
 
 
 def parse_option(text: str) -> tuple[str, Any]:

@@ -261,6 +261,7 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
             assignment=config.assignment,
             temperature=config.temperature,
             backend=config.backend,
+            way="fused",  # a run is resumed bit for bit, so nothing depends on timings
             **({} if name == "proposal" else config.router_options),
         ).to(device)
         for name, network in networks.items()

@@ -1,0 +1,87 @@
+"""Messages of a browser that no page of the viewer sends."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import random
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from attempts import REFUSED, RIGHT, Failed
+from given import FIELDS
+from hostile import VALUES, damaged
+
+from voronerf import open_run
+
+sys.path.append(str(Path(__file__).parents[1] / "viewer"))
+
+#: Messages of a client in an attempt.
+MESSAGES = 20
+
+
+def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
+    """One client sends what it likes; the viewer says it in lines, and another client goes on."""
+    import msgspec  # here, since the viewer is an extra
+    from tab import Tab
+    from websockets.exceptions import ConnectionClosed
+
+    from voronerf.viewer import view_run
+
+    said: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    logging.getLogger("voronerf").addHandler(handler)
+    torch.set_num_threads(1)
+    viewer = view_run(open_run(given / rng.choice(list(FIELDS)), data=given / "blender"), port=0)
+    cameras = viewer.subject.scene.test.cameras
+    with contextlib.closing(viewer), contextlib.closing(Tab(viewer, cameras)) as other:
+        other.rest()
+        other.set("Pixels", 128)
+        bad = Tab(viewer, cameras, number=1)
+        bad.rest()
+        with contextlib.suppress(ConnectionClosed):
+            for _ in range(MESSAGES):
+                data = msgspec.msgpack.encode(message(rng, bad.gui))
+                bad.socket.send(damaged(rng, data) if rng.random() < 0.1 else data)
+                viewer.render_next()
+                bad.read()
+        other.set("Show", "depth")
+        other.rest()
+        if 0 not in viewer.clients:
+            raise Failed(f"another client was disconnected: {said}")
+        verdict = RIGHT if 1 in viewer.clients else REFUSED
+        bad.close()
+    if any("\n" in line or len(line) > 500 for line in said):
+        raise Failed(f"not in lines: {said}")
+    return verdict
+
+
+def message(rng: random.Random, gui: dict[str, Any]) -> dict[str, Any]:
+    """A message of which something is odd."""
+    part = rng.choice([part for part in gui.values() if part.get("value") is not None or "options" in part] or [{}])
+    camera = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0] * 3, "fov": 1.0, "near": 0.01, "far": 1000.0}
+    camera |= {"image_height": 48, "image_width": 48, "look_at": [0.0, 0.0, 1.0], "up_direction": [0.0, 0.0, 1.0]}
+    click = {"event_type": "click", "ray_origin": [0.0] * 3, "ray_direction": [0.0, 0.0, 1.0], "modifier": None}
+    kinds = {
+        "GuiUpdateMessage": {"uuid": part.get("uuid"), "updates": {"value": value(rng)}},
+        "ViewerCameraMessage": camera,
+        "ScenePointerMessage": {**click, "screen_pos": [[0.5, 0.5]]},
+        "FileTransferStartUpload": {"size_bytes": 2**60, "part_count": 2**60, "filename": "x", "mime_type": "x"},
+        "ShareUrlRequest": {},
+    }
+    kind = rng.choice(("GuiUpdateMessage", "GuiUpdateMessage", "ViewerCameraMessage", *kinds))
+    made = {"type": kind, **kinds[kind]}
+    if kind != "GuiUpdateMessage" or rng.random() < 0.3:
+        made[rng.choice(list(made))] = value(rng)
+    return made
+
+
+def value(rng: random.Random) -> Any:
+    """Something that a message can hold."""
+    found = rng.choice((*VALUES, [1.0], [math.nan] * 2, [1e300] * 3, [[1.0], [2.0, 3.0]], {"update_cb": 3}, -1.0))
+    large = isinstance(found, int) and abs(found) > 2**63
+    return str(found) if large else found

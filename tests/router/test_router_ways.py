@@ -1,0 +1,186 @@
+"""The choice between the ways of a call: measured, said, and without a trace."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from convention_harness import uniform
+from router_fields import masked_loop
+from torch import Tensor, nn
+
+from voronerf import VoronoiRouter
+from voronerf.router import ways
+from voronerf.router.grouped import Grouped, Loop
+from voronerf.router.grouping import Grouping
+from voronerf.router.layout import Call, Layout
+
+CENTRES = torch.rand(6, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
+
+
+def network() -> nn.Module:
+    return nn.Sequential(nn.Linear(3, 16), nn.ReLU(), nn.Linear(16, 4))
+
+
+@pytest.mark.parametrize("fastest", ["fused", "grouped", "cell by cell"])
+def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest: str) -> None:
+    calls = []
+
+    def measured(found: Any, call: Any, grouping: Any) -> list[float]:
+        calls.append([way.name for way in found])
+        return [0.001 if way.name == fastest else 0.004 for way in found]
+
+    monkeypatch.setattr(ways, "measured", measured)
+    router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=True), uniform((200,))
+    for _ in range(3):
+        torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    others = [f"{name} 4 ms" for name in ("fused", "grouped", "cell by cell") if name != fastest]
+    assert router.explain() == f"forward: {fastest}: 1 ms for 200 samples, {', '.join(others)}"
+    assert calls == [["fused", "grouped", "cell by cell"]]
+    router(uniform((2000,)))  # measured again, since it is larger by more than a factor of four
+    router(uniform((2,)))
+    with torch.no_grad():
+        router(x)
+    assert len(calls) == 3
+
+
+def test_what_is_about_as_fast_and_more_promising_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ways, "measured", lambda found, call, grouping: [1.01, 1.0])
+    router = VoronoiRouter(network(), CENTRES, coords="first3")
+    router(uniform((200,)))
+    assert router.explain().startswith("forward: grouped: ")
+
+
+@pytest.mark.parametrize(
+    ("way", "fuse", "taken"),
+    [
+        ("fused", True, "fused"),
+        ("fused", False, "grouped"),
+        ("grouped", True, "grouped"),
+        ("loop", True, "cell by cell"),
+        ("loop", False, "cell by cell"),
+    ],
+)
+def test_a_way_by_name_is_not_measured(monkeypatch: pytest.MonkeyPatch, way: Any, fuse: bool, taken: str) -> None:
+    monkeypatch.setattr(ways, "measured", None)
+    router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=fuse, way=way), uniform((200,))
+    torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    assert router.explain() == f"forward: {taken}"
+
+
+def test_a_way_that_is_none() -> None:
+    with pytest.raises(ValueError, match="way must be 'fastest', 'fused', 'grouped' or 'loop', got 'quick'"):
+        VoronoiRouter(network(), CENTRES, coords="first3", way="quick")  # type: ignore[arg-type]
+
+
+class Counts(nn.Module):
+    """Draws numbers, and writes into a buffer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = network()
+        self.register_buffer("seen", torch.zeros(()))
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.seen += 1
+        return self.net(x) + 0 * torch.rand_like(x[:, :1])
+
+
+@pytest.mark.measures
+@pytest.mark.parametrize("requires_grad", [False, True])
+def test_measuring_leaves_no_trace(requires_grad: bool) -> None:
+    router, x = VoronoiRouter(Counts(), CENTRES, coords="first3"), uniform((200,)).requires_grad_(requires_grad)
+    fixed = copy.deepcopy(router)
+    fixed.way = "grouped"
+    torch.manual_seed(3)
+    found = router(x)
+    after = torch.get_rng_state()
+    text = router.explain()
+    assert " ms for 200 samples, " in text and "grouped" in text and "cell by cell" in text
+    torch.manual_seed(3)
+    torch.testing.assert_close(found, fixed(x))
+    if text.startswith("forward: grouped"):
+        assert torch.equal(after, torch.get_rng_state()) and router.module.seen == fixed.module.seen == 1
+    assert all(parameter.grad is None for parameter in router.parameters()) and x.grad is None
+
+
+@pytest.mark.measures
+def test_times_are_those_of_a_step() -> None:
+    """Forward and backward where there is one; the loop of 16 cells takes longer than one pass for all of them."""
+
+    seen = []
+
+    class Spy(nn.Linear):
+        def forward(self, x: Tensor) -> Tensor:
+            y = super().forward(x)
+            if y.requires_grad:
+                y.register_hook(lambda gradient: seen.append("backward"))
+            return y
+
+    router, x = VoronoiRouter(Spy(3, 2), CENTRES, coords="first3", way="grouped"), uniform((300,))
+    router(x)
+    seen.clear()
+    layout = Call(router.module, "forward", Layout((300,), None, frozenset()), ["input"], (x,), {})
+    grouping = Grouping({"cells": router.diagram.locate(x)}, 300, 6, x.device, "auto")
+    times = ways.measured([Grouped(), Loop()], layout, grouping)
+    assert len(times) == 2 and all(0 < time < 10 for time in times) and seen.count("backward") >= 2 * (1 + 6)
+    with torch.no_grad():
+        seen.clear()
+        ways.measured([Grouped(), Loop()], layout, grouping)
+        assert not seen
+
+
+class Decides(nn.Module):
+    """Reads values of the samples on the way."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = network()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.net(x) if float(x[:, 0].max()) < 100 else -self.net(x)
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+def test_a_module_that_reads_values_is_tried_again_by_doubling(monkeypatch: pytest.MonkeyPatch) -> None:
+    tries, call, own = [], [0], ways.Trial.is_groupable
+    monkeypatch.setattr(ways.Trial, "is_groupable", lambda trial: tries.append(call[0]) or own(trial))
+    router, x = VoronoiRouter(Decides(), CENTRES, coords="first3"), uniform((60,))
+    for number in range(100):
+        call[0] = number
+        router(x)
+    assert len(tries) <= 8 and tries[:2] == [1, 2]
+    assert router.explain().startswith("forward: cell by cell: torch.Tensor.__float__ reads values of the samples")
+
+
+class Half(nn.Module):
+    """Runs grouped unless a sample lies outside."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net, self.tries = network(), [0]
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.tries[0] += 1
+        if (x.abs() > 1).any():
+            return self.net(x.clamp(-1, 1)) * float(len(x) and x[0, 0].detach() > -100)
+        return self.net(x)
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+def test_batches_that_cannot_be_grouped_are_tried_by_doubling() -> None:
+    router, near = VoronoiRouter(Half(), CENTRES, coords="first3"), uniform((60,)).clamp(-1, 1)
+    far = near * 3
+    router(near)
+    cells, tries = len(router.diagram.locate(far).unique()), router.module.tries
+    tries[0] = 0
+    for _ in range(64):
+        torch.testing.assert_close(router(far), masked_loop(router, router.diagram.locate(far), [far])[0][0])
+    assert 64 * cells < tries[0] <= 64 * 2 * cells + 10  # the loop's calls, those of the expected values, few others
+    for _ in range(80):
+        router(near)
+    tries[0] = 0
+    router(near)
+    assert tries[0] == 1  # grouped again

@@ -1,0 +1,195 @@
+"""A double of a routed module, which runs in its place with other tensors where its parameters are.
+
+The module itself never changes, so other threads may save, copy or call it at any time.
+"""
+
+from __future__ import annotations
+
+import functools
+import types
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.router.layout import Call, map_tree
+
+_OP = "VoronoiRouter"
+_PLAIN = {type(None), bool, int, float, str, type, torch.dtype, torch.device, torch.Size, types.FunctionType, Tensor}
+_LAYERS = "torch.nn.modules."  # whose classes assign nothing in ``forward``
+_SEARCHED = 1000  # objects of an attribute that are searched for parts of the module
+
+
+class Forbidden(TypeError):
+    """A method changes the parameters of its module."""
+
+
+class Double:
+    """Copies of the parts of a module, which share its buffers and have registries of their own.
+
+    Each run begins with the attributes that the module has, so what ``forward`` assigns is of that run alone.
+
+    Args:
+        module: The routed module.
+
+    Attributes:
+        keeps: The name of an attribute that a run has kept a parameter as, if any.
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        self.keeps = ""
+        parts: dict[int, nn.Module] = {}
+        _collect(module, parts)
+        twins = {key: _twin(part) for key, part in parts.items()}
+        for key, part in parts.items():  # a compiled part runs as it was before
+            twins[key] = twins.get(id(part._modules.get("_orig_mod")), twins[key])
+        self.module = twins[id(module)]
+        self._places: list[tuple[dict[str, Any], str, int]] = []
+        self._kept: list[tuple[nn.Module, dict[str, Any]]] = []  # parts whose ``forward`` may assign, and what they had
+        self._registries: list[tuple[nn.Module, dict[str, Any], set[str]]] = []
+        for key, part in parts.items():
+            twin, own = twins[key], dict(vars(part))
+            if twin is part:
+                continue
+            registry = own["_parameters"] = dict(part._parameters)
+            own["_buffers"] = dict(part._buffers)
+            own["_modules"] = {name: twins.get(id(child), child) for name, child in part._modules.items()}
+            others = own.keys() - {"_parameters", "_buffers", "_modules"}
+            own.update({name: _moved(own[name], twins) for name in others if _reaches(own[name], parts)})
+            vars(twin).update(own)
+            if not type(part).__module__.startswith(_LAYERS) or part._forward_pre_hooks:
+                self._kept.append((twin, own))
+            self._places += [(registry, name, id(p)) for name, p in registry.items() if p is not None]
+            self._registries.append((twin, registry, set(registry)))
+
+    def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any]) -> Any:
+        """A call with other tensors where the module's parameters are.
+
+        Args:
+            call: A call of the module.
+            rows: The rows of its arguments.
+            values: The tensors, by the id of the parameter; without one a parameter stays.
+
+        Raises:
+            Forbidden: Where the method adds, removes or replaces parameters, or writes into them.
+        """
+        placed = self.fill(values)
+        versions = [_version(value) for _, _, value in placed]
+        own = Call(self.module, call.method, call.layout, call.names, call.args, call.kwargs, call.kinds)
+        try:
+            return own.run(rows)
+        finally:
+            self._check(call.name, placed, versions)
+            self._begin_again(placed)
+
+    def _check(self, name: str, placed: list[tuple[dict[str, Any], str, Any]], versions: list[int]) -> None:
+        """Raises Forbidden where a run has changed the parameters."""
+        for twin, registry, names in self._registries:
+            if vars(twin)["_parameters"] is not registry or registry.keys() != names:
+                odd = sorted(vars(twin)["_parameters"].keys() ^ names)
+                raise Forbidden(f"{_OP}: {name} must not add or remove parameters, but does so with {odd[0]!r}")
+        for (registry, own, value), version in zip(placed, versions, strict=True):
+            does = "replace parameters" if registry[own] is not value else "write into its parameters"
+            if registry[own] is not value or _version(value) != version:
+                raise Forbidden(f"{_OP}: {name} must not {does}, but does so with {own!r}")
+
+    def _begin_again(self, placed: list[tuple[dict[str, Any], str, Any]]) -> None:
+        """Gives the parts the attributes that they had before the run."""
+        for twin, own in self._kept:
+            now = vars(twin)
+            if len(now) != len(own) or any(now.get(name) is not value for name, value in own.items()):
+                kept = {name for name in now if any(now[name] is value for _, _, value in placed)}
+                self.keeps = next(iter(kept), self.keeps)
+                now.clear()
+                now.update(own)
+
+    def fill(self, values: Mapping[int, Any]) -> list[tuple[dict[str, Any], str, Any]]:
+        """Puts tensors in the place of parameters, by their id; gives (registry, name, tensor) of each."""
+        placed = [(registry, name, values[key]) for registry, name, key in self._places if key in values]
+        for registry, name, value in placed:
+            registry[name] = value
+        return placed
+
+    def own_buffers(self) -> None:
+        """Has the double write into buffers of its own."""
+        for part in self.module.modules():
+            part._buffers = {name: None if b is None else b.clone() for name, b in part._buffers.items()}
+
+    def end(self) -> None:
+        """Takes the parameters away, so that code that runs again in the backward pass fails."""
+        for registry, _, _ in self._places:
+            registry.clear()
+
+
+def _collect(module: nn.Module, parts: dict[int, nn.Module]) -> None:
+    """Finds all parts of a module tree, in the order of ``modules()``, which takes three times as long."""
+    if id(module) not in parts:
+        parts[id(module)] = module
+        for child in module._modules.values():
+            if child is not None:
+                _collect(child, parts)
+
+
+def _twin(part: nn.Module) -> nn.Module:
+    """An empty object in the place of a part; the part itself where it has nothing that changes."""
+    empty = not (part._parameters or part._modules or part._buffers)
+    if (empty and type(part).__module__.startswith(_LAYERS)) or isinstance(part, torch.jit.ScriptModule):
+        return part
+    twin: nn.Module = object.__new__(type(part))
+    return twin
+
+
+def _version(value: Any) -> int:
+    """Counts what was written into a tensor, or into all cells' ones that it stands for."""
+    tensor = getattr(value, "stacked", value)
+    return 0 if tensor.is_inference() else int(tensor._version)
+
+
+def _reaches(value: Any, parts: Mapping[int, nn.Module]) -> bool:
+    """Whether a value holds a part of the module."""
+    if type(value) in _PLAIN or (not value and isinstance(value, (dict, list, set))):
+        return False
+    left, seen = [value], set[int]()
+    while left and len(seen) < _SEARCHED:
+        item = left.pop()
+        if type(item) in _PLAIN or id(item) in seen:
+            continue
+        seen.add(id(item))
+        if isinstance(item, nn.Module):
+            if id(item) in parts:
+                return True
+        elif isinstance(item, types.MethodType):
+            left.append(item.__self__)
+        elif isinstance(item, functools.partial):
+            left += [item.func, *item.args, *item.keywords.values()]
+        elif isinstance(item, dict):
+            left += item.values()
+        elif isinstance(item, (list, tuple, set, frozenset)):
+            left += item
+        elif not isinstance(item, (Tensor, type, types.ModuleType)):
+            left += getattr(item, "__dict__", {}).values()
+    return False
+
+
+def _moved(value: Any, twins: Mapping[int, nn.Module]) -> Any:
+    """The same with twins in the place of parts."""
+
+    def change(name: str, leaf: Any, nested: bool) -> Any:
+        if isinstance(leaf, nn.Module):
+            return twins.get(id(leaf), leaf)
+        if isinstance(leaf, types.MethodType):
+            return types.MethodType(leaf.__func__, _moved(leaf.__self__, twins))
+        if isinstance(leaf, functools.partial):
+            return functools.partial(
+                _moved(leaf.func, twins), *_moved(leaf.args, twins), **_moved(leaf.keywords, twins)
+            )
+        if isinstance(leaf, (set, frozenset)):
+            return type(leaf)(_moved(item, twins) for item in leaf)
+        if callable(leaf) and type(leaf) not in _PLAIN and not isinstance(leaf, type) and hasattr(leaf, "__dict__"):
+            own: Any = object.__new__(type(leaf))
+            vars(own).update({name: _moved(item, twins) for name, item in vars(leaf).items()})
+            return own
+        return leaf
+
+    return map_tree(value, change)
