@@ -108,14 +108,16 @@ class Op:
 
         def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
             *given, lengths = flat
-            arguments = _nested(given, lengths)
+            arguments, ctx.lengths = _nested(given, lengths), lengths
             result = self._run(*arguments)
             setup_context(ctx, arguments, result)
             return tuple(result) if self._listed else result  # autograd.Function knows no lists
 
         def gradients(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
             found = backward(ctx, of_results) if self._listed else backward(ctx, *of_results)
-            return (*_flattened(found if isinstance(found, tuple) else (found,))[0], None)
+            found = found if isinstance(found, tuple) else (found,)
+            lists = zip(found, ctx.lengths, strict=True)
+            return (*_flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0], None)
 
         parts = {"forward": staticmethod(forward), "backward": staticmethod(gradients)}
         self._function = type("Direct", (torch.autograd.Function,), parts)

@@ -83,7 +83,6 @@ class Fused:
         self.why = f"{len(self._runs)} run{'s' * (len(self._runs) > 1)}, between them {'; '.join(said)}" if said else ""
         for node in trace.graph.nodes:
             if isinstance(node.meta.get("value"), Tensor):
-                node.meta["shape"] = _by_sample(node.meta["value"].shape)
                 node.meta["dtype"] = node.meta.pop("value").dtype
         del self._lowering, self._entries
 
@@ -276,7 +275,8 @@ class Fused:
             if isinstance(of, fx.Node):
                 shape, at, m = of.meta["layout"]
                 tensor = tensor.reshape(n * m, *shape).movedim(0, at) if at else tensor.reshape(n * m, *shape)
-                tensor = tensor.to(of.meta["dtype"])
+                half = of.meta["dtype"] in (torch.bfloat16, torch.float16)
+                tensor = tensor.to(of.meta["dtype"]) if half else tensor
             values[of] = tensor
 
     def _compute_weights(self, values: dict[Any, Any]) -> None:
@@ -372,7 +372,3 @@ def _taken(value: Tensor, of: Any, codes: Tensor) -> Tensor:
 
 def _sample_dimension(shape: torch.Size) -> int:
     return next(d for d, size in enumerate(shape) if size and size % ROWS == 0)
-
-
-def _by_sample(shape: torch.Size) -> list[int]:
-    return [-1 if size and size % ROWS == 0 else size for size in shape]

@@ -419,7 +419,7 @@ def admitted(trial: Trial, choices: Choices, wish: Wish) -> Kind:
         except Exception as error:
             trial.check_rows(loop)
             why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
-            says = f"fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
+            says = f"fuse=True needs a network that can be fused, but in {trial.call.name} {why}"
             if not wish.several:
                 raise ValueError(f"{_OP}: {says}") from error
             choices.say_once(f"fuse {trial.call.method}", says)
