@@ -60,10 +60,12 @@ isa-check: $(VENV)/.built
 	@for isa in $(ISAS); do \
 	  VORONERF_ISA=$$isa OMP_NUM_THREADS=1 $(BIN)/pytest -q -n $(JOBS) tests/ops -k native-cpu || exit 1; done
 
-# Everything to be learnt from a machine with a GPU, in eight minutes; OUT is a folder for what it says.
+# Everything to be learnt from a machine with a GPU, in three calls of ten minutes: CALL=1, 2 and 3. OUT is a folder for
+# the two files that a call leaves.
 OUT ?= build/gpu-check
+CALL ?= 1
 gpu-check:
-	@$(PYTHON) benchmarks/gpu/gpu_check.py --out $(OUT) $(GPU_CHECK_ARGS)
+	@$(PYTHON) benchmarks/gpu/gpu_check.py $(CALL) --out $(OUT) $(GPU_CHECK_ARGS)
 
 # The tests of the operations on CUDA kernels that run on the CPU, threads in several orders.
 emulate-cuda: $(VENV)/.built

@@ -39,11 +39,37 @@ BATCH_SECONDS = 5e-3
 data in the caches, and its threads spinning."""
 
 
-def processor() -> str:
-    """The processor's name."""
+FAMILIES = {
+    ("AuthenticAMD", 25, range(0x10, 0x20)): "Zen 4",
+    ("AuthenticAMD", 25, range(0x60, 0xB0)): "Zen 4",
+    ("AuthenticAMD", 25, range(0x100)): "Zen 3",
+    ("AuthenticAMD", 26, range(0x100)): "Zen 5",
+    ("GenuineIntel", 6, (0x6A, 0x6C)): "Ice Lake",
+    ("GenuineIntel", 6, (0x8F,)): "Sapphire Rapids",
+    ("GenuineIntel", 6, (0xCF,)): "Emerald Rapids",
+    ("GenuineIntel", 6, (0xAD, 0xAE)): "Granite Rapids",
+}
+"""Names by vendor, family and models; the first that fits. Virtual machines leave them out of the processor's name."""
+
+
+def processor(text: str | None = None) -> str:
+    """The processor's name, and that of its family where it is known.
+
+    Args:
+        text: of /proc/cpuinfo; by default that of this machine.
+    """
     path = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.*)", path.read_text()) if path.is_file() else []
-    return names[0] if names else platform.processor() or platform.machine()
+    known = text if text is not None else path.read_text() if path.is_file() else ""
+    found = {name: re.search(rf"^{name}\s*: (.*)$", known, re.MULTILINE) for name in ("model name", *_NUMBERS)}
+    name = found["model name"][1] if found["model name"] else platform.processor() or platform.machine()
+    if not all(found[number] for number in _NUMBERS):
+        return name
+    vendor, family, model = (match[1] for number in _NUMBERS if (match := found[number]))
+    families = [n for (v, f, models), n in FAMILIES.items() if (v, f) == (vendor, int(family)) and int(model) in models]
+    return f"{name} ({families[0]})" if families else f"{name} (family {family}, model {model})"
+
+
+_NUMBERS = ("vendor_id", "cpu family", "model")
 
 
 def metadata(**extra: Any) -> dict[str, Any]:

@@ -31,7 +31,8 @@ from typing import Any, NoReturn
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 
 import torch
-from harness import Others, Peaks, Stopwatch, Timing, instruction_set, measure, metadata, threads
+from harness import Others, Peaks, Stopwatch, Timing, instruction_set, measure, metadata, processor, threads
+from ops import cases_any as cases_any
 from ops import cases_foreign as cases_foreign
 from ops import cases_hash as cases_hash
 from ops import cases_lookup as cases_lookup
@@ -97,6 +98,7 @@ def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """The cases that the options select."""
     every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases(), *cases_marching.cases()]
     every += [*cases_hash.cases(), *cases_step.cases()]
+    every += cases_any.cases(every)
     if options.foreign:
         every = cases_foreign.cases()
     if options.filter is not None:
@@ -305,6 +307,7 @@ def main(arguments: list[str] | None = None) -> None:
     bench = Bench(torch.device(options.device), quick=options.quick, wanted=options.backends)
     found, missing = installed()
     print(f"threads {torch.get_num_threads()}; missing: {', '.join(missing) or 'nothing'}", file=sys.stderr)
+    print(f"{processor()}\n")
     print(HEADER, flush=True)
     for number, case in enumerate(cases, 1):
         progress = functools.partial(print, file=sys.stderr, flush=True)

@@ -409,19 +409,6 @@ def composite_backward(_0: CompositeInputs, _1: CompositeGradients, _2: Cpu) -> 
 @overload
 def composite_backward(_0: CompositeInputs, _1: CompositeGradients, _2: Cuda) -> None: ...
 
-# const float32*, const float32*, const float32*, const int32*, const int32*, const float32*, int32*, int32*, float32*, int64, int64, int32, float64, Cpu
-@overload
-def draw_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: Tensor | None, _8: Tensor | None, _9: int, _10: int, _11: int, _12: float, _13: Cpu) -> bool: ...
-# const float32*, const float32*, const float32*, const int32*, const int32*, const float32*, int32*, int64, int64, int64, int32, float64, Cuda
-@overload
-def draw_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: int, _8: int, _9: int, _10: int, _11: float, _12: Cuda) -> None: ...
-
-# int64, Cpu
-def draw_cell_places(_0: int, _1: Cpu) -> int: ...
-
-# int64, Cpu
-def draw_cell_sums(_0: int, _1: Cpu) -> int: ...
-
 # DrawPixelsInputs, int64*, float32*, Cpu
 @overload
 def draw_pixels(_0: DrawPixelsInputs, _1: Tensor | None, _2: Tensor | None, _3: Cpu) -> None: ...

@@ -104,15 +104,13 @@ def declare(
     return op
 
 
-def ops() -> tuple[str, ...]:
-    """Names of the ops, in the order of ``voronerf.ops``."""
-    importlib.import_module("voronerf.ops")  # which declares them
-    return tuple(dict.fromkeys(op for op, _ in _TABLE))
+def ops(backend: str = "reference", device: str = "cpu") -> tuple[str, ...]:
+    """Names of the ops that a backend implements for a device, which declare themselves where voronerf is imported."""
+    return tuple(op for (op, name), found in _TABLE.items() if name == backend and device in (found.devices or ORDER))
 
 
 def implemented(op: str) -> tuple[str, ...]:
     """Backends that have an implementation of an op, whether or not it can run here."""
-    ops()  # puts them into the table
     return tuple(backend for backend in BACKENDS if (op, backend) in _TABLE)
 
 

@@ -34,6 +34,8 @@ def agree(found: Tensor, expected: Tensor) -> bool:
     """
     if found.shape != expected.shape or found.dtype != expected.dtype:
         return False
+    if expected.is_complex():
+        found, expected = torch.view_as_real(found), torch.view_as_real(expected)
     if not expected.is_floating_point() or expected.numel() == 0:
         return torch.equal(found, expected)
     a, b = found.detach().double(), expected.detach().double()
@@ -51,6 +53,10 @@ def agree_gradients(found: Sequence[Tensor], expected: Sequence[Tensor]) -> bool
     decides to which side a sample falls, and single entries of a gradient jump. A gradient that is zero but for
     rounding is compared with the largest of them.
     """
+    found, expected = (
+        [torch.view_as_real(tensor) if tensor.is_complex() else tensor for tensor in tensors]
+        for tensors in (found, expected)
+    )
     largest = max((float(b.detach().double().norm()) for b in expected), default=0.0)
     for a, b in zip(found, expected, strict=True):
         if a.shape != b.shape or a.dtype != b.dtype:

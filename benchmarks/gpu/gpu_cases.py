@@ -161,14 +161,6 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         found = voronerf.resample(weights.to(where), edges.to(where), 70, backend="native")
         torch.testing.assert_close(found.cpu(), voronerf.resample(weights, edges, 70, backend="reference"))
 
-    def draw() -> None:
-        diagram = voronerf.VoronoiDiagram(torch.rand(12, 3)).refine({1: torch.rand(5, 3)})[0]
-        given = (torch.rand(3000, 3), diagram.centres, diagram.child_offsets, diagram.child, torch.rand(3000, 2))
-        options: dict[str, Any] = {"temperature": 0.1, "depth": 2}
-        found = voronerf.draw_cell(*(tensor.to(where) for tensor in given), **options, backend="native")
-        # numbers within rounding of a border are few
-        assert int((found.cpu() != voronerf.draw_cell(*given, **options, backend="reference")).sum()) <= 3
-
     def shifted(tensor: Any) -> Any:
         """The same numbers, beginning four bytes (eight in float64) into their memory: nothing wider is aligned."""
         return torch.cat([tensor.new_zeros(1), tensor.flatten()])[1:].view(tensor.shape)
@@ -250,7 +242,6 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             for k, d in ((17, torch.float32), (700, torch.float32), (17, torch.float64))
         ),
         ("locate_cell", functools.partial(lookup, "locate_cell", 300, 3, torch.float32)),
-        ("draw_cell", draw),
         *(
             (f"cell_sort {n} {k} by {way}", functools.partial(sort, n, k, way))
             for n, k, way in (

@@ -1,24 +1,28 @@
-"""Everything to be learnt from a machine with a GPU, in one command: ``gpu_check.py --out DIR``.
+"""Everything to be learnt from a machine with a GPU, in three calls of ten minutes: ``gpu_check.py CALL --out DIR``.
 
-For a bare machine: torch with CUDA, nvcc and ninja, no network. Parts run one after another, each for itself: one that
-fails or runs into its limit is reported with its last lines, and the next one begins. All of them together keep within
---seconds, eight minutes by default, the most telling first: what finds no time any more is left out. ``--parts`` takes
-some of them, ``--data DIR`` is a Blender scene for the training.
+For a bare machine: torch with CUDA, nvcc and ninja, no network. The parts of a call run one after another, each for
+itself: one that fails or runs into its limit is reported with its last lines, and the next one begins. The limits of a
+call add up to less than its time, the most telling part first. ``--parts`` takes some of all parts, ``--data DIR``
+is a Blender scene for the trainings.
 
-    machine    versions, and what is missing
-    build      the extension for this GPU alone
-    small      every operation once against float64, each case for itself and with a time limit of its own
-    captured   steps of the route in CUDA graphs, fused and layer by layer
-    roofs      networks, look-ups and sorts at full size, beside the machine's own limits
-    step       what surrounds the networks in a step, and hash grids, beside the same in plain torch
-    training   short trainings, on --data or the built-in scene
-    tests      the tests of the operations on CUDA, a process for each file
-    memcheck   compute-sanitizer over the small cases, where it is installed
-    racecheck  the same for races in shared memory
-    benchmark  benchmarks/throughput.py --quick
+    1   machine    versions, and what is missing
+        build      the extension for this GPU alone
+        small      every operation once against float64, each case for itself and with a time limit of its own
+        large      networks at 2^22 samples: every way against the others and against float64, with gradients
+        captured   steps of the route in CUDA graphs, fused and layer by layer
+        memcheck   compute-sanitizer over the small cases, where it is installed
+    2   roofs      networks, look-ups and sorts at full size, beside the machine's own limits
+        sizes      a network at 2^13 to 2^22 samples, 1 to 4,096 cells, all precisions, beside torch's products
+        step       what surrounds the networks in a step, and hash grids, beside the same in plain torch
+        profile    a default step: launches, the share of the time that the device works, waits of the host
+    3   training   trainings on --data or the built-in scene, with PSNR over seconds
+        tests      the tests of the operations on CUDA, a process for each file
+        counters   ncu over eight kernels, where it is installed
+        racecheck, synccheck, initcheck   compute-sanitizer over the small cases
 
-DIR gets summary.json, with the outcome of every part and all that it has found (each case, timing, training and file of
-tests), and what each part said, as text. The last lines printed are the summary; the exit status counts failures.
+DIR gets two files: summary-CALL.json, with the outcome of every part and all that it has found (each case, timing,
+training and file of tests), and parts-CALL.tar.gz, with what each part said. The last lines printed are the verdict;
+the exit status counts failures.
 """
 
 from __future__ import annotations
@@ -32,6 +36,8 @@ import shutil
 import signal
 import subprocess
 import sys
+import tarfile
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +50,11 @@ TAIL = 40
 SPLIT = "--split-compile=0"
 TARGETS = {"90": "90a"}
 """What to build for, where that is not the compute capability as it is: with wgmma, to compare it."""
+JUDGED = (
+    *("small", "large", "captured", "roofs", "sizes", "step", "profile", "training"),
+    *("memcheck", "racecheck", "synccheck", "initcheck"),
+)
+"""Parts that have cases, each right or wrong."""
 SHORTEST = 10.0
 """Seconds for which a part is not begun."""
 
@@ -58,28 +69,43 @@ class Part:
     found: Path | None = None
 
 
+CALLS = {
+    "1": ("machine", "build", "small", "large", "captured", "memcheck"),
+    "2": ("build", "roofs", "sizes", "step", "profile"),
+    "3": ("build", "training", "tests", "counters", "racecheck", "synccheck", "initcheck"),
+}
+"""Parts of each call. All begin with the build, which takes no time where an earlier call's is there."""
+SECONDS = 575.0
+"""Of a call."""
+
+
 def main(arguments: list[str]) -> int:
     """Run the parts and return the number of those that failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for summary.json and the parts' outputs")
+    parser.add_argument("call", choices=tuple(CALLS), help="which of the three calls")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the summary and the archive")
     parser.add_argument("--parts", nargs="+", help="some of the parts, in this order")
-    parser.add_argument("--data", type=Path, help="a Blender scene for the training, else the built-in one")
-    parser.add_argument("--seconds", type=float, default=470, help="for all parts together")
+    parser.add_argument("--data", type=Path, help="a Blender scene for the trainings, else the built-in one")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="for all parts together")
     given = parser.parse_args(arguments)
     given.out = given.out.resolve()  # the parts run elsewhere
     given.data = given.data and given.data.resolve()
-    known = parts(given.out, given.data)
-    chosen = given.parts or list(known)
-    if unknown := [name for name in chosen if name not in known]:
-        parser.error(f"--parts takes {', '.join(known)}, got {', '.join(unknown)}")
-    given.out.mkdir(parents=True, exist_ok=True)
-    results = {}
-    end = time.perf_counter() + given.seconds
-    for name in chosen:
-        print(f"gpu-check: {name} ...", flush=True)
-        results[name] = run(name, known[name], given.out, end - time.perf_counter())
-        # Kept after every part, should this be stopped from outside.
-        (given.out / "summary.json").write_text(json.dumps({"device": device(), "parts": results}, indent=1) + "\n")
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        known = parts(scratch, given.data)
+        chosen = given.parts or list(CALLS[given.call])
+        if unknown := [name for name in chosen if name not in known]:
+            parser.error(f"--parts takes {', '.join(known)}, got {', '.join(unknown)}")
+        given.out.mkdir(parents=True, exist_ok=True)
+        results = {}
+        end = time.perf_counter() + given.seconds
+        for name in chosen:
+            print(f"gpu-check: {name} ...", flush=True)
+            results[name] = run(name, known[name], scratch, end - time.perf_counter())
+            # Kept after every part, should this be stopped from outside.
+            said = json.dumps({"device": device(), "parts": results}, indent=1) + "\n"
+            (given.out / f"summary-{given.call}.json").write_text(said)
+            pack(scratch, given.out / f"parts-{given.call}.tar.gz")
     print(f"\ngpu-check on {device()}:")
     for line in highlights({name: result.get("found") for name, result in results.items()}):
         print(f"  {line}")
@@ -88,9 +114,18 @@ def main(arguments: list[str]) -> int:
     return sum(result["outcome"] == "failed" for result in results.values())
 
 
+def pack(folder: Path, archive: Path) -> None:
+    """What the parts have said and found, but not the runs of trainings."""
+    with tarfile.open(archive, "w:gz") as tar:
+        for path in sorted(folder.rglob("*")):
+            if path.suffix in (".txt", ".json", ".csv", ".jsonl"):
+                tar.add(path, path.relative_to(folder))
+
+
 def parts(out: Path, data: Path | None) -> dict[str, Part]:
-    """The parts by name."""
-    sanitizer = shutil.which("compute-sanitizer", path=os.environ.get("PATH", "") + ":/usr/local/cuda/bin")
+    """The parts by name; ``out`` is for what they leave."""
+    places = os.environ.get("PATH", "") + ":/usr/local/cuda/bin"
+    sanitizer, profiler = shutil.which("compute-sanitizer", path=places), shutil.which("ncu", path=places)
     architecture = capability()
     # nvcc optimises the kernels of a file in parallel, where it can.
     target = TARGETS.get(architecture or "", architecture or "")
@@ -98,34 +133,42 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
     own = [PYTHON, str(ROOT / "benchmarks" / "gpu" / "gpu_parts.py")]
     # Each allocation for itself, so that what reads or writes beyond one leaves all of them.
     apart = (("PYTORCH_NO_CUDA_MEMORY_CACHING", "1"),)
-    benchmark = [PYTHON, str(ROOT / "benchmarks" / "throughput.py"), "--device", "cuda", "--quick", "--json"]
 
     def part(
         command: list[str], seconds: int, environment: tuple[tuple[str, str], ...] = (), found: Path | None = None
     ) -> Part:
         return Part(command, seconds, environment, found) if architecture else Part("torch sees no GPU", 0)
 
-    def sanitized(tool: str, environment: tuple[tuple[str, str], ...] = ()) -> Part:
+    def program(name: str, seconds: int, *rest: str) -> Part:
+        return part([*own, name, str(out), *rest], seconds, (), out / f"{name}.json")
+
+    def sanitized(tool: str, seconds: int, environment: tuple[tuple[str, str], ...] = ()) -> Part:
         if sanitizer is None:
             return Part("no compute-sanitizer", 0)
         command = [sanitizer, "--error-exitcode", "9", "--target-processes", "all", "--tool", tool, *own, "small"]
         found = out / tool
-        return part([*command, str(found), "--case-seconds", "30"], 60, environment, found / "small.json")
+        return part([*command, str(found), "--case-seconds", "30"], seconds, environment, found / "small.json")
 
-    tested = part([*own, "tests", str(out / "tests")], 100, (), out / "tests" / "tests.json")
-    trained, scene = out / "training", "builtin" if data is None else str(data)
+    counted = ["--launch-count", "8", "--set", "basic", "--csv", "--log-file", str(out / "counters.csv")]
     return {
-        "machine": Part([*own, "machine", str(out)], 30, (), out / "machine.json"),
-        "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 300, built),
-        "small": part([*own, "small", str(out)], 60, (), out / "small.json"),
-        "captured": part([*own, "captured", str(out)], 45, (), out / "captured.json"),
-        "roofs": part([*own, "roofs", str(out)], 60, (), out / "roofs.json"),
-        "step": part([*own, "step", str(out)], 60, (), out / "step.json"),
-        "training": part([*own, "training", str(trained), scene], 110, (), trained / "training.json"),
-        "tests": tested if importlib.util.find_spec("pytest") else Part("no pytest", 0),
-        "memcheck": sanitized("memcheck", apart),
-        "racecheck": sanitized("racecheck"),
-        "benchmark": part([*benchmark, str(out / "throughput.json")], 60, (), out / "throughput.json"),
+        "machine": Part([*own, "machine", str(out)], 15, (), out / "machine.json"),
+        "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 270, built),
+        "small": program("small", 75),
+        "large": program("large", 95),
+        "captured": program("captured", 45),
+        "roofs": program("roofs", 90),
+        "sizes": program("sizes", 90),
+        "step": program("step", 75),
+        "profile": program("profile", 40),
+        "training": program("training", 120, "builtin" if data is None else str(data)),
+        "tests": program("tests", 75) if importlib.util.find_spec("pytest") else Part("no pytest", 0),
+        "counters": part([profiler, *counted, *own, "profile", str(out / "counted")], 40)
+        if profiler
+        else Part("no ncu", 0),
+        "memcheck": sanitized("memcheck", 70, apart),
+        "racecheck": sanitized("racecheck", 30),
+        "synccheck": sanitized("synccheck", 20),
+        "initcheck": sanitized("initcheck", 20),
     }
 
 
@@ -177,7 +220,7 @@ def highlights(found: dict[str, Any]) -> list[str]:
         return kept.get(kind, []) if isinstance(kept, dict) else []
 
     lines = []
-    timed = [*rows("roofs", "rows"), *rows("step", "rows")]
+    timed = [row for part in ("roofs", "sizes", "step") for row in rows(part, "rows")]
     for row in timed:
         aim = row["aim"]
         verdict = "" if aim is None else f", {'reached' if row['share'] >= aim else 'MISSED'} {100 * aim:.0f} %"
@@ -191,12 +234,37 @@ def highlights(found: dict[str, Any]) -> list[str]:
         for other, its in times.items():
             if other.startswith(f"{name} by "):
                 lines.append(f"{name}: {seconds / its:.2f} x the time of {other.removeprefix(f'{name} by ')}")
+    lines += [f"RULE {line}" for line in ruled(times)]
+    for row in rows("profile", "steps"):
+        said = f"{row['launches']} launches, {row['waits']} waits, busy {100 * row['busy']:.0f} %"
+        lines.append(f"step {row['name']}: {said}, {row['nanoseconds']:.1f} ns a sample")
     for row in rows("training", "trainings"):
         said = f"{row['milliseconds']:.2f} ms a step, PSNR {row['psnr']:.2f} after {row['steps']} steps"
         lines.append(f"training {row['name']}: {said}")
-    for part in ("small", "captured", "roofs", "step", "training", "memcheck", "racecheck"):
+    for part in JUDGED:
         lines += [f"WRONG in {part}: {row['name']}: {row['said']}" for row in rows(part, "cases") if not row["right"]]
     lines += [f"WRONG in tests: {row['name']}: {row['said']}" for row in rows("tests", "files") if not row["right"]]
+    return lines
+
+
+def ruled(times: dict[str, float]) -> list[str]:
+    """What docs/cuda.md says is to be kept or deleted, by seconds of each row."""
+    chain, tiles, groups = (times.get(f"nerf64 k=16 forward{way}") for way in ("", " by tiles", " by wgmma"))
+    lines = []
+    if chain and tiles:
+        gain = tiles / chain
+        lines.append(f"chain is {gain:.2f} x the tiles: {'keep it' if gain >= 1.5 else 'delete it (below 1.5)'}")
+    if chain and groups:
+        gain = chain / groups
+        lines.append(f"wgmma is {gain:.2f} x the chain: {'keep it' if gain >= 1.2 else 'delete it (below 1.2)'}")
+    pairs = [
+        (times.get(f"cell_sort k={k} by counting"), times.get(f"cell_sort k={k} by radix")) for k in (16, 256, 1022)
+    ]
+    known = [(counting, radix) for counting, radix in pairs if counting and radix]
+    if known:
+        slower = sum(counting > radix for counting, radix in known)
+        lost = {0: "counting up to 1,022 cells stays", len(known): "delete sorting by counting"}
+        lines.append(f"sort: {lost.get(slower, 'move the limit between counting and radix')}")
     return lines
 
 

@@ -2,10 +2,13 @@
 
     machine    what a build and the tests need, each with what is missing
     small      every operation once, forward and backward, against float64: each case for itself
+    large      networks at full size, each way against the others
     captured   steps of the route in CUDA graphs
     tests      tests/ops on CUDA, a process for each file
     roofs      the networks, look-ups and sorts at full size, beside the machine's own copy and products
+    sizes      a network at many sizes and precisions, beside torch's products
     step       what surrounds the networks in a training step, beside the same in plain torch
+    profile    launches and waits of a default step
     training   short trainings, and ones whose steps are replayed from a CUDA graph
 
 Each leaves what it has found in OUT/PART.json as well, after every case, and ``gpu_check.py`` takes it from there.
@@ -32,7 +35,8 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in ("benchmarks/gpu", "
 
 from gpu_cases import captured_steps, small_cases  # noqa: E402
 from gpu_journal import CASE_SECONDS, Again, Case, Journal, one_by_one, settling  # noqa: E402
-from gpu_timings import roofs, step  # noqa: E402
+from gpu_large import large_cases  # noqa: E402
+from gpu_timings import profile, roofs, sizes, step  # noqa: E402
 
 FILE_SECONDS = 60.0
 """For one file of the tests."""
@@ -99,6 +103,12 @@ def small(again: Again, journal: Journal) -> int:
         run()
 
     cases: list[Case] = [(name, functools.partial(seeded, run)) for name, run in small_cases("cuda")]
+    return one_by_one(cases, again, settling("cuda"), journal)
+
+
+def large(again: Again, journal: Journal) -> int:
+    """Networks at full size."""
+    cases: list[Case] = list(large_cases("cuda"))
     return one_by_one(cases, again, settling("cuda"), journal)
 
 
@@ -174,25 +184,32 @@ def training(out: Path, data: str, again: Again, device: str = "cuda", seconds: 
     from voronerf.training.trainer import Trainer
 
     journal = Journal(out, "training", begun=again.start > 0)
-    scene = load_scene(data, downscale=1 if data == "builtin" else 2)
+    # Lego at 100 x 100 and at 400 x 400; the built-in scene has one size.
+    scenes = {size: load_scene(data, downscale=by) for size, by in ([("", 1)] if data == "builtin" else SIZES)}
     common: dict[str, Any] = {"data": data, "device": device, "budget": seconds, "cells": (12,), "rays": 4096}
-    common |= {"evaluations": 1, "eval_views": 2, "final_views": 5, "panels": 0}
+    common |= {"evaluations": 4, "eval_views": 2, "final_views": 5, "panels": 0}
 
-    def train(name: str, options: dict[str, Any]) -> str:
+    def train(name: str, size: str, options: dict[str, Any]) -> str:
         settings = {**common, **options}
-        summary = Trainer(TrainConfig(**settings, out=out / name), scene).run()
+        trainer = Trainer(TrainConfig(**settings, out=out / "runs" / name), scenes[size])
+        summary = trainer.run()
         milliseconds = 1e3 * settings["rays"] / summary["rays_per_second"]
-        journal.add("trainings", {"name": name, "settings": options, "milliseconds": milliseconds, **summary})
+        over = [(round(row["seconds"], 2), row["psnr"]) for row in trainer.metrics]
+        found = {"name": name, "settings": options, "milliseconds": milliseconds, "psnr over seconds": over}
+        journal.add("trainings", {**found, **summary})
         return f"{summary['steps']} steps of {milliseconds:.2f} ms, PSNR {summary['psnr']:.2f} on 5 views"
 
     cases: list[Case] = [
-        (name, functools.partial(train, name, options))
+        (name + size, functools.partial(train, name + size, size, options))
+        for size in scenes
         for name, options in TRAININGS.items()
         if device != "cpu" or not options.get("cuda_graph")
     ]
     return one_by_one(cases, again, settling(device), journal)
 
 
+SIZES = ((" at 100", 8), (" at 400", 2))
+"""Trainings on a Blender scene of 800 x 800: a name and the downscale of each."""
 NERF: dict[str, Any] = {"field": "nerf", "occupancy": False}
 TRAININGS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -210,27 +227,29 @@ TRAININGS: dict[str, dict[str, Any]] = {
 def main(arguments: list[str]) -> int:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("machine", "small", "captured", "roofs", "step", "training", "tests"))
+    parser.add_argument("part", choices=tuple(PARTS))
     parser.add_argument("out", nargs="?", type=Path, default=ROOT / "build" / "gpu-check")
     parser.add_argument("data", nargs="?", default="builtin")
     parser.add_argument("--case-seconds", type=float, help="for one case, after which it is said to hang")
     parser.add_argument("--start", type=int, default=0, help="the first case")
     parser.add_argument("--failed", type=int, default=0, help="cases before it that failed")
     given = parser.parse_args(arguments)
-    # A case of the timings makes a batch as well, and a training is one.
-    longer = {"roofs": 2, "step": 2, "training": 4}
-    seconds = given.case_seconds or longer.get(given.part, 1) * CASE_SECONDS
+    seconds = given.case_seconds or PARTS[given.part] * CASE_SECONDS
     again = Again((given.part, str(given.out), given.data), given.start, given.failed, seconds)
-    runs: dict[str, Callable[[], int]] = {
-        "machine": lambda: machine(given.out),
-        "small": lambda: small(again, Journal(given.out, "small", begun=given.start > 0)),
-        "captured": lambda: captured(again, Journal(given.out, "captured", begun=given.start > 0)),
-        "roofs": lambda: roofs(given.out, again),
-        "step": lambda: step(given.out, again),
-        "training": lambda: training(given.out, given.data, again),
-        "tests": lambda: tests(given.out),
-    }
-    return runs[given.part]()
+    checks = {"small": small, "large": large, "captured": captured}
+    timings = {"roofs": roofs, "sizes": sizes, "step": step, "profile": profile}
+    if given.part in checks:
+        return checks[given.part](again, Journal(given.out, given.part, begun=given.start > 0))
+    if given.part in timings:
+        return timings[given.part](given.out, again)
+    if given.part == "training":
+        return training(given.out, given.data, again)
+    return {"machine": machine, "tests": tests}[given.part](given.out)
+
+
+PARTS = {"machine": 1, "small": 1, "large": 3, "captured": 1, "roofs": 2, "sizes": 2, "step": 2, "profile": 3}
+PARTS |= {"training": 4, "tests": 1}
+"""Times ``CASE_SECONDS`` that a case may take: a timing makes a batch as well, and a training is one."""
 
 
 if __name__ == "__main__":

@@ -168,6 +168,129 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     return rows.measure()
 
 
+def sizes(out: Path, again: Again, device: str = "cuda", most: int = N) -> int:
+    """A network of four layers of 64 at many sizes, in all precisions; beside it the same layers as torch's products
+    over cells of one size, which need neither a sort nor offsets."""
+    import torch
+    from ops.case import BACKWARD
+    from ops.networks import NETS, cost, make_batch
+
+    import voronerf
+
+    rows = Rows(out, "sizes", again, device)
+    where, net = rows.device, NETS["w64d4"]
+    price = cost(net)
+
+    def network(n: int, k: int, precision: str, backward: bool) -> Run:
+        kind = torch.float32 if precision == "tf32" else getattr(torch, precision)
+        batch = make_batch(net, n, k, kind, BACKWARD, where)
+        given = batch.positions[0], batch.offsets, batch.weights, batch.biases
+
+        def run() -> None:
+            torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
+            with torch.set_grad_enabled(backward):
+                result = voronerf.grouped_mlp(*given, layers=net, backend="native")
+                if backward:
+                    torch.autograd.grad(result, [*batch.weights, *batch.biases], batch.gradients[1].to(result.dtype))
+
+        return run
+
+    def products(n: int, k: int, grouped: bool) -> Run:
+        share = n // k
+        shapes = [
+            (i + -i % 16, o + -o % 16) for o, i in net.weight_shapes(3)
+        ]  # torch._grouped_mm wants multiples of 16
+        weights = [torch.randn(k, *shape, device=where, dtype=torch.bfloat16) for shape in shapes]
+        first = torch.randn(k, share, shapes[0][0], device=where, dtype=torch.bfloat16)
+        ends = torch.arange(1, k + 1, dtype=torch.int32, device=where) * share
+
+        def run() -> Any:
+            x = first.flatten(0, 1) if grouped else first
+            for weight in weights:
+                x = (torch._grouped_mm(x, weight, offs=ends) if grouped else torch.bmm(x, weight)).relu_()
+            return x
+
+        return run
+
+    for n in (1 << 13, 1 << 15, 1 << 18, 1 << 22):
+        if n > most:
+            break
+        for k in (1, 16, 256, 4096):
+            for precision in ("bfloat16", "float16", "tf32", "float32") if k == 16 else ("bfloat16", "float32"):
+                limit = "float32" if precision == "float32" else "bfloat16"
+                for backward in (False, True):
+                    name = f"w64d4 {precision} n={n} k={k}{' + backward' * backward}"
+                    work = (price.forward + price.backward * backward) * n
+                    rows.add(name, functools.partial(network, n, k, precision, backward), limit, work)
+            ours = f"w64d4 bfloat16 n={n} k={k}"
+            rows.add(f"{ours} by torch.bmm", functools.partial(products, n, k, False), "bfloat16", price.forward * n)
+            if where.type == "cuda" and hasattr(torch, "_grouped_mm"):
+                grouped = functools.partial(products, n, k, True)
+                rows.add(f"{ours} by torch._grouped_mm", grouped, "bfloat16", price.forward * n)
+    return rows.measure()
+
+
+def profile(out: Path, again: Again, device: str = "cuda", steps: int = 10) -> int:
+    """Launches of a default step, the share of the time in which the device works, and how often the host waits."""
+    import time
+    import warnings
+
+    import torch
+    from torch.profiler import ProfilerActivity
+    from torch.profiler import profile as profiled
+
+    from voronerf.data import load_scene
+    from voronerf.training.config import TrainConfig
+    from voronerf.training.trainer import Trainer
+
+    journal, cuda = Journal(out, "profile", begun=again.start > 0), device == "cuda"
+    scene = load_scene("builtin")
+
+    def train(name: str, options: dict[str, Any]) -> str:
+        config = TrainConfig(out=out / name, device=device, steps=10_000, cells=(16,), evaluations=1, **options)
+        trainer = Trainer(config, scene)
+        for trainer.step in range(2 * steps):
+            trainer.train_step()
+        settle = settling(device)
+        settle()
+        with warnings.catch_warnings(record=True) as waits:
+            warnings.simplefilter("always")
+            if cuda:
+                torch.cuda.set_sync_debug_mode("warn")
+            begin = time.perf_counter()
+            for _ in range(steps):
+                trainer.train_step()
+            if cuda:
+                torch.cuda.set_sync_debug_mode("default")
+            settle()
+            seconds = (time.perf_counter() - begin) / steps
+        with profiled(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as seen:
+            for _ in range(steps):
+                trainer.train_step()
+            settle()
+        kernels = [event for event in seen.events() if event.device_type == torch.autograd.DeviceType.CUDA]
+        row = {
+            "name": name,
+            "seconds": seconds,
+            "nanoseconds": 1e9 * seconds / (trainer.rays * trainer.config.samples),
+            "launches": len(kernels) // steps,
+            "waits": sum("synchroniz" in str(warning.message) for warning in waits) // steps,
+            "busy": sum(event.device_time for event in kernels) / 1e6 / steps / seconds,
+            "kernels": sorted({event.name for event in kernels}),
+        }
+        journal.add("steps", row)
+        return (
+            f"{1e3 * seconds:.3f} ms, {row['launches']} launches, {row['waits']} waits, busy {100 * row['busy']:.0f} %"
+        )
+
+    kinds: dict[str, dict[str, Any]] = {"default": {}, "default, 4,096 rays": {"rays": 4096}}
+    kinds["default, 4,096 rays, bf16"] = {"rays": 4096, "precision": "bf16"}
+    if not cuda:
+        kinds = {"default": {"rays": 32, "samples": 8, "width": 16}}
+    cases: list[Case] = [(name, functools.partial(train, name, options)) for name, options in kinds.items()]
+    return one_by_one(cases, again, settling(device), journal)
+
+
 def step(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     """What surrounds the networks in a training step, and a network on a hash grid: the bytes that must be moved, the
     milliseconds that a copy of as many takes, and the same work in plain torch."""

@@ -1,4 +1,4 @@
-"""Cases of nearest_centre, locate_cell, draw_cell and cell_sort. n points, k cells."""
+"""Cases of nearest_centre, locate_cell and cell_sort. n points, k cells."""
 
 from __future__ import annotations
 
@@ -41,10 +41,6 @@ def cases() -> list[Case]:
         shown = ALL if quick else ("native",)
         cells = int(np.prod(shape))
         found.append(Case("locate_cell", f"{name} n={count}", single, FORWARD, count, cells, work, shown, quick))
-    for k in (12, 256, 4096):
-        work = functools.partial(_draw_work, n, k)
-        shown = ALL if k == 12 else ("native",)
-        found.append(Case("draw_cell", f"n={n} k={k}", single, FORWARD, n, k, work, shown, k == 12))
     for count, k in (
         (n, 1),
         (n, 16),
@@ -260,66 +256,6 @@ def _locate_work(n: int, shape: tuple[int, int], device: torch.device) -> Work:
         amount=float(FLOPS) * n * (outer + inner),
         bound="float32",
     )
-
-
-def _draw_work(n: int, k: int, device: torch.device, temperature: float = 0.05) -> Work:
-    """A cell for each point by exp(-distance / temperature); what is drawn for that is part of the time."""
-    points = [uniform_points(n, seed, device) for seed in range(rotation(12 * n))]
-    centres = uniform_points(k, 1000, device)
-    tables = VoronoiDiagram(centres)
-    rows = max(256, CHUNK // k)
-
-    def ours(backend: str) -> Contender:
-        def run(call: int) -> Tensor:
-            batch, uniforms = points[call % len(points)], torch.rand(n, 1, device=device)
-            return ops.draw_cell(
-                batch,
-                centres,
-                tables.child_offsets,
-                tables.child,
-                uniforms,
-                temperature=temperature,
-                depth=1,
-                backend=backend,
-            )
-
-        return Contender(run)
-
-    def in_pieces(draw: Callable[[Tensor], Tensor]) -> Callable[[], Contender]:
-        def run(call: int) -> Tensor:
-            cells = torch.empty(n, dtype=torch.int32, device=device)
-            for start in range(0, n, rows):
-                distance = torch.cdist(points[call % len(points)][start : start + rows], centres)
-                cells[start : start + rows] = draw(distance / -temperature)
-            return cells
-
-        return lambda: Contender(run)
-
-    def inverse(logits: Tensor) -> Tensor:
-        sums = logits.softmax(1).cumsum(1)
-        wanted = torch.rand(logits.shape[0], 1, device=device) * sums[:, -1:]
-        return torch.searchsorted(sums, wanted)[:, 0].clamp(max=k - 1)
-
-    def race(logits: Tensor) -> Tensor:
-        return (logits - torch.empty_like(logits).exponential_().log()).argmax(1)
-
-    def error(cells: Tensor) -> float:
-        """Largest deviation of the number of points in a cell from its expectation, in standard deviations."""
-        mean, variance = torch.zeros(k, dtype=torch.float64), torch.zeros(k, dtype=torch.float64)
-        for piece in points[0].double().cpu().split(max(1, (1 << 20) // k)):
-            law = (torch.cdist(piece, centres.double().cpu()) / -temperature).softmax(1)
-            mean += law.sum(0)
-            variance += (law * (1 - law)).sum(0)
-        counts = torch.bincount(cells.long().cpu(), minlength=k)
-        return float(((counts - mean).abs() / (variance + 1).sqrt()).max())
-
-    alternatives = {
-        "torch softmax + searchsorted": in_pieces(inverse),
-        "torch softmax + multinomial": in_pieces(lambda logits: logits.softmax(1).multinomial(1)[:, 0]),
-        "torch exponential race": in_pieces(race),
-    }
-    # of every centre the squared distance at the least; roots and exponentials of the near ones come on top
-    return Work(ours, alternatives, error, tolerance=6.0, amount=float(FLOPS) * n * k, bound="float32")
 
 
 def _sort_work(n: int, k: int, device: torch.device) -> Work:

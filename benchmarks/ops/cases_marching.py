@@ -1,4 +1,4 @@
-"""Cases of march_rays, update_occupancy, camera_rays, balance_centres and select_heaviest.
+"""Cases of march_rays, update_occupancy, camera_rays and balance_centres.
 
 r rays, s strata of a ray, n strata of all rays, cells, pixels or samples; k centres.
 """
@@ -27,7 +27,6 @@ GRID = 64
 """Cells of the grid that is marched through, along each axis."""
 STEPS = 500
 """Of a balance."""
-KEPT = 20
 """Heaviest samples of a batch: 10,000 over 500 batches."""
 LENS = (-0.08, 0.02, 1e-3, -5e-4, 0.0, 0.0, 0.0, 0.0)
 """A lens that bends the corner of a picture by some ten pixels."""
@@ -56,10 +55,6 @@ def cases() -> list[Case]:
         work = functools.partial(_balance_work, n, k)
         name = f"n={n} k={k} {STEPS} steps"
         found.append(Case("balance_centres", name, FULL, FORWARD, n, k, work, ALL if k == 16 else ("native",), k == 16))
-    for n in (1 << 16, 1 << 20):
-        work = functools.partial(_heaviest_work, n)
-        name = f"{KEPT} of n={n}"
-        found.append(Case("select_heaviest", name, FULL, FORWARD, n, None, work, ("reference", "warp"), n == 1 << 16))
     return found
 
 
@@ -334,44 +329,3 @@ def _spread_of_masses(batch: list[Tensor], centres: Tensor) -> float:
     """std(W / max W) over the cells."""
     weights = _masses_cdist(batch[0].double(), batch[1], centres.double())
     return float((weights / weights.max()).std())
-
-
-def _heaviest_work(n: int, device: torch.device) -> Work:
-    def batch(seed: int) -> list[Tensor]:
-        random = generator(seed)
-        # Most samples of a batch lie in empty space and weigh nothing.
-        importance = torch.rand(n, generator=random) ** 8 * (torch.rand(n, generator=random) < 0.2)
-        return [tensor.to(device) for tensor in (torch.randn(n, 3, generator=random), importance)]
-
-    sets = [batch(seed) for seed in range(rotation(16 * n))]
-
-    def contender(function: Callable[..., Any]) -> Contender:
-        return Contender(lambda call: function(*sets[call % len(sets)]))
-
-    expected = sets[0][1].double().sort(descending=True).values[:KEPT]
-
-    def error(found: Any) -> float:
-        """Error of the weights; infinite if a point does not belong to its weight."""
-        points, kept = found
-        rows = (sets[0][0][None] == points[:, None]).all(-1).float().argmax(1)
-        same = torch.equal(sets[0][0][rows], points) and torch.equal(sets[0][1][rows], kept)
-        return relative_error(kept, expected) if same else float("inf")
-
-    return Work(
-        lambda backend: contender(lambda points, weights: ops.select_heaviest(points, weights, KEPT, backend=backend)),
-        {"torch topk": lambda: contender(_heaviest_topk), "torch sort": lambda: contender(_heaviest_sort)},
-        error,
-        0.0,
-        16.0 * n,
-        "copy",
-    )
-
-
-def _heaviest_topk(points: Tensor, importance: Tensor) -> tuple[Tensor, Tensor]:
-    kept, rows = importance.nan_to_num(0, 0, 0).topk(KEPT)
-    return points[rows], kept
-
-
-def _heaviest_sort(points: Tensor, importance: Tensor) -> tuple[Tensor, Tensor]:
-    kept, rows = importance.nan_to_num(0, 0, 0).sort(descending=True)
-    return points[rows[:KEPT]], kept[:KEPT]

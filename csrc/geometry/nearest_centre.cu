@@ -1,6 +1,6 @@
-// Nearest centre on CUDA: a thread a point, centres through shared memory in tiles that every thread of the block reads
-// at the same address (a broadcast). Float32 input is screened and, rarely, decided again in float64 by
-// nearest_centre_math.h, with the same answer as on the CPU to the last index.
+// Nearest centre on CUDA: a thread has two points, centres come through shared memory in tiles that every thread of the
+// block reads at the same address (a broadcast), once for both points. Float32 input is screened and, rarely, decided
+// again in float64 by nearest_centre_math.h, with the same answer as on the CPU to the last index.
 #include "common/cuda_wrappers.h"
 #include "geometry/nearest_centre.h"
 #include "geometry/nearest_centre_math.h"
@@ -11,41 +11,67 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kTile = 512;  // centres: 8 KiB of shared memory with their weights
+constexpr int kPoints = 2;  // of a thread
 
-__global__ void __launch_bounds__(kThreads)
-    nearest_centre_kernel(const float* __restrict__ points, const float* __restrict__ centres,
-                          const float* __restrict__ weights, int32_t* __restrict__ cells, int64_t n, int64_t k) {
+template <bool kWeighted>
+__global__ void __launch_bounds__(kThreads, 4)
+    nearest_screened_kernel(const float* __restrict__ points, const float* __restrict__ centres,
+                            const float* __restrict__ weights, int32_t* __restrict__ cells, int64_t n, int64_t k) {
   VN_SHARED(tile, float4[kTile]);
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  // Threads past the end stay for the barriers, on the last point.
-  const float* point = points + 3 * (i < n ? i : n - 1);
-  const float x = point[0], y = point[1], z = point[2];
-  float best = INFINITY, second = INFINITY, weight_bound = 0.0f;
-  int32_t cell = 0;
+  VN_SHARED(bounds, float[kThreads / 32]);
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kPoints * kThreads + threadIdx.x;
+  float at[kPoints][3], best[kPoints], second[kPoints];
+  int32_t cell[kPoints];
+#pragma unroll
+  for (int p = 0; p < kPoints; ++p) {
+    // Threads past the end stay for the barriers, on the last point.
+    const int64_t i = first + p * kThreads < n ? first + p * kThreads : n - 1;
+#pragma unroll
+    for (int axis = 0; axis < 3; ++axis) at[p][axis] = points[3 * i + axis];
+    best[p] = second[p] = INFINITY;
+    cell[p] = 0;
+  }
+  float weight_bound = 0.0f;  // of the weights that this thread copies
   for (int64_t start = 0; start < k; start += kTile) {
     const int count = static_cast<int>(k - start < kTile ? k - start : kTile);
     __syncthreads();  // the tile before is read by all
     for (int j = threadIdx.x; j < count; j += kThreads) {
       const float* c = centres + 3 * (start + j);
-      tile[j] = make_float4(c[0], c[1], c[2], weights == nullptr ? 0.0f : weights[start + j]);
+      const float w = kWeighted ? weights[start + j] : 0.0f;
+      if constexpr (kWeighted) weight_bound = fmaxf(weight_bound, fabsf(w));
+      tile[j] = make_float4(c[0], c[1], c[2], w);
     }
     __syncthreads();
+    const int32_t number = static_cast<int32_t>(start);
+#pragma unroll 4
     for (int j = 0; j < count; ++j) {
       const float4 c = tile[j];
-      const float dx = x - c.x, dy = y - c.y, dz = z - c.z;
-      const float v = fmaf(dz, dz, fmaf(dy, dy, dx * dx)) - c.w;
-      weight_bound = fmaxf(weight_bound, fabsf(c.w));
-      second = fminf(second, fmaxf(v, best));
-      if (v < best) {
-        best = v;
-        cell = static_cast<int32_t>(start) + j;
+#pragma unroll
+      for (int p = 0; p < kPoints; ++p) {
+        const float dx = at[p][0] - c.x, dy = at[p][1] - c.y, dz = at[p][2] - c.z;
+        const float distance = fmaf(dz, dz, fmaf(dy, dy, dx * dx)), v = kWeighted ? distance - c.w : distance;
+        second[p] = fminf(second[p], fmaxf(v, best[p]));
+        cell[p] = v < best[p] ? number + j : cell[p];
+        best[p] = fminf(v, best[p]);
       }
     }
   }
-  if (i >= n) return;
-  // Beyond 1e30 a value can overflow while its difference from the weight does not; see nearest_centre_weight_bound.
-  const bool screened = weight_bound <= 1e30f && nearest_is_certain(best, second, weight_bound);
-  cells[i] = screened ? cell : nearest_by_definition(point, centres, weights, k);
+  if constexpr (kWeighted) {
+    for (int step = 16; step > 0; step /= 2) {
+      weight_bound = fmaxf(weight_bound, __shfl_xor_sync(kAllLanes, weight_bound, step));
+    }
+    if (threadIdx.x % 32 == 0) bounds[threadIdx.x / 32] = weight_bound;
+    __syncthreads();
+    for (float bound : bounds) weight_bound = fmaxf(weight_bound, bound);
+  }
+#pragma unroll
+  for (int p = 0; p < kPoints; ++p) {
+    const int64_t i = first + p * kThreads;
+    if (i >= n) return;
+    // Beyond 1e30 a value can overflow while its difference from the weight does not; see nearest_centre_weight_bound.
+    const bool screened = weight_bound <= 1e30f && nearest_is_certain(best[p], second[p], weight_bound);
+    cells[i] = screened ? cell[p] : nearest_by_definition(points + 3 * i, centres, weights, k);
+  }
 }
 
 __global__ void __launch_bounds__(kThreads)
@@ -55,17 +81,29 @@ __global__ void __launch_bounds__(kThreads)
   if (i < n) cells[i] = nearest_by_definition(points + 3 * i, centres, weights, k);
 }
 
-}  // namespace
-
-template <typename T>
-void nearest_centre_cuda(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
-                         void* stream) {
-  if (n == 0) return;
-  const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
-  VN_LAUNCH(nearest_centre_kernel, blocks, kThreads, 0, stream, points, centres, weights, cells, n, k);
+unsigned blocks_of(int64_t n, int64_t points) {
+  return static_cast<unsigned>(ceil_div<int64_t>(n, points * kThreads));
 }
 
-template void nearest_centre_cuda(const float*, const float*, const float*, int32_t*, int64_t, int64_t, void*);
-template void nearest_centre_cuda(const double*, const double*, const double*, int32_t*, int64_t, int64_t, void*);
+}  // namespace
+
+template <>
+void nearest_centre_cuda(const float* points, const float* centres, const float* weights, int32_t* cells, int64_t n,
+                         int64_t k, void* stream) {
+  if (n == 0) return;
+  const unsigned blocks = blocks_of(n, kPoints);
+  if (weights == nullptr) {
+    VN_LAUNCH(nearest_screened_kernel<false>, blocks, kThreads, 0, stream, points, centres, weights, cells, n, k);
+  } else {
+    VN_LAUNCH(nearest_screened_kernel<true>, blocks, kThreads, 0, stream, points, centres, weights, cells, n, k);
+  }
+}
+
+template <>
+void nearest_centre_cuda(const double* points, const double* centres, const double* weights, int32_t* cells, int64_t n,
+                         int64_t k, void* stream) {
+  if (n == 0) return;
+  VN_LAUNCH(nearest_centre_kernel, blocks_of(n, 1), kThreads, 0, stream, points, centres, weights, cells, n, k);
+}
 
 }  // namespace voronerf

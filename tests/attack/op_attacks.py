@@ -5,11 +5,11 @@ from __future__ import annotations
 import inspect
 import random
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import op_calls
 import torch
 from attempts import REFUSED, RIGHT, Failed
 from hostile import NUMBERS, TEXTS
@@ -19,9 +19,10 @@ from torch.utils._pytree import tree_leaves, tree_map
 from voronerf import MLP, HashGrid, Layer, backends, ops, tolerances
 from voronerf.cli.main import NO_MEMORY
 from voronerf.ops import CentreGrid
+from voronerf.ops.cases import SIZES, Draw, cases
+from voronerf.ops.grouped_mlp.case import layer_table
+from voronerf.ops.hash_encode.case import hash_grid
 
-#: Ops that write into their arguments.
-IN_PLACE = ("observe_occupancy", "sparse_adam")
 DTYPES = (
     torch.float16,
     torch.float32,
@@ -33,23 +34,23 @@ DTYPES = (
     torch.bool,
     torch.complex64,
 )
-DIFFERENTIABLE = (
-    *("composite", "frequency_encode", "integrated_encode", "spherical_harmonics", "hash_encode"),
-    *("grouped_linear", "grouped_mlp", "routed_mlp", "render_loss"),
-)
+CASES = cases()
+
+
+def called(op: str) -> Callable[..., Any]:
+    """The public function of an op."""
+    function: Callable[..., Any] = getattr(ops, CASES[op].call or op)
+    return function
 
 
 def valid_call(rng: random.Random, folder: Path, given: Path) -> str:
     """A call that keeps to the contract, with gradients now and then."""
-    op = rng.choice(list(op_calls.CALLS))
-    call = op_calls.CALLS[op](rng, rng.choice(op_calls.SIZES))
-    gradients = op in DIFFERENTIABLE and rng.random() < 0.3
-    viewed = call if op in IN_PLACE or rng.random() < 0.8 else tree_map(negated, call)
+    op = rng.choice([name for name, case in CASES.items() if case.comparable])
+    case, call = CASES[op], CASES[op].make(Draw(rng.getrandbits(32), free=True), rng.choice(SIZES))
+    gradients = case.differentiable and rng.random() < 0.3
+    viewed = call if case.in_place or rng.random() < 0.8 else tree_map(negated, call)
     found, slopes = results(op, viewed, "auto", gradients)
     expected, others = results(op, call, "reference", gradients)
-    if op == "draw_cell":
-        drawn_rightly(call, found[0], expected[0])
-        return RIGHT
     for part, other in zip(found, expected, strict=True):
         if not tolerances.agree(part, other):
             raise Failed(f"{op}: not what the reference gives: {difference(part, other)}; {describe(call)}")
@@ -66,9 +67,8 @@ def negated(value: Any) -> Any:
 
 def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tuple[list[Tensor], list[Tensor]]:
     """The tensors that an op returns or has written into, and the gradients of their sum where they are asked for."""
-    own = tree_map(
-        lambda value: value.detach().clone() if isinstance(value, Tensor) and op in IN_PLACE else value, call
-    )
+    case = CASES[op]
+    own = tree_map(lambda value: value.detach().clone() if isinstance(value, Tensor) and case.in_place else value, call)
     leaves = []
     if gradients:
 
@@ -79,8 +79,8 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tup
             return leaves[-1]
 
         own = tree_map(leaf, own)
-    returned = getattr(ops, op)(**own, backend=backend)
-    found = [part for part in tree_leaves(own if op in IN_PLACE else returned) if isinstance(part, Tensor)]
+    returned = called(op)(**own, backend=backend)
+    found = [part for part in tree_leaves(own if case.in_place else returned) if isinstance(part, Tensor)]
     smooth = [part for part in found if part.requires_grad and part.numel()]
     if not smooth:
         return found, []
@@ -88,27 +88,18 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tup
     return found, list(torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True))
 
 
-def drawn_rightly(call: dict[str, Any], found: Tensor, expected: Tensor) -> None:
-    """Rounding may move a draw over the border of two cells, and then one of the two is next to the other."""
-    near = [expected]
-    for step in (-1e-4, 1e-4):
-        near.append(ops.draw_cell(**{**call, "uniforms": (call["uniforms"] + step).clamp(0, 1)}, backend="reference"))
-    if not torch.stack([found == one for one in near]).any(dim=0).all():
-        raise Failed(f"draw_cell: drawn far from what the reference draws; {describe(call)}")
-
-
 def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
     """A call of which one argument is not what it must be; where it is one that the op takes, nothing may break."""
-    op = rng.choice(list(op_calls.CALLS))
-    call = op_calls.CALLS[op](rng, rng.choice(op_calls.SIZES[1:]))
-    name = rng.choice([name for name in (*call, "backend") if name in inspect.signature(getattr(ops, op)).parameters])
+    op = rng.choice(list(CASES))
+    call = CASES[op].make(Draw(rng.getrandbits(32), free=True), rng.choice(SIZES[1:]))
+    name = rng.choice([*call, "backend"])
     call.setdefault("backend", "auto")
     if name == "backend":
         call["backend"] = rng.choice(("", "cuda", None, 3, "warp", "Native"))
     else:
         call[name] = other_argument(rng, op, name, call[name])
     try:
-        getattr(ops, op)(**call)
+        called(op)(**call)
     except (ValueError, TypeError, backends.BackendUnavailable) as error:
         check_message(op, call, name, error)
         return REFUSED
@@ -122,7 +113,7 @@ def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
 def check_message(op: str, call: dict[str, Any], name: str, error: Exception) -> None:
     """The error names the op, or one that it is composed of, and an argument, in a line of some length."""
     text = str(error)
-    arguments = inspect.signature(getattr(ops, op)).parameters
+    arguments = inspect.signature(called(op)).parameters
     named = re.match(rf"({'|'.join(backends.ops())})(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
     if not named or "\n" in text or len(text) > 500:
         raise Failed(f"{op}: the error for {name} is not clear: {type(error).__name__}: {text:.300}; {describe(call)}")
@@ -144,7 +135,15 @@ def other_argument(rng: random.Random, op: str, name: str, value: Any) -> Any:
         there = value[at] if isinstance(value[at], Tensor) else torch.ones(2)
         return [*value[:at], other_tensor(rng, there), *value[at + 1 :]]
     if isinstance(value, (MLP, HashGrid, CentreGrid)):
-        others = (None, "x", 3, op_calls.layer_table(rng), op_calls.hash_grid(rng), Layer((-1,), 3), {})
+        others = (
+            None,
+            "x",
+            3,
+            layer_table(Draw(rng.getrandbits(32), free=True)),
+            hash_grid(Draw()),
+            Layer((-1,), 3),
+            {},
+        )
         return rng.choice((*others, ops.centre_grid(torch.rand(4, 3))))
     if isinstance(value, str):
         return rng.choice((*TEXTS, None, 3, torch.ones(2)))

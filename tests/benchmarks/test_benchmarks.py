@@ -30,17 +30,10 @@ from ops import (
 
 import voronerf
 from voronerf import native
+from voronerf.ops import cases as of_ops
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 CPU = torch.device("cpu")
-OPS = {
-    *("nearest_centre", "locate_cell", "draw_cell", "cell_sort", "grouped_linear", "grouped_mlp", "frequency_encode"),
-    *("integrated_encode", "spherical_harmonics", "hash_encode", "composite", "resample", "routed_mlp"),
-    "render_loss",
-}
-NOT_DIFFERENTIABLE = {"march_rays", "update_occupancy", "camera_rays", "balance_centres", "select_heaviest"}
-NOT_DIFFERENTIABLE |= {"pixel_rays", "observe_occupancy", "sparse_adam"}
-OPS |= NOT_DIFFERENTIABLE
 COLUMNS = [
     *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "threads"),
     *("median_ms", "iqr_ms", "throughput", "unit", "percent_of_peak", "alternatives", "speedup_over_best", "max_error"),
@@ -119,11 +112,11 @@ def test_instruction_set_is_forced_and_put_back():
 def test_every_operation_has_rows_in_both_modes():
     for arguments in ([], ["--quick"]):
         cases = throughput.chosen_cases(throughput.parse(arguments))
-        assert {case.op for case in cases} == OPS
+        assert {case.op for case in cases} == set(of_ops.cases())
         keys = [case.key for case in cases]
         assert len(set(keys)) == len(keys)
     both = {(case.op, case.direction) for case in throughput.chosen_cases(throughput.parse([]))}
-    differentiable = OPS - NOT_DIFFERENTIABLE - {"nearest_centre", "locate_cell", "draw_cell", "cell_sort", "resample"}
+    differentiable = {op for op, case in of_ops.cases().items() if case.differentiable}
     assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 
@@ -207,7 +200,6 @@ def test_what_is_compared_is_right_in_every_small_case():
     works = {
         "nearest_centre": lookup._nearest_work(500, 7, torch.float32, False, CPU),
         "locate_cell": lookup._locate_work(500, (4, 3), CPU),
-        "draw_cell": lookup._draw_work(500, 7, CPU),
         "cell_sort": lookup._sort_work(500, 7, CPU),
         "resample": sampling._resample_work(512, CPU),
         "march_rays": marching._march_work(1 << 13, False, CPU),
@@ -216,7 +208,6 @@ def test_what_is_compared_is_right_in_every_small_case():
         "camera_rays": marching._camera_work(300, False, CPU),
         "camera_rays, lens": marching._camera_work(300, True, CPU),
         "balance_centres": marching._balance_work(600, 5, CPU),
-        "select_heaviest": marching._heaviest_work(2000, CPU),
         "pixel_rays": cases_step.pixel_work(300, CPU),
         "render_loss": cases_step.loss_work(100, 800, CPU),
         "observe_occupancy": cases_step.observe_work(800, CPU),
@@ -255,7 +246,6 @@ def test_wrong_answers_are_found():
         (marched, lambda right: right._replace(depths=right.depths * 1.1), 0.05),
         (marched, lambda right: marched.ours("reference").run(1), 0.1),  # other rays
         (marching._update_work(250, CPU), lambda right: (right[0], ~right[1]), infinite),
-        (marching._heaviest_work(2000, CPU), lambda right: (right[0].flip(0), right[1]), infinite),
     ):
         right = work.ours("reference").run(0)
         assert work.error(right) < 1e-6 and work.error(spoilt(right)) >= least
@@ -335,8 +325,24 @@ def test_throughput_runs_and_table_reads_its_result(tmp_path, capsys):
         assert row["alternatives"]["torch cumsum + searchsorted"] > 0 and row["max_error"] < 1e-2
         if row["backend"] == "native":
             assert f"`resample` {row['case']}" in table.markdown([row])[-1]
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps({**outcome, "metadata": {**metadata, "machine": "Another"}}))
+    capsys.readouterr()
+    table.main([str(path), str(other), "--rows", "^resample"])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"| | dtype | | {harness.processor()} | Another |"
+    assert all(line.count(" ms, ") == 2 for line in lines[2:]) and len(lines) > 2
     with pytest.raises(SystemExit, match=r"must be a result of throughput\.py"):
         table.load(BENCHMARKS / "results" / "time_to_quality_lego.json")
+
+
+def test_processors_have_names():
+    text = "vendor_id\t: {}\ncpu family\t: {}\nmodel\t\t: {}\nmodel name\t: A name\n"
+    assert harness.processor(text.format("AuthenticAMD", 26, 2)) == "A name (Zen 5)"
+    assert harness.processor(text.format("AuthenticAMD", 25, 17)) == "A name (Zen 4)"
+    assert harness.processor(text.format("GenuineIntel", 6, 207)) == "A name (Emerald Rapids)"
+    assert harness.processor(text.format("GenuineIntel", 6, 1)) == "A name (family 6, model 1)"
+    assert harness.processor("model name: Arm\n") == "Arm"
 
 
 def _row(case, ms, alternatives, **columns):

@@ -157,22 +157,6 @@ def test_seams_are_compared_at_the_looks_that_both_have():
     assert fewer(row("a", 0, late=0.0), row("b", 0, late=0.0)) == []
 
 
-def test_balanced_over_random_over_uniform(settings):
-    experiment = EXPERIMENTS["split-kinds"]
-
-    def claim(scores):
-        rows = claims.Rows(synthetic(experiment, settings, scores.__getitem__))
-        order, loose = experiment.claims(rows, settings)
-        assert (loose.here.split(" (")[0], loose.verdict) == ("+3.00 dB", "holds for every seed")
-        return order
-
-    assert claim((30.0, 29.0, 28.0, 27.0)).verdict == "holds for every seed"
-    other = claim((30.0, 31.0, 28.0, 27.0))
-    assert "balanced centres over random centres: does not hold" in other.verdict
-    assert "random centres over uniform centres: holds for every seed" in other.verdict
-    assert "-1.00 dB" in other.here and "+3.00 dB" in other.here
-
-
 @pytest.mark.parametrize(
     ("before", "after", "start"),
     [(0.2, 0.0017, "holds"), (0.5, 0.003, "the factor holds: 167"), (0.2, 0.02, "evener by a factor of 10"),
@@ -197,24 +181,3 @@ def test_published_figures_stand_beside_ours(settings):
         other = synthetic(experiment, paper, lambda i: 20.0 + i, "fern")
         elsewhere = report.score_table(other, experiment.published)
         assert "published" not in elsewhere[0] and not any("27.355" in line for line in elsewhere)
-
-
-def test_published_figures_are_of_their_own_cells_and_scenes(settings):
-
-    def published(name, cells, scene):
-        experiment, size = EXPERIMENTS[name], replace(settings, cells=cells)
-        rows = synthetic(experiment, size, lambda i: 20.0 + i, scene)
-        named = {row["variant"] for row in rows if experiment.published(row["variant"], scene)}
-        return named, {claim.published for claim in experiment.claims(claims.Rows(rows), size)}
-
-    named, gains = published("sampling", 12, "lego")
-    rows = [f"{field}, {sampling}: " for field in ("NeRF", "mip-NeRF") for sampling in ("stratified", "hierarchical")]
-    wide = {f"{row}one network, width 256" for row in rows}
-    assert named == wide | {f"{row}12 Voronoi cells, width 64" for row in rows}
-    assert gains == {"-", "+0.30 dB", "+0.70 dB", "+0.15 dB", "+0.58 dB"}
-    for count in (4, 112):
-        named, gains = published("sampling", count, "lego")
-        assert named == wide and gains == {"-"}
-    assert published("sampling", 12, "ship")[1] == {"-", "+0.66 dB", "+0.78 dB"}
-    assert published("kilonerf", 12, "lego")[1] == {"-", "+0.685 dB"}
-    assert published("kilonerf", 12, "ship") == (set(), {"-"})

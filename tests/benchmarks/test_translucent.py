@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers import refuses
-from paper.translucent import MEDIA, Medium, bounds, integrate, layered_block, striped_shell, translucent_scene
+from paper.translucent import MEDIA, integrate, translucent_scene
 
 from voronerf.data import load_scene
 
@@ -56,30 +56,6 @@ def test_rays_against_marching():
     batch = integrate(origin[None], np.stack([direction, -direction, direction]))
     np.testing.assert_allclose(batch, [found, [0, 0, 0, 0], found], atol=1e-6)  # what is behind is not seen
     assert integrate(origin[None], np.zeros((0, 3), np.float32)).shape == (0, 4)
-
-
-def test_a_ball_and_a_shell_by_hand():
-    origin, ahead = np.array([[-4.0, 0, 0]], np.float32), np.array([[1.0, 0, 0]], np.float32)
-    ball = (Medium((0, 0, 0), (0.5, 1, 1), 2.0, (1.0, 0.5, 0.0)),)
-    opacity = 1 - np.exp(-2.0)
-    np.testing.assert_allclose(integrate(origin, ahead, ball), [[opacity, opacity / 2, 0, opacity]], atol=1e-6)
-    shell = tuple(striped_shell((0, 0, 0), 1.0, 0.1, 3.0, 0, ((1.0, 0, 0), (0, 0, 1.0))))
-    wall = 1 - np.exp(-0.3)  # red in front, blue behind
-    expected = [[wall, 0, (1 - wall) * wall, 1 - (1 - wall) ** 2]]
-    np.testing.assert_allclose(integrate(origin, ahead, shell), expected, atol=1e-5)
-    block = tuple(layered_block((-1, -1, -1), (1, 1, 1), 0.5, ((1.0, 0, 0), (0, 1.0, 0))))
-    np.testing.assert_allclose(integrate(origin, ahead, block)[0, 3], 1 - np.exp(-1.0), atol=1e-6)
-    beside = np.array([[-4.0, 1.5, 0]], np.float32)
-    assert not integrate(beside, ahead, block).any()
-
-
-def test_everything_lies_in_the_box_and_no_density_is_negative():
-    box = bounds()
-    points = np.random.default_rng(0).uniform(box[0] - 0.2, box[1] + 0.2, size=(200_000, 3))
-    density = sum(medium.density * contains(medium, points) for medium in MEDIA)
-    assert density.min() > -1e-9
-    outside = ((points < box[0]) | (points > box[1])).any(axis=-1)
-    assert not density[outside].any() and density[~outside].mean() > 0.1
 
 
 def test_most_of_what_is_seen_is_translucent(scene):

@@ -160,7 +160,7 @@ def test_demo_compares_two_runs(tmp_path, capsys, monkeypatch, fails):
     assert (results["single"]["cells"], results["voronoi"]["cells"]) == (1, 3)
     for result in results.values():
         assert f"{result['psnr']:.2f}" in output
-    assert (tmp_path / "psnr.png").stat().st_size > 1000
+    assert "<h2>PSNR over training time</h2>" in (tmp_path / "compare.html").read_text()
     config = read_json(tmp_path / "voronoi" / "config.json")
     assert (config["data"], config["downscale"]) == ("builtin", 6)  # 100 // 6 = 16, for who resumes or scores it
     fails("--size must be 100 over a whole number", "demo --size 60")

@@ -14,7 +14,6 @@
 #include "encoding/touched_entries.h"
 #include "geometry/cell_sort.h"
 #include "geometry/centre_grid.h"
-#include "geometry/draw_cell.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre.h"
 #include "network/grouped_linear.h"
@@ -63,34 +62,6 @@ void search(Isa isa) {
   }
 }
 
-// Of double precision there is no drawing.
-void draw(const Array<double>&, const Array<double>&, const Array<double>&, const Array<int32_t>&,
-          const Array<int32_t>&, int32_t, Isa) {}
-
-void draw(const Array<float>& points, const Array<float>& centres, const Array<float>& weights,
-          const Array<int32_t>& offsets, const Array<int32_t>& child, int32_t leaves, Isa isa) {
-  const int64_t n = static_cast<int64_t>(points.size()) / 3, m = offsets.back();
-  const Array<float> uniforms = uniform<float>(2 * n);
-  const double temperatures[] = {1e-300, 1e-3, 0.3, 1e30};
-  const double temperature = temperatures[below(4)];
-  Array<int32_t> results[2];
-  for (int i = 0; i < 2; ++i) {
-    const int threads = 1 + 2 * i;
-    results[i].assign(n, -7);
-    Array<int32_t> places(voronerf::draw_cell_places(m, threads));
-    Array<float> sums = poisoned(voronerf::draw_cell_sums(m, threads));
-    if (!voronerf::draw_cell_cpu(points.data(), centres.data(), or_null(weights), offsets.data(), child.data(),
-                                 uniforms.data(), results[i].data(), places.data(), sums.data(), n, m, 2, temperature,
-                                 isa, threads)) {
-      fail("draw_cell: did not arrive");
-    }
-  }
-  same(results[0], results[1], "draw_cell");
-  within(results[0], leaves, "draw_cell");
-  like_portable(Array<float>(results[0].begin(), results[0].end()), "draw_cell",
-                0.05);  // a draw on the edge may differ
-}
-
 template <typename T>
 void locate(Isa isa) {
   // A root whose every other centre is refined, by diagrams of different sizes.
@@ -126,7 +97,6 @@ void locate(Isa isa) {
   same(results[0], results[1], "locate_cell");
   within(results[0], leaves, "locate_cell");
   like_portable(results[0], "locate_cell");
-  draw(points, centres, weights, offsets, child, leaves, isa);
 }
 
 void sort() {

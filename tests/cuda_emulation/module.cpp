@@ -1,11 +1,12 @@
 // The CUDA half of voronerf._C, emulated: the bindings of csrc/bindings over .cu files compiled by g++.
+#include "bindings/module.h"
+
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
 #include "bindings/grouped_mlp.h"
-#include "bindings/module.h"
-#include "geometry/cell_sort.h"
 #include "emulation.h"
+#include "geometry/cell_sort.h"
 #include "network/cuda/grouped_mlp_cuda_layers.h"
 
 namespace py = pybind11;
@@ -37,9 +38,8 @@ PYBIND11_MODULE(voronerf_emulation, module) {
         voronerf::MlpCudaChoice choice;
         voronerf::MlpCudaDevice device = voronerf::mlp_cuda_device();
         device.groups = voronerf::mlp_chain_groups_compiled();
-        const char* fault =
-            voronerf::mlp_cuda_choose(table.get(), static_cast<voronerf::MlpPrecision>(precision),
-                                      n, k, backward, static_cast<voronerf::MlpCudaWay>(way), device, choice);
+        const char* fault = voronerf::mlp_cuda_choose(table.get(), static_cast<voronerf::MlpPrecision>(precision), n, k,
+                                                      backward, static_cast<voronerf::MlpCudaWay>(way), device, choice);
         VN_CHECK(fault == nullptr, fault);
         py::dict plan;
         const bool by_layers = choice.way == voronerf::MlpCudaWay::layers;
@@ -52,6 +52,8 @@ PYBIND11_MODULE(voronerf_emulation, module) {
         plan["shared_bytes"] = choice.fused.shared_bytes;
         plan["block_rows"] = choice.fused.rows();
         plan["resident"] = choice.fused.resident;
+        plan["block_warps"] = choice.fused.warps;
+        plan["warps"] = by_layers ? 0 : voronerf::mlp_cuda_warps(choice.fused, voronerf::mlp_cuda_device());
         plan["slab"] = choice.layers.slab;
         plan["slabs"] = choice.layers.slabs;
         plan["tiles"] = choice.layers.tiles;

@@ -76,16 +76,6 @@ def locate_cell(module):
     written(leaves)
 
 
-def draw_cell(module):
-    points, centres, uniforms = floats(300, 3), floats(5, 3), floats(300, 2)
-    tables = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
-    for weights in (None, floats(5)):
-        leaves = unwritten(300, dtype=np.int32)
-        given = every((points, centres, weights, *tables, uniforms, leaves))
-        module.draw_cell(*given, 300, 5, 2, 2, 0.3, module.Cuda(0, 0))
-        written(leaves)
-
-
 def sort(module, cells, k, way):
     n, gpu = len(cells), module.Cuda(0, 0)
     order, offsets = unwritten(n, dtype=np.int32), unwritten(k + 1, dtype=np.int32)
@@ -347,10 +337,6 @@ def hostile(module):
         tables, leaves = [integers(*child_offsets), integers(*child)], unwritten(300, dtype=np.int32)
         module.locate_cell(*every((points, centres, None, *tables, leaves)), 300, 5, 2, 3, gpu)
         written(leaves)
-        uniforms, leaves = floats(300, 3), unwritten(300, dtype=np.int32)
-        uniforms[::4] = np.array([np.nan, -1, 7])
-        module.draw_cell(*every((points, centres, None, *tables, uniforms, leaves)), 300, 5, 2, 3, 0.1, gpu)
-        written(leaves)
 
     m, r, c = 180, 5, 3
     for offsets in ([5, 3, -4, 500, 90, 7], [least, most, least, most, 0, 180], [180, 180, 181, 0, -1, most]):
@@ -382,7 +368,6 @@ def main(path, kind="usual"):
     usual = (
         nearest_centre,
         locate_cell,
-        draw_cell,
         cell_sort,
         composite,
         step,

@@ -11,14 +11,9 @@ from bugs import group_error, verdict
 from emulated import module
 from emulation_build import build
 
+from voronerf import backends
+
 HERE = Path(__file__).resolve().parent
-OPERATIONS = (
-    *("nearest_centre", "locate_cell", "draw_cell", "cell_sort", "composite", "frequency_encode", "integrated_encode"),
-    *("hash_encode", "spherical_harmonics", "resample", "grouped_linear", "grouped_mlp", "routed_mlp"),
-    *("sparse_adam", "observe_occupancy", "pixel_rays", "render_loss", "march_rays"),
-    "update_occupancy",
-)
-"""Those that have CUDA kernels."""
 BUGS = [
     ("p0", "none", "right"),
     ("p1", "none", "wrong"),
@@ -97,7 +92,7 @@ def test_kernels_touch_nothing_outside_and_race_with_nobody(given):
 def test_operations_pass_their_tests_on_the_emulated_device():
     """The tests of the operations themselves; ``make emulate-cuda`` takes more seeds."""
     command = ["-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--emulate-cuda", "1", "-W", "ignore"]
-    files = [str(HERE.parent / "ops" / f"test_{op}.py") for op in (*OPERATIONS, "every_op")]
+    files = [str(HERE.parent / "ops" / f"test_{op}.py") for op in (*backends.ops("native", "cuda"), "every_op")]
     found = run([*command, "-k", "native-cpu and not compile and not opcheck", *files])
     assert found.returncode == 0 and " passed" in found.stdout, found.stdout
 

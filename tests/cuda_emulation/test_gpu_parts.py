@@ -309,10 +309,78 @@ def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path)
     known = {"good": part("good", write, '{"a": [1]}'), "torn": part("torn", write, '{"a"'), "old": part("old", "pass")}
     known["absent"] = check.Part("not here", 0)
     monkeypatch.setattr(check, "parts", lambda out, data: known)
-    assert check.main(["--out", str(tmp_path), "--seconds", "400"]) == 0
-    kept = read_json(tmp_path / "summary.json")["parts"]
+    monkeypatch.setitem(check.CALLS, "2", tuple(known))
+    assert check.main(["2", "--out", str(tmp_path / "out"), "--seconds", "400"]) == 0
+    kept = read_json(tmp_path / "out" / "summary-2.json")["parts"]
     assert kept["good"]["found"] == {"a": [1]} and kept["torn"]["found"].startswith("torn.json: ")
     assert kept["old"]["found"] is None and kept["absent"]["outcome"] == "left out"
+
+
+def test_calls_fit_their_time_and_leave_two_files(check, monkeypatch, tmp_path):
+    """Without a GPU every part says why it is left out, but for the one that says what is missing."""
+    monkeypatch.setattr(check, "capability", lambda: "90")
+    monkeypatch.setattr(check.shutil, "which", lambda name, **_: name)
+    known = check.parts(tmp_path, None)
+    assert {name for call in check.CALLS.values() for name in call} == set(known)
+    for call in check.CALLS.values():
+        assert sum(known[name].seconds for name in call) <= check.SECONDS
+    monkeypatch.undo()
+    for call in check.CALLS:
+        # "machine" fails for want of a GPU; it is not begun in so little time.
+        assert check.main([call, "--out", str(tmp_path), "--seconds", "1"]) == 0
+        outcomes = read_json(tmp_path / f"summary-{call}.json")["parts"]
+        assert list(outcomes) == list(check.CALLS[call])
+        assert all(row["outcome"] == "left out" and row["last"] for row in outcomes.values())
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        f"{kind}-{call}.{end}" for kind, end in (("summary", "json"), ("parts", "tar.gz")) for call in check.CALLS
+    )
+
+
+def test_what_loses_is_to_be_deleted(check):
+    times = {"nerf64 k=16 forward": 1.0, "nerf64 k=16 forward by tiles": 1.6, "nerf64 k=16 forward by wgmma": 0.9}
+    times |= {f"cell_sort k={k} by {way}": 1.0 + (way == "radix") for k in (16, 1022) for way in ("counting", "radix")}
+    assert check.ruled(times) == [
+        "chain is 1.60 x the tiles: keep it",
+        "wgmma is 1.11 x the chain: delete it (below 1.2)",
+        "sort: counting up to 1,022 cells stays",
+    ]
+    assert check.ruled({}) == []
+
+
+@pytest.mark.native
+def test_large_cases(parts, monkeypatch):
+    """Each way beside the others, small, on the emulated device; and a way that is wrong is found."""
+    large = sys.modules["gpu_large"]
+    monkeypatch.setattr(large, "SUBSET", 16)
+    with emulated():
+        run = dict(large.large_cases("cpu", 300))["w64d4 bfloat16 by tiles, layers, chain, wgmma"]
+        assert run().count("e-") == 4
+        whole = large.evaluate
+        twice = itertools.count()
+
+        def spoilt(given, *, gradients):
+            parts_of = whole(given, gradients=gradients)
+            if next(twice) == 1:
+                parts_of[1] = parts_of[1] * 1.5
+            return parts_of
+
+        monkeypatch.setattr(large, "evaluate", spoilt)
+        with pytest.raises(AssertionError, match="layers: part 1 is"):
+            run()
+
+
+@pytest.mark.native
+def test_sizes_and_a_profiled_step(parts, timings, monkeypatch, tmp_path):
+    import harness
+
+    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
+    assert timings.sizes(tmp_path, parts.Again(("sizes",), case_seconds=60.0), "cpu", 1 << 13) == 0
+    rows = read_json(tmp_path / "sizes.json")["rows"]
+    assert len(rows) == 24 and all(row["seconds"] > 0 for row in rows)
+    monkeypatch.setattr("voronerf.data.load_scene", lambda *_, **__: builtin_scene(12))
+    assert timings.profile(tmp_path, parts.Again(("profile",), case_seconds=60.0), "cpu", 2) == 0
+    (row,) = read_json(tmp_path / "profile.json")["steps"]
+    assert row["seconds"] > 0 and row["launches"] == row["waits"] == 0
 
 
 def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
@@ -334,13 +402,14 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
         "step": {"rows": [{**row, "name": name} for name in ("loss", "loss by torch, sums by rays")]},
     }
     said = check.highlights(found)
-    assert len(said) == 17
+    assert len(said) == 18
     assert said[3].endswith("0.020 ms  50.0 % of copy, MISSED 60 %") and said[4].endswith("copy, reached 40 %")
     assert said[9:] == [
         "cell_sort k=16 by counting: 0.50 x the time of radix",
         "far: 0.25 x the time of tiles",
         "far: 2.00 x the time of wgmma",
         "loss: 1.00 x the time of torch, sums by rays",
+        "RULE sort: counting up to 1,022 cells stays",
         "training plain: 8.25 ms a step, PSNR 21.50 after 90 steps",
         "WRONG in roofs: slow: hangs",
         "WRONG in training: bf16: no",

@@ -44,34 +44,6 @@ def test_look_ups(dtype):
     assert torch.equal(*both(voronerf.locate_cell, torch.rand(300, 3, dtype=dtype), *tables, depth=diagram.depth))
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-def test_draw_cell(weighted):
-    def of(k):
-        return VoronoiDiagram(torch.rand(k, 3), weights=torch.rand(k) / 4 if weighted else None)
-
-    diagram, _ = of(4).refine({1: of(3), 3: of(3)})
-    points, uniforms = torch.rand(300, 3), torch.rand(300, 2)
-    points[7], uniforms[8] = torch.nan, torch.nan
-    arguments = points, diagram.centres, diagram.child_offsets, diagram.child, uniforms
-    found, expected = both(voronerf.draw_cell, *arguments, temperature=0.2, depth=2, weights=diagram.power)
-    # numbers within rounding of a border, of which there is one in 10,000
-    assert int((found != expected).sum()) <= 1 and found[7] == 0
-
-
-def test_draw_cell_stays_inside_unsound_tables():
-    points, centres = torch.rand(50, 3), torch.rand(3, 3)
-    for offsets, child, depth in (
-        ([0, 3], [5, 1_000_000_000, 9], 3),  # no such diagram
-        ([0, 2_000_000_000], [-1, -2, -3], 1),  # more centres than there are
-        ([0, 0, 3], [1, 1, 1], 2),  # a diagram without centres
-        ([0, 1, 3], [1, 1, 0], 4),  # a walk that ends at no leaf
-    ):
-        tables = (torch.tensor(table, dtype=torch.int32) for table in (offsets, child))
-        uniforms = torch.rand(50, depth)
-        leaves = voronerf.draw_cell(points, centres, *tables, uniforms, temperature=0.1, depth=depth, backend="native")
-        assert bool((leaves < 0).all())
-
-
 SIZES = [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600), (2100, 1022), (2100, 1023), (300, 65_534), (300, 65_535)]
 
 
@@ -162,3 +134,18 @@ def test_adam_is_that_of_the_formula(count):
 def test_adam_leaves_out_a_step_that_is_not_finite(spoilt):
     adam_on_both(45, spoilt=spoilt)
     adam_on_both(45, spoilt=spoilt, limit=torch.inf if spoilt == "loss" else 1e3)
+
+
+def test_atomic_sums_are_refused_where_deterministic_algorithms_are_asked_for():
+    grid = voronerf.HashGrid(levels=2, features=2, log2_entries=10, finest=20)
+    table = torch.rand(grid.table_shape, requires_grad=True)
+    total = voronerf.hash_encode(torch.rand(9, 3), table, grid, backend="native").sum()
+    try:
+        torch.use_deterministic_algorithms(True)
+        with pytest.raises(RuntimeError, match=r"^hash_encode: the gradient of a hash grid's table has no determ"):
+            total.backward(retain_graph=True)
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        with pytest.warns(UserWarning, match=r"^hash_encode: the gradient"):
+            total.backward()
+    finally:
+        torch.use_deterministic_algorithms(False)

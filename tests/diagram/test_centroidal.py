@@ -5,7 +5,7 @@ import torch
 from helpers import refuses, seeded
 
 from voronerf.diagram import VoronoiDiagram, balance, split_diagram
-from voronerf.diagram.centroidal import lloyd
+from voronerf.diagram.balance import lloyd
 
 METHODS = ("centroidal", "centroidal-transport")
 

@@ -1,163 +1,31 @@
-"""What holds for every op: it compiles whole for any size, takes any strides, and its custom ops are registered well.
+"""What holds for every op: it compiles whole for any size, takes any strides and sizes, refuses what it must, and its
+custom ops are registered well.
 
-A new op is a line of `CASES`. What is particular to it, such as its formula, is in its own file.
+A row is a kind of an op's case (``voronerf/ops/<op>/case.py``). What is particular to an op, such as its formula, is in
+its own file.
 """
 
 from __future__ import annotations
 
+import functools
+import re
+
 import pytest
 import torch
-from op_cases import need, offsets_of, strided
+from op_cases import need, refused, strided
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from voronerf import HashGrid, backends, ops
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf import backends, ops
+from voronerf.ops.cases import Draw, cases
 
-NETWORK = MLP((Layer((POSITIONS,), 6, "sine"), Layer((0, DIRECTIONS), 4, "sigmoid")), (1, 0), 2, 1)
-GAUSSIANS = MLP(NETWORK.layers, NETWORK.outputs, 2, 1, "integrated")
-HASHED = HashGrid(levels=3, features=2, log2_entries=10, base=3, finest=40, interpolation="smoothstep")
-# The 16 features of whole vectors: what a forward pass keeps has no padding, which is never written.
-EIGHT = HashGrid(levels=8, features=2, log2_entries=10, base=3, finest=40)
-GRIDDED = MLP(NETWORK.layers, NETWORK.outputs, None, 1, "hash", EIGHT)
-# Diagram 0 has three centres, the second and third refined by diagrams 1 and 2, and that again by diagram 3.
-TREE = {
-    "centres": torch.rand(10, 3, generator=torch.Generator().manual_seed(1)),
-    "child_offsets": torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32),
-    "child": torch.tensor([-1, 1, 2, -2, -3, -4, 3, -5, -6, -7], dtype=torch.int32),
-}
-
-
-def index(n, below):
-    return torch.randint(below, (n,), dtype=torch.int32)
-
-
-def network(n, layers=NETWORK, k=2):
-    """Samples, weights and biases of k cells."""
-    p = 6 if layers.integrated else 3
-    weights = [torch.randn(k, o, i) / i**0.5 for o, i in layers.weight_shapes(p, 3)]
-    rays = {"directions": torch.randn(4, 3), "direction_index": index(n, 4)}
-    return {"positions": torch.rand(n, p), "weights": weights, "biases": [torch.randn(k, 6), None], **rays}
-
-
-def rays(n, s=5):
-    """Densities and so on of n rays of s samples."""
-    values = {"sigma": torch.rand(n, s), "rgb": torch.rand(n, s, 3), "depths": torch.rand(n, s)}
-    return {**values, "deltas": torch.rand(n, s) / 2, "background": torch.rand(3)}
-
-
-def packed(n):
-    flat = {name: value.flatten(0, 1) if value.dim() > 1 else value for name, value in rays(n).items()}
-    return {**flat, "ray_offsets": offsets_of([2, 0, 5 * n - 2])}
-
-
-def march(n):
-    start = {"uniforms": torch.rand(n, 7), "start": index(n, 3)}
-    towards = torch.nn.functional.normalize(torch.randn(n, 3), dim=1)
-    ends = {"near": torch.rand(n), "far": 3 + torch.rand(n), "box": torch.tensor([[-1.0] * 3, [1.0] * 3])}
-    return {"origins": -towards, "directions": towards, "occupied": torch.rand(5, 4, 6) < 0.4, **ends, **start}
-
-
-def cameras(n):
-    some = {"poses": torch.eye(4).repeat(3, 1, 1), "intrinsics": 30 + torch.rand(3, 4), "camera": index(n, 3)}
-    some["models"] = torch.arange(3, dtype=torch.int32)
-    return {**some, "x": 64 * torch.rand(n), "y": 48 * torch.rand(n), "distortion": 0.01 * torch.randn(3, 8)}
-
-
-def pixels(n):
-    """n pixels of three images."""
-    some = cameras(n)
-    given = {name: some[name] for name in ("poses", "intrinsics", "distortion", "models")}
-    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
-    images = torch.randint(256, (3, 5, 7, 4), dtype=torch.uint8)
-    return {**given, "images": images, "index": torch.randint(105, (n,)), "background": torch.rand(n, 3), "box": box}
-
-
-def solids(n):
-    frames = torch.cat([torch.eye(3).expand(4, 3, 3), torch.randn(4, 1, 3) / 2], dim=1)
-    tables = {"kinds": torch.arange(4, dtype=torch.int32), "frames": frames, "sizes": 0.2 + 0.2 * torch.rand(4, 3)}
-    origins = 4 * torch.nn.functional.normalize(torch.randn(n, 3), dim=1)
-    return {**tables, "origins": origins, "directions": -origins / 4}
-
-
-# For each: the tensors of n samples, and the other arguments.
-CASES = {
-    "nearest_centre": (
-        lambda n: {"points": torch.rand(n, 3), "centres": torch.rand(7, 3), "weights": torch.rand(7)},
-        {},
-    ),
-    "locate_cell": (lambda n: {"points": torch.rand(n, 3), **TREE, "weights": torch.rand(10)}, {"depth": 3}),
-    "draw_cell": (
-        lambda n: {"points": torch.rand(n, 3), **TREE, "uniforms": torch.rand(n, 3), "weights": torch.rand(10)},
-        {"depth": 3, "temperature": 0.3},
-    ),
-    "cell_sort": (lambda n: {"cells": index(n, 6)}, {"k": 6}),
-    "select_heaviest": (lambda n: {"points": torch.rand(n, 3), "importance": torch.rand(n)}, {"count": 4}),
-    "balance_centres": (
-        lambda n: {"samples": torch.rand(n, 3), "masses": torch.rand(n).double(), "centres": torch.rand(3, 3)},
-        {"steps": 2},
-    ),
-    "camera_rays": (cameras, {}),
-    "pixel_rays": (pixels, {"near": 0.2, "far": 3.0}),
-    "cast_solids": (solids, {}),
-    "march_rays": (march, {"samples": 7, "capacity": 40, "most": 5}),
-    "update_occupancy": (
-        lambda n: {"density": torch.rand(2, 3, 4), "cells": index(n, 24), "values": torch.rand(n)},
-        {"decay": 0.5, "threshold": 0.4},
-    ),
-    "resample": (
-        lambda n: {"weights": torch.rand(n, 5), "edges": torch.rand(n, 6).cumsum(1), "uniforms": torch.rand(n, 8)},
-        {"count": 8},
-    ),
-    "resample, even": (lambda n: {"weights": torch.rand(n, 5), "edges": torch.rand(n, 6).cumsum(1)}, {"count": 8}),
-    "composite": (rays, {}),
-    "composite, packed": (packed, {}),
-    "frequency_encode": (lambda n: {"x": torch.rand(n, 3)}, {"octaves": 4}),
-    "frequency_encode, itself": (lambda n: {"x": torch.rand(n, 3)}, {"octaves": 0}),
-    "frequency_encode, nothing": (lambda n: {"x": torch.rand(n, 3)}, {"octaves": 0, "include_input": False}),
-    "integrated_encode": (lambda n: {"means": torch.rand(n, 3), "variances": torch.rand(n, 3)}, {"octaves": 3}),
-    "spherical_harmonics": (lambda n: {"directions": torch.randn(n, 3)}, {"degree": 4}),
-    "spherical_harmonics, constant": (lambda n: {"directions": torch.randn(n, 3)}, {"degree": 1}),
-    "hash_encode": (
-        lambda n: {"positions": torch.rand(n, 3), "table": torch.randn(HASHED.table_shape)},
-        {"grid": HASHED},
-    ),
-    "hash_encode, of cells": (
-        lambda n: {"positions": torch.rand(n, 3), "table": torch.randn(2, *HASHED.table_shape), "cells": index(n, 2)},
-        {"grid": HASHED},
-    ),
-    "grouped_linear": (
-        lambda n: {
-            "x": torch.randn(n, 7),
-            "offsets": offsets_of([n - 5, 0, 5]),
-            "weight": torch.randn(3, 5, 7),
-            "bias": torch.randn(3, 5),
-        },
-        {"activation": "sigmoid"},
-    ),
-    "grouped_mlp": (lambda n: {**network(n), "offsets": offsets_of([n - 5, 5])}, {"layers": NETWORK}),
-    "grouped_mlp, integrated": (
-        lambda n: {**network(n, GAUSSIANS), "offsets": offsets_of([n - 5, 5])},
-        {"layers": GAUSSIANS},
-    ),
-    "grouped_mlp, hashed": (
-        lambda n: {
-            **network(n, GRIDDED),
-            "features": torch.randn(EIGHT.table_shape),
-            "offsets": offsets_of([n - 5, 5]),
-        },
-        {"layers": GRIDDED},
-    ),
-    "routed_mlp": (lambda n: {**network(n), "centres": torch.rand(2, 3)}, {"layers": NETWORK}),
-    "routed_mlp, nested": (lambda n: {**network(n, k=7), **TREE}, {"layers": NETWORK, "depth": 3}),
-    "routed_mlp, one cell": (lambda n: network(n, GAUSSIANS, k=1), {"layers": GAUSSIANS}),
-    "routed_mlp, of cells": (lambda n: {**network(n), "cells": index(n, 2)}, {"layers": NETWORK}),
-}
+CASES = cases()
+KINDS = [(op, kind) for op, case in CASES.items() if case.comparable and not case.in_place for kind in case.kinds]
 RUNS = [
-    (name, backend, device)
-    for name in CASES
-    for backend in backends.implemented(name.split(",")[0])
+    (f"{op}, {kind}" if kind else op, backend, device)
+    for op, kind in KINDS
+    for backend in backends.implemented(op)
     for device in ("cpu", "cuda")
 ]
 every_op = pytest.mark.parametrize(
@@ -166,17 +34,29 @@ every_op = pytest.mark.parametrize(
 
 
 def prepare(name, backend, device):
-    """The op as a function of its tensors, and a maker of those."""
-    op, (make, options) = name.split(",")[0], CASES[name]
+    """The op as a function of its tensors, and a maker of those by their number."""
+    op, _, kind = name.partition(", ")
+    case = CASES[op]
     need(op, backend, device, torch.int32 if op == "cell_sort" else torch.float32)
+    rest = {}
 
     def ready(tensor):
         # Warp's camera rays have no gradients.
         return tensor.to(device).detach().requires_grad_(tensor.is_floating_point() and op != "camera_rays")
 
-    return lambda given: getattr(ops, op)(**given, **options, backend=backend), lambda n: tree_map_only(
-        Tensor, ready, make(n)
-    )
+    def make(n):
+        given = tree_map_only(Tensor, ready, case.make(Draw(n, **case.kinds[kind]), n))
+        rest.update({name: value for name, value in given.items() if not holds_tensors(value)})
+        return {name: value for name, value in given.items() if holds_tensors(value)}
+
+    def run(given, backend=backend):
+        return getattr(ops, case.call or op)(**given, **rest, backend=backend)
+
+    return run, make
+
+
+def holds_tensors(value):
+    return any(isinstance(leaf, Tensor) for leaf in tree_leaves(value))
 
 
 def results(run, given):
@@ -197,7 +77,7 @@ def assert_close(found, expected):
 
 @every_op
 def test_compiles_for_any_size(device, backend, name):
-    if (name, backend) == ("cast_solids", "reference"):
+    if backend == "reference" and not CASES[name.partition(",")[0]].compiles:
         pytest.skip("is not compiled whole")
     torch.compiler.reset()
     run, tensors = prepare(name, backend, device)
@@ -227,6 +107,18 @@ def test_any_view(device, backend, name):
     for form in (strided, columns, negated):
         spread = lambda tensor, form=form: form(tensor.detach()).requires_grad_(tensor.requires_grad)  # noqa: E731
         assert_close(results(run, tree_map_only(Tensor, spread, given)), expected)
+
+
+@every_op
+def test_any_size_gives_what_the_reference_gives(device, backend, name):
+    """Both kinds of rounding are allowed for: tests of each op compare with float64."""
+    if backend == "reference":
+        pytest.skip("is what the others are compared with")
+    run, tensors = prepare(name, backend, device)
+    for n in (0, 1, 2, 15, 16, 17, 33, 257):
+        given = tensors(n)
+        expected = results(functools.partial(run, backend="reference"), given)
+        assert_close(results(run, given)[: len(expected)], expected)
 
 
 class Calls(TorchFunctionMode):
@@ -265,3 +157,15 @@ def test_custom_ops_pass_opcheck(device, backend, name):
     assert calls.found
     for function, args in calls.found.values():
         torch.library.opcheck(function, args)
+
+
+@pytest.mark.parametrize(("op", "message"), [(op, message) for op, case in CASES.items() for message in case.refused])
+def test_refuses(op, message):
+    case = CASES[op]
+    name, given = case.call or op, case.make(Draw(), 6)
+    getattr(ops, name)(**given)
+    of_types = re.search(
+        "dtype|must be (an integer|a number|a tensor|a list|an MLP|a HashGrid|a CentreGrid|True)", message
+    )
+    with refused(TypeError if of_types else ValueError, f"{name}: {message}"):
+        getattr(ops, name)(**{**given, **case.refused[message]})

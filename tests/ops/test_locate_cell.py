@@ -103,8 +103,6 @@ x, c = torch.rand(3000, 3, dtype=torch.float64), torch.rand(4, 3, dtype=torch.fl
 tree = torch.tensor([0, 2, 4], dtype=torch.int32), torch.tensor([1, -1, -2, -3], dtype=torch.int32)
 def run():
     voronerf.locate_cell(x, c, *tree, depth=2, backend="native")
-    u = torch.rand(3000, 2)
-    voronerf.draw_cell(x.float(), c.float(), *tree, u, temperature=0.1, depth=2, backend="native")
     print("found")
 thread = threading.Thread(target=run)
 thread.start()

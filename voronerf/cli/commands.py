@@ -24,17 +24,18 @@ from voronerf import backends
 from voronerf.cli.board import Board
 from voronerf.cli.display import StageDisplay, TrainingDisplay, printable
 from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
-from voronerf.cli.ranks import train_on_ranks
 from voronerf.data import Scene, SceneError, load_scene
 from voronerf.data.process import process as make_scene
-from voronerf.distributed.group import Group, world_size
-from voronerf.distributed.trainer import RankTrainer
+from voronerf.distributed.group import Group, joined, local_rank, restarts, world_size
+from voronerf.distributed.same import check_same, check_same_scene
+from voronerf.distributed.trainer import RankTrainer, check_ranks
 from voronerf.evaluation.panels import picture_of_colour, write_panels
 from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.paths import CameraPath, read_camera_path, spiral_cameras
 from voronerf.run import Run
+from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device, why_no_occupancy
 from voronerf.training.progress import Progress
@@ -66,7 +67,7 @@ def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", p
         port: Port that --view listens at; 0 is any that is free.
     """
     if world_size() > 1:
-        return train_on_ranks(config, run_training, view=view)
+        return train_on_ranks(config, view=view)
     check_device(config.device)
     if view:
         import_viewer().check_address(host, port)
@@ -79,6 +80,36 @@ def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", p
         if config.out is None:
             with contextlib.suppress(OSError):
                 chosen.out.rmdir()  # fails if something was written, and is then not needed
+    return 0 if summary["complete"] else 130
+
+
+def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
+    """Trains together with the other ranks; all of them call it, and rank 0 alone writes files.
+
+    Args:
+        config: The settings.
+        view: Whether a viewer was asked for.
+
+    Raises:
+        ConfigError: A setting that multi-process training does not support.
+        RankLost: Another rank has ended, or says what is wrong.
+    """
+    device = torch.device(f"cuda:{local_rank()}" if config.device == "cuda" else config.device)
+    config = replace(config, device=str(device))
+    check_device(config.device)
+    with joined(device) as group:
+        check_same(group, config)
+        if view:
+            raise ConfigError("--view must be off with several ranks")
+        check_ranks(config, world_size())
+        assert config.out is not None
+        scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
+        check_same_scene(group, scene)
+        if group.rank == 0:  # alone, for what it writes is there already when others look
+            again = restarts() > 0 and bool(checkpoint_paths(config.out))
+            config = choose_directory(replace(config, resume=config.resume or again), scene)
+        config = replace(config, resume=group.from_first(config.resume))
+        summary = run_training(config, scene, group=group)
     return 0 if summary["complete"] else 130
 
 

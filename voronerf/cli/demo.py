@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from rich.table import Table
-
-from voronerf.cli.commands import console, run_training, say
-from voronerf.data import BUILTIN_SIZE, Scene, load_scene
-from voronerf.evaluation.plots import plot_curves
+from voronerf.cli.commands import console, run_training
+from voronerf.cli.compare import compare
+from voronerf.data import BUILTIN_SIZE, load_scene
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.run_directory import held, read_curve
+from voronerf.training.run_directory import held
 
 
 def demo(
@@ -49,38 +46,15 @@ def demo(
         for name, levels in (("single", ()), ("voronoi", (cells,)))
     }
     scene = load_scene("builtin", downscale=downscale)
-    results: dict[str, dict[str, Any]] = {}
     for name, config in configs.items():
         with held(out / name):
             _remove_run(out / name)
         networks = f"{cells} Voronoi cells" if config.cells else "one coarse network"
         console.print(f"\n[bold]{name}[/bold]: {networks}, {budget:.0f} s", highlight=False)
-        results[name] = run_training(config, scene)
-        if not results[name]["complete"]:
+        if not run_training(config, scene)["complete"]:
             return 130
-    _report(out, scene, results)
-    return 0
-
-
-def _report(out: Path, scene: Scene, results: dict[str, dict[str, Any]]) -> None:
-    """Prints the comparison of the two runs and plots their curves."""
-    curves = {name: read_curve(out / name) for name in results}
-    splits = {name: [s["started_at_second"] for s in r["stages"][1:]] for name, r in results.items()}
-    plot_curves(out / "psnr.png", curves, splits=splits, title="built-in scene, equal training time")
-    table = Table("network", "parameters", "steps", "training [s]", "psnr [dB]", "ssim", title="test views")
-    for result in results.values():
-        table.add_row(
-            "one coarse network" if result["cells"] == 1 else f"{result['cells']} Voronoi cells",
-            f"{result['parameters']:,}",
-            f"{result['steps']:,}",
-            f"{result['seconds']:.0f}",
-            f"{result['psnr']:.2f}",
-            f"{result['ssim']:.4f}",
-        )
     console.print()
-    console.print(table)
-    say(f"pictures: {out / 'voronoi' / 'images'} (truth, render, error, depth, cells)")
-    say(f"curves:   {out / 'psnr.png'}")
+    return compare(tuple(out / name for name in configs), out=out / "compare.html")
 
 
 def _remove_run(run: Path) -> None:

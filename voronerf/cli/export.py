@@ -12,7 +12,7 @@ from voronerf.evaluation.video import check_video
 from voronerf.export import cells as cell_files
 from voronerf.export import mesh as mesh_files
 from voronerf.export import points as point_files
-from voronerf.export.files import check_export
+from voronerf.export.space import check_export
 from voronerf.training.config import ConfigError
 
 

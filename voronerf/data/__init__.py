@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from voronerf.data.blender import load_blender
 from voronerf.data.builtin import builtin_scene, city_scene, rich_scene
 from voronerf.data.builtin.city import city_of
-from voronerf.data.capture import load_capture
 from voronerf.data.colmap import find_model, load_colmap
 from voronerf.data.llff import FILE, load_llff
 from voronerf.data.photographs import Reading
 from voronerf.data.scene import KINDS, Scene, SceneError, Split
+from voronerf.data.transforms import load_transforms
 
 __all__ = [
     "Scene",
@@ -27,12 +29,26 @@ __all__ = [
 BUILTIN_SIZE = 100
 BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene}
 CITY = "builtin-city"  # of one block, or with their number: builtin-city:4x4
-#: In the order in which a folder is tried, with what shows each.
+
+
+class Format(NamedTuple):
+    """What shows that a folder has a format, how it is loaded, and how it is told if not by a file of that name."""
+
+    sign: str
+    load: Callable[[Path, Reading], Scene]
+    find: Callable[[Path], Path | None] | None = None
+
+    def held(self, folder: Path) -> bool:
+        """Whether a folder has it."""
+        return (folder / self.sign).is_file() if self.find is None else self.find(folder) is not None
+
+
+#: In the order in which a folder is tried.
 FORMATS = {
-    "blender": "transforms_train.json",
-    "colmap": "a COLMAP model in sparse/0",
-    "transforms": "transforms.json",
-    "llff": FILE,
+    "blender": Format("transforms_train.json", load_blender),
+    "colmap": Format("a COLMAP model in sparse/0", load_colmap, find_model),
+    "transforms": Format("transforms.json", load_transforms),
+    "llff": Format(FILE, load_llff),
 }
 
 
@@ -104,22 +120,17 @@ def load_scene(
         raise SceneError(f"{folder}: there is no such folder")
     if not folder.is_dir():
         raise SceneError(f"{folder}: is not a folder")
-    model = find_model(folder)
-    held = [
-        name for name, sign in FORMATS.items() if (model is not None if name == "colmap" else (folder / sign).is_file())
-    ]
-    if model == folder / "colmap/sparse/0" and "transforms" in held:
+    held = [name for name, each in FORMATS.items() if each.held(folder)]
+    if "transforms" in held and find_model(folder) == folder / "colmap/sparse/0":
         held.remove("colmap")  # nerfstudio's, whose transforms.json was made of it and says more
         held.append("colmap")
     if not held:
-        raise SceneError(f"{folder}: is not a scene, it has none of {', '.join(FORMATS.values())}")
+        raise SceneError(
+            f"{folder}: is not a scene, it has none of {', '.join(each.sign for each in FORMATS.values())}"
+        )
     if format != "auto" and format not in held:
         raise SceneError(f"{folder}: format must be {' or '.join(held)}, which it has, got {format}")
     chosen = held[0] if format == "auto" else format
-    reading = Reading(downscale, allow_outside, kind, normalise, images)
-    others = tuple(f"--format {name} would read {FORMATS[name]}" for name in held if name != chosen)
-    scene = LOADERS[chosen](folder, reading)
+    scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images))
+    others = tuple(f"--format {name} would read {FORMATS[name].sign}" for name in held if name != chosen)
     return replace(scene, notes=(*scene.notes, *others))
-
-
-LOADERS = {"blender": load_blender, "transforms": load_capture, "colmap": load_colmap, "llff": load_llff}

@@ -11,12 +11,19 @@ from typing import Any
 
 import torch
 
-from voronerf.data.capture import Listed, capture_scene, has_lens
 from voronerf.data.carving import carve_box
 from voronerf.data.images import read_images
-from voronerf.data.photographs import Reading
+from voronerf.data.photographs import Reading, distinct_names
 from voronerf.data.scene import Scene, SceneError, Split
-from voronerf.data.transforms import Frame, distinct_names, focal_length, number, read_transforms
+from voronerf.data.transforms import (
+    Frame,
+    Listed,
+    capture_scene,
+    focal_length,
+    has_lens,
+    number,
+    read_transforms,
+)
 from voronerf.rendering.cameras import Cameras
 
 log = logging.getLogger(__name__)
@@ -29,7 +36,7 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
     The test views are those of `transforms_test.json`, or of `transforms_val.json` if the former is missing. Entries
     such as `fl_x`, `cx` or `k1`, which Blender's files do not have, mark a capture that was split before. It is loaded
-    like `load_capture` does, with that split.
+    like `load_transforms` does, with that split.
 
     Args:
         folder: holds `transforms_train.json`.
@@ -37,7 +44,7 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
     Returns:
         The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
-        the training views; without alpha the box is None. For a capture see `load_capture`.
+        the training views; without alpha the box is None. For a capture see `load_transforms`.
 
     Raises:
         SceneError: a file is missing, broken or inconsistent.

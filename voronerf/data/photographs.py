@@ -8,6 +8,7 @@ camera is at distance 1.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,6 @@ from voronerf.data.images import read_images, read_masks
 from voronerf.data.lenses import PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.data.scene import Scene, SceneError, Sightings, Split
 from voronerf.data.soundness import camera_faults, lost_cameras
-from voronerf.data.transforms import distinct_names
 from voronerf.rendering.cameras import Cameras, focus_point
 from voronerf.rendering.contraction import Contraction, Perspective
 
@@ -96,6 +96,21 @@ class Photographs:
 def least_factor(longest: float) -> int:
     """The factor that leaves a side of so many pixels at most `LONGEST_SIDE`."""
     return max(math.ceil(longest / LONGEST_SIDE), 1)
+
+
+def distinct_names(paths: list[Path], folder: Path) -> list[str]:
+    """A unique name for each image, under which pictures of it are stored.
+
+    The names are the stems of the files if these differ; otherwise the paths inside the folder of the scene, such as
+    a_00 for a/00.png; and if a file is listed twice, the paths behind the number of the image.
+    """
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        inside = [Path(os.path.relpath(path, folder)).with_suffix("") for path in paths]
+        names = ["_".join(part for part in path.parts if part != "..") for path in inside]
+    if len(set(names)) < len(names):
+        names = [f"{position:04d}_{name}" for position, name in enumerate(names)]
+    return names
 
 
 def hold_out(count: int) -> Tensor:

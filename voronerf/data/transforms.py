@@ -1,19 +1,27 @@
-"""Reads what Blender's `transforms_*.json` and the `transforms.json` of captures share: frames, poses, numbers."""
+"""Captures as `transforms.json`, with intrinsics, lens distortion and poses (instant-ngp, nerfstudio).
+
+Blender's `transforms_*.json` share its frames, poses and numbers. Poses are OpenGL's, as everywhere.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
 import os
+import posixpath
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from voronerf.data.scene import SceneError
+from voronerf.data.images import read_header
+from voronerf.data.lenses import COEFFICIENTS, FISHEYE, PERSPECTIVE, Lens
+from voronerf.data.photographs import Photographs, Reading, View, hold_out, least_factor, photograph_scene
+from voronerf.data.scene import Scene, SceneError
 from voronerf.files import leads_outside, read_json
 
 log = logging.getLogger(__name__)
@@ -24,6 +32,13 @@ ORTHONORMAL = 2e-3
 LARGEST = 1e9
 #: Of a focal length, in sides of the image, and its inverse the smallest: fields of view of 0.06 to 179.9 degrees.
 LONGEST = 1000
+SPLITS = ("train_filenames", "test_filenames", "val_filenames")
+PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
+FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "distortion_params", "camera_model", "is_fisheye")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's distortion_params
+# k4 of a perspective camera belongs to r^8 in nerfstudio, and to the divisor in OpenCV.
+UNSUPPORTED = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 
 
 @dataclass(frozen=True)
@@ -133,21 +148,6 @@ def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> fl
     return focal
 
 
-def distinct_names(paths: list[Path], folder: Path) -> list[str]:
-    """A unique name for each image, under which pictures of it are stored.
-
-    The names are the stems of the files if these differ; otherwise the paths inside the folder of the scene, such as
-    a_00 for a/00.png; and if a file is listed twice, the paths behind the number of the image.
-    """
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        inside = [Path(os.path.relpath(path, folder)).with_suffix("") for path in paths]
-        names = ["_".join(part for part in path.parts if part != "..") for path in inside]
-    if len(set(names)) < len(names):
-        names = [f"{position:04d}_{name}" for position, name in enumerate(names)]
-    return names
-
-
 def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Path | None:
     """Finds an image file; Blender's files leave out the suffix, and files from Windows may have its separators."""
     for spelt in dict.fromkeys((name, name.replace("\\", "/"))):
@@ -203,3 +203,157 @@ def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor
     pose = np.eye(4)
     pose[:3] = values[:3]
     return torch.from_numpy(pose)
+
+
+def load_transforms(folder: Path, reading: Reading) -> Scene:
+    """Loads a capture; every 8th image in the order of their names is held out for testing.
+
+    Where the file has nerfstudio's `train_filenames`, `test_filenames` or `val_filenames`, they decide instead.
+    Validation images are for testing if there are no others, and are else left out.
+
+    Args:
+        folder: holds `transforms.json`.
+        reading: how it is read.
+
+    Raises:
+        SceneError: the file is broken, its lens model is not supported, or it has fewer than two images.
+    """
+    path = folder / "transforms.json"
+    entries, frames = read_transforms(path, reading.allow_outside)
+    frames = sorted(frames, key=lambda frame: frame.path.as_posix())
+    if len(frames) < 2:
+        raise SceneError(f"{path}: one image is too few, one is held out for testing")
+    declared = _declared_split(path, entries, frames)
+    if declared is None:
+        held_out = hold_out(len(frames))
+    else:
+        frames, held_out = declared
+    return capture_scene(folder, [Listed(path, entries, frame) for frame in frames], held_out, reading)
+
+
+def _declared_split(path: Path, entries: dict[str, Any], frames: list[Frame]) -> tuple[list[Frame], Tensor] | None:
+    """The frames that nerfstudio's lists of file names choose, and which are held out; None without such lists.
+
+    Where one list is missing or empty, the images of no other list take its place.
+    """
+    lists: dict[str, set[str]] = {}
+    for key in SPLITS:
+        names = entries.get(key)
+        if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+            raise SceneError(f"{path}: {key} must be a list of file names, got {names!r:.60}")
+        lists[key] = {_plain(name) for name in names or ()}
+    every = {_plain(frame["file_path"]) for frame in entries["frames"]}
+    for key, names in lists.items():
+        if unknown := sorted(names - every):
+            raise SceneError(f"{path}: {key} has {unknown[0]}, which is no file_path of a frame")
+    train, test, validation = lists.values()
+    if not (train or test or validation):
+        return None
+    test = test or validation
+    train, test = train or every - test - validation, test or every - train
+    if both := sorted(train & test):
+        raise SceneError(f"{path}: train_filenames and the images for testing must differ, both have {both[0]}")
+    if unused := len(every - train - test - validation):
+        log.warning("%s: %d images are in none of %s and are left out", path, unused, ", ".join(SPLITS))
+    names = [_plain(frame.entries["file_path"]) for frame in frames]
+    chosen = [(frame, name in test) for frame, name in zip(frames, names) if name in train | test]
+    held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool)
+    for part, there in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
+        if not there:
+            raise SceneError(f"{path}: {', '.join(SPLITS)} leave no image for {part}")
+    return [frame for frame, _ in chosen], held_out
+
+
+def _plain(name: str) -> str:
+    """A file name in one spelling, so that ./images/a.png is images/a.png."""
+    return posixpath.normpath(name.replace("\\", "/"))
+
+
+class Listed(NamedTuple):
+    """A frame, the file that lists it, and the entries of that file, which the frame may override."""
+
+    path: Path
+    entries: dict[str, Any]
+    frame: Frame
+
+
+def has_lens(entries: dict[str, Any], frames: Sequence[Frame]) -> bool:
+    """Whether a transforms file describes lenses as captures do; Blender's files give the field of view alone."""
+    return any(given.get(key) is not None for given in (entries, *(f.entries for f in frames)) for key in LENS)
+
+
+def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, reading: Reading) -> Scene:
+    """Makes the scene of a capture from its frames, see `load_transforms`.
+
+    Args:
+        folder: of the scene.
+        listed: its c images.
+        held_out: bool [c], the test views.
+        reading: how it is read.
+
+    Raises:
+        SceneError: as `load_transforms`.
+    """
+    path, entries, _ = listed[0]
+    notes = [f"{path.name} of {len(listed)} images"]
+    if any(entry.frame.entries.get("depth_file_path") is not None for entry in listed):
+        notes.append("its depth images are not used")
+    applied = entries.get("applied_transform")
+    transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
+    views = [_view(*entry, reading.downscale or 1) for entry in listed]
+    factor = reading.downscale or least_factor(max(max(view.size) for view in views))
+    return photograph_scene(folder, Photographs(path, views, held_out, factor, tuple(notes), transform), reading)
+
+
+def _view(path: Path, entries: dict[str, Any], frame: Frame, downscale: int) -> View:
+    values = {**_named_distortion(entries, path), **_named_distortion(frame.entries, path)}
+    model = FISHEYE if _is_fisheye(values, path) else PERSPECTIVE
+    size = read_header(frame.path, downscale).size
+    given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
+    coefficients = tuple(given.get(key, 0.0) for key in COEFFICIENTS[model])
+    lens = Lens(_intrinsics(values, size, path, frame), coefficients, model)
+    return View(frame.path, frame.pose, lens, size, frame.mask)
+
+
+def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> tuple[float, ...]:
+    """(fx, fy, cx, cy) in pixels."""
+    width, height = size
+    for key, actual in (("w", width), ("h", height)):
+        stated = number(values, key, path, positive=True)
+        if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
+            raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {path} says {key} = {stated:g}")
+    fx, fy = (
+        focal_length(values, f"fl_{axis}", side, path) or focal_length(values, f"camera_angle_{axis}", side, path)
+        for axis, side in zip("xy", size)
+    )
+    if fx is None and fy is None:
+        raise SceneError(f"{path}: has no focal length (fl_x or camera_angle_x)")
+    fx, fy = fx or fy, fy or fx
+    cx, cy = number(values, "cx", path), number(values, "cy", path)
+    assert fx is not None and fy is not None
+    return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+
+
+def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The entries with k1, k2... in the place of nerfstudio's distortion_params."""
+    given = entries.get("distortion_params")
+    if given is None or given == []:
+        return entries
+    if not isinstance(given, list) or len(given) != len(DISTORTION):
+        raise SceneError(f"{path}: distortion_params must be six numbers, {', '.join(DISTORTION)}, got {given!r:.60}")
+    return {**entries, **dict(zip(DISTORTION, given))}
+
+
+def _is_fisheye(values: dict[str, Any], path: Path) -> bool:
+    """Whether a camera is a fisheye; checks that its model is known and all of it is used."""
+    model = values.get("camera_model", "OPENCV")
+    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
+        names = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
+        raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {names}")
+    fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
+    refused = ("p1", "p2", *UNSUPPORTED[1:]) if fisheye else UNSUPPORTED
+    used = [key for key in refused if number(values, key, path)]
+    if used:
+        known = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2"
+        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only {known}")
+    return fisheye

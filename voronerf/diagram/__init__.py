@@ -1,9 +1,8 @@
 """Voronoi diagrams of space: nested look-up, balancing, subdivision, blending across borders, and the kept samples."""
 
-from voronerf.diagram.balance import Balance, balance, imbalance
+from voronerf.diagram.balance import Balance, balance, imbalance, uniform_centres
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.diagram.subdivision import Split, split_diagram
-from voronerf.diagram.uniform import uniform_centres
 from voronerf.diagram.voronoi import VoronoiDiagram
 
 __all__ = [

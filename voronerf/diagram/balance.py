@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from voronerf import ops
-from voronerf.diagram.centroidal import lloyd
 from voronerf.diagram.transport import transport
-from voronerf.diagram.uniform import uniform_centres
 from voronerf.diagram.voronoi import VoronoiDiagram
+
+_STEPS = 200  # of Lloyd's iteration at most
+_TOLERANCE = 1e-5  # it ends when a step lowers the energy by less than this part of it
 
 METHODS = ("published", "transport", "centroidal", "centroidal-transport")
 
@@ -96,7 +97,6 @@ def balance(
     steps: int = 500,
     alpha: float = 0.05,
     neighbours: int = 8,
-    normalise: str = "neighbourhood",
     init: str | None = None,
     uniform_scale: float = 1.0,
     generator: torch.Generator | None = None,
@@ -108,9 +108,8 @@ def balance(
 
         v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i,
 
-    where N(i) are its `neighbours` closest centres (all others if there are fewer). Light cells move towards heavy
-    neighbours, and heavy cells away from light ones. `norm_i` is the largest W of i and N(i), as the text of the paper
-    says ("neighbourhood"), or the largest of all cells ("global"), the other reading of its formula.
+    where N(i) are its `neighbours` closest centres (all others if there are fewer), and `norm_i` is the largest W of i
+    and N(i). Light cells move towards heavy neighbours, and heavy cells away from light ones.
 
     Args:
         points: floating [m, 3], finite.
@@ -124,7 +123,6 @@ def balance(
         steps: number of updates; 0 keeps the first centres.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
-        normalise: "neighbourhood" or "global".
         init: the first centres. "random": distinct samples, all equally likely (as in the paper; default of
             "published"). "weighted": distinct samples drawn one by one with probability proportional to importance
             (default of the other methods). "uniform": `uniform_centres` over the bounding box of the samples.
@@ -152,7 +150,6 @@ def balance(
     _check_choice("method", method, METHODS)
     init = init or ("random" if method == "published" else "weighted")
     _check_choice("init", init, ("random", "weighted", "uniform"))
-    _check_choice("normalise", normalise, ("neighbourhood", "global"))
     if k < 1:
         raise ValueError(f"balance: k must be at least 1, got {k}")
     if not 0 < uniform_scale < float("inf"):
@@ -188,7 +185,6 @@ def balance(
             steps=steps,
             alpha=alpha,
             neighbours=neighbours,
-            global_norm=normalise == "global",
             backend=backend,
         )
     device = points.device
@@ -226,6 +222,103 @@ def first_centres(
     place = torch.full((distinct.shape[0],), samples.shape[0], dtype=torch.int64)
     place.scatter_reduce_(0, member[order], torch.arange(samples.shape[0]), "amin")
     return samples[order[place.sort().values[:k]]]
+
+
+def uniform_centres(box: Tensor, k: int) -> Tensor:
+    """k centres spread evenly over a box, as close to a regular grid as k allows (the paper's "uniform" ablation).
+
+    The box is cut across its longest side: into 2 equal parts if k is even, into 3 if k is divisible by 3, otherwise
+    into 2 parts in proportion to their numbers of centres. Each part is cut in the same way, until it holds one centre,
+    in its middle. All final parts have the same volume. In a cube, 8, 27, 64 ... give cubic grids, 12 gives 2 x 2 x 3,
+    and 16 gives 4 x 2 x 2.
+
+    Args:
+        box: floating [2, 3], lowest and highest corner; flat boxes are allowed.
+        k: number of centres, >= 1.
+
+    Returns:
+        [k, 3] in the dtype and on the device of `box`.
+
+    Raises:
+        ValueError: k < 1, a wrong shape, a value that is not finite, or a highest corner below the lowest.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import uniform_centres
+        >>> box = torch.tensor([[0.0, 0, 0], [2.0, 1, 1]])
+        >>> uniform_centres(box, 2)
+        tensor([[0.5000, 0.5000, 0.5000],
+                [1.5000, 0.5000, 0.5000]])
+    """
+    if k < 1:
+        raise ValueError(f"uniform_centres: k must be at least 1, got {k}")
+    if tuple(box.shape) != (2, 3):
+        raise ValueError(f"uniform_centres: box must have shape [2, 3], got {list(box.shape)}")
+    low, high = box.tolist()
+    if not bool(torch.isfinite(box).all()) or any(a > b for a, b in zip(low, high, strict=True)):
+        raise ValueError(f"uniform_centres: box must be finite with box[0] <= box[1], got {box.tolist()}")
+
+    def place(low: list[float], high: list[float], k: int) -> list[list[float]]:
+        if k == 1:
+            return [[(a + b) / 2 for a, b in zip(low, high, strict=True)]]
+        if k % 2 == 0:
+            shares = [k // 2] * 2
+        elif k % 3 == 0:
+            shares = [k // 3] * 3
+        else:
+            shares = [k // 2, k - k // 2]
+        sides = [b - a for a, b in zip(low, high, strict=True)]
+        # Rounding must not decide between equal sides: they count as equal up to one part in a million.
+        axis = next(i for i, side in enumerate(sides) if side >= max(sides) * (1 - 1e-6))
+        centres: list[list[float]] = []
+        start, done = low[axis], 0
+        for share in shares:
+            done += share
+            end = low[axis] + sides[axis] * done / k
+            centres += place([*low[:axis], start, *low[axis + 1 :]], [*high[:axis], end, *high[axis + 1 :]], share)
+            start = end
+        return centres
+
+    return torch.tensor(place(low, high, k), dtype=box.dtype, device=box.device)
+
+
+def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
+    """Centres that are the centroids of their Voronoi cells, so that cells are compact.
+
+    The centres v_i lower the energy E = sum_j m_j min_i |x_j - v_i|^2 of samples x_j of mass m_j by Lloyd's iteration:
+    samples go to the nearest centre, and centres to the centroids of their samples (Du, Faber and Gunzburger 1999,
+    "Centroidal Voronoi tessellations: applications and algorithms", section 5; with masses, section 2). A centre
+    without mass in its cell is moved to the sample with the largest share `m_j |x_j - v|^2` of the energy; it
+    stays where it is if that is 0.
+
+    Args:
+        samples: float32 [m, 3] on the CPU.
+        masses: float64 [m], >= 0, not all 0.
+        centres: float32 [k, 3], k >= 1.
+        backend: backend of `nearest_centre`.
+
+    Returns:
+        Centres float32 [k, 3].
+    """
+    k = centres.shape[0]
+    precise, energy = samples.double(), float("inf")
+    weighted = [masses * axis for axis in precise.unbind(1)]
+    for _ in range(_STEPS):
+        cells = ops.nearest_centre(samples, centres, backend=backend)
+        costs = masses * (precise - centres.double()[cells]).square().sum(1)
+        before, energy = energy, float(costs.sum())
+        mass = torch.bincount(cells, weights=masses, minlength=k)
+        if before - energy <= _TOLERANCE * energy and bool((mass > 0).all()):
+            break
+        sums = torch.stack([torch.bincount(cells, weights=axis, minlength=k) for axis in weighted], 1)
+        moved = torch.where(mass[:, None] > 0, sums / mass[:, None], centres.double())
+        for empty in (mass == 0).nonzero().flatten().tolist():
+            worst = int(costs.argmax())
+            if costs[worst] > 0:
+                moved[empty] = precise[worst]
+                costs = torch.minimum(costs, masses * (precise - precise[worst]).square().sum(1))
+        centres = moved.float()
+    return centres
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

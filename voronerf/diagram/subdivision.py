@@ -73,8 +73,7 @@ def split_diagram(
         uniform_scale: factor > 0 on the size of the box of "uniform", or of init="uniform", about its middle.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.backends`.
-        **options: arguments of `balance` for "balanced" and "centroidal": method, steps, alpha, neighbours, normalise,
-            init.
+        **options: arguments of `balance` for "balanced" and "centroidal": method, steps, alpha, neighbours, init.
 
     Returns:
         The split. Cells that are too small stay leaves; `balances` has the cells that were split.

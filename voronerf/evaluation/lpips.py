@@ -68,7 +68,7 @@ class Lpips:
 
         Args:
             image: [h, w, 3] in 0..1, at least 31 pixels on a side.
-            truth: likewise.
+            truth: [h, w, 3] in 0..1, what it should be.
 
         Raises:
             ValueError: shapes, or images that are too small.

@@ -35,8 +35,8 @@ def ssim(image: Tensor, truth: Tensor) -> Tensor:
     make them negative. For an image with a side below 11 pixels, the window is the largest odd one that fits.
 
     Args:
-        image: [..., h, w, c] in 0..1.
-        truth: likewise.
+        image: [..., h, w, c], the picture, in 0..1.
+        truth: [..., h, w, c], what it should be, in 0..1.
 
     Raises:
         ValueError: the shapes differ.

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.panels import palette
-from voronerf.export.files import check_export, write_geometry
-from voronerf.export.space import box_of
+from voronerf.export.space import box_of, check_export, write_geometry
 from voronerf.run import Run
 
 SUFFIXES = (".glb",)

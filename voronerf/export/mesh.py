@@ -16,8 +16,18 @@ import torch
 from torch import Tensor
 
 from voronerf.checks import available_memory
-from voronerf.export.files import check_export, write_geometry
-from voronerf.export.space import Nodes, Track, ask, box_of, density_at, hidden_and_seen, in_silence, training_views
+from voronerf.export.space import (
+    Nodes,
+    Track,
+    ask,
+    box_of,
+    check_export,
+    density_at,
+    hidden_and_seen,
+    in_silence,
+    training_views,
+    write_geometry,
+)
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
 

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from voronerf.export.files import check_export, write_geometry
-from voronerf.export.space import VIEWS, box_of, training_views
+from voronerf.export.space import VIEWS, box_of, check_export, training_views, write_geometry
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
 

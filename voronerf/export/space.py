@@ -1,17 +1,20 @@
-"""What a trained field has in space: where it may be asked, its densities on a grid, and what its cameras see.
+"""What exports share: their files, the densities of a field on a grid, and what its cameras see.
 
 n points, c cameras. Positions and densities are in scene units.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from voronerf.files import write_bytes
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.contraction import Contraction
 from voronerf.run import Run
@@ -19,12 +22,38 @@ from voronerf.training.config import ConfigError
 
 #: What shows progress: it is given the parts of a work and its name, and yields the parts, as `rich.progress.track`.
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
+#: Packages of the extra `export`: the name that is imported, and the name that is installed.
+PACKAGES = {"trimesh": "trimesh", "skimage": "scikit-image", "scipy": "scipy"}
 #: Points that a field is asked for at a time.
 CHUNK = 1 << 17
 #: Views that are rendered to find out what cameras see, and the pixels along their longer side.
 VIEWS, VIEW_SIDE = 64, 128
 #: Opacity from which a pixel shows a surface.
 SOLID = 0.5
+
+
+def check_export(path: Path, suffixes: tuple[str, ...]) -> None:
+    """Finds out before the work is done whether a file can be written; makes its folder.
+
+    Raises:
+        ValueError: a suffix that is none of ``suffixes``.
+        ImportError: a package of the extra is missing.
+        OSError: the folder cannot be made.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: the file must end in {' or '.join(suffixes)}")
+    for module, package in PACKAGES.items():
+        try:
+            importlib.import_module(module)
+        except ImportError:
+            raise ImportError(f"an export needs {package}: pip install 'voronerf[export]'") from None
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
+    """Writes a mesh, points or a scene of trimesh in the format of the suffix, whole or not at all."""
+    data = geometry.export(file_type=path.suffix[1:].lower(), **options)
+    write_bytes(path, data.encode() if isinstance(data, str) else data)
 
 
 def box_of(run: Run, box: Tensor | None = None) -> Tensor:

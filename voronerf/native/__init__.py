@@ -15,6 +15,7 @@ import ctypes
 import functools
 import os
 import sys
+import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -127,6 +128,28 @@ def cpu() -> compiled.Cpu:
 def machine(tensor: Tensor) -> compiled.Cpu | compiled.Cuda:
     """Where the compiled function for a tensor runs."""
     return compiled.Cuda(*stream(tensor)) if on_cuda(tensor) else cpu()
+
+
+def refuse_where_deterministic(op: str, tensor: Tensor) -> None:
+    """Says that atomic operations on CUDA add up the gradient of a table in any order, if deterministic algorithms are
+    asked for (``torch.use_deterministic_algorithms``).
+
+    Args:
+        op: Name of the op, for the message.
+        tensor: Of the op; on the CPU nothing is refused.
+
+    Raises:
+        RuntimeError: Deterministic algorithms are asked for, and not only with a warning.
+    """
+    if not (on_cuda(tensor) and torch.are_deterministic_algorithms_enabled()):
+        return
+    said = (
+        f"{op}: the gradient of a hash grid's table has no deterministic CUDA kernel, got "
+        "torch.use_deterministic_algorithms(True); use backend='reference' or warn_only=True"
+    )
+    if not torch.is_deterministic_algorithms_warn_only_enabled():
+        raise RuntimeError(said)
+    warnings.warn(said, stacklevel=2)
 
 
 @functools.lru_cache(maxsize=64)

@@ -151,7 +151,7 @@ class PerCell(torch.Tensor):
             stacked.shape[1:],
             dtype=stacked.dtype,
             device=stacked.device,
-            requires_grad=stacked.requires_grad and stacked.is_floating_point(),
+            requires_grad=stacked.requires_grad,
         )
         wrapper.stacked, wrapper.origin = stacked, origin or (stacked, 0)
         return wrapper

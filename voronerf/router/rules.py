@@ -64,15 +64,25 @@ def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None =
     m = run.entries(input) * (flat.shape[0] // input.shape[0])
     together = isinstance(weight, PerCell) and (bias is None or isinstance(bias, PerCell))
     if isinstance(weight, PerCell):
-        stacked = bias.stacked if isinstance(bias, PerCell) else None
-        offsets, backend = run.grouping.scaled_offsets(m), run.grouping.backend
-        y = grouped_linear(flat, offsets, weight.stacked, stacked, backend=backend)
+        y = _product(run, flat, m, weight.stacked, bias.stacked if isinstance(bias, PerCell) else None)
     else:
         y = F.linear(flat, weight)
     if bias is not None and not together:
         y = y + (run.rows_of(bias, m) if isinstance(bias, PerCell) else bias)
     # Not a view of rows that are these already: what is written into a view takes the gradient along a slow way.
     return y if input.dim() == 2 else y.reshape(*input.shape[:-1], weight.shape[0])
+
+
+def _product(run: GroupedRun, x: Tensor, m: int, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """Rows [n * m, i] with weights [k, o, i] and biases [k, o]; complex ones as real ones of twice the features."""
+    offsets, backend = run.grouping.scaled_offsets(m), run.grouping.backend
+    if not weight.is_complex():
+        return grouped_linear(x, offsets, weight, bias, backend=backend)
+    real, imaginary = weight.real, weight.imag
+    weight = torch.cat([torch.cat([real, -imaginary], 2), torch.cat([imaginary, real], 2)], 1)
+    bias = None if bias is None else torch.cat([bias.real, bias.imag], 1)
+    y = grouped_linear(torch.cat([x.real, x.imag], 1), offsets, weight, bias, backend=backend)
+    return torch.complex(*y.chunk(2, 1))
 
 
 @rule(torch.matmul, torch.Tensor.matmul, torch.mm, torch.Tensor.mm, torch.Tensor.__matmul__)
@@ -139,10 +149,22 @@ def expand(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
     if not isinstance(source, PerCell) or len(sizes) <= 1 or sizes[0] != run.n:
         return NotImplemented
     added = len(sizes) - source.dim()
-    if added not in (0, 1) or (added == 0 and source.shape[0] != 1):
+    if added < 0 or (added == 0 and source.shape[0] != 1):
         return NotImplemented
-    inner = source.shape if added else source.shape[1:]
+    inner = (*[1] * (added - 1), *source.shape) if added else source.shape[1:]
     return run.rows_of(PerCell(source.stacked.reshape(-1, *inner))).expand(run.n, *sizes[1:])
+
+
+@rule(torch.Tensor.expand_as)
+def expand_as(run: GroupedRun, source: Tensor, other: Tensor) -> Any:
+    """A parameter repeated as rows are, ``p.expand_as(x)``."""
+    return expand(run, source, *other.shape) if run.is_rows(other) else NotImplemented
+
+
+@rule(torch.Tensor.data.__get__)  # type: ignore[attr-defined]
+def data(run: GroupedRun, source: Tensor) -> Any:
+    """The values of a parameter without its gradient."""
+    return PerCell(source.stacked.detach()) if isinstance(source, PerCell) else NotImplemented
 
 
 @rule(torch.Tensor.repeat, torch.tile, torch.Tensor.tile)
@@ -274,28 +296,31 @@ def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
 
 @rule(F.grid_sample)
 def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) -> Any:
-    """A plane [1, c, h, w] or volume [1, c, d, h, w] at rows [1, ..., 2] or [1, ..., 3].
+    """Planes [p, c, h, w] or volumes [p, c, d, h, w] at rows [p, ..., 2] or [p, ..., 3], p of them for each cell.
 
     Cells of many samples come one after the other. Those of few have one look-up together, which reads and writes the
     corners alone.
     """
     places = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
-    if not isinstance(input, PerCell) or not run.is_rows(grid) or len(places) != 1 or grid.shape[0] != 1:
+    if not isinstance(input, PerCell) or not run.is_rows(grid) or len(places) != 1 or len(grid) != len(input):
         return NotImplemented
     plain = options["mode"] == "bilinear" and options["padding_mode"] in ("zeros", "border") and input.dim() == 4
-    few = grid[0, ..., 0].numel() * input.shape[1] <= _FEW * run.grouping.k
+    few = grid[..., 0].numel() * input.shape[1] <= _FEW * run.grouping.k
     if plain and few and input.origin[0].numel() < 1 << 31:
         cells = run.grouping.sorted_cells.reshape(-1, *[1] * (2 - places[0])).expand(grid.shape[1:3])
-        return _bilinear(run, input, grid[0], cells, options["padding_mode"] == "zeros", bool(options["align_corners"]))
+        zeros, corners = options["padding_mode"] == "zeros", bool(options["align_corners"])
+        return torch.cat([_bilinear(run, input, i, grid[i], cells, zeros, corners) for i in range(len(input))])
     occupied, planes = run.grouping.occupied, cells_of(input.stacked)
     points = grid.split([last - first for _, first, last in occupied], places[0])
     found = [F.grid_sample(planes[cell], own, **options) for (cell, _, _), own in zip(occupied, points, strict=True)]
     return torch.cat(found, places[0] + 1) if len(found) > 1 else found[0]
 
 
-def _bilinear(run: GroupedRun, plane: PerCell, grid: Tensor, cells: Tensor, zeros: bool, align_corners: bool) -> Tensor:
-    """Planes [1, c, h, w] of ``cells``, [a, b], at points [a, b, 2] -> [1, c, a, b], as ``F.grid_sample`` has it."""
-    c, h, w = plane.shape[1:]
+def _bilinear(
+    run: GroupedRun, planes: PerCell, i: int, grid: Tensor, cells: Tensor, zeros: bool, align_corners: bool
+) -> Tensor:
+    """Planes i of [p, c, h, w] of ``cells``, [a, b], at points [a, b, 2] -> [1, c, a, b], as ``F.grid_sample``."""
+    p, c, h, w = planes.shape
     size = grid.new_tensor([w, h]).view(2, 1, 1)
     x = grid.movedim(-1, 0).contiguous() + 1  # [2, a, b]
     x = x * (0.5 * (size - 1)) if align_corners else (x * size - 1) * 0.5
@@ -307,7 +332,8 @@ def _bilinear(run: GroupedRun, plane: PerCell, grid: Tensor, cells: Tensor, zero
     corner, share = corner.where(inside, 0).int(), torch.stack([1 - high, high]) * inside  # [2, 2, a, b]
     along = 1 if w == 1 and align_corners else 2  # corners of a line, which lies at 0 across
     index = (corner[:, None, 1] * w + corner[:along, 0]).flatten(0, 1)[:, None]
-    first = (cells.int() * c + torch.arange(c, dtype=torch.int32, device=cells.device).view(-1, 1, 1)) * (h * w)
+    channel = torch.arange(c, dtype=torch.int32, device=cells.device).view(-1, 1, 1)
+    first = ((cells.int() * p + i) * c + channel) * (h * w)
     index = index + first  # [2 or 4, c, a, b], of values of all planes
-    found = _found(run, plane, 1, index.reshape(-1)).reshape(index.shape)
+    found = _found(run, planes, 1, index.reshape(-1)).reshape(index.shape)
     return (found * (share[:, None, 1] * share[:along, 0]).flatten(0, 1)[:, None]).sum(0)[None]

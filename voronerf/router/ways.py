@@ -312,7 +312,8 @@ class Trial:
         """Results, and gradients of a weighted sum of them."""
         results, generator, total = self.run(way), torch.Generator().manual_seed(7), []
         for tensor in results.tensors:
-            if tensor.requires_grad and tensor.is_floating_point():
+            if tensor.requires_grad:
+                tensor = torch.view_as_real(tensor) if tensor.is_complex() else tensor
                 weights = torch.randn(tensor.shape, generator=generator).to(tensor)
                 total.append((tensor * weights).sum().float())
         if not total or not torch.is_grad_enabled():
@@ -390,10 +391,10 @@ def _made_different(parameter: Tensor, generator: torch.Generator) -> nn.Paramet
     """Entries for the cells of a trial, [3, ...], each some way off the router's own."""
     with torch.inference_mode(False):
         values = parameter.detach()[torch.arange(_CELLS, device=parameter.device) % parameter.shape[0]].clone()
-        if values.is_floating_point() and values.numel():
-            size = float(values.float().square().mean().sqrt()) or 0.1
-            noise = torch.randn(values.shape, generator=generator)
-            values += (0.2 * size * noise).to(values)
+        if (values.is_floating_point() or values.is_complex()) and values.numel():
+            numbers = torch.view_as_real(values) if values.is_complex() else values
+            size = float(numbers.float().square().mean().sqrt()) or 0.1
+            numbers += (0.2 * size * torch.randn(numbers.shape, generator=generator)).to(numbers)
         return nn.Parameter(values, requires_grad=parameter.requires_grad)
 
 

@@ -30,10 +30,27 @@ struct HalfProducts {
   }
   static __device__ float load(const Element* from) { return unpack_half<kBfloat16>(*from); }
 
-  // sums += a b^T with a [16 kRowTiles][depth], b [8 tiles][depth]; depth a multiple of 16, tiles of 2.
+  // sums += a b^T with a [16 kRowTiles][depth], b [8 tiles][depth]; depth a multiple of 16, tiles of 2. How many tiles
+  // there are is decided before the loop: a branch for each would keep loads from running ahead of products.
   template <bool kTransposedA, bool kTransposedB, int kRowTiles, int kTiles>
   static __device__ void multiply(MlpSums<kRowTiles, kTiles>& sums, const Element* a, int a_stride, const Element* b,
                                   int b_stride, int depth, int tiles) {
+    if constexpr (kTiles == 8) {
+      if (tiles == 8) {
+        return multiply_tiles<kTransposedA, kTransposedB, 0, 8>(sums, a, a_stride, b, b_stride, depth);
+      }
+      if (tiles == 6) multiply_tiles<kTransposedA, kTransposedB, 4, 2>(sums, a, a_stride, b, b_stride, depth);
+    }
+    if (tiles >= 4) {
+      multiply_tiles<kTransposedA, kTransposedB, 0, 4>(sums, a, a_stride, b, b_stride, depth);
+    } else if (tiles > 0) {
+      multiply_tiles<kTransposedA, kTransposedB, 0, 2>(sums, a, a_stride, b, b_stride, depth);
+    }
+  }
+
+  template <bool kTransposedA, bool kTransposedB, int kFirst, int kCount, int kRowTiles, int kTiles>
+  static __device__ void multiply_tiles(MlpSums<kRowTiles, kTiles>& sums, const Element* a, int a_stride,
+                                        const Element* b, int b_stride, int depth) {
     const int lane = threadIdx.x % 32, low = lane % 8, middle = lane / 8 % 2, high = lane / 16;
     for (int k = 0; k < depth; k += 16) {
       uint32_t left[kRowTiles][4];
@@ -47,20 +64,18 @@ struct HalfProducts {
         }
       }
 #pragma unroll
-      for (int tile = 0; tile < kTiles; tile += 2) {
-        if (tile < tiles) {
-          uint32_t right[4];
-          if constexpr (kTransposedB) {
-            load_matrices<true>(right, b + (k + low + 8 * middle) * b_stride + 8 * tile + 8 * high);
-          } else {
-            load_matrices<false>(right, b + (8 * tile + low + 8 * high) * b_stride + k + 8 * middle);
-          }
-          const uint32_t first[2] = {right[0], right[1]}, second[2] = {right[2], right[3]};
+      for (int tile = kFirst; tile < kFirst + kCount; tile += 2) {
+        uint32_t right[4];
+        if constexpr (kTransposedB) {
+          load_matrices<true>(right, b + (k + low + 8 * middle) * b_stride + 8 * tile + 8 * high);
+        } else {
+          load_matrices<false>(right, b + (8 * tile + low + 8 * high) * b_stride + k + 8 * middle);
+        }
+        const uint32_t first[2] = {right[0], right[1]}, second[2] = {right[2], right[3]};
 #pragma unroll
-          for (int r = 0; r < kRowTiles; ++r) {
-            multiply_halves<kBfloat16>(sums[r][tile], left[r], first);
-            multiply_halves<kBfloat16>(sums[r][tile + 1], left[r], second);
-          }
+        for (int r = 0; r < kRowTiles; ++r) {
+          multiply_halves<kBfloat16>(sums[r][tile], left[r], first);
+          multiply_halves<kBfloat16>(sums[r][tile + 1], left[r], second);
         }
       }
     }

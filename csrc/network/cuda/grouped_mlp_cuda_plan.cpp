@@ -14,6 +14,10 @@ constexpr int kWidest = 256;
 // Tasks of a multiprocessor: many, since the last ones leave others idle; backward each has a partial gradient.
 constexpr int kForwardTasks = 32;
 constexpr int kBackwardTasks = 8;
+// Warps of a multiprocessor that hide each other's waiting for shared memory and products; more of them do not pay for
+// weights that pass through, or for fewer rows.
+constexpr int kEnoughWarps = 8;
+constexpr int kBlockReserve = 1024;  // bytes of shared memory that the system takes of each block
 
 int pad(int64_t width) {
   return static_cast<int>(ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth);
@@ -166,31 +170,49 @@ const char* mlp_cuda_plan(const MlpTable& table, MlpPrecision precision, int64_t
   const int size = is_half(precision) ? 2 : 4, skew = 16 / size;
   place_weights(plan, skew);
   plan.packed_bytes = ceil_div<int64_t>(int64_t{plan.packed_weights} * size + int64_t{plan.packed_biases} * 4, 16) * 16;
-  // Many rows amortise the weights, resident weights spare barriers; the first that fits.
+  // Many rows amortise the weights, resident weights spare barriers: the first that fits, unless a
+  // multiprocessor has few warps of it, and twice as many of a later one.
   struct Shape {
     int row_tiles, warps;
     bool resident;
   };
   constexpr Shape kShapes[] = {{2, 4, true}, {2, 4, false}, {2, 2, true},  {2, 2, false}, {2, 1, false},
                                {1, 4, true}, {1, 4, false}, {1, 2, false}, {1, 1, false}};
-  for (const Shape& shape : kShapes) {
+  const auto attempt = [&](const Shape& shape) {
     // Forward values take turns in memory: 32 rows of them fit wherever 16 do, and one kernel less is compiled.
-    if (!backward && shape.row_tiles == 1) continue;
+    if (!backward && shape.row_tiles == 1) return 0;
     plan.row_tiles = shape.row_tiles;
     plan.warps = shape.warps;
     plan.resident = shape.resident;
     plan.region = place_values(plan, 16 * shape.row_tiles, skew);
     plan.slot = shape.resident ? plan.packed_weights : slot_of(plan, skew);
     const int64_t bytes = (int64_t{plan.region} * shape.warps + plan.slot) * size;
-    if (bytes > device.shared_bytes) continue;
+    if (bytes > device.shared_bytes) return 0;
     plan.shared_bytes = static_cast<int>(bytes);
-    const int64_t wanted =
-        std::max<int64_t>(1, int64_t{backward ? kBackwardTasks : kForwardTasks} * device.multiprocessors);
-    plan.task_rows = ceil_div(std::max<int64_t>(1, ceil_div(n, wanted)), int64_t{plan.rows()}) * plan.rows();
-    plan.tasks = n / plan.task_rows + k;  // every cell's last task may be short
-    return nullptr;
+    return mlp_cuda_warps(plan, device);
+  };
+  const Shape* chosen = nullptr;
+  int most = 0;
+  for (const Shape& each : kShapes) {
+    const int warps = attempt(each);
+    if (warps < (chosen == nullptr ? 1 : 2 * most)) continue;
+    most = warps;
+    chosen = &each;
+    if (warps >= kEnoughWarps) break;
   }
-  return "the values of a warp's rows must fit the shared memory of a block";
+  if (chosen == nullptr) return "the values of a warp's rows must fit the shared memory of a block";
+  attempt(*chosen);
+  const int64_t wanted =
+      std::max<int64_t>(1, int64_t{backward ? kBackwardTasks : kForwardTasks} * device.multiprocessors);
+  plan.task_rows = ceil_div(std::max<int64_t>(1, ceil_div(n, wanted)), int64_t{plan.rows()}) * plan.rows();
+  plan.tasks = n / plan.task_rows + k;  // every cell's last task may be short
+  return nullptr;
+}
+
+int mlp_cuda_warps(const MlpCudaPlan& plan, const MlpCudaDevice& device) {
+  const int by_memory = (device.shared_bytes + kBlockReserve) / (plan.shared_bytes + kBlockReserve);
+  // What __launch_bounds__ of the kernels says: registers for as many blocks of four warps.
+  return std::min(by_memory * plan.warps, plan.backward ? 8 : 12) / plan.warps * plan.warps;
 }
 
 MlpCudaWorkspace mlp_cuda_workspace(const MlpCudaPlan& plan, int64_t k, bool parameters) {

@@ -84,6 +84,9 @@ const char* mlp_cuda_read_table(const MlpTable& table, MlpCudaPlan& plan);
 const char* mlp_cuda_plan(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
                           const MlpCudaDevice& device, MlpCudaPlan& plan);
 
+// Warps that a multiprocessor has at a time, of a plan with its shape.
+int mlp_cuda_warps(const MlpCudaPlan& plan, const MlpCudaDevice& device);
+
 // Bytes of workspace of a call, and where its parts begin: packed cells, first task of every cell [k+1], partials.
 struct MlpCudaWorkspace {
   int64_t packed, first_task, partials, bytes;

@@ -48,7 +48,7 @@ def city_scene(
         size: of the square images, pixels.
         blocks: on each side, 1 to 32.
         train_views: of each block, every other one from its streets and the rest from above.
-        test_views: likewise, apart from the training views.
+        test_views: of each block, at other places than the training views.
         images: "memory"; "cached", which also keeps them in a store of the cache, where a next call finds them; or
             "disk", which maps them from there.
 

@@ -7,14 +7,9 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_number, check_same_device, check_shape
 
-_OP = backends.declare(
-    "draw_cell",
-    native=Implementation(EVERYWHERE, (torch.float32,)),
-    warp=Implementation(EVERYWHERE, (torch.float32,)),
-)
+_OP = backends.declare("draw_cell")
 
 
 def draw_cell(
@@ -36,13 +31,9 @@ def draw_cell(
         exp(-d_i / temperature),    d_i = |x - c_i|,    with power weights d_i = sqrt(|x - c_i|^2 + max_j w_j - w_i),
 
     by the inverse of the cumulative distribution: the first centre up to which the probabilities sum to at least 1 - u,
-    where u is the uniform number of the point for that level. Equal numbers give equal leaves on all backends, except
-    where 1 - u lies within rounding of such a sum. The arithmetic is float64 if points, centres or weights are, else
-    float32; "native" and "warp" support float32 only. A centre that is less likely than the nearest by a factor of e^20
-    may never be drawn. A point that is not finite, or whose squared distances overflow, goes to the first centre on
+    where u is the uniform number of the point for that level. The arithmetic is float64 if points, centres or weights
+    are, else float32. A point that is not finite, or whose squared distances overflow, goes to the first centre on
     every level. Not differentiable.
-
-    Tables that are not a tree are treated as in `locate_cell`.
 
     Args:
         points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are taken as float32.
@@ -53,14 +44,14 @@ def draw_cell(
         temperature: above 0, finite, in scene units.
         depth: levels of the tree, 1 for a flat diagram.
         weights: [m] floating point or None: power diagrams (squared scene units), finite.
-        backend: "auto", "reference", "native" or "warp".
+        backend: "auto" or "reference".
 
     Returns:
         leaf int32 [n].
 
     Raises:
-        ValueError: shapes, devices, temperature, depth or an unknown backend; with "native" on the CPU also tables that
-            are not a tree.
+        ValueError: shapes, devices, temperature, depth or an unknown backend; on the CPU also tables that are not a
+            tree.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 
@@ -112,7 +103,22 @@ def draw_cell(
         weights = weights.detach().to(dtype)
     points, centres, uniforms = (tensor.detach().to(dtype) for tensor in (points, centres, uniforms))
     run = backends.resolve(_OP, backend=backend, device=points.device, dtype=dtype)
+    host = points.device.type == "cpu" and not torch.compiler.is_compiling()
+    if host:
+        _check_tree(child_offsets, child)
     leaf: Tensor = run(
         points, centres, child_offsets, child, uniforms, temperature=float(temperature), depth=depth, weights=weights
     )
+    if host and bool((leaf < 0).any()):
+        raise ValueError(f"{_OP}: depth must be the number of levels of the tree, got {depth}, which is too few")
     return leaf
+
+
+def _check_tree(child_offsets: Tensor, child: Tensor) -> None:
+    if int(child_offsets[0]) != 0 or int(child_offsets[-1]) != len(child):
+        ends = child_offsets[[0, -1]].tolist()
+        raise ValueError(f"{_OP}: child_offsets must go from 0 to the number of centres, got {ends}")
+    if bool((child_offsets.diff() < 1).any()):
+        raise ValueError(f"{_OP}: child_offsets must increase, got a diagram without centres")
+    if bool((child >= len(child_offsets) - 1).any()):
+        raise ValueError(f"{_OP}: child must name a diagram, got {int(child.max())}")

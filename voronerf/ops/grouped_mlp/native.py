@@ -234,6 +234,8 @@ def backward(
         features=results[-1] if wanted[3] else None,
     )
     if isinstance(machine, compiled.Cuda):
+        if wanted[3]:
+            native.refuse_where_deterministic("grouped_mlp", positions)
         rest = _on_cuda(table, given, inputs, machine, backward=True, parameters=wanted[0])
         compiled.grouped_mlp_backward(given, inputs, gradients, *rest, machine)
     else:

@@ -51,6 +51,8 @@ def _backward(
     of_table = positions.new_empty(table.shape if to_table else 0)
     yield [of_positions, of_table]
     on_huge_pages(of_table)
+    if to_table:
+        native.refuse_where_deterministic("hash_encode", positions)
     native.compiled.hash_encode_backward(
         _inputs(positions, table, direction, cells),
         compiled_grid(grid),

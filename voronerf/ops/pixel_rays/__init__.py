@@ -109,6 +109,8 @@ def pixel_rays(
     check_number(_OP, "far", far)
     if not 0 <= near < far:
         raise ValueError(f"{_OP}: near and far must satisfy 0 <= near < far, got {near} and {far}")
+    if torch.finfo(torch.float32).max < far < float("inf"):
+        raise ValueError(f"{_OP}: far must be at most 3.4e+38 or infinite, got {far}")
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
     found = run(
         poses.detach(),

@@ -6,13 +6,9 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_shape
 
-_OP = backends.declare(
-    "select_heaviest",
-    warp=Implementation(EVERYWHERE, (torch.float32,)),
-)
+_OP = backends.declare("select_heaviest")
 
 
 def select_heaviest(points: Tensor, importance: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
@@ -25,7 +21,7 @@ def select_heaviest(points: Tensor, importance: Tensor, count: int, *, backend: 
         points: float32 [n, 3].
         importance: float32 [n].
         count: at least 1.
-        backend: "auto", "reference" or "warp".
+        backend: "auto" or "reference".
 
     Returns:
         (points float32 [q, 3], importance float32 [q]) with q = min(count, n); the last rows are 0 if fewer samples

@@ -1,0 +1,163 @@
+"""Networks at full size, each way through them against the others and, on some rows, against the reference.
+
+The small cases are one tile of rows a task on a device with 132 multiprocessors. Here a task walks over many tiles, the
+last of them short, rings of copies wrap, partial gradients are added up over tiles, and batches are cut into slabs.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from gpu_cases import has_wgmma
+
+N = 1 << 22
+"""Samples, at which every loop of the kernels is walked several times."""
+SUBSET = 1 << 12
+"""Rows of each cell, at most, that the reference computes in float64."""
+ALLOWED = {"float32": 2e-4, "bfloat16": 4e-2, "float16": 2e-2}
+"""Norm of a difference in norms of what is right; between two ways, which round alike, twice that."""
+
+
+def large_cases(device: str, n: int = N) -> list[tuple[str, Callable[[], str]]]:
+    """Names and checks, which raise, or say how far the ways are apart."""
+    cases = []
+    for name in ("w64d4", "nerf64", "hash32"):
+        for precision in ALLOWED:
+            # Chained networks look up no hash grid, and take 16 bits.
+            chained = precision != "float32" and name != "hash32"
+            ways = ("tiles", "layers", *(("chain", *["wgmma"] * has_wgmma(device)) if chained else ()))
+            ways = ("tiles",) if name == "hash32" else ways
+            run = functools.partial(compare, device, name, precision, ways, n)
+            cases.append((f"{name} {precision} by {', '.join(ways)}", run))
+    return cases
+
+
+def compare(device: str, name: str, precision: str, ways: tuple[str, ...], n: int) -> str:
+    """Outputs and gradients of all ways, of which chained ones have no gradients of their own."""
+    import torch
+
+    from voronerf.ops.grouped_mlp.native import using_way
+
+    given = batch(device, name, precision, n)
+    found = {}
+    for way in ways:
+        with using_way(way):
+            found[way] = evaluate(given, gradients=way in ("tiles", "layers"))
+    exact, rows = in_float64(given)
+    apart: dict[str, float] = {}
+    for way, parts in found.items():
+        assert all(bool(part.isfinite().all()) for part in parts), f"{way}: not finite"
+        apart[way] = distance(parts[0][rows], exact)
+        assert apart[way] <= ALLOWED[precision], f"{way}: outputs are {apart[way]:.1e} from float64"
+        first = found[ways[0]]
+        for number, (one, other) in enumerate(zip(parts, first)):
+            between = distance(one, other)
+            assert between <= 2 * ALLOWED[precision], f"{way}: part {number} is {between:.1e} from {ways[0]}"
+    if device == "cuda":
+        torch.cuda.empty_cache()
+    return ", ".join(f"{way} {value:.1e}" for way, value in apart.items())
+
+
+def distance(one: Any, other: Any) -> float:
+    """Norm of the difference, in norms of the second."""
+    one, other = one.double(), other.double()
+    return float((one - other).norm() / other.norm().clamp_min(1e-30))
+
+
+def batch(device: str, name: str, precision: str, n: int) -> dict[str, Any]:
+    """Samples of nine cells: the first has half of them, one has none and one a single sample."""
+    import torch
+    from ops.networks import NETS
+
+    import voronerf
+    from voronerf.layers import MLP, POSITIONS, Layer
+
+    generator = torch.Generator().manual_seed(0)
+    layers = NETS.get(name)
+    if layers is None:
+        rest = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 32, "relu"), Layer((1,), 4)), (2,))
+        grid = voronerf.HashGrid(levels=8, features=2, log2_entries=15, finest=512)
+        layers = replace(rest, position_encoding="hash", grid=grid)
+    share = (n - n // 2 - 1) // 6
+    counts = [n // 2, 0, *[share] * 5, 1, n - n // 2 - 1 - 5 * share]
+    k, kind = len(counts), getattr(torch, precision)
+
+    def drawn(*shape: int) -> Any:
+        return torch.randn(*shape, generator=generator)
+
+    leaves = [(drawn(k, o, i) / i**0.5).to(device, kind).requires_grad_() for o, i in layers.weight_shapes(3)]
+    table = drawn(*layers.grid.table_shape).to(device).requires_grad_() if layers.grid is not None else None
+    rays = max(1, n // 64)
+    return {
+        "positions": torch.rand(n, 3, generator=generator).to(device),
+        "offsets": torch.tensor([0, *counts], dtype=torch.int32).cumsum(0).int().to(device),
+        "counts": counts,
+        "weights": leaves,
+        "layers": layers,
+        "features": table,
+        "directions": torch.nn.functional.normalize(drawn(rays, 3), dim=1).to(device)
+        if layers.uses_directions
+        else None,
+        "index": (torch.arange(n, dtype=torch.int32) // 64).clamp(max=rays - 1).to(device),
+        "gradient": drawn(n, layers.out_features).to(device),
+    }
+
+
+def call(given: dict[str, Any], positions: Any, offsets: Any, index: Any, weights: Any, **rest: Any) -> Any:
+    """The network on some of the rows."""
+    import voronerf
+
+    directed = given["directions"] is not None
+    return voronerf.grouped_mlp(
+        positions,
+        offsets,
+        weights,
+        [None] * len(weights),
+        layers=given["layers"],
+        directions=rest.pop("directions", given["directions"]),
+        direction_index=index if directed else None,
+        **rest,
+    )
+
+
+def evaluate(given: dict[str, Any], *, gradients: bool) -> list[Any]:
+    """Outputs, and gradients of all parameters."""
+    import torch
+
+    weights, table = given["weights"], given["features"]
+    arguments = given["positions"], given["offsets"], given["index"], weights
+    with torch.set_grad_enabled(gradients):
+        out = call(given, *arguments, features=table, backend="native")
+    if not gradients:
+        return [out]
+    leaves = [*weights, *([] if table is None else [table])]
+    return [out.detach(), *torch.autograd.grad(out, leaves, given["gradient"].to(out.dtype))]
+
+
+def in_float64(given: dict[str, Any]) -> tuple[Any, Any]:
+    """Outputs of the last rows of every cell by the reference, and which rows these are."""
+    import torch
+
+    rows, counts, begin = [], [], 0
+    for count in given["counts"]:
+        counts.append(min(count, SUBSET))
+        rows.append(torch.arange(begin + count - counts[-1], begin + count))
+        begin += count
+    chosen = torch.cat(rows).to(given["positions"].device)
+    offsets = torch.tensor([0, *counts], dtype=torch.int32).cumsum(0).int().to(chosen.device)
+    table, directions = given["features"], given["directions"]
+    with torch.no_grad():
+        exact = call(
+            given,
+            given["positions"][chosen].double(),
+            offsets,
+            given["index"][chosen],
+            [weight.double() for weight in given["weights"]],
+            features=None if table is None else table.double(),
+            directions=None if directions is None else directions.double(),
+            backend="reference",
+        )
+    return exact, chosen

@@ -1,0 +1,165 @@
+"""Steps of real fields that meet parameters in one run for all cells, against a loop over masks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from convention_harness import uniform
+from router_fields import masked_loop, perturb
+from torch import Tensor, nn
+
+from voronerf import VoronoiRouter
+
+
+class FiLM(nn.Module):
+    """pi-GAN: frequencies and shifts of a layer that a network makes of a code, here a parameter."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.code, self.mapping = nn.Parameter(torch.randn(1, 4)), nn.Linear(4, 16)
+        self.layers, self.out = nn.ModuleList([nn.Linear(3, 8), nn.Linear(8, 8)]), nn.Linear(8, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        freq, phase = self.mapping(self.code).chunk(2, -1)
+        for layer in self.layers:
+            x = layer(x)
+            x = torch.sin((1 + freq).expand_as(x) * x + phase.expand_as(x))
+        return self.out(x)
+
+
+class WideFiLM(FiLM):
+    """The same with a dimension in the middle, as pi-GAN has it."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        freq, phase = self.mapping(self.code).chunk(2, -1)
+        x = x[:, None]
+        for layer in self.layers:
+            x = layer(x)
+            x = torch.sin(freq[0].expand_as(x) * x + phase.unsqueeze(1).expand_as(x))
+        return self.out(x)[:, 0]
+
+
+class Normed(nn.Module):
+    """stable-dreamfusion: LayerNorm between layers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(3, 8), nn.LayerNorm(8), nn.SiLU(), nn.Linear(8, 2))
+        self.rms = nn.RMSNorm(2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.rms(self.net(x))
+
+
+class TensorVM(nn.Module):
+    """nerfstudio's TensoRF: three planes and three lines stacked in one parameter each."""
+
+    def __init__(self, padding: str = "zeros") -> None:
+        super().__init__()
+        self.plane_coef = nn.Parameter(0.3 * torch.randn(3, 4, 9, 7))
+        self.line_coef = nn.Parameter(0.3 * torch.randn(3, 4, 8, 1))
+        self.basis, self.padding = nn.Linear(12, 2, bias=False), padding
+
+    def forward(self, x: Tensor) -> Tensor:
+        plane = torch.stack([x[..., [0, 1]], x[..., [0, 2]], x[..., [1, 2]]])
+        line = torch.stack([x[..., 2], x[..., 1], x[..., 0]])
+        line = torch.stack([torch.zeros_like(line), line], dim=-1)
+        options: Any = {"align_corners": True, "padding_mode": self.padding}
+        planes = F.grid_sample(self.plane_coef, plane.view(3, -1, 1, 2), **options)
+        lines = F.grid_sample(self.line_coef, line.view(3, -1, 1, 2), **options)
+        return self.basis((planes * lines).view(12, *x.shape[:-1]).moveaxis(0, -1))
+
+
+class BARF(nn.Module):
+    """Coarse to fine: a weight of each frequency, from a parameter that is read through ``.data``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.progress, self.net = nn.Parameter(torch.tensor(0.4)), nn.Linear(3 + 24, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        spectrum = x[..., None] * 2.0 ** torch.arange(4) * math.pi
+        encoded = torch.stack([spectrum.sin(), spectrum.cos()], dim=-2).view(*x.shape[:-1], -1)
+        alpha = (self.progress.data - 0.1) / 0.4 * 4
+        weight = (1 - (alpha - torch.arange(4, dtype=torch.float32)).clamp_(min=0, max=1).mul_(math.pi).cos_()) / 2
+        shape = encoded.shape
+        encoded = (encoded.view(-1, 4) * weight).tile(int(encoded.numel() / encoded.view(-1, 4).numel())).view(shape)
+        return self.net(torch.cat([x, encoded], dim=-1))
+
+
+class Gabor(nn.Module):
+    """WIRE: complex layers behind a real one."""
+
+    def __init__(self, bias: bool = True) -> None:
+        super().__init__()
+        self.first, self.omega = nn.Linear(3, 8), nn.Parameter(torch.tensor([3.0]))
+        self.scale = nn.Parameter(torch.tensor([1.0]))
+        self.layers = nn.ModuleList(nn.Linear(8, 8, bias=bias, dtype=torch.cfloat) for _ in range(2))
+        self.out = nn.Linear(8, 2, dtype=torch.cfloat)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.first(x)
+        x = torch.exp(1j * self.omega * x - (self.scale * x).abs().square())
+        for layer in self.layers:
+            x = layer(x)
+            x = torch.exp(1j * x - x.abs().square())
+        return self.out(x).real
+
+
+class Spectrum(Gabor):
+    """The same with complex results."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.exp(1j * self.layers[0](self.first(x).cfloat())) @ self.out.weight.T
+
+
+MODULES: dict[str, Callable[[], nn.Module]] = {
+    "FiLM": FiLM,
+    "FiLM in the middle": WideFiLM,
+    "LayerNorm": Normed,
+    "stacked planes": TensorVM,
+    "stacked planes, border": lambda: TensorVM("border"),
+    "stacked planes, reflection": lambda: TensorVM("reflection"),
+    "data of a parameter": BARF,
+    "complex layers": Gabor,
+    "complex layers without bias": lambda: Gabor(bias=False),
+    "complex results": Spectrum,
+}
+
+
+def real(tensor: Tensor) -> Tensor:
+    return torch.view_as_real(tensor) if tensor.is_complex() else tensor
+
+
+@pytest.mark.parametrize("n", [60, 9, 6000])  # look-ups of few samples have a way of their own
+@pytest.mark.parametrize("name", MODULES)
+def test_results_and_gradients_are_those_of_the_loop(name: str, n: int) -> None:
+    generator = torch.Generator().manual_seed(3)
+    centres = torch.rand(5, 3, generator=generator) * 2 - 1
+    torch.manual_seed(0)
+    router = perturb(VoronoiRouter(MODULES[name](), centres, coords="first3", way="grouped"), generator)
+    x = (uniform((n,)) * 1.1).requires_grad_()
+    (expected,), modules = masked_loop(router, router.diagram.locate(x), [x])
+    found = router(x)
+    assert router.explain() == "forward: grouped"
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+    weights = torch.randn(real(found).shape, generator=generator)
+    ours = torch.autograd.grad((real(found) * weights).sum(), x, create_graph=True)[0]
+    theirs = torch.autograd.grad((real(expected) * weights).sum(), x, create_graph=True)[0]
+    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
+
+    (ours.square().sum() + (real(found) * weights).sum()).backward()
+    (theirs.square().sum() + (real(expected) * weights).sum()).backward()
+    for path, parameter in router.module.named_parameters():
+        own = [module.get_parameter(path) for module in modules]
+        gradient = torch.stack([torch.zeros_like(p) if p.grad is None else p.grad for p in own])
+        if parameter.grad is None:
+            assert not gradient.any(), path
+        else:
+            torch.testing.assert_close(parameter.grad, gradient, rtol=2e-3, atol=2e-3 * float(gradient.abs().max()))

@@ -1,0 +1,21 @@
+"""The case of ``centre_grid``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.ops.cases import Arguments, Case, Draw
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    centres = draw.points(n + 1, draw.dtype(torch.float32, torch.float64))
+    weights = draw.uniform(n + 1, dtype=centres.dtype) if draw.among("weighted", False, True) else None
+    return {"centres": centres, "weights": weights}
+
+
+CASE = Case(
+    _make,
+    refused={"centres must have shape [k, 3], got [2]": {"centres": torch.zeros(2)}},
+    compiles=False,
+    comparable=False,
+)

@@ -1,0 +1,26 @@
+"""The case of ``composite``."""
+
+from __future__ import annotations
+
+from voronerf.ops.cases import Arguments, Case, Draw
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    dtype, s, c = draw.dtype(), draw.among("s", 5, 0, 1, 7, 16, 33, 64), draw.among("channels", 3, 3, 1, 5)
+    packed = draw.among("packed", False, True)
+    shape = (n * s,) if packed else (n, s)
+    call: Arguments = {name: draw.uniform(*shape, dtype=dtype) for name in ("sigma", "depths", "deltas")}
+    call["rgb"] = draw.uniform(*shape, c, dtype=dtype)
+    if packed:
+        call["ray_offsets"] = draw.offsets(n * s, n)
+    if draw.among("background", True, False):
+        call["background"] = draw.uniform(*draw.among("backgrounds", (c,), (n, c)), dtype=dtype)
+    return call
+
+
+CASE = Case(
+    _make,
+    {"": {}, "packed": {"packed": True}},
+    refused={"background must be a tensor, got str": {"background": "x"}},
+    differentiable=True,
+)

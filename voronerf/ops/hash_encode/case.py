@@ -1,0 +1,41 @@
+"""The case of ``hash_encode``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.grids import HashGrid
+from voronerf.ops.cases import Arguments, Case, Draw
+
+
+def hash_grid(draw: Draw) -> HashGrid:
+    """Some levels, the coarse ones dense and the fine ones hashed."""
+    base = draw.number("base", 3, 2, 9)
+    return HashGrid(
+        levels=draw.number("levels", 3, 1, 5),
+        features=draw.among("features", 2, 1, 4),
+        log2_entries=draw.number("log2_entries", 10, 10, 12),
+        base=base,
+        finest=base + draw.number("finest", 37, 1, 50),
+        interpolation=draw.among("interpolation", "smoothstep", "linear"),
+    )
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    grid, k = hash_grid(draw), draw.among("k", None, 1, 3)
+    table = draw.normal(*grid.table_shape if k is None else (k, *grid.table_shape), dtype=draw.dtype())
+    positions = 3 * draw.uniform(n, 3, dtype=draw.dtype(*(torch.float32, torch.float64))) - 1
+    return {
+        "positions": positions,
+        "table": table,
+        "grid": grid,
+        "cells": None if k is None else draw.integers(0, k, n),
+    }
+
+
+CASE = Case(
+    _make,
+    {"": {}, "of cells": {"k": 2}},
+    refused={"grid must be a HashGrid, got dict": {"grid": {}}},
+    differentiable=True,
+)

@@ -1,0 +1,17 @@
+"""The case of ``observe_occupancy``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.ops.cases import Arguments, Case, Draw
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    density = draw.uniform(*(draw.number("side", side, 1, 9) for side in (2, 3, 4))).contiguous()
+    call: Arguments = {"density": density, "occupied": density >= 0.4, "threshold": 0.4, "decay": 0.9, "hidden": 1e-3}
+    call |= {name: draw.uniform(n) for name in ("sigma", "deltas", "weights")}
+    return {**call, "box": torch.tensor([[-1.0] * 3, [1.0] * 3]), "positions": draw.normal(n, 3)}
+
+
+CASE = Case(_make, in_place=True)

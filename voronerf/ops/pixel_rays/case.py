@@ -1,0 +1,25 @@
+"""The case of ``pixel_rays``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.ops.camera_rays.case import cameras
+from voronerf.ops.cases import Arguments, Case, Draw
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    c, h, w = draw.number("cameras", 3, 1, 4), draw.number("height", 5, 1, 9), draw.number("width", 7, 1, 9)
+    images = draw.integers(0, 256, c, h, w, draw.among("channels", 4, 3), dtype=torch.uint8)
+    call: Arguments = {**cameras(draw, c), "images": images, "near": 0.2, "far": 3.0, "background": draw.uniform(n, 3)}
+    call["box"] = draw.among("box", torch.tensor([[-1.0] * 3, [1.0] * 3]), None)
+    return {**call, "index": draw.integers(0, c * h * w, n, dtype=torch.int64)}
+
+
+CASE = Case(
+    _make,
+    refused={
+        "far must be a number, got NoneType": {"far": None},
+        "far must be at most 3.4e+38 or infinite, got 1e+39": {"far": 1e39},
+    },
+)

@@ -1,0 +1,32 @@
+"""The case of ``routed_mlp``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops.grouped_mlp.case import GAUSSIANS, network
+from voronerf.ops.locate_cell.case import tree
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    by = draw.among("by", "centres", "tree", "cells", "one cell")
+    if by == "tree":
+        tables, k = tree(draw)
+        return {**network(draw, n, k), **tables}
+    k = 1 if by == "one cell" else draw.among("k", 2, 1, 9)
+    where = {"centres": draw.uniform(k, 3)} if by == "centres" else {"cells": draw.integers(0, k, n)}
+    return {**network(draw, n, k), **({} if by == "one cell" else where)}
+
+
+CASE = Case(
+    _make,
+    {
+        "": {},
+        "nested": {"by": "tree"},
+        "one cell": {"by": "one cell", **GAUSSIANS},
+        "of cells": {"by": "cells"},
+    },
+    refused={"centres must have shape [k, 3] with k = 2, got [1, 3]": {"centres": torch.zeros(1, 3)}},
+    differentiable=True,
+)

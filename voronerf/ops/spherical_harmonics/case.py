@@ -1,0 +1,17 @@
+"""The case of ``spherical_harmonics``."""
+
+from __future__ import annotations
+
+from voronerf.ops.cases import Arguments, Case, Draw
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    return {"directions": draw.unit(n, draw.dtype()), "degree": draw.number("degree", 4, 1, 4)}
+
+
+CASE = Case(
+    _make,
+    {"": {}, "constant": {"degree": 1}},
+    refused={"degree must be an integer, got str": {"degree": "x"}},
+    differentiable=True,
+)
