@@ -167,11 +167,12 @@ VN_FUNCTION(log, logarithm(x), one / x, zero - one / (x * x), splat(2.0f) / (x *
 VN_FUNCTION(power, raised(x, a, 0), raised(x, a - 1.0f, 1), raised(x, a - 2.0f, 2), raised(x, a - 3.0f, 3))
 
 // In the order of FUNCTIONS in voronerf/program.py.
-#define VN_FUNCTIONS(DO)                                                                                      \
-  DO(0, copy)                                                                                                 \
-  DO(1, stop) DO(2, step) DO(3, at_least) DO(4, floor) DO(5, affine) DO(6, relu) DO(7, leaky_relu) DO(8, abs) \
-      DO(9, clamp) DO(10, elu) DO(11, softplus) DO(12, sigmoid) DO(13, tanh) DO(14, silu) DO(15, gelu)        \
-          DO(16, gelu_tanh) DO(17, sine) DO(18, exp) DO(19, log) DO(20, power)
+// clang-format off
+#define VN_FUNCTIONS(DO)                                                                                         \
+  DO(0, copy) DO(1, stop) DO(2, step) DO(3, at_least) DO(4, floor) DO(5, affine) DO(6, relu) DO(7, leaky_relu)   \
+  DO(8, abs) DO(9, clamp) DO(10, elu) DO(11, softplus) DO(12, sigmoid) DO(13, tanh) DO(14, silu) DO(15, gelu)    \
+  DO(16, gelu_tanh) DO(17, sine) DO(18, exp) DO(19, log) DO(20, power)
+// clang-format on
 
 }  // namespace
 }  // namespace VN_ISA_NAMESPACE
