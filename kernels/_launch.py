@@ -20,7 +20,7 @@ def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float3
         tensor = like.new_empty(0, dtype=dtype)
     if tensor.dtype == torch.bool:
         tensor = tensor.view(torch.uint8)
-    return wp.from_torch(tensor.detach())
+    return wp.from_torch(tensor.detach().resolve_neg())  # which torch leaves to ops that take lists
 
 
 def on_stream(tensor: Tensor) -> AbstractContextManager[Any]:

@@ -7,13 +7,15 @@ on its own (``fuse_fp`` off): a sample falls in the same cell.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from voronerf.checks import MAX_COUNT
 from voronerf.kernels._launch import array, launch
-from voronerf.ops.march_rays.reference import March
+from voronerf.ops.march_rays.reference import March, Rays
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -196,154 +198,69 @@ def _march_kernel(
         stop[ray] = samples
 
 
-def march_rays(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    samples: int,
-    *,
-    uniforms: Tensor | None = None,
-    seed: Tensor | None = None,
-    disparity: bool = False,
-    start: Tensor | None = None,
-    most: int | None = None,
-    capacity: int | None = None,
-    contraction: Tensor | None = None,
-) -> March:
+def march_rays(rays: Rays, capacity: int | None) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    rest = (samples, disparity, samples if most is None else most)
-    tensors = (origins, directions, near, far, occupied, box, uniforms, seed, start, contraction)
-    offsets = _count(*tensors, *rest, MAX_COUNT if capacity is None else capacity)
+    *tensors, samples, disparity, most = rays
+    rest = samples, disparity, most
+    offsets = _count(tensors, *rest, MAX_COUNT if capacity is None else capacity)
     rows = int(offsets[-1]) if capacity is None else capacity
-    return March(offsets, *_fill(*tensors, offsets, *rest, rows))
+    return March(offsets, *_fill(tensors, offsets, *rest, rows))
 
 
+# The tensors of the custom ops are those of `Rays`, in its order.
 @torch.library.custom_op("voronerf::march_rays_warp_count", mutates_args=())
-def _count(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    start: Tensor | None,
-    contraction: Tensor | None,
-    samples: int,
-    disparity: bool,
-    most: int,
-    capacity: int,
-) -> Tensor:
+def _count(tensors: Sequence[Tensor | None], samples: int, disparity: bool, most: int, capacity: int) -> Tensor:
+    rays = Rays._make([*tensors, samples, disparity, most])
+    near = rays.near
     offsets = near.new_zeros(near.shape[0] + 1, dtype=torch.int32)
-    counts = offsets[1:]
-    inputs = _inputs(
-        origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
-    )
     none, no_index = array(near[:0], near), array(offsets[:0], near)
-    results = [array(counts, near), no_index, none, none, array(origins[:0], near), no_index]
-    launch(_march_kernel, near.shape[0], [*inputs, True, no_index, *results], near)
+    results = [array(offsets[1:], near), no_index, none, none, array(rays.origins[:0], near), no_index]
+    launch(_march_kernel, near.shape[0], [*_inputs(rays), True, no_index, *results], near)
     # In int64: the number of samples of all rays may not fit int32; the capacity does.
     return offsets.cumsum(dim=0).clamp(max=capacity).to(torch.int32)
 
 
+@_count.register_fake
+def _(tensors: Sequence[Tensor | None], samples: int, disparity: bool, most: int, capacity: int) -> Tensor:
+    near = Rays._make([*tensors, samples, disparity, most]).near
+    return near.new_empty(near.shape[0] + 1, dtype=torch.int32)
+
+
 @torch.library.custom_op("voronerf::march_rays_warp_fill", mutates_args=())
 def _fill(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    start: Tensor | None,
-    contraction: Tensor | None,
-    offsets: Tensor,
-    samples: int,
-    disparity: bool,
-    most: int,
-    rows: int,
+    tensors: Sequence[Tensor | None], offsets: Tensor, samples: int, disparity: bool, most: int, rows: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    ray_index = near.new_zeros(rows, dtype=torch.int32)
-    depths, deltas, positions = near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3)
-    stop = near.new_empty(near.shape[0], dtype=torch.int32)
-    inputs = _inputs(
-        origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
-    )
-    results = [
-        array(offsets[:0], near),
-        *(array(tensor, near) for tensor in (ray_index, depths, deltas, positions, stop)),
-    ]
-    launch(_march_kernel, near.shape[0], [*inputs, False, array(offsets, near), *results], near)
-    return ray_index, depths, deltas, positions, stop
-
-
-def _inputs(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    start: Tensor | None,
-    contraction: Tensor | None,
-    samples: int,
-    disparity: bool,
-    most: int,
-) -> list[object]:
-    """The inputs of both launches, in the order of the kernel."""
-    places = near.new_empty(0, 0) if uniforms is None else uniforms
-    views = [array(tensor, near) for tensor in (origins, directions, near, far, occupied, box, places)]
-    hashed = [array(seed, near, torch.int32), seed is not None]
-    first = [array(start, near, torch.int32), start is not None]
-    # [0, 0] for the world's own, [1, 4] or [5, 3].
-    space = near.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1])
-    return [*views, uniforms is not None, *hashed, *first, array(space, near), samples, disparity, most]
-
-
-@_count.register_fake
-def _(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    start: Tensor | None,
-    contraction: Tensor | None,
-    samples: int,
-    disparity: bool,
-    most: int,
-    capacity: int,
-) -> Tensor:
-    return near.new_empty(near.shape[0] + 1, dtype=torch.int32)
+    rays = Rays._make([*tensors, samples, disparity, most])
+    near, results = rays.near, _new_samples(rays.near, rows)
+    arrays = [array(tensor, near) for tensor in (offsets[:0], *results)]
+    launch(_march_kernel, near.shape[0], [*_inputs(rays), False, array(offsets, near), *arrays], near)
+    return results
 
 
 @_fill.register_fake
 def _(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    start: Tensor | None,
-    contraction: Tensor | None,
-    offsets: Tensor,
-    samples: int,
-    disparity: bool,
-    most: int,
-    rows: int,
+    tensors: Sequence[Tensor | None], offsets: Tensor, samples: int, disparity: bool, most: int, rows: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
-    return index, near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3), stop
+    return _new_samples(Rays._make([*tensors, samples, disparity, most]).near, rows)
+
+
+def _new_samples(near: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Rays, depths, deltas and positions, 0 in rows that belong to no ray; and where the rays stop."""
+    index, stop = near.new_zeros(rows, dtype=torch.int32), near.new_empty(near.shape[0], dtype=torch.int32)
+    return index, near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3), stop
+
+
+def _inputs(rays: Rays) -> list[object]:
+    """The inputs of both launches, in the order of the kernel."""
+    near, contraction = rays.near, rays.contraction
+    places = near.new_empty(0, 0) if rays.uniforms is None else rays.uniforms
+    given = (rays.origins, rays.directions, near, rays.far, rays.occupied, rays.box, places)
+    views = [array(tensor, near) for tensor in given]
+    hashed = [array(rays.seed, near, torch.int32), rays.seed is not None]
+    first = [array(rays.start, near, torch.int32), rays.start is not None]
+    # [0, 0] for the world's own, [1, 4] or [5, 3].
+    space = near.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1])
+    return [
+        *(*views, rays.uniforms is not None, *hashed, *first),
+        *(array(space, near), rays.samples, rays.disparity, rays.most),
+    ]

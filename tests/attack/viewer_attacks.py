@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import math
 import random
@@ -38,11 +39,16 @@ def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
     torch.set_num_threads(1)
     viewer = view_run(open_run(given / rng.choice(list(FIELDS)), data=given / "blender"), port=0)
     cameras = viewer.subject.scene.test.cameras
-    with contextlib.closing(viewer), contextlib.closing(Tab(viewer, cameras)) as other:
+    printed = io.StringIO()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.redirect_stderr(printed))
+        stack.enter_context(contextlib.closing(viewer))
+        other = stack.enter_context(contextlib.closing(Tab(viewer, cameras)))
         other.rest()
         other.set("Pixels", 128)
         bad = Tab(viewer, cameras, number=1)
         bad.rest()
+        bad.set("Crop", True)  # so that its sliders count
         with contextlib.suppress(ConnectionClosed):
             for _ in range(MESSAGES):
                 data = msgspec.msgpack.encode(message(rng, bad.gui))
@@ -55,8 +61,8 @@ def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
             raise Failed(f"another client was disconnected: {said}")
         verdict = RIGHT if 1 in viewer.clients else REFUSED
         bad.close()
-    if any("\n" in line or len(line) > 500 for line in said):
-        raise Failed(f"not in lines: {said}")
+    if "Traceback" in printed.getvalue() or any("\n" in line or len(line) > 500 for line in said):
+        raise Failed(f"not in lines: {said} {printed.getvalue()[-200:]}")
     return verdict
 
 

@@ -10,7 +10,7 @@ from voronerf.data import builtin_scene
 from voronerf.training.config import TrainConfig
 from voronerf.training.trainer import Trainer
 
-LAUNCHES, READS = 54, 12
+LAUNCHES, READS = 48, 2
 """Of a default step. These go down only: at the aim they are 30 and 0."""
 
 
@@ -44,4 +44,4 @@ def test_a_default_step(tmp_path):
         trainer.train_step()
     told = f"{counted.kernels} {counted.operations} {counted.reads}"
     assert counted.launches <= LAUNCHES and counted.reads.total() <= READS, told
-    assert set(counted.on_cpu) <= {"adam"}, counted.on_cpu
+    assert not counted.on_cpu

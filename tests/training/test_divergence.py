@@ -94,6 +94,6 @@ def test_poor_scores_are_told_with_their_likely_cause(scores, lr, settled, said)
 
 def test_too_high_a_rate_is_told(tmp_path, scene):
     lines = []
-    config = small(tmp_path, field="hashgrid", width=None, depth=None, lr=1.0, steps=210, cells=(), evaluations=1)
+    config = small(tmp_path, field="hashgrid", width=None, depth=None, lr=1.0, steps=100, cells=(), evaluations=1)
     Trainer(config, scene, on_event=lines.append).run()
     assert "nothing is learnt" in lines[-1] and "try --lr 0.02" in lines[-1]

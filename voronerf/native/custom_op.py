@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -39,7 +40,8 @@ def custom_op(
             native.compiled.nearest_centre(points, centres, weights, cells, ...)
 
     The op's fake, with which torch traces, ends at the ``yield``: up to there shapes alone are known. The op is
-    functional; what it may get and what it returns is said by the annotations. The compiled functions check dtypes and
+    functional; what it may get and what it returns is said by the annotations. An argument may be a named tuple, whose
+    fields are arguments of the custom op one by one. The compiled functions check dtypes and
     make their inputs contiguous (csrc/bindings/load.h).
 
     Args:
@@ -58,13 +60,50 @@ def custom_op(
 
         signature = inspect.signature(steps, eval_str=True)
         (results,) = typing.get_args(signature.return_annotation)
-        run.__signature__ = signature.replace(return_annotation=results)  # type: ignore[attr-defined]
-        schema = torch.library.infer_schema(run, mutates_args=())
-        op = torch.library.custom_op(f"voronerf::{name}", run, mutates_args=(), device_types=devices, schema=schema)
-        op.register_fake(fake or (lambda *arguments: next(steps(*arguments))))
-        return Op(op, run, devices, listed=typing.get_origin(results) is list)
+        structs = Structs(signature)
+
+        def flat(*arguments: Any) -> Any:
+            return run(*structs.packed(arguments))
+
+        flat.__signature__ = structs.flat_signature(results)  # type: ignore[attr-defined]
+        schema = torch.library.infer_schema(flat, mutates_args=())
+        op = torch.library.custom_op(f"voronerf::{name}", flat, mutates_args=(), device_types=devices, schema=schema)
+        op.register_fake(fake or (lambda *arguments: next(steps(*structs.packed(arguments)))))
+        return Op(op, run, devices, structs, listed=typing.get_origin(results) is list)
 
     return declare
+
+
+class Structs:
+    """The arguments of a function of which some are named tuples, and those of its custom op, which knows none."""
+
+    def __init__(self, signature: inspect.Signature) -> None:
+        self._parameters = list(signature.parameters.values())
+        self._kinds = [kind if hasattr(kind := given.annotation, "_fields") else None for given in self._parameters]
+        self._any = any(kind is not None for kind in self._kinds)
+
+    def flat_signature(self, results: Any) -> inspect.Signature:
+        """The signature with the fields of named tuples in their place."""
+        found = []
+        for given, kind in zip(self._parameters, self._kinds):
+            hints = {given.name: given.annotation} if kind is None else typing.get_type_hints(kind)
+            found += [inspect.Parameter(name, given.kind, annotation=hint) for name, hint in hints.items()]
+        return inspect.Signature(found, return_annotation=results)
+
+    def packed(self, flat: Sequence[Any]) -> Sequence[Any]:
+        """The arguments of the function."""
+        if not self._any:
+            return flat
+        values = iter(flat)
+        return [
+            next(values) if kind is None else kind(*itertools.islice(values, len(kind._fields))) for kind in self._kinds
+        ]
+
+    def flat(self, packed: Sequence[Any]) -> Sequence[Any]:
+        """The arguments of the custom op."""
+        if not self._any:
+            return packed
+        return [value for given in packed for value in (given if hasattr(given, "_fields") else (given,))]
 
 
 class Op:
@@ -75,27 +114,30 @@ class Op:
     profilers are given the custom op.
     """
 
-    def __init__(self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], listed: bool) -> None:
-        self._op, self._run, self._devices, self._listed = op, run, devices, listed
+    def __init__(
+        self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], structs: Structs, listed: bool
+    ) -> None:
+        self._op, self._run, self._devices, self._structs, self._listed = op, run, devices, structs, listed
         self._function: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
+        flat = self._structs.flat(arguments)
         if torch.compiler.is_compiling() or _PROFILES() or any(listens() for listens in _LISTENERS):
-            return self._op(*arguments)
-        tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
-        for argument in arguments:
+            return self._op(*flat)
+        tensors = [argument for argument in flat if isinstance(argument, Tensor)]
+        for argument in flat:
             if isinstance(argument, (list, tuple)):
                 tensors += [entry for entry in argument if isinstance(entry, Tensor)]
         for tensor in tensors:
             if type(tensor) not in _PLAIN or tensor.device.type not in self._devices:
-                return self._op(*arguments)
+                return self._op(*flat)
         if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
             return self._run(*arguments)
         if self._function is None:
-            return self._op(*arguments)
-        flat, lengths = _flattened(arguments)
-        results = self._function.apply(*flat, lengths)
+            return self._op(*flat)
+        entries, lengths = _flattened(flat)
+        results = self._function.apply(*entries, lengths)
         return list(results) if self._listed else results
 
     def inside(self, *arguments: Any) -> Any:
@@ -103,19 +145,26 @@ class Op:
         return self._run(*arguments)
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
-        """The op's backward, as of ``torch.library.custom_op``."""
-        self._op.register_autograd(backward, setup_context=setup_context)
+        """The op's backward, as of ``torch.library.custom_op``; inputs and gradients are packed like the arguments."""
+        structs = self._structs
 
+        def setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+            setup_context(ctx, structs.packed(inputs), output)
+
+        def unpacked(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
+            found = backward(ctx, *of_results)
+            return tuple(structs.flat(found if isinstance(found, tuple) else (found,)))
+
+        self._op.register_autograd(unpacked, setup_context=setup)
         def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
             *given, lengths = flat
-            arguments, ctx.lengths = _nested(given, lengths), lengths
+            arguments, ctx.lengths = structs.packed(_nested(given, lengths)), lengths
             result = self._run(*arguments)
             setup_context(ctx, arguments, result)
             return tuple(result) if self._listed else result  # autograd.Function knows no lists
 
         def gradients(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
-            found = backward(ctx, of_results) if self._listed else backward(ctx, *of_results)
-            found = found if isinstance(found, tuple) else (found,)
+            found = unpacked(ctx, of_results) if self._listed else unpacked(ctx, *of_results)
             lists = zip(found, ctx.lengths, strict=True)
             return (*_flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0], None)
 

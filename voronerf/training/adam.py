@@ -55,6 +55,9 @@ class Adam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        if self._is_on_device():
+            self._step_on_device()
+            return loss
         entries = [(p, p.grad, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
         together = self._native and all(_is_plain(parameter) for parameter, _, _ in entries)
         own = [entry for entry in entries if together or entry[2].get("sparse", False)]
@@ -110,6 +113,44 @@ class Adam(torch.optim.Adam):
         step = state["step"] = state["step"].cpu()  # a fused optimiser loads it to the parameter's device
         step += 1
         return state, int(step)
+
+    def _is_on_device(self) -> bool:
+        """Whether the compiled module's CUDA step takes all parameters, for which the host does not wait."""
+        parameters = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
+        if not parameters or backends.why_not("sparse_adam", "native", parameters[0].device) is not None:
+            return False
+        from voronerf import native
+
+        return all(native.on_cuda(p) and p.dtype == torch.float32 and p.is_contiguous() for p in parameters)
+
+    def _step_on_device(self) -> None:
+        from voronerf.ops.sparse_adam.native import Judged, Rule, adam_on_device
+
+        rates: dict[float, Tensor] = {}
+        rules, tensors = [], []
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is None:
+                    continue
+                rate, device, state = group["lr"], parameter.device, self.state[parameter]
+                if not isinstance(rate, Tensor):
+                    if rate not in rates:
+                        rates[rate] = torch.full((), rate, device=device)
+                    rate = rates[rate]
+                if not state:
+                    state["step"] = torch.zeros((), device=device)
+                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+                state["step"] = state["step"].to(device)  # a checkpoint of a CPU has it there
+                first, second = group["betas"]
+                every = not group.get("sparse", False)
+                rules.append(Rule(rate.to(device), state["step"], first, second, group["eps"], every))
+                tensors.append((parameter.grad, parameter, state["exp_avg"], state["exp_avg_sq"]))
+        found = getattr(self, "found_inf", None)
+        judged = None if found is None else Judged(found)
+        gradients, parameters, means, squares = zip(*tensors, strict=True)
+        adam_on_device(
+            rules, gradients, parameters, means, squares, judged=judged, scale=getattr(self, "grad_scale", None)
+        )
 
 
 def _is_plain(parameter: Tensor) -> bool:

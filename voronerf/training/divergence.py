@@ -21,7 +21,7 @@ PATIENCE = 10
 #: Decibels below the best evaluation so far that are a collapse.
 COLLAPSE = 5.0
 #: A run is compared with pictures of one colour from its middle on, and from this step.
-SETTLED = 200
+SETTLED = 100
 
 
 class GradientGuard:

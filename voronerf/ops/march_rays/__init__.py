@@ -17,7 +17,7 @@ from voronerf.checks import (
     check_same_dtype,
     check_shape,
 )
-from voronerf.ops.march_rays.reference import March
+from voronerf.ops.march_rays.reference import March, Rays
 
 _OP = backends.declare(
     "march_rays",
@@ -161,17 +161,20 @@ def march_rays(
     if samples > 65_535:
         raise ValueError(f"{_OP}: samples must be at most 65535, got {samples}")
     run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
-    tensors = (tensor.detach() for tensor in (origins, directions, near, far, occupied, box))
-    return March(
-        *run(
-            *tensors,
-            samples,
-            uniforms=None if uniforms is None else uniforms.detach(),
-            seed=seed,
-            disparity=spacing == "disparity",
-            start=start,
-            most=most,
-            capacity=capacity,
-            contraction=None if contraction is None else contraction.detach(),
-        )
+    rays = Rays(
+        origins=origins.detach(),
+        directions=directions.detach(),
+        near=near.detach(),
+        far=far.detach(),
+        occupied=occupied,
+        box=box.detach(),
+        uniforms=None if uniforms is None else uniforms.detach(),
+        seed=seed,
+        start=start,
+        contraction=None if contraction is None else contraction.detach(),
+        samples=samples,
+        disparity=spacing == "disparity",
+        most=samples if most is None else most,
     )
+    march: March = run(rays, capacity)
+    return march

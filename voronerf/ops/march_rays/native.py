@@ -14,124 +14,58 @@ from torch import Tensor
 from voronerf import native
 from voronerf.checks import MAX_COUNT
 from voronerf.native.custom_op import custom_op
-from voronerf.ops.march_rays.reference import March
+from voronerf.ops.march_rays.reference import March, Rays
 
 
-def march_rays(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    samples: int,
-    *,
-    uniforms: Tensor | None = None,
-    seed: Tensor | None = None,
-    disparity: bool = False,
-    start: Tensor | None = None,
-    most: int | None = None,
-    capacity: int | None = None,
-    contraction: Tensor | None = None,
-) -> March:
+def march_rays(rays: Rays, capacity: int | None) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    rest = (samples, disparity, samples if most is None else most)
-    tensors = (origins, directions, near, far, occupied, box, uniforms, seed, start, contraction)
-    mask, offsets = _count(*tensors, *rest, MAX_COUNT if capacity is None else capacity)
+    mask, offsets = _count(rays, MAX_COUNT if capacity is None else capacity)
     rows = int(offsets[-1]) if capacity is None else capacity
-    return March(offsets, *_fill(*tensors, mask, offsets, *rest, rows))
+    return March(offsets, *_fill(rays, mask, offsets, rows))
 
 
 @custom_op("march_rays_native_count")
-def _count(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    start: Tensor | None,
-    contraction: Tensor | None,
-    samples: int,
-    disparity: bool,
-    most: int,
-    capacity: int,
-) -> Iterator[tuple[Tensor, Tensor]]:
-    r = near.shape[0]
-    mask = near.new_empty(r, -(-samples // 32), dtype=torch.int32)
-    offsets = near.new_empty(r + 1, dtype=torch.int32)
+def _count(rays: Rays, capacity: int) -> Iterator[tuple[Tensor, Tensor]]:
+    r = rays.near.shape[0]
+    mask = rays.near.new_empty(r, -(-rays.samples // 32), dtype=torch.int32)
+    offsets = rays.near.new_empty(r + 1, dtype=torch.int32)
     yield mask, offsets
-    given = _inputs(
-        origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
-    )
-    native.compiled.march_rays_count(given, mask, offsets, capacity, native.machine(near))
+    native.compiled.march_rays_count(_inputs(rays), mask, offsets, capacity, native.machine(rays.near))
 
 
 @custom_op("march_rays_native_fill")
 def _fill(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    start: Tensor | None,
-    contraction: Tensor | None,
-    mask: Tensor,
-    offsets: Tensor,
-    samples: int,
-    disparity: bool,
-    most: int,
-    rows: int,
+    rays: Rays, mask: Tensor, offsets: Tensor, rows: int
 ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    near = rays.near
     ray_index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
     depths, deltas, positions = near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3)
     results = ray_index, depths, deltas, positions, stop
     yield results
-    given = _inputs(
-        origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most
-    )
-    native.compiled.march_rays_fill(given, mask, offsets, rows, *results, native.machine(near))
+    native.compiled.march_rays_fill(_inputs(rays), mask, offsets, rows, *results, native.machine(near))
 
 
-def _inputs(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    start: Tensor | None,
-    contraction: Tensor | None,
-    samples: int,
-    disparity: bool,
-    most: int,
-) -> native.compiled.MarchInputs:
-    x, y, z = occupied.shape
+def _inputs(rays: Rays) -> native.compiled.MarchInputs:
+    x, y, z = rays.occupied.shape
+    contraction = rays.contraction
     contracted = 0 if contraction is None else contraction.dim()
     return native.compiled.MarchInputs(
-        origins=origins,
-        directions=directions,
-        near=near,
-        far=far,
-        occupied=occupied.view(torch.uint8),
-        box=box,
-        uniforms=uniforms,
-        seed=seed,
-        start=start,
-        r=near.shape[0],
-        s=samples,
+        origins=rays.origins,
+        directions=rays.directions,
+        near=rays.near,
+        far=rays.far,
+        occupied=rays.occupied.view(torch.uint8),
+        box=rays.box,
+        uniforms=rays.uniforms,
+        seed=rays.seed,
+        start=rays.start,
+        r=rays.near.shape[0],
+        s=rays.samples,
         x=x,
         y=y,
         z=z,
-        disparity=disparity,
-        most=most,
+        disparity=rays.disparity,
+        most=rays.most,
         space=native.compiled.MarchSpace(
             sphere=contraction if contracted == 1 else None, perspective=contraction if contracted == 2 else None
         ),

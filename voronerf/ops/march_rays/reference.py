@@ -12,6 +12,40 @@ import torch
 from torch import Tensor
 
 
+class Rays(NamedTuple):
+    """What ``march_rays`` reads; ``voronerf.ops.march_rays`` says what each is.
+
+    Attributes:
+        origins: [r, 3].
+        directions: [r, 3].
+        near: [r].
+        far: [r].
+        occupied: bool [x, y, z].
+        box: [2, 3].
+        uniforms: [r, s] or None.
+        seed: int32 [1] or None.
+        start: int32 [r] or None.
+        contraction: [4], [5, 3] or None.
+        samples: s.
+        disparity: whether strata are equal steps of 1 / distance.
+        most: samples of a ray, at the most.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    near: Tensor
+    far: Tensor
+    occupied: Tensor
+    box: Tensor
+    uniforms: Tensor | None
+    seed: Tensor | None
+    start: Tensor | None
+    contraction: Tensor | None
+    samples: int
+    disparity: bool
+    most: int
+
+
 class March(NamedTuple):
     """Samples of rays in occupied cells, packed.
 
@@ -43,24 +77,9 @@ class March(NamedTuple):
 
 
 @torch.no_grad()
-def march_rays(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    samples: int,
-    *,
-    uniforms: Tensor | None = None,
-    seed: Tensor | None = None,
-    disparity: bool = False,
-    start: Tensor | None = None,
-    most: int | None = None,
-    capacity: int | None = None,
-    contraction: Tensor | None = None,
-) -> March:
+def march_rays(rays: Rays, capacity: int | None) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
+    origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most = rays
     r, device = len(near), near.device
     stratum = torch.arange(samples + 1, device=device)
     # Divisions are by tensors: one by a number may be done as a product with its reciprocal, and round otherwise.
@@ -87,7 +106,7 @@ def march_rays(
         taken = taken & (stratum[:-1] >= start[:, None])
     rank = taken.cumsum(dim=1)
     # Of what a ray could have, what it gets: at most `most`, and no more than fits in all.
-    wanted = rank[:, -1].clamp(max=samples if most is None else most)
+    wanted = rank[:, -1].clamp(max=most)
     offsets = torch.nn.functional.pad(wanted.cumsum(dim=0), (1, 0))
     if capacity is not None:
         offsets = offsets.clamp(max=capacity)
@@ -109,7 +128,7 @@ def march_rays(
     last = torch.where(taken_now, stratum[:-1], -1).amax(dim=1)
     waiting = torch.where(taken & ~taken_now, stratum[:-1], samples).amin(dim=1)
     # A ray that has got all it may goes on behind its last sample, one that was cut with the sample it did not get.
-    full = (got == wanted) & (wanted == (samples if most is None else most))
+    full = (got == wanted) & (wanted == most)
     stop = torch.where(got < wanted, waiting, torch.where(full, last + 1, samples))
     return March(offsets.to(torch.int32), ray_index, depths, deltas, positions, stop.to(torch.int32))
 

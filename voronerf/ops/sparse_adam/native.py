@@ -74,13 +74,13 @@ class Judged(NamedTuple):
 
     Attributes:
         found: not 0 if the last step was left out.
-        skipped: how many steps were left out.
-        in_a_row: how many of the last ones.
+        skipped: how many steps were left out; needed with a loss.
+        in_a_row: how many of the last ones; needed with a loss.
     """
 
     found: Tensor
-    skipped: Tensor
-    in_a_row: Tensor
+    skipped: Tensor | None = None
+    in_a_row: Tensor | None = None
 
 
 def adam_on_device(
