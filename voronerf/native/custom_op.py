@@ -156,6 +156,7 @@ class Op:
             return tuple(structs.flat(found if isinstance(found, tuple) else (found,)))
 
         self._op.register_autograd(unpacked, setup_context=setup)
+
         def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
             *given, lengths = flat
             arguments, ctx.lengths = structs.packed(_nested(given, lengths)), lengths
