@@ -152,7 +152,7 @@ class Fused:
         for value, known_as in zip(node.meta["results"], made, strict=True):
             if known_as is None or known_as.of is not None:
                 raise NotAStep("a result without samples")
-            if not node.meta["grad"]:
+            if torch.is_grad_enabled() and not node.meta["grad"]:
                 places, numbers = self._lowering.order(known_as.codes)
                 b = self._lowering.builder
                 stopped = b.apply("stop", self._lowering.operand(numbers))
