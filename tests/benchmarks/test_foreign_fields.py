@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-
 from ops import cases_foreign as cases
+
 from voronerf import VoronoiRouter
 
 NAMES = [name for name in cases.FIELDS if "2^19" not in name and "torch-ngp" not in name]

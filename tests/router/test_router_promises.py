@@ -335,3 +335,18 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
     assert not torch.equal(before, router.module.weight)
     with pytest.raises(ValueError, match="load_state_dict: optimizer must hold the router's parameters"):
         router.load_state_dict(state, optimizer=torch.optim.SGD([nn.Parameter(torch.zeros(2))]))
+
+
+def test_a_promise_about_samples_lets_a_module_fuse() -> None:
+    class Masked(Forward):
+        def forward(self, x: Tensor) -> Tensor:
+            mask = x[:, 0] < 5
+            if not mask.any():
+                return self.b(self.a(x))
+            return super().forward(x)
+
+    field = Masked(lambda net, h: torch.tanh(h))
+    router = VoronoiRouter(field, centres(), coords="first3", fuse=True, assume={"mask.any()": True}, way="fused")
+    x = uniform((50,))
+    torch.testing.assert_close(router(x), router.cell(0)(x))
+    assert router.explain() == "forward: fused"
