@@ -207,7 +207,7 @@ class Cameras:
         Args:
             image_index: integer [b], the camera of each pixel, or one camera for all.
             x: [b] column. Integers are pixels (the ray goes through their centre), floats are positions in the image.
-            y: [b] row, likewise.
+            y: [b] row, in pixels from the upper edge.
             cones: give the rays radii of 2 / sqrt(12) of the width of a pixel, so that the variance of a cone across
                 its axis is that of the pixel (Barron et al. 2021, section 3.1). A pixel away from the optical axis is
                 farther away and so appears narrower. Lens distortion of the size of a pixel is ignored.
