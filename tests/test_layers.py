@@ -18,9 +18,9 @@ LAYERS = (
     {"diagram"},
     {"router"},
     {"data", "rendering", "fields"},
-    {"evaluation"},
+    {"evaluation", "distributed"},
+    {"step"},
     {"training"},
-    {"distributed"},
     {"run"},
     {"export"},
     {"cli", "viewer"},
@@ -97,6 +97,13 @@ def faults(source: str, module: str) -> list[str]:
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_imports_go_down(path: Path) -> None:
     assert faults(path.read_text(), module_name(path)) == []
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_backends_alone_choose(path: Path) -> None:
+    """A fast path is an op with a row in their table; whoever asks whether a backend is there has one beside it."""
+    if room(module_name(path)) not in ("backends", "cli", "native", "kernels"):
+        assert "backends.missing" not in path.read_text()
 
 
 @pytest.mark.parametrize(
