@@ -15,7 +15,7 @@ from torch import Tensor
 
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.ops.grouped_linear.activation import activate
-from voronerf.ops.grouped_linear.native import _forward as linear
+from voronerf.ops.grouped_linear.cpu import layer as linear
 from voronerf.ops.grouped_linear.reference import grouped_linear as _reference
 from voronerf.ops.grouped_mlp.layer_table import encoded_already
 from voronerf.ops.grouped_mlp.reference import cells_of

@@ -31,6 +31,7 @@ from voronerf.ops.grouped_mlp.layer_table import (
     storage,
     table_text,
 )
+from voronerf.ops.grouped_mlp.layerwise import gradients as differentiable
 from voronerf.ops.grouped_mlp.reference import cells_of
 
 # Of one layer, whose width does not matter here.
@@ -101,7 +102,7 @@ def grouped_linear(
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer.
 
-    For CUDA; the CPU has kernels of one layer (``voronerf/ops/grouped_linear/native.py``).
+    For CUDA; the CPU has kernels of one layer (``voronerf/ops/grouped_linear/cpu.py``).
     """
     given = in_float32(x, [weight], [bias], _LINEAR[activation], None, "grouped_linear")
     out: Tensor
@@ -342,9 +343,6 @@ def gradients(
 ) -> list[Tensor | None]:
     """Gradients of weights, biases, positions, directions and features, None for those that are not asked for."""
     if torch.is_grad_enabled():
-        # Late: that module takes grouped_linear, which takes this one for CUDA.
-        from voronerf.ops.grouped_mlp.layerwise import gradients as differentiable
-
         layers = Table.parse(table).with_widths(weights)
         given = gradient, positions, offsets, weights, biases, layers, directions, direction_index, features, order
         return differentiable(*given, asked=asked)
