@@ -40,27 +40,26 @@ def learn_rays(
     """
     where = routed_mlp.Where(**{name: routed[name] for name in routed_mlp.Where._fields if name in routed})
     network = {name: value for name, value in routed.items() if name not in routed_mlp.Where._fields}
-    arguments, _ = routed_mlp.prepared(**network, where=where)
+    call, _ = routed_mlp.prepared(**network, where=where)
     rays = march.deltas, march.ray_offsets, target, background, density_scale, hidden
-    _, weights, biases, *_ = arguments
-    return RenderLoss(*_Learn.apply(arguments, rays, *weights, *biases, arguments[6]))
+    taken = call.network
+    return RenderLoss(*_Learn.apply(call, rays, *taken.weights, *taken.biases, taken.features))
 
 
 class _Learn(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, arguments: tuple[Any, ...], rays: tuple[Any, ...], *parameters: Tensor | None
+        ctx: Any, call: routed_mlp.Call, rays: tuple[Any, ...], *parameters: Tensor | None
     ) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
-        out, _, order, offsets, encoded = routed_mlp.forward.inside(*arguments)
+        out, _, order, offsets, encoded = routed_mlp.forward.inside(*call)
         *found, gradient = render_loss.forward.inside(out, *rays)
         ctx.mark_non_differentiable(*found[1:])
         *needs, to_features = ctx.needs_input_grad[2:]
         if any(needs) or to_features:
-            network, order = arguments[:7], order if order.numel() else None
-            positions, *rest = network
             wanted = [any(needs), False, False, to_features]
-            results = grouped_mlp.backward.inside(gradient, positions, offsets, *rest, order, encoded, wanted)
+            sorted_by = order if order.numel() else None
+            results = grouped_mlp.backward.inside(gradient, call.network, offsets, sorted_by, encoded, wanted)
             *of_parameters, _, _, of_features = results
             ctx.gradients = [*of_parameters, of_features]
         return tuple(found)

@@ -80,26 +80,26 @@ class Networks:
 
     def __init__(self, routed: dict[str, Any], cells: Tensor) -> None:
         network = {name: value for name, value in routed.items() if name not in routed_mlp.Where._fields}
-        self._arguments, _ = routed_mlp.prepared(**network, where=routed_mlp.Where(cells=cells))
+        self._call, _ = routed_mlp.prepared(**network, where=routed_mlp.Where(cells=cells))
         with torch.no_grad():
-            self.out, _, *self._sorted = routed_mlp.forward(*self._arguments)
+            self.out, _, *self._sorted = routed_mlp.forward(*self._call)
 
     def backward(self, gradient: Tensor) -> None:
         """Adds to the gradients of the parameters, given that of the outputs."""
-        positions, weights, biases, table, directions, index, features, *_ = self._arguments
+        network = self._call.network
         order, offsets, encoded = self._sorted
-        parameters = [*weights, *biases, features]
+        parameters = [*network.weights, *network.biases, network.features]
         wanted = [tensor is not None and tensor.requires_grad for tensor in parameters]
         of_features = wanted.pop()
         asked = [any(wanted), False, False, of_features]
-        network = positions, offsets, weights, biases, table, directions, index, features
-        *found, _, _, to_features = grouped_mlp.backward(
-            gradient, *network, order if order.numel() else None, encoded, asked
-        )
+        sorted_by = order if order.numel() else None
+        *found, _, _, to_features = grouped_mlp.backward(gradient, network, offsets, sorted_by, encoded, asked)
         for tensor, found_gradient, want in zip(parameters, (*found, to_features), (*wanted, of_features), strict=True):
-            if want and tensor.is_leaf and tensor.grad is None:
+            if tensor is None or not want:
+                continue
+            if tensor.is_leaf and tensor.grad is None:
                 tensor.grad = found_gradient  # which autograd would copy
-            elif want:
+            else:
                 tensor.backward(found_gradient)
 
 
