@@ -34,6 +34,7 @@ print(sorted({"torch._dynamo", "sympy"} & sys.modules.keys()))
 """
 
 
+@pytest.mark.native
 def test_a_first_call_imports_no_compiler() -> None:
     """It takes as long as importing torch."""
     run = subprocess.run([sys.executable, "-c", FIRST], capture_output=True, text=True, check=False)

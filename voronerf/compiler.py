@@ -22,8 +22,13 @@ def constant_result(function: Callable[P, R]) -> Callable[P, R]:
     return function
 
 
-def not_compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """``torch.compiler.disable``, applied once there is a compiler: it runs the function as it is."""
+def not_compiled(function: Callable[P, R], reason: str) -> Callable[P, R]:
+    """``torch.compiler.disable``, applied once there is a compiler: it runs the function as it is.
+
+    Args:
+        function: Any.
+        reason: What the compiler says where a graph must not break.
+    """
 
     @functools.wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -31,7 +36,7 @@ def not_compiled(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         disabled = getattr(function, "_not_compiled", None)
         if disabled is None:
-            disabled = torch.compiler.disable(function)
+            disabled = torch.compiler.disable(function, reason=reason)
             function._not_compiled = disabled  # type: ignore[attr-defined]
         result: R = disabled(*args, **kwargs)
         return result

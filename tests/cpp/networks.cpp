@@ -61,6 +61,11 @@ MlpTable random_table() {
   }
   const int64_t outputs = 1 + below(3);
   for (int64_t o = 0; o < outputs; ++o) table.outputs.push_back(static_cast<int>(below(layers)));
+  if (below(2) == 0) {  // a head of few outputs, which are dot products
+    table.layers.push_back({32 * (1 + below(3)), Activation::relu, {voronerf::kFromPositions}});
+    table.layers.push_back({1 + below(4), static_cast<Activation>(below(5)), {static_cast<int>(layers)}});
+    table.outputs.push_back(static_cast<int>(layers) + 1);
+  }
   return table;
 }
 
@@ -120,6 +125,9 @@ struct Case {
     for (int64_t i = 0; ordered && i < n; ++i) order.push_back(static_cast<int32_t>(i));
     std::shuffle(order.begin(), order.end(), generator);
     positions = uniform<float>(n * table.positions);
+    if (table.position.kind == MlpEncodingKind::integrated) {  // the second half are variances
+      for (int64_t i = 0; i < n * 6; ++i) positions[i] = i % 6 < 3 ? positions[i] : std::fabs(positions[i]);
+    }
     directions = uniform<float>(rays * table.directions);
     tables = below(2) == 0 ? 1 : k;
     for (const voronerf::GridLevel& level : table.grid.levels) {

@@ -149,3 +149,12 @@ def test_atomic_sums_are_refused_where_deterministic_algorithms_are_asked_for():
             total.backward()
     finally:
         torch.use_deterministic_algorithms(False)
+
+
+def test_march_rays_adds_up_more_rays_than_a_block_has_threads():
+    r, box = 2100, torch.tensor([[0.0, 0, 0], [1, 1, 1]])
+    directions = torch.nn.functional.normalize(torch.rand(r, 3) - 0.5, dim=1)
+    rays = torch.rand(r, 3), directions, torch.zeros(r), torch.rand(r)
+    given = *rays, torch.rand(3, 4, 5) < 0.5, box, 5
+    for capacity in (None, 1500, 20_000):
+        assert same(*both(voronerf.march_rays, *given, capacity=capacity))

@@ -88,7 +88,7 @@ def read_summary(run: Path, name: str) -> Summary:
 
     Raises:
         ConfigError: there is no run, or a folder of it leads elsewhere.
-        ValueError: a file of it is none of a run.
+        ValueError: a file cannot be read as that of a run.
     """
     check_folders(run)
     if not (run / "config.json").is_file():
@@ -188,7 +188,7 @@ def png(path: Path) -> bytes:
     """The bytes of a PNG.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the file is not a PNG.
     """
     try:
         with Image.open(path, formats=("PNG",)) as image:

@@ -18,7 +18,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class ImageFolder(NamedTuple):
-    """A folder of images, by how much they are still to be reduced, and a line about it, or none."""
+    """A folder of images, by how much they are still to be reduced, and lines about it."""
 
     path: Path
     factor: int
@@ -33,7 +33,7 @@ def choose_images(folder: Path, downscale: int | None, longest: float) -> ImageF
     is the longest side of those in `images`.
 
     Raises:
-        SceneError: there is no folder of images, or `downscale` is none of what there is.
+        SceneError: no folder of images, or no folder that `downscale` fits.
     """
     sizes = {1: folder / "images"} if (folder / "images").is_dir() else {}
     for path in folder.glob("images_*"):

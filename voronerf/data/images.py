@@ -72,7 +72,7 @@ def read_header(path: Path, factor: int) -> Header:
     """Reads the header of an image file, without its pixels.
 
     Args:
-        path: the file.
+        path: image file, PNG or JPEG.
         factor: of the reduction, >= 1.
 
     Raises:
@@ -94,7 +94,7 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
     while they are decoded, from the low frequencies of each block of 8 x 8 pixels, which saves time and memory.
 
     Args:
-        path: the file.
+        path: image file, PNG or JPEG.
         factor: of the reduction, from 1 to the number of pixels of the shorter side.
 
     Returns:
@@ -204,7 +204,7 @@ def read_masks(
     """Decodes the masks of images: black pixels do not count, nor does a block that has one.
 
     Args:
-        masks: the file of each image, or None where all of it counts.
+        masks: the mask file of each image, or None if the whole image counts.
         paths: of the images.
         sizes: int64 [c, 2], (width, height) of the images, and of their masks.
         factor: of the reduction.

@@ -45,7 +45,7 @@ def read_scene(path: Path) -> Scene:
     """Reads what :func:`write_scene` has written: a scene whose splits have no images.
 
     Raises:
-        SceneError: the file is none of these; it names the file.
+        SceneError: the file is not a record of a scene; the message names it.
         OSError: it cannot be read.
     """
     try:

@@ -126,7 +126,7 @@ def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> fl
         entries: of the file or a frame.
         key: "fl_x" or "fl_y", "camera_angle_x" or "camera_angle_y".
         side: pixels of the image along that axis.
-        path: the file.
+        path: the file, for messages.
 
     Raises:
         SceneError: the entry is no such number, or nothing that a camera has.

@@ -203,7 +203,7 @@ class Mixture:
 
     @classmethod
     def of(cls, diagram: VoronoiDiagram, positions: Tensor, margin: float, backend: str) -> Mixture | None:
-        """The mixture at positions [..., 3]; None where no sample lies in a margin."""
+        """The mixture at positions [..., 3]; None if no sample lies in a margin."""
         positions = positions.detach().reshape(-1, 3)
         blend = blend_cells(diagram, positions, margin)
         if blend.rows.numel() == 0:

@@ -116,7 +116,7 @@ def find_lpips(
             given.
 
     Returns:
-        The metric, or None; and a line that says where its weights came from, or why there are none.
+        The metric, or None; and a line that says where its weights came from, or why it has no weights.
 
     Raises:
         LpipsError: the given file or folder, or the first one found, cannot be used; or the images are too small and

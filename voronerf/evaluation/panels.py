@@ -120,7 +120,7 @@ def save_panel(path: Path, truth: Tensor, image: RenderedImage, cells: Tensor) -
     """Writes truth, render, error, depth and cells of one view side by side, as PNG.
 
     Args:
-        path: the file.
+        path: PNG file to write.
         truth: [h, w, 3] in 0..1.
         image: the rendered view, on the CPU.
         cells: integer [h, w].

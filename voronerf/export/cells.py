@@ -30,8 +30,8 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None) -> An
     The objects are named `cell_0000` and so on, and have the colours that the cells have in pictures.
 
     Args:
-        run: the run.
-        path: the file.
+        run: trained run, as `open_run` opens it.
+        path: file to write, .glb.
         box: [2, 3]; default the scene's, or that around the sphere of the contraction.
 
     Raises:

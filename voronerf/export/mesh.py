@@ -32,7 +32,7 @@ from voronerf.run import Run
 from voronerf.training.config import ConfigError
 
 SUFFIXES = (".ply", ".glb", ".obj")
-#: Cubes along the longest side of the box, where there is memory for them.
+#: Cubes along the longest side of the box, if memory allows.
 RESOLUTION = 256
 #: Share of the longest side of the box over which the density of the surface lets half of the light pass. Smaller ones
 #: leave out what a short training has made a faint fog, larger ones take fog around surfaces for a part of them.
@@ -58,8 +58,8 @@ def export_mesh(
     open: its surfaces end where the box ends, and where no camera looks.
 
     Args:
-        run: the run.
-        path: the file.
+        run: trained run, as `open_run` opens it.
+        path: file to write, .ply, .glb or .obj.
         resolution: cubes along the longest side of the box; default 256, or what fits into the memory.
         density: of the surface, per scene unit; default that of which a thirtieth of that side lets half of the light
             pass.
@@ -68,8 +68,8 @@ def export_mesh(
             and yields the parts.
 
     Raises:
-        ConfigError: a resolution that does not fit into the memory, a density that is none, no box, or a run that has
-            no surface there.
+        ConfigError: a resolution that does not fit into the memory, a density that is not positive, no box,
+            or no surface in it.
         ImportError: trimesh, scikit-image or scipy is missing.
         ValueError: another suffix.
         OSError: the file cannot be written.

@@ -25,8 +25,8 @@ def export_points(run: Run, path: Path | str, *, count: int = 200_000, box: Tens
     neighbours spread the least.
 
     Args:
-        run: the run.
-        path: the file.
+        run: trained run, as `open_run` opens it.
+        path: file to write, .ply.
         count: points at the most, drawn at random where the views have more.
         box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
 

@@ -36,7 +36,7 @@ def check_export(path: Path, suffixes: tuple[str, ...]) -> None:
     """Finds out before the work is done whether a file can be written; makes its folder.
 
     Raises:
-        ValueError: a suffix that is none of ``suffixes``.
+        ValueError: a suffix that is not in ``suffixes``.
         ImportError: a package of the extra is missing.
         OSError: the folder cannot be made.
     """
@@ -60,7 +60,7 @@ def box_of(run: Run, box: Tensor | None = None) -> Tensor:
     """The box [2, 3] that is exported: the one given, the scene's, or one around the sphere of a contraction.
 
     Raises:
-        ConfigError: the given box is empty or not finite, or there is none.
+        ConfigError: the given box is empty or not finite, or the scene has no box.
     """
     if box is not None:
         if box.shape != (2, 3) or not bool(box.isfinite().all()) or not bool((box[0] < box[1]).all()):
@@ -83,7 +83,7 @@ def ask(
     Where rays find nothing, since the occupancy grid is empty there, the density is 0 and the colour black.
 
     Args:
-        run: the run.
+        run: trained run, as `open_run` opens it.
         points: [n, 3].
         directions: [n, 3], or [1, 3] for all.
         side: of a cube around a point, for fields that are asked about Gaussians.
@@ -173,7 +173,7 @@ class View:
 
     Attributes:
         camera: the camera alone.
-        distance: [h, w], along the ray to the surface, infinite where there is none.
+        distance: [h, w], along the ray to the surface, infinite if it meets none.
         colour: [h, w, 3].
         surface: [h, w, 3], the point that each pixel shows.
     """

@@ -30,6 +30,7 @@ from voronerf.router.cells import (
     renew_cells,
     stack_parameters,
 )
+from voronerf.router.compiled import Known, built, spec_of, structure_of
 from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.optimizers import check_optimizer, drop_state, move_state, watch_optimizers
@@ -38,6 +39,10 @@ from voronerf.router.ways import Choices, Wish, evaluate
 
 # Centres of a flat diagram beyond which it may look cells up by a grid of its own.
 _MANY = 256
+_NO_GRAPH = (
+    "VoronoiRouter: a graph without breaks takes a router with fuse=True that has made such a call before, of tensors, "
+    "numbers and strings, without blend and autocast; its results are tensors, or tuples, lists and dicts of them"
+)
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
@@ -154,7 +159,7 @@ class VoronoiRouter(nn.Module):
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
-        self._choices = Choices()
+        self._choices, self._known = Choices(), Known(self)
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self._by_table = self._layered and described_by_table(self.module)
 
@@ -475,18 +480,38 @@ class VoronoiRouter(nn.Module):
                 f"methods={[*methods, name]!r} to the router"
             ) from None
 
-    @not_compiled
     def _route(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
-        """One call of a method of the module. ``torch.compile`` leaves it as it is and goes on behind it."""
+        """One call of a method of the module; in a graph one operation where it is fused, else a break of the graph."""
+        if torch.compiler.is_compiling() and self.fuse and self.blend == 0 and not torch.is_autocast_enabled("cpu"):
+            rule = coords if coords is not None else self.coords
+            spec = spec_of(args, kwargs)
+            structure = None if spec is None else structure_of(self._known.number, method, spec)
+            if structure is not None:
+                tensors = [value for value in (*args, *kwargs.values()) if isinstance(value, Tensor)]
+                positions, parameters = find_positions(rule, args, kwargs), list(self.module.parameters())
+                number, text = self._known.number, repr(spec)
+                found = torch.ops.voronerf.routed(number, method, text, positions, tensors, parameters)
+                return built(structure, found)
+        return self._route_as_it_is(method, *args, coords=coords, **kwargs)
+
+    @functools.partial(not_compiled, reason=_NO_GRAPH)
+    def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         called = getattr(self.module, method)
         if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
             kwargs, coords = {**kwargs, "coords": coords}, None
-        known = argument_names(called)
-        names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
         rule = coords if coords is not None else self.coords
         if rule is None and self._layered:
             rule = "first3"
         positions = find_positions(rule, args, kwargs)
+        result = self._call(self.module, method, positions, args, kwargs)
+        if method in self._choices.fused:
+            self._known.note(method, args, kwargs, positions.dim() - 1, result)
+        return result
+
+    def _call(self, module: nn.Module, method: str, positions: Tensor, args: Any, kwargs: dict[str, Any]) -> Any:
+        """What a method gives with the parameters of a module, the router's own or a double of it."""
+        known = argument_names(getattr(module, method))
+        names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
 
         def named(item: str | int) -> str:
             return item if isinstance(item, str) else names[item] if item < len(names) else str(item)
@@ -497,7 +522,7 @@ class VoronoiRouter(nn.Module):
             frozenset(map(named, self.shared)),
             self.layout == "flat",
         )
-        call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
+        call = Call(module, method, layout, [*names, *kwargs], args, kwargs)
         mixture, grouping = self._mixture(positions), self._group(method, positions)
         wish = Wish(self.fuse, self.way, bool(self.methods))
         return evaluate(call, grouping, mixture, self._choices, wish)
@@ -540,12 +565,17 @@ class VoronoiRouter(nn.Module):
         return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_watch": None, "_assigned": None}
+        return {**self.__dict__, "_watch": None, "_assigned": None, "_known": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._known = Known(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
         detach_results(self, memo)
         copied = memo[id(self)] = type(self).__new__(type(self))
         copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
+        copied._known = Known(copied)
         return copied
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:

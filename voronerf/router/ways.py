@@ -76,6 +76,7 @@ class Choices:
     def forget(self) -> None:
         """Begins anew, after a change of dtype, device or parameters' names."""
         self.kinds: dict[Any, Kind] = {}
+        self.fused: set[str] = set()  # methods that have a fused way in all kinds of calls
         self._said: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
@@ -417,6 +418,7 @@ def admitted(trial: Trial, choices: Choices, wish: Wish) -> Kind:
     if wish.fuse and wish.way in ("fastest", "fused"):
         try:
             ways.append(trial.fused(loop, expected))
+            choices.fused.add(trial.call.method)
         except Exception as error:
             trial.check_rows(loop)
             why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
@@ -424,6 +426,7 @@ def admitted(trial: Trial, choices: Choices, wish: Wish) -> Kind:
             if not wish.several:
                 raise ValueError(f"{_OP}: {says}") from error
             choices.say_once(f"fuse {trial.call.method}", says)
+            choices.fused.discard(trial.call.method)
     if wish.way in ("fastest", "grouped") or (wish.way == "fused" and not ways):
         try:
             tried = Grouped(quiet=True)

@@ -14,7 +14,7 @@ from voronerf.viewer.pictures import Subject, groups_of
 
 
 def read_samples(folder: Path) -> tuple[Tensor, Tensor] | None:
-    """The samples that a run's last split was made from, [m, 3], and their importance [m]; None if there are none."""
+    """The samples that a run's last split was made from, [m, 3], and their importance [m]; None without them."""
     files = {int(found[1]): path for path in folder.glob("samples/*.npz") if (found := re.search(r"(\d+)$", path.stem))}
     if not files:
         return None

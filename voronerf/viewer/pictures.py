@@ -174,7 +174,7 @@ def picture_of(subject: Subject, camera: Cameras, image: RenderedImage, look: Lo
 
 
 def cell_at(subject: Subject, camera: Cameras, look: Look, x: float, y: float) -> int | None:
-    """The leaf that a pixel shows, or None where nothing is.
+    """The leaf that a pixel shows, or None if it shows nothing.
 
     Args:
         subject: what is viewed.

@@ -94,7 +94,7 @@ def city_of(size: int, blocks: str, images: str) -> Scene:
     """The city of blocks such as "4x4"; in the cache if it is larger than one block.
 
     Raises:
-        SceneError: they are none of these.
+        SceneError: other blocks than these.
     """
     found = re.fullmatch(r"([1-9]\d?)x\1", blocks)
     if found is None or int(found[1]) > MOST:

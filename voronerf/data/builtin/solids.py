@@ -238,7 +238,7 @@ def candidates(solids: Sequence[Solid], origins: Array, directions: Array) -> li
 
 
 def first_hits(solids: Sequence[Solid], origins: Array, directions: Array) -> tuple[Array, Rows]:
-    """The first solid on each ray: (distance [r], infinite where there is none; its number [r], 0 there).
+    """The first solid on each ray: (distance [r], infinite for a miss; its number [r], 0 for a miss).
 
     Arguments as of `candidates`.
     """

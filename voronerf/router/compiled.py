@@ -1,0 +1,196 @@
+"""A routed call as one operation in a graph of ``torch.compile`` or ``torch.export``.
+
+The operation runs the router as it is, and its backward runs the call again. It is for routers with ``fuse=True``,
+whose ``forward`` does the same in every call, after one call outside of the graph: this says what the results are like.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import itertools
+import weakref
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.compiler import constant_result
+from voronerf.router.double import Double
+from voronerf.router.layout import tensors_of
+
+_ROUTERS: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
+_NUMBERS = itertools.count()
+_PLAIN = (type(None), bool, int, float, str)
+Spec = tuple[Any, ...]  # of an argument: ("tensor",) or ("plain", value), with names in front of keyword arguments
+
+
+class Known:
+    """The calls of a router that a graph may hold, and a number by which the operation finds the router."""
+
+    def __init__(self, router: nn.Module) -> None:
+        self.number, self.calls = next(_NUMBERS), dict[Any, Any]()
+        _ROUTERS[self.number] = router
+
+    def note(self, method: str, args: Any, kwargs: Any, lead: int, result: Any) -> None:
+        """Remembers what a call gives: the structure of its results, and features and dtype of each tensor.
+
+        Args:
+            method: The method of the module.
+            args: The call's.
+            kwargs: The call's.
+            lead: Leading dimensions, which all results have.
+            result: What it returned.
+        """
+        spec = spec_of(args, kwargs)
+        if spec is not None and (method, spec) not in self.calls:
+            found, count = tensors_of(result), itertools.count()
+            structure = _structure(result, count)
+            if structure is not None and next(count) == len(found):
+                self.calls[method, spec] = structure, [(tuple(t.shape[lead:]), t.dtype) for t in found]
+
+
+def spec_of(args: Any, kwargs: Any) -> Spec | None:
+    """What a call is like apart from its tensors; None where an argument is no tensor, number, string or None."""
+    spec: list[Any] = []
+    for name, value in [*[(None, value) for value in args], *kwargs.items()]:
+        if isinstance(value, Tensor):
+            spec.append((name, "tensor"))
+        elif isinstance(value, _PLAIN):
+            spec.append((name, "plain", value))
+        else:
+            return None
+    return tuple(spec)
+
+
+def _structure(value: Any, count: Iterator[int]) -> Any:
+    """Numbers of the tensors in a result of tensors, tuples, lists and dicts; None for any other."""
+    if isinstance(value, Tensor):
+        return next(count)
+    if type(value) not in (tuple, list, dict):
+        return None
+    keys = tuple(value) if isinstance(value, dict) else None
+    parts = tuple(_structure(item, count) for item in (value.values() if isinstance(value, dict) else value))
+    plain = keys is None or all(isinstance(key, str) for key in keys)
+    return (type(value).__name__, keys, parts) if plain and None not in parts else None
+
+
+def built(structure: Any, tensors: list[Tensor]) -> Any:
+    """The result that a structure stands for."""
+    if isinstance(structure, int):
+        return tensors[structure]
+    kind, keys, parts = structure
+    items = [built(part, tensors) for part in parts]
+    return dict(zip(keys, items)) if kind == "dict" else tuple(items) if kind == "tuple" else items
+
+
+@constant_result
+def structure_of(number: int, method: str, spec: Spec) -> Any:
+    """The structure of a call's results; None for a call that is not known."""
+    return _ROUTERS[number]._known.calls.get((method, spec), (None, None))[0]
+
+
+def _call(
+    number: int, method: str, spec: str, positions: Tensor, tensors: list[Tensor], parameters: list[Tensor]
+) -> list[Tensor]:
+    """The tensors that a call of a router returns.
+
+    Args:
+        number: Of the router's :class:`Known`.
+        method: The method.
+        spec: ``repr`` of the call's :func:`spec_of`.
+        positions: [..., 3], which decide the cells.
+        tensors: The tensors among the arguments.
+        parameters: In the place of the router's own.
+    """
+    router, following = _ROUTERS[number], iter(tensors)
+    args, kwargs = [], {}
+    for name, _, *plain in ast.literal_eval(spec):
+        value = plain[0] if plain else next(following)
+        if name is None:
+            args.append(value)
+        else:
+            kwargs[name] = value
+    double = Double(router.module)
+    double.fill({id(own): given for own, given in zip(router.module.parameters(), parameters, strict=True)})
+    return tensors_of(router._call(double.module, method, positions, tuple(args), kwargs))
+
+
+@torch.library.custom_op("voronerf::routed", mutates_args=())
+def _routed(
+    number: int, method: str, spec: str, positions: Tensor, tensors: list[Tensor], parameters: list[Tensor]
+) -> list[Tensor]:
+    with torch.no_grad():
+        return [t.clone() for t in _call(number, method, spec, positions, tensors, parameters)]
+
+
+@_routed.register_fake
+def _(
+    number: int, method: str, spec: str, positions: Tensor, tensors: list[Tensor], parameters: list[Tensor]
+) -> list[Tensor]:
+    shapes = _ROUTERS[number]._known.calls[method, ast.literal_eval(spec)][1]
+    return [positions.new_empty((*positions.shape[:-1], *features), dtype=dtype) for features, dtype in shapes]
+
+
+@torch.library.custom_op("voronerf::routed_backward", mutates_args=())
+def _routed_backward(
+    number: int,
+    method: str,
+    spec: str,
+    positions: Tensor,
+    tensors: list[Tensor],
+    parameters: list[Tensor],
+    gradients: list[Tensor],
+) -> list[Tensor]:
+    with _recorded():
+        leaves = [t.detach().requires_grad_(t.is_floating_point() or t.is_complex()) for t in (*tensors, *parameters)]
+        found = _call(number, method, spec, positions, leaves[: len(tensors)], leaves[len(tensors) :])
+        linked = [(t, g) for t, g in zip(found, gradients, strict=True) if t.requires_grad]
+        wanted = [leaf for leaf in leaves if leaf.requires_grad]
+        results, weights = [t for t, _ in linked], [g for _, g in linked]
+        made = iter(torch.autograd.grad(results, wanted, weights, allow_unused=True))
+    given = [next(made) if leaf.requires_grad else None for leaf in leaves]
+    return [torch.zeros_like(leaf) if g is None else g.clone() for g, leaf in zip(given, leaves, strict=True)]
+
+
+@_routed_backward.register_fake
+def _(
+    number: int,
+    method: str,
+    spec: str,
+    positions: Tensor,
+    tensors: list[Tensor],
+    parameters: list[Tensor],
+    gradients: list[Tensor],
+) -> list[Tensor]:
+    return [torch.empty_like(t) for t in (*tensors, *parameters)]
+
+
+@contextlib.contextmanager
+def _recorded() -> Iterator[None]:
+    """Has autograd record inside of an operation, which PyTorch runs below it."""
+    keys = (torch._C.DispatchKey.AutogradFunctionality, torch._C.DispatchKey.ADInplaceOrView)
+    with contextlib.ExitStack() as stack:
+        for key in keys:
+            stack.enter_context(torch._C._SetExcludeDispatchKeyGuard(key, False))
+        stack.enter_context(torch.enable_grad())
+        yield
+
+
+def _save(ctx: Any, inputs: Any, output: Any) -> None:
+    ctx.call, (positions, tensors, parameters) = inputs[:3], inputs[3:]
+    ctx.count = len(tensors)
+    ctx.save_for_backward(positions, *tensors, *parameters)
+
+
+def _backward(ctx: Any, gradients: list[Tensor]) -> Any:
+    positions, *others = ctx.saved_tensors
+    found = torch.ops.voronerf.routed_backward(
+        *ctx.call, positions, others[: ctx.count], others[ctx.count :], [g.contiguous() for g in gradients]
+    )
+    needed = [g if t.is_floating_point() or t.is_complex() else None for g, t in zip(found, others, strict=True)]
+    return None, None, None, None, needed[: ctx.count], needed[ctx.count :]
+
+
+_routed.register_autograd(_backward, setup_context=_save)
