@@ -15,7 +15,7 @@ from unittest import mock
 import pytest
 import torch
 
-from voronerf.rendering import Renderer
+from voronerf.rendering import Hierarchical, Occupancy, Proposal, Renderer, Space, Stratified
 
 
 def refuses(message, call, *args, error=ValueError, **options):
@@ -108,4 +108,16 @@ def read_json(path):
 
 def render_image(field, cameras, index, *, samples, occupancy=None, **given):
     """The image of one field."""
-    return Renderer({"field": field}, samples=samples, occupancy=occupancy).image(cameras, index, **given)
+    return renderer_of({"field": field}, samples=samples, occupancy=occupancy).image(cameras, index, **given)
+
+
+def renderer_of(fields, *, samples, fine_samples=0, occupancy=None, picture_samples=None, backend="auto", **space):
+    """A renderer with the sampler that suits the names of the fields and what else is given."""
+    given = {"space": Space(**space), "backend": backend}
+    if occupancy is not None:
+        sampler = Occupancy(occupancy, samples, picture_samples=picture_samples, **given)
+    elif "proposal" in fields:
+        sampler = Proposal(samples, fine_samples, **given)
+    else:
+        sampler = Hierarchical(samples, fine_samples, **given) if fine_samples else Stratified(samples, **given)
+    return Renderer(fields, sampler, backend=backend)

@@ -18,9 +18,9 @@ LAYERS = (
     {"diagram"},
     {"router"},
     {"data", "rendering", "fields"},
-    {"evaluation"},
+    {"evaluation", "distributed"},
+    {"step"},
     {"training"},
-    {"distributed"},
     {"run"},
     {"export"},
     {"cli", "viewer"},
@@ -99,6 +99,13 @@ def test_imports_go_down(path: Path) -> None:
     assert faults(path.read_text(), module_name(path)) == []
 
 
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_backends_alone_choose(path: Path) -> None:
+    """A fast path is an op with a row in their table; whoever asks whether a backend is there has one beside it."""
+    if room(module_name(path)) not in ("backends", "cli", "native", "kernels"):
+        assert "backends.missing" not in path.read_text()
+
+
 @pytest.mark.parametrize(
     ("source", "module", "fault"),
     [
@@ -163,6 +170,13 @@ def test_circles_are_found() -> None:
     }
     graph = {name: needed(source, name, set(sources)) for name, source in sources.items()}
     assert circles(graph) == ["a.b", "a.c", "a.d"]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_table_alone_asks_whether_a_backend_is_there(path: Path) -> None:
+    """A fast path is an op, which `backends.resolve` chooses or refuses."""
+    if room(module_name(path)) not in ("backends", "cli"):
+        assert "backends.missing(" not in path.read_text()
 
 
 @pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)

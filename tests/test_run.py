@@ -79,7 +79,7 @@ def test_networks_stay_in_their_file(scene, tmp_path) -> None:
 def test_how_a_run_is_rendered_may_differ(trained, scene) -> None:
     folder = trained[0].out
     other = open_run(folder, scene=scene, samples=5, blend=0.2, occupancy=True, backend="reference")
-    assert (other.renderer.samples, other.router.blend) == (5, 0.2)
+    assert (other.renderer.sampler.samples, other.router.blend) == (5, 0.2)
     assert {other.renderer.backend, other.router.backend} == {"reference"}
     assert other.renderer.occupancy is not None and open_run(folder, scene=scene).renderer.occupancy is None
     smaller = open_run(folder, data="builtin", downscale=10)

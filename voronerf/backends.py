@@ -132,6 +132,16 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
     return _FUNCTIONS[op, _choose(op, backend, device.type, device.index, dtype)]
 
 
+def folder(op: str) -> str:
+    """The folder of ``voronerf.ops`` that has an op."""
+    return _TABLE[op, "reference"].file or op
+
+
+def chosen(op: str, device: torch.device, dtype: torch.dtype, *, backend: str = "auto") -> str:
+    """Name of the implementation that :func:`resolve` gives, with the same arguments and errors."""
+    return _choose(op, backend, device.type, device.index, dtype)
+
+
 def why_not(op: str, backend: str, device: torch.device, dtype: torch.dtype | None = None) -> str | None:
     """Why a backend cannot run an op, with the remedy if there is one; None if it can.
 

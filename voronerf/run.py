@@ -12,20 +12,19 @@ import torch
 from voronerf.data import Scene, load_scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.lpips import Lpips, find_lpips
-from voronerf.evaluation.scores import render_camera, score_views
+from voronerf.evaluation.scores import score_views
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.rendering.renderer import RenderedImage, Renderer
+from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
 from voronerf.router import VoronoiRouter
 from voronerf.training.average import load_averages
 from voronerf.training.checkpoint import last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
 from voronerf.training.networks import check_shapes, make_routers, parameter_groups, restore_routers
-from voronerf.training.occupancy import make_picture_grid
-from voronerf.training.renderers import make_renderer
-from voronerf.training.resume import stored_values
+from voronerf.training.renderers import make_picture_grid, make_renderer, through_grid
 from voronerf.training.run_directory import check_folders, check_stored_paths
+from voronerf.training.state import stored_values
 
 
 @dataclass(frozen=True)
@@ -201,8 +200,11 @@ def open_run(
     scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     state = checkpoint.group("occupancy")
+    grid = None
     if state:
-        renderer.occupancy = OccupancyGrid.from_state(state, contraction=renderer.contraction, device=renderer.device)
+        grid = OccupancyGrid.from_state(state, contraction=renderer.contraction, device=renderer.device)
     elif occupancy:
-        renderer.occupancy = make_picture_grid(config, scene, renderer.field, backend=backend)
+        grid = make_picture_grid(config, scene, renderer)
+    if grid is not None:
+        renderer.sampler = through_grid(renderer.sampler, grid, picture_samples=samples)
     return Run(path, config, scene, routers, renderer)

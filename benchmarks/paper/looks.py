@@ -92,7 +92,7 @@ def seams(trainer: Trainer) -> dict[str, float]:
 
     Only for trainings with one field of points.
     """
-    if len(trainer.routers) > 1 or trainer.renderer.fine_samples or trainer.renderer.cones:
+    if len(trainer.routers) > 1 or trainer.renderer.sampler.passes > 1 or trainer.renderer.cones:
         return {}
     scene, renderer = trainer.scene, trainer.renderer
     found = seam(trainer.router, scene, lambda view: render_view(renderer, scene, view), views=SEAM_VIEWS)

@@ -174,7 +174,7 @@ def stressed_command(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 #: Settings that are a wish for more work, however much, or that choose what is tried.
-WORK = ("steps", "budget", "evaluations", "eval_views", "final_views", "proposal_rounds", "out", "resume", "device")
+WORK = ("steps", "budget", "evaluations", "eval_views", "final_views", "out", "resume", "device")
 
 
 def settings(rng: random.Random, folder: Path) -> str:

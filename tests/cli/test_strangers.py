@@ -117,7 +117,10 @@ def flat_average(run, checkpoint):
 OVERSIZED = {
     "width": (settings(width=18_000), "router.module.trunk.0.weight must have shape [3, 18000, 39], got [3, 8, 39]"),
     "depth": (settings(depth=1_000_000), "--depth must be at least 1 and at most 1000, got 1000000"),
-    "octaves": (settings(position_octaves=10**9), "router.module.trunk.0.weight must have shape [3, 8, 6000000003]"),
+    "octaves": (
+        settings(field_options=("position_octaves=1000000000",)),
+        "router.module.trunk.0.weight must have shape [3, 8, 6000000003]",
+    ),
     "average": (flat_average, "optimizer.0.average must have shape [3, 8, 39], got [936]"),
     "centres": (many_centres, "router.module.trunk.0.weight must have shape [2000000, 8, 39], got [3, 8, 39]"),
 }

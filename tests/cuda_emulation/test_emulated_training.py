@@ -1,6 +1,7 @@
 """Whole training steps on the emulated device: every CUDA kernel of a step, in the trainer's own order and types."""
 
 import contextlib
+from unittest import mock
 
 import pytest
 from emulated import emulated
@@ -23,10 +24,10 @@ def losses(out, field, precision, *, on_device):
     config = TrainConfig(
         out=out, field=field, **SMALL[field], steps=STEPS,
         cells=(4,), split_at=(0.5,), width=16, rays=32, samples=8, lr=0.005,
-        warmup=0.0, reservoir=200, reservoir_batches=8, evaluations=1, precision=precision,
+        reservoir=200, reservoir_batches=8, evaluations=1, precision=precision,
     )  # fmt: skip
     found = []
-    with emulated() if on_device else contextlib.nullcontext():
+    with mock.patch("voronerf.training.rates.WARMUP", 0.0), emulated() if on_device else contextlib.nullcontext():
         trainer = Trainer(config, builtin_scene(12))
         for trainer.step in range(STEPS):
             if trainer.split_is_due():

@@ -43,7 +43,7 @@ def on_ranks(function, *args, folder, size=2, each=None, restarts=0, store=None)
     printed.
     """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["voronerf.cli", "voronerf.distributed.trainer"])
+    context.set_forkserver_preload(["voronerf.cli", "voronerf.training.trainer"])
     folder = Path(folder)
     store = store or new_store()
     given = each or [args] * size

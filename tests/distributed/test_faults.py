@@ -47,12 +47,15 @@ def complaints(texts):
 
 def test_settings_that_ranks_cannot_use(tmp_path):
     """One says so at every start: what ranks of an earlier start have left in torchrun's store is not theirs."""
-    expected, store = "voronerf: error: --sampling must be stratified with several ranks, got 'proposal'", new_store()
+    expected, store = (
+        "voronerf: error: --sampling must take one pass, as stratified: no rank sees whole rays, got 'proposal'",
+        new_store(),
+    )
     for restarts in range(2):
         given = command(tmp_path / "run", "--sampling", "proposal")
         codes, texts = on_ranks(main, given, folder=tmp_path, restarts=restarts, store=store)
         assert codes == [1, 1] and not (tmp_path / "run").exists()
-        assert complaints(texts) == [expected]
+        assert complaints(texts) == [f"voronerf: error: {expected}"]
 
 
 def test_an_option_that_does_not_exist(tmp_path):
@@ -71,7 +74,7 @@ def test_ranks_that_differ(tmp_path):
 def test_more_ranks_than_cells(tmp_path):
     codes, texts = on_ranks(main, command(tmp_path / "run", "--cells", "2"), folder=tmp_path, size=3)
     assert codes == [1] * 3
-    expected = "voronerf: error: --cells must be at least the 3 ranks on the first level with several ranks, got (2,)"
+    expected = "voronerf: error: --cells must be at least the 3 ranks on the first level, got (2,)"
     assert complaints(texts) == [expected]
 
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 from helpers import refuses, seeded
 
-from voronerf import OccupancyGrid, VoronoiDiagram, composite
-from voronerf.distributed.sharing import Sharing, assign_cells, voxels_of_ranks
-from voronerf.distributed.sums import along_rays, compose, own_samples, sum_runs
-from voronerf.ops import render_loss
-from voronerf.ops.march_rays import March
+from voronerf import OccupancyGrid, VoronoiDiagram, backends, composite
+from voronerf.distributed.sharing import assign_cells, voxels_of_ranks
+from voronerf.ops import compose_runs, render_loss, run_gradients, run_sums
+from voronerf.ops import own_samples as keep_own
+from voronerf.ops.ray_runs.reference import along_rays, compose, own_samples, sum_runs
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
@@ -33,8 +33,9 @@ def test_partial_sums_are_one_composite(ranks):
     for rank in range(ranks):
         own = (owner == rank).reshape(-1)
         given = torch.zeros(rays * samples, 3), index, depths.reshape(-1), deltas.reshape(-1)
-        mine = own_samples(*given, owner.reshape(-1), own, hidden=False)
-        found.append(sum_runs(mine, parts[1].reshape(-1, 3)[own], parts[0].reshape(-1)[own], "auto"))
+        numbers = torch.where(torch.arange(ranks) == rank, 0, -1)
+        mine = own_samples(*given, owner.reshape(-1), numbers, bent=False, hidden=False)
+        found.append(sum_runs(mine, parts[1].reshape(-1, 3)[own], parts[0].reshape(-1)[own]))
     ray, start = torch.cat([runs.ray for runs in found]), torch.cat([runs.start for runs in found])
     order = along_rays(ray, start)
     sums = [torch.cat([getattr(runs, name) for runs in found])[order] for name in ("colour", "optical")]
@@ -50,12 +51,15 @@ def test_partial_sums_are_one_composite(ranks):
     assert torch.allclose(parts[1].grad, whole[1].grad, rtol=1e-10, atol=1e-13)
 
 
+@pytest.mark.parametrize("backend", ["native", "reference"])
 @pytest.mark.parametrize("ranks", [1, 3])
-def test_compiled_partial_sums_are_one_loss(ranks):
-    """Loss, gradients, weights and importance of `render_loss`, whatever rank has which sample; long and empty rays."""
-    ray_runs = pytest.importorskip("voronerf.ops.ray_runs.native", reason="the extension is not built")
+def test_partial_sums_are_one_loss(ranks, backend):
+    """Loss, gradients and weights of `render_loss`, whatever rank has which sample; long and empty rays."""
+    reason = backends.why_not("run_sums", backend, torch.device("cpu"))
+    if reason is not None:
+        pytest.skip(reason)
     generator, counts = seeded(), torch.tensor([5, 0, 1, 300, 40, 0, 7])
-    n, rays = int(counts.sum()), len(counts)
+    n, rays, given = int(counts.sum()), len(counts), {"backend": backend}
     index = torch.repeat_interleave(counts).int()
     offsets = torch.cat((torch.zeros(1, dtype=torch.int64), counts.cumsum(0))).int()
     raw = torch.randn(n, 4, generator=generator)
@@ -67,31 +71,34 @@ def test_compiled_partial_sums_are_one_loss(ranks):
     leaf = raw.clone().requires_grad_()
     expected = render_loss(leaf, deltas, offsets, target, background=background, **rest)
     expected.loss.backward()
-    whole = March(offsets, index, depths, deltas, torch.rand(n, 3, generator=generator), index)
+    positions = torch.rand(n, 3, generator=generator)
 
     own = [torch.where(torch.arange(ranks) == rank, 0, -1).int() for rank in range(ranks)]
     kept = [(cells == rank).nonzero()[:, 0] for rank in range(ranks)]
-    samples = [ray_runs.own_samples(whole, cells, numbers, bent=False) for numbers in own]
-    assert all(mine.positions.equal(whole.positions[rows]) for mine, rows in zip(samples, kept, strict=True))
-    sums = [ray_runs.run_sums(raw[rows], mine, 2.0)[0] for mine, rows in zip(samples, kept, strict=True)]
-    answers, loss = ray_runs.compose_runs(torch.cat(sums), target, background, first=0, rays=rays)
+    samples = [keep_own(positions, index, depths, deltas, cells, numbers, **given) for numbers in own]
+    assert all(mine.positions.equal(positions[rows]) for mine, rows in zip(samples, kept, strict=True))
+    sums = [run_sums(raw[rows], mine, density_scale=2.0, **given)[0] for mine, rows in zip(samples, kept, strict=True)]
+    shown = {"background": background, "first": 0, "rays": rays}
+    answers, loss = compose_runs(torch.cat(sums), target, **shown, **given)
     assert torch.allclose(loss, expected.loss, rtol=1e-6)
     for mine, rows, told in zip(samples, kept, answers.split(list(map(len, sums))), strict=True):
-        gradient, weights, importance = ray_runs.run_gradients(raw[rows], mine, told, **rest)
+        gradient, weights = run_gradients(raw[rows], mine, told, **rest, **given)
         assert torch.allclose(gradient, leaf.grad[rows], rtol=1e-4, atol=1e-8)
         assert torch.allclose(weights, expected.weights[rows], rtol=1e-5, atol=1e-8)
-        assert torch.allclose(importance, (expected.weights * expected.error[index])[rows], rtol=1e-5, atol=1e-8)
+        assert torch.allclose(
+            told[:, 5], expected.error[mine.ray_index[mine.run_offsets[:-1].long()].long()], rtol=1e-5
+        )
     with pytest.raises(ValueError, match="compose_runs: rays must be 1 to 7, got 0"):
-        ray_runs.compose_runs(sums[0], target, background, first=1, rays=rays)
+        compose_runs(sums[0], target, **{**shown, "first": 1}, **given)
 
 
 def test_a_gap_that_another_rank_may_fill_ends_a_run():
     depths, deltas = torch.tensor([0.1, 0.19, 0.5, 0.9]), torch.full((4,), 0.1)
     given = torch.zeros(4, 3), torch.zeros(4, dtype=torch.int32), depths, deltas
-    cells, own = torch.tensor([0, 1, 2, 2]), torch.ones(4, dtype=torch.bool)
-    assert own_samples(*given, cells, own, hidden=True).run_offsets.tolist() == [0, 2, 4]
-    assert own_samples(*given, cells, own, hidden=False).run_offsets.tolist() == [0, 4]
-    assert own_samples(*given, cells, ~own, hidden=False).run_offsets.tolist() == [0]
+    cells, own = torch.tensor([0, 1, 2, 2]), torch.arange(3)
+    assert own_samples(*given, cells, own, bent=False).run_offsets.tolist() == [0, 2, 4]
+    assert own_samples(*given, cells, own, bent=False, hidden=False).run_offsets.tolist() == [0, 4]
+    assert own_samples(*given, cells, own * 0 - 1, bent=False, hidden=False).run_offsets.tolist() == [0]
 
 
 @pytest.mark.parametrize("power", [False, True])
@@ -101,12 +108,12 @@ def test_voxels_that_cells_reach(power):
     centres = torch.rand(6, 3, generator=generator)
     weights = torch.rand(6, generator=generator) * 0.1 if power else None
     diagram, _ = VoronoiDiagram(centres, weights=weights).refine({2: torch.rand(4, 3, generator=generator)})
-    sharing = Sharing(diagram, assign_cells(diagram.leaf_centres, torch.ones(9), 3))
+    owner = assign_cells(diagram.leaf_centres, torch.ones(9), 3)
     grid = OccupancyGrid(torch.tensor([[0.0, 0, 0], [1.0, 1, 1]]), (8, 6, 10), threshold=1.0)
     points = torch.rand(200_000, 3, generator=generator)
     inside = torch.zeros(3, 480, dtype=torch.bool)
-    inside[sharing.owner[diagram.locate(points)], grid.cells(points)] = True
-    reached = voxels_of_ranks(sharing, grid, 3)
+    inside[owner[diagram.locate(points)], grid.cells(points)] = True
+    reached = voxels_of_ranks(diagram, owner, grid, 3)
     assert not (inside & ~reached).any()
     assert reached.sum() < 1.3 * inside.sum()
 

@@ -14,7 +14,6 @@ from voronerf import open_run
 from voronerf.data import builtin_scene
 from voronerf.data.scene import Sightings
 from voronerf.distributed.group import joined
-from voronerf.distributed.trainer import RankTrainer
 from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.trainer import Trainer
@@ -59,7 +58,7 @@ def train(folder, configs, stop=None):
     with joined(torch.device("cpu")) as group:
         for name, config in configs.items():
             group.sent.clear()
-            trainer = RankTrainer(config, scene(), group)
+            trainer = Trainer(config, scene(), group=group)
             trainer.on_step = functools.partial(stop_at, trainer, stop)
             trainer.run()
             held = list(trainer.router.parameters())

@@ -5,14 +5,13 @@ from functools import partial
 
 import pytest
 import torch
-from helpers import refuses
+from helpers import refuses, renderer_of
 from torch import nn
 
 from voronerf import VoronoiRouter
 from voronerf.data import builtin_scene
 from voronerf.evaluation.scores import render_view
 from voronerf.evaluation.seams import seam
-from voronerf.rendering.renderer import Renderer
 
 RADIUS, THICK = 0.6, 800.0
 
@@ -48,7 +47,7 @@ def measure(router, scene, **options):
 
 
 def render_view_of(router, scene, view):
-    return render_view(Renderer({"field": router}, samples=128, backend="reference"), scene, view)
+    return render_view(renderer_of({"field": router}, samples=128, backend="reference"), scene, view)
 
 
 def test_a_known_jump(scene):

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from helpers import refuses, seeded
+from helpers import refuses, renderer_of, seeded
 
 from voronerf import VoronoiDiagram
 from voronerf.data import builtin_scene
 from voronerf.export import cell_meshes, export_cells, export_mesh, export_points
-from voronerf.rendering import Contraction, OccupancyGrid, Renderer
+from voronerf.rendering import Contraction, OccupancyGrid
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
 
@@ -37,7 +37,7 @@ def run():
     scene = replace(builtin_scene(24, train_views=20, test_views=1), box=BOX)
     diagram = VoronoiDiagram(torch.rand(5, 3, generator=seeded()) - 0.5)
     router = SimpleNamespace(diagram=diagram)
-    return Run(Path("unused"), SimpleNamespace(), scene, {"field": router}, Renderer({"field": shell}, samples=192))
+    return Run(Path("unused"), SimpleNamespace(), scene, {"field": router}, renderer_of({"field": shell}, samples=192))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
@@ -59,13 +59,13 @@ def test_vertices_in_empty_cells_of_an_occupancy_grid_have_colours(run, tmp_path
     grid = OccupancyGrid(BOX, 40, threshold=1.0)
     grid.density = shell(grid.points(torch.arange(40**3)), None, None)[1].view(40, 40, 40)
     grid.occupied = grid.density > 0
-    skipping = replace(run, renderer=Renderer({"field": shell}, samples=192, occupancy=grid))
+    skipping = replace(run, renderer=renderer_of({"field": shell}, samples=192, occupancy=grid))
     mesh = export_mesh(skipping, tmp_path / "ball.ply", resolution=48)
     assert mesh.is_watertight and mesh.visual.vertex_colors[:, :3].max(-1).min() > 200
 
 
 def test_a_mesh_of_an_unbounded_scene_is_what_the_cameras_see(run, tmp_path):
-    renderer = Renderer({"field": shell}, samples=192, contraction=Contraction(torch.zeros(3), 1.2))
+    renderer = renderer_of({"field": shell}, samples=192, contraction=Contraction(torch.zeros(3), 1.2))
     unbounded = replace(run, scene=replace(run.scene, box=None), renderer=renderer)
     mesh = export_mesh(unbounded, tmp_path / "ball.ply", resolution=48)
     distance = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
@@ -96,7 +96,7 @@ def test_points_have_colours_and_normals(run, tmp_path):
 def test_points_of_a_contracted_scene_lie_in_the_world(run, tmp_path):
     space = Contraction(torch.zeros(3), 0.3)
     field = lambda positions, *rest: shell(space.inverse(positions), *rest)  # noqa: E731
-    contracted = replace(run, renderer=Renderer({"field": field}, samples=192, contraction=space))
+    contracted = replace(run, renderer=renderer_of({"field": field}, samples=192, contraction=space))
     place = np.asarray(export_points(contracted, tmp_path / "ball.ply", count=500, box=BOX).vertices)
     assert np.abs(np.linalg.norm(place[np.linalg.norm(place, axis=-1) < 0.8], axis=-1) - RADIUS).max() < 0.05
 

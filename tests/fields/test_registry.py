@@ -159,7 +159,7 @@ def test_every_kind_of_field_is_trained_split_resumed_and_scored(tmp_path: Path,
 
 def test_options_reach_the_field(scene: Scene) -> None:
     config = TrainConfig(field="foreign", field_options=("hidden=16", "growth=2.5", "kind=tanh"))
-    assert config.lr == 0.08 / 16 and (config.width, config.depth, config.direction_octaves) == (None, None, None)
+    assert config.lr == 0.08 / 16 and (config.width, config.depth) == (None, None)
     field = config.field_type.build(config.network_options)
     assert isinstance(field, Foreign) and (field.growth, field.kind, field.head.in_features) == (2.5, "tanh", 16)
     nerf = TrainConfig(field="nerf", field_options=("density_scale=20",), depth=2)
@@ -178,7 +178,6 @@ def test_options_reach_the_field(scene: Scene) -> None:
             "--field must be nerf, mipnerf, kilonerf, hashgrid, table, own-encoding, fourier, fo",
         ),
         ({"field": "table", "depth": 3}, "--depth must not come with --field table, got 3"),
-        ({"field": "table", "view_directions": False}, "--view-directions must not come with --field table, got False"),
         ({"field_options": ("gain",)}, "--field-options must be NAME=VALUE, got 'gain'"),
         *(
             (
@@ -189,7 +188,7 @@ def test_options_reach_the_field(scene: Scene) -> None:
         ),
         (
             {"field": "nerf", "field_options": ("gain=2",)},
-            "--field-options of nerf are density_scale, .*; got 'gain=2'",
+            "--field-options of nerf are skips, .*, density_scale, .*; got 'gain=2'",
         ),
         ({"field_options": ("width=2",)}, "--field-options must not hold width, use --width; got 'width=2'"),
         ({"field": "balls", "field_options": ("gain=2",)}, "--field-options of balls are none; got 'gain=2'"),

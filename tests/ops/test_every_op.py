@@ -21,7 +21,12 @@ from voronerf import backends, ops
 from voronerf.ops.cases import Draw, cases
 
 CASES = cases()
-KINDS = [(op, kind) for op, case in CASES.items() if case.comparable and not case.in_place for kind in case.kinds]
+KINDS = [
+    (op, kind)
+    for op, case in CASES.items()
+    if case.comparable and case.traced and not case.in_place
+    for kind in case.kinds
+]
 RUNS = [
     (f"{op}, {kind}" if kind else op, backend, device)
     for op, kind in KINDS

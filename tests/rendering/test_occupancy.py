@@ -2,22 +2,23 @@
 
 import pytest
 import torch
-from helpers import refuses, render_image, seeded
+from helpers import refuses, render_image, renderer_of, seeded
 
 from voronerf import HashGridField, NeRF, VoronoiRouter
 from voronerf.rendering import (
     Cameras,
     Contraction,
+    Occupancy,
     OccupancyGrid,
     Perspective,
     Rays,
-    Renderer,
+    Stratified,
     intersect_box,
     orbit_cameras,
-    render_marched,
     render_rays,
     render_until_opaque,
 )
+from voronerf.step import Batch, Step
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 WHITE = torch.ones(3)
@@ -117,8 +118,9 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
         towards = torch.rand(300, 3, generator=random) * 1.6 - 0.8
         rays = Rays(origins, torch.nn.functional.normalize(towards - origins, dim=1))
         near, far, hit = intersect_box(rays.origins, rays.directions, BOX, 0.0, 9.0)
-        seen = render_marched(ball, rays[hit], near[hit], far[hit], grid, samples=64, jitter=True, generator=random)
-        grid.observe(seen.positions, seen.density, seen.deltas, seen.weights, decay=0.8)
+        given = {"samples": Occupancy(grid, 64), "jitter": True, "generator": random}
+        seen = render_rays(ball, rays[hit], near[hit], far[hit], **given)
+        grid.observe(seen.samples.positions, seen.density, seen.samples.deltas, seen.weights, decay=0.8)
     distance = grid.points(torch.arange(16**3)).norm(dim=-1).reshape(16, 16, 16)
     half = 3**0.5 / 16
     corners = grid.points(torch.arange(16**3)).abs().amax(-1).reshape(16, 16, 16) > 0.8
@@ -129,7 +131,7 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
     plain, quick = (render_image(ball, cameras(), 0, occupancy=each, **options).colour for each in (None, grid))
     assert float((plain - quick).abs().mean()) < 2e-3
     before = ball.asked
-    render_marched(ball, rays[hit], near[hit], far[hit], grid, samples=64)
+    render_rays(ball, rays[hit], near[hit], far[hit], samples=Occupancy(grid, 64))
     assert (ball.asked - before) * 5 < 64 * int(hit.sum())
     # A cell comes back when a look finds something there, and fades no further by it.
     inside = grid.cells(torch.zeros(1, 3))
@@ -184,14 +186,15 @@ def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
     rays, options = camera.image_rays(0), {"samples": 96, "spacing": "disparity"}
     ends = torch.full((len(rays),), 1.0), torch.full((len(rays),), 60.0)
     for _ in range(40):
-        seen = render_marched(scene, rays, *ends, grid, jitter=True, generator=random, **options)
-        grid.observe(seen.positions, seen.density, seen.deltas, seen.weights, decay=0.8)
+        renderer = renderer_of({"field": scene}, contraction=space, occupancy=grid, **options)
+        seen = renderer.render(rays, *ends, jitter=True, generator=random)[-1]
+        grid.observe(seen.samples.positions, seen.density, seen.samples.deltas, seen.weights, decay=0.8)
         cells = torch.randint(16**3, (256,), generator=random)
         grid.update(scene, cells, decay=1.0, generator=random)
     pictures, counts = [], []
     for occupancy in (None, grid):
         asked[0] = 0
-        renderer = Renderer({"field": scene}, contraction=space, occupancy=occupancy, **options)
+        renderer = renderer_of({"field": scene}, contraction=space, occupancy=occupancy, **options)
         pictures.append(renderer.image(camera, 0, near=1.0, far=60.0))
         counts.append(asked[0])
     assert counts[1] * 3 < counts[0]
@@ -200,7 +203,7 @@ def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
     assert bool((plain.opacity > 0.95).all())  # by the ball or the wall
     torch.testing.assert_close(quick.heaviest[12, 12], plain.heaviest[12, 12], atol=1e-5, rtol=0)
     same = OccupancyGrid.from_state(grid.state_dict(), contraction=space)
-    again = Renderer({"field": scene}, contraction=space, occupancy=same, **options)
+    again = renderer_of({"field": scene}, contraction=space, occupancy=same, **options)
     assert torch.equal(again.image(camera, 0, near=1.0, far=60.0).colour, quick.colour)
 
 
@@ -222,14 +225,13 @@ def test_training_samples_and_gradients_are_those_of_the_dense_form(backend):
     background = torch.rand(len(rays), 3)
     grid = OccupancyGrid(BOX * 1.01, 6, threshold=0.1)
     found = []
-    for render, more in ((render_rays, ()), (render_marched, (grid,))):
+    for sampler in (Stratified(20, backend=backend), Occupancy(grid, 20, backend=backend)):
         scale = torch.tensor(2.0, requires_grad=True)
-        options = {"samples": 20, "background": background, "backend": backend}
         field = lambda p, d, i, scale=scale: ((p * scale).sigmoid(), p.square().sum(-1) * scale)  # noqa: E731
-        result = render(field, rays, near, far, *more, **options)
+        result = render_rays(field, rays, near, far, samples=sampler, background=background)
         result.colour.square().sum().backward()
-        found.append((result.colour, result.opacity, result.depth, result.weights.reshape(-1), scale.grad))
-        assert result.positions.reshape(-1, 3).shape == (20 * len(rays), 3)
+        found.append((result.colour, result.opacity, result.depth, result.weights, scale.grad))
+        assert result.samples.positions.shape == (20 * len(rays), 3)
     for a, b in zip(*found):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
 
@@ -240,12 +242,13 @@ def test_rays_that_meet_nothing_show_the_background():
     rays = Rays(torch.zeros(3, 3), torch.eye(3))
     ends = torch.full((3,), 0.1), torch.full((3,), 0.9)
     asked = Ball()
-    seen = render_until_opaque(asked, rays, *ends, grid, samples=8, background=WHITE)
+    seen = render_until_opaque(asked, rays, *ends, Occupancy(grid, 8), background=WHITE)
     assert asked.asked == 0
     assert torch.equal(seen.colour, torch.ones(3, 3)) and torch.equal(seen.depth, ends[1])
     assert torch.equal(seen.heaviest, 0.9 * torch.eye(3))
     parameter = torch.ones((), requires_grad=True)
-    marched = render_marched(lambda p, d, i: (p * parameter, p[:, 0] * parameter), rays, *ends, grid, samples=8)
+    field = lambda p, d, i: (p * parameter, p[:, 0] * parameter)  # noqa: E731
+    marched = render_rays(field, rays, *ends, samples=Occupancy(grid, 8))
     marched.colour.sum().backward()
     assert torch.equal(marched.colour.detach(), torch.zeros(3, 3)) and parameter.grad == 0
 
@@ -287,13 +290,17 @@ def test_refuses_what_is_no_grid():
 def test_pictures_have_samples_of_their_own():
     given = {"near": 1.0, "far": 5.0, "box": BOX, "background": WHITE}
     pictures = [
-        Renderer({"field": Ball()}, samples=samples, picture_samples=own, occupancy=tight_grid()).image(
+        renderer_of({"field": Ball()}, samples=samples, picture_samples=own, occupancy=tight_grid()).image(
             cameras(), 0, **given
         )
         for samples, own in ((48, None), (24, 48), (24, None))
     ]
     assert torch.equal(pictures[0].colour, pictures[1].colour)
     assert not torch.equal(pictures[0].colour, pictures[2].colour)
+
+
+def ends(rays):
+    return torch.ones(len(rays)), torch.full((len(rays),), 5.0)
 
 
 @pytest.mark.parametrize("full_gradient", [None, 4.0])
@@ -304,18 +311,18 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient):
     rays = cameras().image_rays(0)
     target, background = torch.rand(len(rays), 3), torch.rand(len(rays), 3)
     options = {"samples": 24, "occupancy": grid, "full_gradient": full_gradient}
-    renderer = Renderer({"field": router}, **options)
+    renderer = renderer_of({"field": router}, **options)
 
     def compare(renderer):
-        given = {"background": background, "generator": torch.Generator().manual_seed(3)}
-        found = renderer.compare(rays, 1.0, 5.0, target, **given)
+        batch = Batch(rays, *ends(rays), target, background)
+        found = Step(renderer).run(batch, torch.Generator().manual_seed(3))
         return found, torch.autograd.grad(found.loss, list(router.parameters()))
 
     found, gradients = compare(renderer)
-    plain = Renderer({"field": lambda *given: router(*given)}, **options)  # a field without a table
+    plain = renderer_of({"field": lambda *given: router(*given)}, **options)  # a field without a table
     expected, same = compare(plain)
-    assert len(found.positions) > 0 and torch.equal(found.positions, expected.positions)
-    for part, other in zip((*found, found.importance(), *gradients), (*expected, expected.importance(), *same)):
+    assert len(found.weights) > 0 and torch.equal(found.samples.positions, expected.samples.positions)
+    for part, other in zip((*found[:4], found.importance(), *gradients), (*expected[:4], expected.importance(), *same)):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-6)
 
 
@@ -326,8 +333,9 @@ def test_samples_that_no_light_reaches_have_no_gradient():
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **field.router_options)
     rays, gradients = cameras().image_rays(0), []
     for of in (router, lambda *given: router(*given)):  # the second is a field without a table
-        renderer = Renderer({"field": of}, samples=96, occupancy=tight_grid())
-        found = renderer.compare(rays, 1.0, 5.0, torch.zeros(len(rays), 3), generator=torch.Generator().manual_seed(3))
+        renderer = renderer_of({"field": of}, samples=96, occupancy=tight_grid())
+        batch = Batch(rays, *ends(rays), torch.zeros(len(rays), 3))
+        found = Step(renderer).run(batch, torch.Generator().manual_seed(3))
         gradients.append(torch.autograd.grad(found.loss, router.module.features)[0])
     some, every = gradients
     assert 0 < some.count_nonzero() < every.count_nonzero()

@@ -1,24 +1,32 @@
 """Several passes along a ray, against slow loops and pictures that are known."""
 
-import itertools
 import math
 
 import pytest
 import torch
-from helpers import refuses, same, seeded
+from helpers import refuses, renderer_of, same, seeded
 from torch import Tensor
 
-from voronerf.rendering import Contraction, OccupancyGrid, Rays, Renderer, render_rays
+from voronerf.rendering import (
+    Contraction,
+    Hierarchical,
+    Occupancy,
+    OccupancyGrid,
+    Rays,
+    Renderer,
+    Space,
+    Stratified,
+    render_rays,
+)
 from voronerf.rendering.sampling import (
     PADDING,
     blurred_weights,
-    distortion_loss,
     interlevel_loss,
-    normalised,
     strata_uniforms,
     stratified_edges,
     union_depths,
 )
+from voronerf.step import Batch, Step
 
 WHITE = torch.ones(3)
 
@@ -46,10 +54,10 @@ def rays(count=3):
 def test_a_second_pass_finds_a_thin_surface():
     """A slab a fortieth of the ray thick: 16 strata see it with a wrong thickness, the second pass does not."""
     expected = 1 - math.exp(-30 * 0.1)
-    one = Renderer({"field": Slab()}, samples=17).render(rays(), 0.0, 4.0)
+    one = renderer_of({"field": Slab()}, samples=17).render(rays(), 0.0, 4.0)
     assert len(one) == 1 and abs(float(one[0].opacity[0]) - expected) > 0.04
     for fields, cones in (({"field": Slab(), "coarse": Slab()}, False), ({"field": Slab()}, True)):
-        passes = Renderer(fields, samples=17, fine_samples=64, cones=cones).render(rays(), 0.0, 4.0)
+        passes = renderer_of(fields, samples=17, fine_samples=64, cones=cones).render(rays(), 0.0, 4.0)
         assert len(passes) == 2
         assert abs(float(passes[1].opacity[0]) - expected) < 0.02
         # Fog of density 30 from 1.95 on, a tenth thick: the mean of an exponential cut off there.
@@ -66,15 +74,17 @@ def test_who_is_asked_about_what():
     ):
         field, other = Slab(), Slab()
         fields = {"field": field} if first is None else {"field": field, first: other}
-        Renderer(fields, samples=8, **options).render(rays(), 0.0, 4.0)
+        renderer_of(fields, samples=8, **options).render(rays(), 0.0, 4.0)
         assert [list(p.shape) for p in other.asked] == of_first
         assert [list(p.shape) for p in field.asked] == of_field
 
 
 def test_one_pass_is_render_rays():
-    sampling, options = {"samples": 9, "spacing": "disparity"}, {"background": WHITE, "jitter": True}
-    (got,) = Renderer({"field": Slab()}, **sampling).render(rays(), 1.0, 3.0, generator=seeded(4), **options)
-    assert same(got, render_rays(Slab(), rays(), 1.0, 3.0, generator=seeded(4), **sampling, **options))
+    options = {"background": WHITE, "jitter": True}
+    sampler = Stratified(9, space=Space(spacing="disparity"))
+    (got,) = Renderer({"field": Slab()}, sampler).render(rays(), 1.0, 3.0, generator=seeded(4), **options)
+    other = render_rays(Slab(), rays(), 1.0, 3.0, samples=sampler, generator=seeded(4), **options)
+    assert same(got[:-1], other[:-1]) and same(got.samples, other.samples)
 
 
 def test_union_against_slow_loop():
@@ -83,7 +93,7 @@ def test_union_against_slow_loop():
     weights = torch.rand(5, 8, generator=generator)
     weights[3] = 0
     depths = (edges[:, 1:] + edges[:, :-1]) / 2
-    every, ends = union_depths(depths, edges, weights, 4, jitter=False)
+    every, ends = union_depths(depths, edges, weights, 4)
     for ray in range(5):
         mass = weights[ray] if ray != 3 else torch.ones(8)
         cumulative = torch.cat((torch.zeros(1), mass.cumsum(0))) / mass.sum()
@@ -143,102 +153,19 @@ def test_a_proposal_that_bounds_the_weights_costs_nothing():
     assert float(interlevel_loss(edges, weights, edges[:, ::2].contiguous(), bounds)) == pytest.approx(0, abs=1e-9)
 
 
-def test_distortion_loss_against_slow_loop():
-    generator = seeded(0)
-    edges = torch.rand(6, 8, generator=generator).sort(dim=1).values
-    weights = torch.rand(6, 7, generator=generator).requires_grad_()
-    expected = 0.0
-    for r in range(6):
-        w, e = weights[r].tolist(), edges[r].tolist()
-        middles = [(a + b) / 2 for a, b in itertools.pairwise(e)]
-        expected += sum(w[i] * w[j] * abs(middles[i] - middles[j]) for i in range(7) for j in range(7)) / 6
-        expected += sum(w[i] ** 2 * (e[i + 1] - e[i]) / 3 for i in range(7)) / 6
-    loss = distortion_loss(edges, weights)
-    assert float(loss.detach()) == pytest.approx(expected, rel=1e-5)
-    loss.backward()
-    assert weights.grad is not None and bool((weights.grad > 0).all())
-    exact = weights.detach().double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda w: distortion_loss(edges.double(), w), exact)
-    # the integral that it stands for, of a density that is constant in each interval
-    u = torch.linspace(0, 1, 2001, dtype=torch.float64)[:-1] + 1 / 4000
-    ends, mass = torch.tensor([0.0, 0.3, 0.5, 1.0]), torch.tensor([0.2, 0.7, 0.1])
-    density = (mass / ends.diff()).double()[torch.bucketize(u, ends[1:-1].double())]
-    integral = float((density[:, None] * density * (u[:, None] - u).abs()).mean())
-    assert float(distortion_loss(ends[None], mass[None])) == pytest.approx(integral, rel=1e-3)
-
-
-def test_distances_as_fractions():
-    near, far = torch.tensor([1.0, 2.0, 3.0, 0.0]), torch.tensor([4.0, 2.0, 30.0, 5.0])
-    for spacing in ("linear", "disparity"):
-        edges = stratified_edges(near, far, 5, jitter=False, spacing=spacing)
-        found = normalised(edges, near, far, spacing)
-        even = torch.linspace(0, 1, 6)
-        torch.testing.assert_close(found[0], even)
-        torch.testing.assert_close(found[2], even)
-        assert torch.equal(found[1], torch.zeros(6)) and bool(((found[3] >= 0) & (found[3] <= 1)).all())
-
-
-def test_a_spread_along_the_ray_costs_by_its_factor():
-    target, fog = torch.rand(3, 3), Slab(-0.6, 0.8, density=1.0)
-    for spacing, fields in (("linear", {"field": fog}), ("disparity", {"field": fog, "proposal": fog})):
-        options = {"samples": 6, "fine_samples": 5 * (len(fields) - 1), "spacing": spacing}
-        passes = Renderer(fields, **options).render(rays(), 1.0, 4.0)
-        plain, with_it = (Renderer(fields, distortion=d, **options).loss(passes, target) for d in (0.0, 0.5))
-        last = passes[-1]
-        spread = distortion_loss(normalised(last.edges, torch.ones(3), 4 * torch.ones(3), spacing), last.weights)
-        torch.testing.assert_close(with_it - plain, 0.5 * spread)
-        assert float(spread) > 0
-
-
-def test_a_proposal_is_asked_in_rounds():
-    field, proposal = Slab(), Slab()
-    renderer = Renderer({"field": field, "proposal": proposal}, samples=8, fine_samples=4, rounds=3)
-    passes = renderer.render(rays(), 0.0, 4.0, jitter=True, generator=seeded(0))
-    assert [list(p.shape) for p in proposal.asked] == [[3 * 8, 3]] * 3
-    assert [list(p.shape) for p in field.asked] == [[3 * 4, 3]] and len(passes) == 4
-    # each round looks closer at what the one before has found
-    inside = [float(((p[:, 2] > -0.3) & (p[:, 2] < 0.3)).float().mean()) for p in (*proposal.asked, *field.asked)]
-    assert inside[0] < inside[1] < inside[2] and inside[3] > inside[0]
-    target = torch.rand(3, 3)
-    last = passes[-1]
-    expected = (last.colour - target).square().mean()
-    for one in passes[:-1]:
-        expected = expected + interlevel_loss(last.edges, last.weights, one.edges, one.weights)
-    torch.testing.assert_close(renderer.loss(passes, target), expected)
-
-
-def test_a_proposal_sharpens():
-    """From even intervals to those of its weights, while training; pictures are made with its weights as they are."""
-    inside, edges = [], []
-    for sharpness in (0.0, 0.4, 1.0):
-        for jitter in (True, False):
-            field = Slab()
-            renderer = Renderer({"field": field, "proposal": Slab()}, samples=16, fine_samples=64)
-            renderer.sharpness = sharpness
-            last = renderer.render(rays(), 0.0, 4.0, jitter=jitter, generator=seeded(0))[-1]
-            if jitter:
-                found = field.asked[0][:, 2]
-                inside.append(float(((found > -0.3) & (found < 0.3)).float().mean()))
-                widths = last.edges.diff(dim=1) if sharpness == 0 else None
-                # Two ends drawn in neighbouring strata are less than twice a stratum apart.
-                assert widths is None or float(widths.max()) < 2 * 4 / 64
-            else:
-                edges.append(last.edges)
-    assert inside[0] < inside[1] < inside[2]
-    assert torch.equal(edges[0], edges[2]) and torch.equal(edges[1], edges[2])
-
-
 def test_losses():
-    target = torch.rand(3, 3)
-    higher = Slab(0.2, 0.8)
-    for others, fine, share in (({}, 5, 0.1), ({"coarse": higher}, 5, 1.0), ({"proposal": higher}, 5, 0), ({}, 0, 0)):
-        renderer = Renderer({"field": Slab(), **others}, samples=6, fine_samples=fine)
-        passes = renderer.render(rays(), 0.0, 4.0, background=WHITE)
-        first, last = passes[0], passes[-1]
+    target, higher = torch.rand(3, 3), Slab(0.2, 0.8)
+    near, far = torch.zeros(3), torch.full((3,), 4.0)
+    for others, cones, share in (({}, True, 0.1), ({"coarse": higher}, False, 1.0), ({"proposal": higher}, False, 0)):
+        renderer = renderer_of({"field": Slab(), **others}, samples=6, fine_samples=5, cones=cones)
+        first, last = renderer.render(rays(), near, far, background=WHITE, jitter=True, generator=seeded(2))
         expected = (last.colour - target).square().mean() + share * (first.colour - target).square().mean()
         if "proposal" in others:
-            expected = expected + interlevel_loss(last.edges, last.weights, first.edges, first.weights)
-        torch.testing.assert_close(renderer.loss(passes, target), expected)
+            given = (x for each in (last, first) for x in (each.samples.edges, each.samples.by_ray(each.weights)))
+            expected = expected + interlevel_loss(*given)
+        found = Step(renderer).run(Batch(rays(), near, far, target, WHITE), seeded(2))
+        torch.testing.assert_close(found.loss, expected)
+        torch.testing.assert_close(found.error, (last.colour - target).square().sum(1))
 
 
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])
@@ -266,11 +193,11 @@ def test_uniforms_are_one_in_each_stratum():
 def test_training_draws_differ_and_pictures_do_not():
     for fields, cones in (({"field": Slab(), "coarse": Slab()}, False), ({"field": Slab(), "proposal": Slab()}, False),
                           ({"field": Slab()}, True)):  # fmt: skip
-        renderer = Renderer(fields, samples=8, fine_samples=8, cones=cones)
+        renderer = renderer_of(fields, samples=8, fine_samples=8, cones=cones)
         seeds = [seeded(seed) for seed in (0, 0, 1)]
         a, b, c = (renderer.render(rays(), 0.0, 4.0, jitter=True, generator=seed)[-1] for seed in seeds)
-        assert torch.equal(a.depths, b.depths) and not torch.equal(a.depths, c.depths)
-        still = [renderer.render(rays(), 0.0, 4.0)[-1].depths for _ in range(2)]
+        assert torch.equal(a.samples.depths, b.samples.depths) and not torch.equal(a.samples.depths, c.samples.depths)
+        still = [renderer.render(rays(), 0.0, 4.0)[-1].samples.depths for _ in range(2)]
         assert torch.equal(*still)
 
 
@@ -278,28 +205,19 @@ def test_contracted_positions_are_what_the_field_sees():
     space = Contraction(torch.zeros(3), 0.5)
     for cones in (False, True):
         field = Slab()
-        passes = Renderer({"field": field}, samples=8, cones=cones, contraction=space).render(rays(), 0.0, 400.0)
-        assert torch.equal(passes[0].positions, field.asked[0].reshape(3, 8, -1)[..., :3])
-        assert float(passes[0].positions.norm(dim=-1).max()) < 1
+        passes = renderer_of({"field": field}, samples=8, cones=cones, contraction=space).render(rays(), 0.0, 400.0)
+        assert torch.equal(passes[0].samples.positions, field.asked[0][:, :3])
+        assert float(passes[0].samples.positions.norm(dim=-1).max()) < 1
 
 
 def test_refusals():
-    one, proposal = {"field": Slab()}, {"field": Slab(), "proposal": Slab()}
-    coarse = {"field": Slab(), "coarse": Slab()}
-    grid = OccupancyGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), 2, threshold=1.0)
-    for fields, options, message in (
-        ({"coarse": Slab()}, {}, "fields must be field, and coarse or proposal, got ['coarse']"),
-        (coarse, {}, "fine_samples must be >= 1 with two fields, got 0"),
-        (one, {"samples": 0}, "samples must be >= 1 and fine_samples >= 0, got 0 and 0"),
-        (proposal, {"fine_samples": 3, "rounds": 0}, "rounds must be >= 1, and 1 without a proposal, got 0"),
-        (coarse, {"fine_samples": 3, "rounds": 2}, "rounds must be >= 1, and 1 without a proposal, got 2"),
-        (one, {"distortion": -1}, "distortion must be >= 0 and finite, got -1"),
-        (one, {"distortion": 0.1, "occupancy": grid}, "without distortion"),
-        (
-            one,
-            {"contraction": Contraction(torch.zeros(3), 1.0), "occupancy": grid},
-            "a grid in the space of contraction",
-        ),
-        (one, {"fine_samples": 3, "occupancy": grid}, "occupancy must come with a single pass over points"),
-    ):
-        refuses(message, Renderer, fields, **{"samples": 3, **options})
+    grid, sphere = (
+        OccupancyGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), 2, threshold=1.0),
+        Contraction(torch.zeros(3), 1.0),
+    )
+    refuses("fields must be field, got ['coarse']", Renderer, {"coarse": Slab()}, Stratified(3))
+    refuses("fields must be field and coarse, got ['field']", Renderer, {"field": Slab()}, Hierarchical(3, 3))
+    refuses("Stratified: samples must be >= 1, got 0", Stratified, 0)
+    refuses("Hierarchical: fine_samples must be >= 1, got 0", Hierarchical, 3, 0)
+    for space in (Space(sphere), Space(cones=True)):
+        refuses("grid must be of points, and in the space of the contraction", Occupancy, grid, 3, space=space)

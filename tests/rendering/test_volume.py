@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
-from helpers import refuses, render_image, seeded
+from helpers import refuses, render_image, renderer_of, seeded
 
-from voronerf.rendering import OccupancyGrid, Renderer
+from voronerf.rendering import OccupancyGrid, Space, Stratified, render_rays
 from voronerf.rendering.cameras import Rays, orbit_cameras
-from voronerf.rendering.volume import render_rays
+from voronerf.step import Batch, Step
 
 BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])
 WHITE = torch.ones(3)
@@ -36,7 +36,10 @@ def cameras():
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])
 def test_against_slow_loop(spacing):
     some, samples, near, far = rays(), 17, 1.5, 4.5
-    result = render_rays(ball, some, near, far, samples=samples, background=WHITE, spacing=spacing)
+    result = render_rays(
+        ball, some, near, far, samples=Stratified(samples, space=Space(spacing=spacing)), background=WHITE
+    )
+    weights, positions = (result.samples.by_ray(x) for x in (result.weights, result.samples.positions))
 
     def distance(fraction):
         if spacing == "linear":
@@ -56,8 +59,8 @@ def test_against_slow_loop(spacing):
                 colour[i] += weight * (0.5 + 0.4 * point[i] * float(some.directions[r, i]))
             opacity += weight
             depth += weight * t
-            assert float(result.weights[r, s]) == pytest.approx(weight, abs=1e-5)
-            assert result.positions[r, s].tolist() == pytest.approx(point, abs=1e-5)
+            assert float(weights[r, s]) == pytest.approx(weight, abs=1e-5)
+            assert positions[r, s].tolist() == pytest.approx(point, abs=1e-5)
         assert result.colour[r].tolist() == pytest.approx([c + 1 - opacity for c in colour], abs=1e-5)
         assert float(result.opacity[r]) == pytest.approx(opacity, abs=1e-5)
         assert float(result.depth[r]) == pytest.approx(depth / opacity if opacity > 1e-7 else far, abs=1e-4)
@@ -116,7 +119,7 @@ def test_what_is_near_the_camera_learns_less(marched):
     for full in (None, 2.0):
         answers = torch.full((8, 4), 0.3, requires_grad=True)
         fog = lambda *_, answers=answers: (answers[:, :3], answers[:, 3])  # noqa: E731
-        renderer = Renderer({"field": fog}, samples=8, occupancy=grid, full_gradient=full)
+        renderer = renderer_of({"field": fog}, samples=8, occupancy=grid, full_gradient=full)
         (rendered,) = renderer.render(ahead, 1.0, 3.0)
         rendered.colour.sum().backward()
         found.append(answers.grad)
@@ -128,12 +131,14 @@ def test_the_last_rays_end_at_points():
     """The weights within 0.03 of the distance and a sample's length of 0.25 count, by minus their logarithm."""
     ahead = Rays(torch.zeros(3, 3), torch.tensor([[0.0, 0, 1]]).expand(3, 3))
     fog = lambda positions, *_: (torch.zeros_like(positions), torch.full_like(positions[:, 0], 0.5))  # noqa: E731
-    renderer = Renderer({"field": fog}, samples=8, sightings=0.1)
-    (rendered,) = passes = renderer.render(ahead, 1.0, 3.0)
+    renderer = renderer_of({"field": fog}, samples=8)
+    rendered, ends = render_rays(fog, ahead, 1.0, 3.0, samples=8), (torch.ones(3), torch.full((3,), 3.0))
+    renderer.sampler.sample = lambda *_, **__: rendered.samples  # without jitter
     expected = 0.1 * sum(-math.log(math.exp(-0.125 * before) * (1 - math.exp(-0.125 * many))) for before, many in ENDS)
     target, seen = rendered.colour, torch.tensor([2.0, 2.9])
-    assert float(renderer.loss(passes, target, seen)) == pytest.approx(expected / 2, rel=1e-5)
-    assert float(renderer.loss(passes, target)) == 0
+    step = Step(renderer, sightings=0.1)
+    assert float(step.run(Batch(ahead, *ends, target, None, seen)).loss) == pytest.approx(expected / 2, rel=1e-5)
+    assert float(step.run(Batch(ahead, *ends, target)).loss) == 0
 
 
 def test_image_is_the_rays_of_its_pixels_whatever_the_chunk():
@@ -147,9 +152,10 @@ def test_image_is_the_rays_of_its_pixels_whatever_the_chunk():
     chunked = render_image(ball, some, 1, chunk=7, **options)
     for one, other in zip(image, chunked):
         torch.testing.assert_close(one, other)
-    top = direct.weights.argmax(-1)
+    weights, positions = (direct.samples.by_ray(x) for x in (direct.weights, direct.samples.positions))
+    top = weights.argmax(-1)
     seen = direct.opacity > 0.5
-    torch.testing.assert_close(image.heaviest.reshape(-1, 3)[seen], direct.positions[torch.arange(len(top)), top][seen])
+    torch.testing.assert_close(image.heaviest.reshape(-1, 3)[seen], positions[torch.arange(len(top)), top][seen])
 
 
 def test_rays_that_miss_the_box_do_not_ask_the_field():
@@ -185,4 +191,4 @@ def test_no_gradient_and_errors():
 
 def test_no_rays():
     result = render_rays(ball, Rays(torch.zeros(0, 3), torch.zeros(0, 3)), 1.0, 2.0, samples=3)
-    assert result.colour.shape == (0, 3) and result.weights.shape == (0, 3)
+    assert result.colour.shape == (0, 3) and result.weights.shape == (0,)

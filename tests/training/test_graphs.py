@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import voronerf.training.trainer as trainer_module
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.cuda_graph import WARMUP, GraphedStep, set_learning_rate
-from voronerf.training.occupancy import make_picture_grid
+from voronerf.training.renderers import make_picture_grid
 from voronerf.training.trainer import Trainer
 
 aten = torch.ops.aten
@@ -62,7 +62,7 @@ def test_a_step_reads_nothing_on_the_host(tmp_path, scene, monkeypatch, settings
         # The optimiser's own reading of its step counter is left out by its capturable form, which is for CUDA alone.
         with monkeypatch.context() as patch, NoReading():
             patch.setattr(trainer.optimizer, "step", lambda: None)
-            patch.setattr(trainer.reservoir, "add", lambda *kept: None)  # after the step that a graph holds
+            patch.setattr(trainer.cells.reservoir, "add", lambda *kept: None)  # after the step that a graph holds
             trainer.train_step()
         if cells == 1:
             trainer.split()
@@ -215,4 +215,4 @@ def test_pictures_through_a_grid_of_a_run_that_was_graphed(tmp_path, scene):
     trainer = Trainer(small(tmp_path, steps=2, cells=()), scene)
     trainer.run()
     config = replace(trainer.config, device="cuda", cuda_graph=True)
-    assert make_picture_grid(config, scene, trainer.renderer.field).occupied.any()
+    assert make_picture_grid(config, scene, trainer.renderer).occupied.any()

@@ -1,4 +1,4 @@
-"""What changes over a run: the learning rate, the rays of a step, the temperature, the sharpness of a proposal."""
+"""What changes over a run: the learning rate and the rays of a step."""
 
 import pytest
 from tiny_runs import small, stopping
@@ -21,7 +21,7 @@ def test_the_learning_rate_of_hash_grids_stays_for_a_quarter():
         ("nerf", (0.1**0.5, 0.1, 0.1**1.5, 0.01)),
     ):
         config = TrainConfig(field=field, lr=0.5, lr_final=0.01)
-        found = [learning_rate(config, done, 1_000, 0) / 0.5 for done in (0.25, 0.5, 0.75, 1.0)]
+        found = [learning_rate(config, done, 1_000) / 0.5 for done in (0.25, 0.5, 0.75, 1.0)]
         assert found == pytest.approx(rates)
 
 
@@ -32,39 +32,6 @@ def test_the_occupancy_grid_of_a_long_run_keeps_the_scene(tmp_path, scene):
     trainer = stopping(config, scene, 200)
     trainer.advance()
     assert trainer.occupancy.share > 0.05
-
-
-def test_the_learning_rate_changes_at_each_split(tmp_path, scene):
-    rates = []
-    for factor in (1.0, 0.5):
-        trainer = Trainer(small(tmp_path / f"{factor}", cells=(3, 2), lr_split=factor), scene)
-        rates.append(seen := [])
-        trainer.on_step = lambda p, trainer=trainer, seen=seen: seen.append((trainer.level, trainer.learning_rate()))
-        trainer.advance()
-    assert [level for level, _ in rates[0]] == [level for level, _ in rates[1]] and rates[0][-1][0] == 2
-    for (level, usual), (_, rate) in zip(*rates):
-        assert rate == pytest.approx(0.5**level * usual)
-
-
-def test_the_temperature_falls_to_its_last_value(tmp_path, scene):
-    settings = {"cells": (3,), "assignment": "stochastic", "temperature": 0.2, "temperature_final": 0.01, "steps": 40}
-    trainer = Trainer(small(tmp_path, **settings, sampling="hierarchical"), scene)
-    seen = []
-    trainer.on_step = lambda p: seen.extend((p.step, router.temperature) for router in trainer.routers.values())
-    trainer.advance()
-    assert len(seen) == 2 * 40
-    for step, temperature in seen:
-        assert temperature == pytest.approx(0.2 * 0.01 ** ((step - 1) / 40))
-
-
-def test_a_proposal_is_annealed(tmp_path, scene):
-    for slope in (0.0, 1.0, 10.0):
-        trainer = Trainer(small(tmp_path / f"{slope}", sampling="proposal", proposal_anneal=slope, steps=10), scene)
-        seen = []
-        trainer.on_step = lambda p, trainer=trainer, seen=seen: seen.append(trainer.renderer.sharpness)
-        trainer.advance()
-        times = [step / 10 for step in range(10)]
-        assert seen == pytest.approx([slope * t / ((slope - 1) * t + 1) if slope else 1.0 for t in times])
 
 
 def test_a_step_takes_more_rays_where_space_is_empty(tmp_path, scene):

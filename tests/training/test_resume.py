@@ -92,7 +92,7 @@ def test_a_loaded_run_renders_the_same(tmp_path, scene):
     with trainer.averaged():
         assert evaluate(run.renderer, scene, views=2) == evaluate(trainer.renderer, scene, views=2)
     coarser = open_run(tmp_path, scene=scene, samples=3, backend="reference").renderer
-    assert (coarser.samples, coarser.backend) == (3, "reference")
+    assert (coarser.sampler.samples, coarser.backend) == (3, "reference")
     # Another configuration, another architecture.
     with pytest.raises(CheckpointError, match=r"a checkpoint of another configuration: --width 8 -> 16; --lr"):
         Trainer(replace(config, width=16, lr=1e-4, resume=True), scene)
@@ -153,7 +153,7 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
 
 @pytest.mark.parametrize("contraction", ["none", "sphere"])
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction):
-    monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
+    monkeypatch.setattr("voronerf.step.cells.REVISIT_EVERY", 2)
     monkeypatch.setattr("voronerf.training.rates.FILL", 1.5)  # other numbers of rays in every step
     settings = {"contraction": contraction, "precision": "fp32" if contraction == "none" else "bf16"}
     found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8, ray_growth=8, **settings)

@@ -10,7 +10,7 @@ from tiny_runs import small, tensors
 from voronerf import backends
 from voronerf.training.trainer import Trainer
 
-PROPOSAL = {"sampling": "proposal", "proposal_rounds": 2, "proposal_anneal": 10.0, "distortion": 0.01}
+PROPOSAL = {"sampling": "proposal"}
 VARIANTS = {
     "nerf": {},
     "hierarchical": {"sampling": "hierarchical"},

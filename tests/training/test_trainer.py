@@ -12,7 +12,6 @@ import torch
 from helpers import read_json, refuses
 from tiny_runs import small, stopping
 
-import voronerf.training.trainer as trainer_module
 from voronerf import open_run
 from voronerf.backends import BackendUnavailable
 from voronerf.evaluation.scores import evaluate, mean_scores, render_view
@@ -108,7 +107,7 @@ def test_splits_that_never_come_are_told(tmp_path, scene):
     trainer.on_step = lambda p: setattr(trainer, "seconds", p.step / 100)
     summary = trainer.run()
     assert summary["complete"] and summary["cells"] == 2 and summary["splits_left"] == 1
-    assert "1 of 2 planned splits not made: the run ended before" in lines
+    assert "Run ended before 1 of 2 planned splits." in lines
 
 
 def test_a_stop_in_the_last_step_leaves_nothing_out(tmp_path, scene):
@@ -192,7 +191,12 @@ def test_random_initialisation_leaves_cells_that_are_not_split(tmp_path, scene):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"backend": "reference"}, {"view_directions": False}, {"cells": ()}, {"assignment": "stochastic"}],
+    [
+        {"backend": "reference"},
+        {"field_options": ("view_directions=False",)},
+        {"cells": ()},
+        {"assignment": "stochastic"},
+    ],
     ids=str,
 )
 def test_further_settings_run(tmp_path, scene, settings):
@@ -201,7 +205,7 @@ def test_further_settings_run(tmp_path, scene, settings):
     assert (router.assignment, router.temperature) == (settings.get("assignment", "nearest"), 0.7)
     summary = trainer.run()
     assert summary["complete"] and summary["cells"] == len(trainer.config.cells) * 3 + 1
-    assert router.field.layers.uses_directions == settings.get("view_directions", True)
+    assert router.field.layers.uses_directions == ("field_options" not in settings)
 
 
 def test_the_reference_backend_trains_to_the_same_curve(tmp_path, scene):
@@ -220,12 +224,12 @@ def test_kept_samples_are_weight_times_ray_error(tmp_path, scene, monkeypatch):
     monkeypatch.setattr(RayBatches, "draw", lambda *a, **k: targets.append(draw(*a, **k)) or targets[-1])
     trainer = stopping(small(tmp_path, reservoir=40, reservoir_batches=1, split_at=(0.9,)), scene, 1)
     trainer.advance()
-    points, importance = trainer.reservoir.samples()
+    points, importance = trainer.cells.reservoir.samples()
     error = (rendered[0].colour - targets[0].target).square().sum(1)
-    expected = (rendered[0].weights * error[:, None]).detach().reshape(-1)
+    expected = (rendered[0].samples.by_ray(rendered[0].weights) * error[:, None]).detach().reshape(-1)
     heaviest = expected.topk(40)
     torch.testing.assert_close(importance.sort(descending=True).values, heaviest.values)
-    at = rendered[0].positions.detach().reshape(-1, 3)[heaviest.indices]
+    at = rendered[0].samples.positions.detach()[heaviest.indices]
     assert {tuple(p) for p in points.tolist()} == {tuple(p) for p in at.tolist()}
 
 
@@ -233,7 +237,6 @@ def test_kept_samples_are_weight_times_ray_error(tmp_path, scene, monkeypatch):
     ("settings", "started", "cells"),
     [
         ({"split_at_steps": (7,)}, [0, 7], [1, 4]),
-        ({"split_at_seconds": (1e-6,)}, [0, 1], [1, 4]),
         # The worst cell first until there are enough, the last of them into what is missing: 4, 4 and 3.
         (
             {"cells": (3, 4), "split": "worst", "max_cells": 11, "split_at": (0.2, 0.8), "steps": 50},
@@ -281,7 +284,7 @@ def test_octaves_follow_the_pixels(scene):
         cameras = Cameras(some.poses, some.intrinsics * size / some.width, size, size)
         sharp = replace(scene, train=replace(scene.train, cameras=cameras))
         assert octaves_for(sharp) == octaves
-        cones = resolve_config(TrainConfig(field="mipnerf"), sharp).position_octaves
+        cones = resolve_config(TrainConfig(field="mipnerf"), sharp).network_options["position_octaves"]
         assert cones == octaves + 2
         rays = cameras.rays(0, torch.tensor([size // 2]), torch.tensor([size // 2]), cones=True)
         variance = float(4 * rays.radii) ** 2 / 4
@@ -313,7 +316,7 @@ def only_below(grid, *_, **__):
 
 
 def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
-    monkeypatch.setattr(trainer_module, "OCCUPANCY_EVERY", 2)
+    monkeypatch.setattr("voronerf.step.cells.REVISIT_EVERY", 2)
     config = small(tmp_path, split_at=(0.9,), reservoir_batches=5, occupancy=True, occupancy_resolution=8)
     trainer = Trainer(config, scene)
     assert trainer.occupancy is not None and trainer.occupancy.share == 1

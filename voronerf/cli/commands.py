@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib
 import os
 import shlex
@@ -28,7 +27,6 @@ from voronerf.data import Scene, SceneError, load_scene
 from voronerf.data.process import process as make_scene
 from voronerf.distributed.group import Group, joined, local_rank, restarts, world_size
 from voronerf.distributed.same import check_same, check_same_scene
-from voronerf.distributed.trainer import RankTrainer, check_ranks
 from voronerf.evaluation.panels import picture_of_colour, write_panels
 from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
@@ -37,7 +35,7 @@ from voronerf.rendering.paths import CameraPath, read_camera_path, spiral_camera
 from voronerf.run import Run
 from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.config_checks import check_device, why_no_occupancy
+from voronerf.training.config_checks import check_device, check_ranks, why_no_occupancy
 from voronerf.training.progress import Progress
 from voronerf.training.run_directory import choose_directory, held, is_outside, write_curve
 from voronerf.training.trainer import Trainer
@@ -55,7 +53,9 @@ def say(line: str) -> None:
     console.print(printable(line), highlight=False, markup=False, emoji=False)
 
 
-def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", port: int = 8080) -> int:
+def train(
+    config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", port: int = 8080, explain: bool = False
+) -> int:
     """Train a scene: coarse network, balanced Voronoi cells, cells trained further.
 
     With --resume, options that are not given keep their value from the run in --out.
@@ -65,6 +65,7 @@ def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", p
         view: Show the training in a browser, and its result until Ctrl-C.
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
         port: Port that --view listens at; 0 is any that is free.
+        explain: Only say how a training step is computed, and what keeps it from a faster way.
     """
     if world_size() > 1:
         return train_on_ranks(config, view=view)
@@ -72,6 +73,11 @@ def train(config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", p
     if view:
         import_viewer().check_address(host, port)
     scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
+    if explain:
+        unused = replace(config, out=config.out or Path("runs"), resume=False)
+        for line in Trainer(unused, scene).learner.explain().splitlines():
+            say(line)
+        return 0
     chosen = choose_directory(config, scene)
     assert chosen.out is not None
     try:
@@ -139,8 +145,8 @@ def _train_and_draw(
         with TrainingDisplay(console, scene.name) as display:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
-            make = Trainer if group is None else functools.partial(RankTrainer, group=group)
-            trainer = make(config, scene, on_step=display.on_step, on_event=display.on_event)
+            told: dict[str, Any] = {"on_step": display.on_step, "on_event": display.on_event}
+            trainer = Trainer(config, scene, group=group, **told)
             if trainer.lpips is None:
                 display.on_event(trainer.lpips_source)
             if config.occupancy and trainer.occupancy is None:

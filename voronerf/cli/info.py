@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from rich.markup import escape
 from rich.table import Table
 
 from voronerf import backends
-from voronerf.cli.commands import console
+from voronerf.cli.commands import console, say
+from voronerf.run import open_run
+from voronerf.step import Step
 
 
 class Extra(NamedTuple):
@@ -31,8 +34,17 @@ EXTRAS = {
 }
 
 
-def info() -> int:
-    """Show what this installation can use: build, instruction set, extras, backends, and why something is missing."""
+def info(run: Path | None = None, /) -> int:
+    """Show what this installation can use: build, instruction set, extras, backends, and why something is missing.
+
+    Args:
+        run: A run directory: show instead how a step of its training is computed, and why not in a faster way.
+    """
+    if run is not None:
+        opened = open_run(run)
+        for line in Step(opened.renderer, sightings=opened.config.sightings or 0.0).explain().splitlines():
+            say(line)
+        return 0
     for name, value in backends.describe().items():
         values = value if isinstance(value, dict) else {"": value}
         for key, entry in values.items():

@@ -146,8 +146,15 @@ def _train_command(args: list[str]) -> Callable[..., int]:
     elif length == {"budget"} and stored.steps is not None:
         stored = replace(stored, budget=sys.float_info.max, steps=None)
 
-    def train(config: TrainConfig = stored, *, view: bool = False, host: str = "127.0.0.1", port: int = 8080) -> int:
-        return commands.train(config, view=view, host=host, port=port)
+    def train(
+        config: TrainConfig = stored,
+        *,
+        view: bool = False,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        explain: bool = False,
+    ) -> int:
+        return commands.train(config, view=view, host=host, port=port, explain=explain)
 
     train.__doc__ = commands.train.__doc__
     return train

@@ -50,27 +50,34 @@ def restarts() -> int:
 
 
 class Group:
-    """All ranks of a training.
+    """All ranks of a training. A group of one is a process by itself, which sends nothing.
 
     Attributes:
         rank: The number of this one.
         size: How many there are.
+        device: Where the tensors are that are sent.
         sent: Bytes that this rank has sent to others, for each kind of message.
 
     Args:
         device: Where the tensors are that are sent.
-
-    Raises:
-        RankLost: When the others do not come.
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.rank, self.size, self.device = own_rank(), world_size(), device
+        self.rank, self.size, self.device = 0, 1, device
         self.sent: Counter[str] = Counter()
         self._rooms: dict[str, tuple[list[int], list[int]]] = {}  # rows of a message of each kind, to and from ranks
-        backend = "nccl" if device.type == "cuda" else "gloo"
-        if device.type == "cuda":
-            torch.cuda.set_device(device)  # where torch puts what it sends of Python objects
+        self.store: dist.Store | None = None
+
+    def join(self) -> None:
+        """Meets the other ranks that torchrun has started.
+
+        Raises:
+            RankLost: When they do not come.
+        """
+        self.rank, self.size = own_rank(), world_size()
+        backend = "nccl" if self.device.type == "cuda" else "gloo"
+        if self.device.type == "cuda":
+            torch.cuda.set_device(self.device)  # where torch puts what it sends of Python objects
         timeout = timedelta(seconds=PATIENCE)
         with self._waiting():
             store, rank, size = next(iter(dist.rendezvous("env://", timeout=timeout)))
@@ -109,8 +116,9 @@ class Group:
 
     def largest(self, values: Tensor) -> Tensor:
         """The largest of all ranks, in place."""
-        with self._waiting():
-            dist.all_reduce(values, dist.ReduceOp.MAX)
+        if self.size > 1:
+            with self._waiting():
+                dist.all_reduce(values, dist.ReduceOp.MAX)
         return values
 
     def begin_total(self, values: Tensor) -> Callable[[], None]:
@@ -136,7 +144,7 @@ class Group:
 
         Args:
             kind: What they are.
-            parts: float32 [n, c] for each rank; the own one stays.
+            parts: [n, c] of 4 bytes each for each rank; the own one stays.
         """
         there, came = self._rooms.get(kind, ([0] * self.size, [0] * self.size))
         messages = [
@@ -179,8 +187,9 @@ class Group:
     def from_first(self, value: Any) -> Any:
         """What rank 0 has, for all."""
         box = [value]
-        with self._waiting():
-            dist.broadcast_object_list(box, src=0)
+        if self.size > 1:
+            with self._waiting():
+                dist.broadcast_object_list(box, src=0)
         return box[0]
 
 
@@ -204,6 +213,7 @@ def joined(device: torch.device) -> Iterator[Group]:
     """
     global _current
     _current = group = Group(device)
+    group.join()
     yield group
     group.total(torch.zeros(1, device=device))  # all have come as far
     dist.destroy_process_group()
@@ -221,6 +231,6 @@ def may_tell(error: Exception) -> bool:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # of torchrun, which ends the ranks that are left
         time.sleep(1)
     try:
-        return bool(_current.store.add(_TOLD, 1) == 1)
+        return _current.store is None or bool(_current.store.add(_TOLD, 1) == 1)
     except RuntimeError:  # the process that kept the store is gone
         return True

@@ -6,19 +6,19 @@ import dataclasses
 import functools
 import zlib
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from voronerf.data import Scene
 from voronerf.distributed.group import Group
-from voronerf.training.config import TrainConfig
 
 #: Settings that machines may name in their own ways.
 OWN = ("data", "device", "lpips")
 
 
-def check_same(group: Group, config: TrainConfig) -> None:
-    """Compares settings and code of all ranks.
+def check_same(group: Group, config: Any) -> None:
+    """Compares settings, a dataclass, and code of all ranks.
 
     Raises:
         ValueError: Names the first that differs.

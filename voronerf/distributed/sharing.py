@@ -5,37 +5,127 @@ k cells, v voxels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
+from voronerf.distributed.group import Group
+from voronerf.ops.ray_runs.reference import OwnSamples, own_samples
+from voronerf.rendering.cameras import Rays
 from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.samplers import Occupancy, Stratified
 
 #: Voxels compared with all centres at a time.
 _CHUNK = 1 << 14
 
 
-@dataclass(frozen=True)
 class Sharing:
-    """The cells of all ranks.
+    """The cells and samples of this rank among those of a group.
+
+    Until the first split all ranks have the one network, and each evaluates a slice of the rays. Afterwards each
+    evaluates its own cells on all rays.
 
     Attributes:
-        diagram: All cells.
-        owner: int64 [k], the rank of each.
+        group: The ranks.
+        diagram: All cells; None before the first split, like the rest.
+        owner: int64 [k], the rank of each cell.
+        numbers: int32 [k], the number of each cell among own ones, or -1.
+        reached: bool [v], the voxels of an occupancy grid that own cells reach; None without a grid.
+        several: bool [v], those that cells of two or more ranks reach; None without a grid.
     """
 
-    diagram: VoronoiDiagram
-    owner: Tensor
+    def __init__(self, group: Group) -> None:
+        self.group = group
+        self.forget()
 
-    def cells(self, rank: int) -> Tensor:
-        """The cells of a rank, int64, ascending."""
-        return (self.owner == rank).nonzero()[:, 0]
+    def forget(self) -> None:
+        """Goes back to one network for all ranks."""
+        self.diagram: VoronoiDiagram | None = None
+        self.owner = self.numbers = torch.zeros(1, dtype=torch.int64)
+        self.reached: Tensor | None = None
+        self.several: Tensor | None = None
 
-    def refined(self, diagram: VoronoiDiagram, parents: Tensor) -> Sharing:
-        """The same after a split: children stay with the rank of their parent, so that no network has to move."""
-        return Sharing(diagram, self.owner[parents.to(self.owner.device)])
+    def take(self, diagram: VoronoiDiagram, owner: Tensor, grid: OccupancyGrid | None) -> None:
+        """Takes the own cells of a diagram; the grid forgets what they do not reach.
+
+        Args:
+            diagram: All cells.
+            owner: int64 [k], the rank of each.
+            grid: That of this rank, or None.
+        """
+        self.diagram, self.owner = diagram, owner.to(self.group.device)
+        own = self.owner == self.group.rank
+        self.numbers = torch.where(own, own.cumsum(0) - 1, -1).to(torch.int32)
+        if grid is not None:
+            reached = voxels_of_ranks(diagram, owner, grid, self.group.size)
+            self.reached, self.several = reached[self.group.rank], reached.sum(0) > 1
+            self.empty_others(grid)
+
+    def cells(self) -> Tensor:
+        """The own cells, int64 [own], ascending."""
+        return (self.owner == self.group.rank).nonzero()[:, 0].cpu()
+
+    def bounds(self, rays: int) -> list[int]:
+        """The rays that each rank puts together: from its number to before the next."""
+        return [rays * rank // self.group.size for rank in range(self.group.size + 1)]
+
+    def slice(self, rays: int) -> slice:
+        """The rays that this rank puts together."""
+        return slice(*self.bounds(rays)[self.group.rank :][:2])
+
+    def owned(self, positions: Tensor, backend: str) -> tuple[Tensor, Tensor]:
+        """The cell of each position [n], int32, and the number of each cell among those of this rank, or -1."""
+        if self.diagram is None:
+            zeros = torch.zeros(len(positions), dtype=torch.int32, device=positions.device)
+            return zeros, zeros[:1] if len(positions) else zeros.new_zeros(1)
+        return self.diagram.locate(positions, backend=backend), self.numbers
+
+    def evaluates(self, positions: Tensor, backend: str) -> Tensor:
+        """Which of the positions [n] this rank evaluates when all have the same ones, bool [n]."""
+        if self.diagram is None:
+            own = torch.zeros(len(positions), dtype=torch.bool, device=positions.device)
+            own[self.slice(len(positions))] = True
+            return own
+        cells, numbers = self.owned(positions, backend)
+        return numbers[cells] >= 0
+
+    def samples(
+        self,
+        sampler: Stratified,
+        rays: Rays,
+        near: Tensor,
+        far: Tensor,
+        *,
+        jitter: bool = False,
+        generator: torch.Generator | None = None,
+        picture: bool = False,
+    ) -> OwnSamples:
+        """The samples that this rank evaluates: those that one process would, with the same random numbers.
+
+        Args:
+            sampler: Of a single pass.
+            rays: r rays, the same on all ranks.
+            near: [r].
+            far: [r].
+            jitter: Random samples.
+            generator: In the same state on all ranks.
+            picture: Whether the strata are those of a picture.
+        """
+        kept = slice(0, len(rays)) if self.diagram is not None else self.slice(len(rays))
+        if picture and isinstance(sampler, Occupancy):
+            known, _ = sampler.march(rays[kept], near[kept], far[kept], picture=True)
+        else:
+            known = sampler.sample(rays, near, far, jitter=jitter, generator=generator, kept=kept)
+        cells, numbers = self.owned(known.positions, sampler.backend)
+        along = known.positions, known.ray_index + kept.start, known.depths, known.deltas
+        hidden = self.diagram is not None and isinstance(sampler, Occupancy)
+        return own_samples(*along, cells, numbers, bent=sampler.space.contraction is not None, hidden=hidden)
+
+    def empty_others(self, grid: OccupancyGrid) -> None:
+        """Empties the voxels that own cells do not reach; they have no samples then."""
+        if self.reached is not None:
+            grid.density.view(-1)[~self.reached] = 0
+            grid.occupied.view(-1)[~self.reached] = False
 
 
 def assign_cells(centres: Tensor, weights: Tensor, ranks: int) -> Tensor:
@@ -79,7 +169,7 @@ def assign_cells(centres: Tensor, weights: Tensor, ranks: int) -> Tensor:
     return owner
 
 
-def voxels_of_ranks(sharing: Sharing, grid: OccupancyGrid, ranks: int) -> Tensor:
+def voxels_of_ranks(diagram: VoronoiDiagram, owner: Tensor, grid: OccupancyGrid, ranks: int) -> Tensor:
     """Which voxels the cells of each rank reach: bool [ranks, v]; too many rather than too few.
 
     In a box about p with half sides e, the difference of the squared distances to centres i and j is at least that at p
@@ -87,10 +177,10 @@ def voxels_of_ranks(sharing: Sharing, grid: OccupancyGrid, ranks: int) -> Tensor
     """
     device = grid.box.device
     half = (grid.box[1] - grid.box[0]) / torch.tensor(grid.occupied.shape, device=device) / 2 * 1.001
-    diagram, voxels = sharing.diagram, torch.arange(grid.occupied.numel(), device=device)
+    voxels = torch.arange(grid.occupied.numel(), device=device)
     reached = torch.zeros(ranks, len(voxels), dtype=torch.bool, device=device)
     offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
-    owner = sharing.owner.tolist()
+    owners = owner.tolist()
     centres = diagram.centres.to(device)
     power = torch.zeros(len(centres), device=device) if diagram.power is None else diagram.power.to(device)
     pending = [(0, part) for part in voxels.split(_CHUNK)]
@@ -105,7 +195,7 @@ def voxels_of_ranks(sharing: Sharing, grid: OccupancyGrid, ranks: int) -> Tensor
         for column, row in enumerate(rows):
             inside = part[reach[:, column]]
             if child[row] < 0:
-                reached[owner[-child[row] - 1], inside] = True
+                reached[owners[-child[row] - 1], inside] = True
             elif len(inside):
                 pending.append((child[row], inside))
     return reached

@@ -12,8 +12,7 @@ import torch
 from voronerf.data import Scene
 from voronerf.evaluation.lpips import Lpips
 from voronerf.evaluation.metrics import psnr, ssim
-from voronerf.rendering.cameras import Cameras
-from voronerf.rendering.renderer import RenderedImage, Renderer
+from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
 
 
 @dataclass(frozen=True)
@@ -44,22 +43,6 @@ def render_view(renderer: Renderer, scene: Scene, view: int, *, heaviest: bool =
     return render_camera(renderer, scene, scene.test.cameras, view, heaviest=heaviest)
 
 
-def render_camera(
-    renderer: Renderer, scene: Scene, cameras: Cameras, index: int, *, heaviest: bool = True
-) -> RenderedImage:
-    """What one of several cameras sees of a scene, on its background, without randomness; on the renderer's device."""
-    device = renderer.device
-    return renderer.train(False).image(
-        cameras.to(device),
-        index,
-        near=scene.near,
-        far=scene.far,
-        box=None if scene.box is None else scene.box.to(device),
-        background=scene.background_colour(device),
-        heaviest=heaviest,
-    )
-
-
 def evaluate(
     renderer: Renderer,
     scene: Scene,
@@ -76,9 +59,9 @@ def evaluate(
         >>> from voronerf import NeRF
         >>> from voronerf.data import load_scene
         >>> from voronerf.evaluation import evaluate
-        >>> from voronerf.rendering import Renderer
+        >>> from voronerf.rendering import Renderer, Stratified
         >>> scene = load_scene("builtin", downscale=20)
-        >>> renderer = Renderer({"field": NeRF(width=16, depth=2)}, samples=8)
+        >>> renderer = Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8))
         >>> [score.name for score in evaluate(renderer, scene, views=2)]
         ['test_000', 'test_012']
     """
@@ -133,9 +116,9 @@ def score_views(
         >>> from voronerf import NeRF
         >>> from voronerf.data import load_scene
         >>> from voronerf.evaluation import score_views
-        >>> from voronerf.rendering import Renderer
+        >>> from voronerf.rendering import Renderer, Stratified
         >>> scene = load_scene("builtin", downscale=20)
-        >>> result = score_views(Renderer({"field": NeRF(width=16, depth=2)}, samples=8), scene, views=2)
+        >>> result = score_views(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)), scene, views=2)
         >>> len(result["views"]), result["psnr"] > 0
         (2, True)
     """

@@ -57,12 +57,12 @@ def seam(
         >>> from voronerf import NeRF, VoronoiRouter
         >>> from voronerf.data import load_scene
         >>> from voronerf.evaluation import seam
-        >>> from voronerf.rendering import Renderer
+        >>> from voronerf.rendering import Renderer, Stratified
         >>> scene = load_scene("builtin", downscale=20)
         >>> field = NeRF(width=16, depth=2)
         >>> _ = torch.nn.init.ones_(field.density.bias)  # opaque, so that borders show
         >>> router = VoronoiRouter(field, 0.1 * torch.eye(3))  # three cells that are copies
-        >>> renderer = Renderer({"field": router}, samples=8)
+        >>> renderer = Renderer({"field": router}, Stratified(8))
         >>> cameras = scene.test.cameras
         >>> def picture(view):
         ...     return renderer.image(cameras, view, near=scene.near, far=scene.far, box=scene.box)

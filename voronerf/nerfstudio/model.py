@@ -15,18 +15,15 @@ from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-from voronerf.diagram import SampleReservoir
+from voronerf.distributed.group import Group
+from voronerf.distributed.sharing import Sharing
 from voronerf.evaluation.panels import palette
 from voronerf.nerfstudio.scene import scene_of, seen_from_inside
-from voronerf.rendering import OccupancyGrid, Rays, intersect_box
-from voronerf.rendering.comparison import Comparison, compared
-from voronerf.rendering.marching import render_until_opaque
-from voronerf.training.config import SamplingName, TrainConfig
+from voronerf.rendering import Rays, intersect_box
+from voronerf.step import Batch, Cells, Found, Step
+from voronerf.training.config import TrainConfig
 from voronerf.training.networks import make_routers, parameter_groups, resolve_config
-from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
-from voronerf.training.renderers import make_renderer
-from voronerf.training.splitting import split_by_samples
-from voronerf.training.trainer import OCCUPANCY_EVERY
+from voronerf.training.renderers import make_grid, make_renderer
 
 
 @dataclasses.dataclass
@@ -48,7 +45,7 @@ class VoronerfModelConfig(ModelConfig):
     split_at: tuple[float, ...] | None = None
     """When to split, as fractions of max_num_iterations, one per level; default: 0.2, or evenly spaced from 0.15 to
     0.5."""
-    sampling: SamplingName = "stratified"
+    sampling: str = "stratified"
     """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something;
     or proposal, where a small density network places the samples."""
     samples: int | None = None
@@ -105,16 +102,18 @@ class VoronerfModel(Model):
         self.background = None if background is None else background.to(device)
         self.routers = make_routers(self.settings, device)
         self.networks = nn.ModuleDict(self.routers)  # whose parameters torch finds
-        occupancy = make_grid(self.settings, self.scene, device) if self.settings.occupancy else None
-        self.renderer = make_renderer(self.settings, self.scene, self.routers, occupancy=occupancy)
-        self.generator = torch.Generator().manual_seed(self.settings.seed)
-        self.splits = 0
-        self._empty_reservoir()
-        self._found: Comparison | None = None
-
-    def _empty_reservoir(self) -> None:
-        device = self.kwargs["device"]
-        self.reservoir = SampleReservoir(self.settings.reservoir, self.settings.reservoir_batches, device=device)
+        grid = make_grid(self.settings, self.scene, device) if self.settings.occupancy else None
+        self.renderer = make_renderer(self.settings, self.scene, self.routers, occupancy=grid)
+        self.learner = Step(self.renderer)
+        self.cells = Cells(
+            self.renderer,
+            self.routers,
+            self.settings.planned_splits,
+            self.settings.split_rule,
+            generator=torch.Generator().manual_seed(self.settings.seed),
+            sharing=Sharing(Group(torch.device(device))),
+        )
+        self._found: Found | None = None
 
     @property
     def num_cells(self) -> int:
@@ -133,23 +132,19 @@ class VoronerfModel(Model):
         trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
         assert trainer is not None and optimizers is not None
         steps, optimizer = trainer.config.max_num_iterations, optimizers.optimizers["fields"]
-        plan = self.settings.planned_splits
 
         def before(step: int) -> None:
-            if self.splits < len(plan) and step >= plan[self.splits].at * steps - 1e-9:
+            if self.cells.is_due(step / steps, step):
                 self._split(step, optimizer)
-            if self.renderer.occupancy is not None and step % OCCUPANCY_EVERY == 0:
-                self.renderer.train(False)
-                revisit_cells(self.renderer.occupancy, self.renderer.field, self.generator, backend="auto")
-                self.renderer.train()
+            self.cells.revisit(step)
+            self.renderer.train()
 
         def after(step: int) -> None:
             found, self._found = self._found, None
             assert found is not None
-            if self.renderer.occupancy is not None:
-                observe_samples(self.renderer.occupancy, found, backend="auto")
-            if self.splits < len(plan):
-                self.reservoir.add(found.positions, found.importance())
+            self.cells.observe(found)
+            if self.cells.planned is not None:
+                self.cells.reservoir.add(found.samples.positions, found.importance())
 
         return [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before, update_every_num_iters=1),
@@ -158,17 +153,13 @@ class VoronerfModel(Model):
 
     def _split(self, step: int, optimizer: torch.optim.Optimizer) -> None:
         """Splits the cells by the kept samples; parameters stay the same objects, with other shapes."""
-        planned = self.settings.planned_splits[self.splits]
-        diagram, samples = self.routers["field"].diagram, self.reservoir.samples()
-        split = split_by_samples(self.settings, planned, diagram, planned.children, *samples, self.generator)
-        self.splits += 1
-        self._empty_reservoir()
+        split, kept = self.cells.find_split(), len(self.cells.reservoir)
+        self.cells.splits += 1
+        self.cells.empty_reservoir()
         if split is None or not split.balances:
-            CONSOLE.log(f"voronerf: no cell split at step {step}, none holds enough of the {len(samples[0])} samples")
+            CONSOLE.log(f"voronerf: no cell split at step {step}, none holds enough of the {kept} samples")
             return
-        for name, router in self.routers.items():
-            if name != "proposal":
-                router.subdivide(split.diagram, split.parents, optimizer=optimizer)
+        self.cells.divide(split, optimizer)
         CONSOLE.log(f"voronerf: {self.num_cells} cells at step {step}")
 
     # --- rays ------------------------------------------------------------------------------------------------------
@@ -185,35 +176,16 @@ class VoronerfModel(Model):
         return rays, near, far
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Colour, accumulation and depth of rays; in evaluation also ``cells``, the colour of the cell that each shows.
+        """Colour, accumulation and depth of rays, and ``cells``, the colour of the cell that each shows.
 
-        In training, ``passes`` are what :meth:`get_loss_dict` needs; their colours lie on black.
+        In training the rays as they came: what they see is found together with the loss, see :meth:`get_loss_dict`.
         """
         rays, near, far = self._rays(ray_bundle)
-        if not self.training:
-            return self._see(rays, near, far)
-        passes = self.renderer.render(rays, near, far, jitter=True)
-        last = passes[-1]
-        outputs = {"rgb": _over(last.colour, last.opacity, self.background), "passes": passes}
-        return {**outputs, "accumulation": last.opacity[:, None], "depth": last.depth[:, None]}
+        return {"rays": (rays, near, far)} if self.training else self._see(rays, near, far)
 
     @torch.no_grad()
     def _see(self, rays: Rays, near: Tensor, far: Tensor) -> dict[str, Tensor]:
-        renderer = self.renderer
-        if renderer.occupancy is not None:
-            colour, opacity, depth, places = render_until_opaque(
-                renderer.field,
-                rays,
-                near,
-                far,
-                renderer.occupancy,
-                samples=renderer.picture_samples,
-                spacing=renderer.spacing,
-            )
-        else:
-            last = renderer.render(rays, near, far)[-1]
-            colour, opacity, depth = last.colour, last.opacity, last.depth
-            places = last.positions[torch.arange(len(rays), device=near.device), last.weights.argmax(-1)]
+        colour, opacity, depth, places = self.renderer.see(rays, near, far)
         background = renderers.BACKGROUND_COLOR_OVERRIDE  # of the viewer and of ns-render
         background = self.background if background is None else background.to(colour)
         cells = self.routers["field"].diagram.locate(places)
@@ -242,19 +214,26 @@ class VoronerfModel(Model):
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
         """The loss of our trainer; images with an alpha channel lie over a colour that is drawn for each ray."""
-        passes = outputs.get("passes")
-        if passes is None:
+        if "rays" not in outputs:
             return {"rgb_loss": (outputs["rgb"] - self._truth(batch, self.background)).square().mean()}
-        background = self.background if batch["image"].shape[-1] == 3 else torch.rand_like(passes[-1].colour)
-        passes = tuple(each._replace(colour=_over(each.colour, each.opacity, background)) for each in passes)
-        target = self._truth(batch, background)
-        loss = self.renderer.loss(passes, target)
-        self._found = compared(loss, passes[-1], target)
-        return {"rgb_loss": loss}
+        return {"rgb_loss": self._learn(outputs, batch).loss}
+
+    def _learn(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> Found:
+        """What a training step finds, once for the outputs of a batch: losses and metrics ask for it."""
+        if "found" not in outputs:
+            rays, near, far = outputs["rays"]
+            background = self.background if batch["image"].shape[-1] == 3 else torch.rand_like(rays.origins)
+            target = self._truth(batch, background)
+            outputs["found"] = self._found = self.learner.run(Batch(rays, near, far, target, background))
+        found: Found = outputs["found"]
+        return found
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """PSNR in dB of the rays of a batch, and the number of cells."""
-        error = (outputs["rgb"].detach() - self._truth(batch, self.background)).square().mean()
+        if "rays" in outputs:
+            error = self._learn(outputs, batch).error.mean() / 3
+        else:
+            error = (outputs["rgb"] - self._truth(batch, self.background)).square().mean()
         return {"psnr": -10 * error.log10(), "cells": torch.tensor(float(self.num_cells))}
 
     @functools.cached_property  # not a part of the model's state; its weights are downloaded where it is first asked
@@ -291,19 +270,17 @@ class VoronerfModel(Model):
         """What nerfstudio's checkpoints hold beside the parameters and the diagram."""
         grid = self.renderer.occupancy
         return {
-            "splits": self.splits,
-            "reservoir": self.reservoir.state_dict(),
+            "splits": self.cells.splits,
+            "reservoir": self.cells.reservoir.state_dict(),
             "occupancy": None if grid is None else grid.state_dict(),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Goes on from :meth:`get_extra_state`; the cells follow from the parameters."""
-        self.splits = state["splits"]
-        self.reservoir.load_state_dict(state["reservoir"])
-        if state["occupancy"] is not None:
-            self.renderer.occupancy = OccupancyGrid.from_state(
-                state["occupancy"], contraction=self.renderer.contraction, device=self.kwargs["device"]
-            )
+        self.cells.splits = state["splits"]
+        self.cells.reservoir.load_state_dict(state["reservoir"])
+        if self.renderer.occupancy is not None and state["occupancy"] is not None:
+            self.renderer.occupancy.load_state_dict(state["occupancy"])
 
 
 def _over(colour: Tensor, opacity: Tensor, background: Tensor | None) -> Tensor:

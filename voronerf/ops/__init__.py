@@ -14,22 +14,28 @@ from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_cell import draw_cell
+from voronerf.ops.draw_pixels import draw_pixels
+from voronerf.ops.draw_pixels.reference import Runs
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
 from voronerf.ops.hash_encode import hash_encode
 from voronerf.ops.integrated_encode import integrated_encode
+from voronerf.ops.learn_outputs import learn_outputs
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
-from voronerf.ops.observe_occupancy import observe_occupancy
+from voronerf.ops.observe_occupancy import observe_occupancy, observe_told, tell_observed
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
-from voronerf.ops.render_loss import RenderLoss, render_loss
+from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
+from voronerf.ops.ray_runs.reference import OwnSamples
+from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.select_heaviest import select_heaviest
-from voronerf.ops.sparse_adam import sparse_adam
+from voronerf.ops.sparse_adam import Rule, adam, sparse_adam
 from voronerf.ops.spherical_harmonics import spherical_harmonics
+from voronerf.ops.touched_entries import add_entries, pack_entries
 from voronerf.ops.update_occupancy import update_occupancy
 
 __all__ = [
@@ -39,30 +45,45 @@ __all__ = [
     "HashGrid",
     "Layer",
     "March",
+    "OwnSamples",
     "PixelRays",
     "RenderLoss",
+    "Rule",
+    "Runs",
+    "adam",
+    "add_entries",
     "balance_centres",
     "camera_rays",
     "cast_solids",
     "cell_sort",
     "centre_grid",
+    "compose_runs",
     "composite",
     "draw_cell",
+    "draw_pixels",
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",
     "hash_encode",
     "integrated_encode",
+    "learn_outputs",
     "locate_cell",
     "march_rays",
     "nearest_centre",
     "observe_occupancy",
+    "observe_told",
+    "own_samples",
+    "pack_entries",
     "pixel_rays",
     "render_loss",
+    "render_loss_gradient",
     "resample",
     "routed_mlp",
+    "run_gradients",
+    "run_sums",
     "select_heaviest",
     "sparse_adam",
     "spherical_harmonics",
+    "tell_observed",
     "update_occupancy",
 ]

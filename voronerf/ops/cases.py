@@ -113,6 +113,7 @@ class Case:
         compiles: whether its reference compiles as one graph.
         comparable: whether all backends give the same tensors.
         call: the public function, if it has another name than the op.
+        traced: whether torch can trace it, on every backend.
     """
 
     make: Callable[[Draw, int], Arguments]
@@ -124,8 +125,13 @@ class Case:
     compiles: bool = True
     comparable: bool = True
     call: str = ""
+    traced: bool = True
 
 
 def cases() -> dict[str, Case]:
-    """Of every op, by its name."""
-    return {op: importlib.import_module(f"voronerf.ops.{op}.case").CASE for op in backends.ops()}
+    """Of every op, by its name. A folder with several ops has ``CASES`` by their names."""
+    found = {}
+    for op in backends.ops():
+        module = importlib.import_module(f"voronerf.ops.{backends.folder(op)}.case")
+        found[op] = getattr(module, "CASES", {}).get(op) or module.CASE
+    return found

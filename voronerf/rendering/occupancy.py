@@ -10,6 +10,7 @@ which decays). Learning it from the samples of a batch, and emptying what is hid
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +18,7 @@ from torch import Tensor
 from voronerf.checks import MAX_COUNT
 from voronerf.fields.radiance import activate_density, activate_radiance
 from voronerf.ops.march_rays import March, march_rays
-from voronerf.ops.observe_occupancy import observe_occupancy
+from voronerf.ops.observe_occupancy import observe_occupancy, observe_told, tell_observed
 from voronerf.ops.observe_occupancy.reference import cells_of
 from voronerf.ops.update_occupancy import update_occupancy
 from voronerf.rendering.cameras import Rays
@@ -165,6 +166,8 @@ class OccupancyGrid:
         weights: Tensor,
         *,
         decay: float,
+        told: Tensor | None = None,
+        reached: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
         """Updates cells, in place, from samples that were rendered anyway.
@@ -179,29 +182,61 @@ class OccupancyGrid:
             deltas: [m], lengths of the strata of the samples.
             weights: [m], contributions of the samples to their rays, from `composite`.
             decay: factor on the old densities of the cells of these samples, 0..1.
-            backend: "auto", "reference" or "native".
+            told: float32 [c, 2], what other ranks :meth:`tell` of theirs, or None.
+            reached: bool [cells], those that this rank has; None for all.
+            backend: "auto", "reference", "native", or without ``told`` "warp".
 
         Raises:
             ValueError: a decay out of range.
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
+        samples = self._samples(positions, density, deltas, weights)
+        rule: dict[str, Any] = {"decay": decay, "threshold": self.threshold, "hidden": HIDDEN, "backend": backend}
+        if told is None:
+            observe_occupancy(*self._tables, *samples, **rule)
+        else:
+            observe_told(self._tables, samples, told, reached=reached, **rule)
+
+    @torch.no_grad()
+    def tell(
+        self,
+        positions: Tensor,
+        density: Tensor,
+        deltas: Tensor,
+        weights: Tensor,
+        *,
+        several: Tensor | None = None,
+        backend: str = "auto",
+    ) -> Tensor:
+        """What other ranks should know of the samples that this one observes, for their :meth:`observe`.
+
+        Args:
+            positions: as in :meth:`observe`.
+            density: [m].
+            deltas: [m].
+            weights: [m].
+            several: bool [cells], those that several ranks have; None for all.
+            backend: of the op.
+
+        Returns:
+            float32 [c, 2], see `voronerf.ops.tell_observed`.
+        """
+        samples = self._samples(positions, density, deltas, weights)
+        return tell_observed(self._tables, samples, several=several, hidden=HIDDEN, backend=backend)
+
+    @property
+    def _tables(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.density, self.occupied, self.box
+
+    def _samples(
+        self, positions: Tensor, density: Tensor, deltas: Tensor, weights: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Samples in the space and the units of the grid."""
         if self.contraction is not None:
             stretch = self.contraction.stretch(positions)
             density, deltas = density * stretch, deltas / stretch
-        observe_occupancy(
-            self.density,
-            self.occupied,
-            self.box,
-            positions,
-            density.float(),
-            deltas.float(),
-            weights.float(),
-            decay=decay,
-            threshold=self.threshold,
-            hidden=HIDDEN,
-            backend=backend,
-        )
+        return positions, density.float(), deltas.float(), weights.float()
 
     def _stretch(self, points: Tensor) -> Tensor | float:
         return 1.0 if self.contraction is None else self.contraction.stretch(points)
@@ -217,7 +252,6 @@ class OccupancyGrid:
         far: Tensor,
         samples: int,
         *,
-        uniforms: Tensor | None = None,
         seed: Tensor | None = None,
         spacing: str = "linear",
         start: Tensor | None = None,
@@ -233,7 +267,6 @@ class OccupancyGrid:
             self.occupied,
             self.box,
             samples,
-            uniforms=uniforms,
             seed=seed,
             spacing=spacing,
             start=start,
@@ -250,6 +283,16 @@ class OccupancyGrid:
             "occupied": self.occupied.clone(),
             "threshold": torch.tensor(self.threshold, dtype=torch.float64),
         }
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Takes the box, the densities and the threshold of another grid's `state_dict`.
+
+        Raises:
+            ValueError: an entry is missing or has a wrong shape.
+        """
+        other = OccupancyGrid.from_state(state, contraction=self.contraction, device=self.box.device)
+        self.box, self.threshold = other.box, other.threshold
+        self.density, self.occupied = other.density, other.occupied
 
     @staticmethod
     def from_state(
@@ -279,6 +322,12 @@ class OccupancyGrid:
         grid.density.copy_(density)
         grid.occupied.copy_(occupied)
         return grid
+
+
+def draw_seed(device: torch.device, generator: torch.Generator | None) -> Tensor:
+    """A seed of jitter for ``march_rays``, int32 [1]; the device is that of the rays."""
+    drawn_on = device if generator is None else generator.device
+    return torch.randint(-(2**31), 2**31, (1,), device=drawn_on, dtype=torch.int32, generator=generator).to(device)
 
 
 def density_of(field: Field, points: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Where the samples of a ray lie. r rays, s samples a ray; distances in world units."""
+"""Where the samples of a ray lie, and what they should have seen. r rays, s samples a ray; distances in world units."""
 
 from __future__ import annotations
 
@@ -136,8 +136,7 @@ def union_depths(
     weights: Tensor,
     count: int,
     *,
-    jitter: bool,
-    generator: torch.Generator | None = None,
+    uniforms: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """The samples of a first pass together with new ones where it found something (NeRF, section 5.2).
@@ -147,18 +146,21 @@ def union_depths(
         edges: [r, s + 1], of its strata.
         weights: [r, s].
         count: f, the number of new samples.
-        jitter: draw them at random, else take the middles of strata of equal weight.
-        generator: of the jitter.
+        uniforms: [r, f], of `strata_uniforms`; None takes the middles of strata of equal weight.
         backend: of the op.
 
     Returns:
         (depths [r, s + f] ascending, edges [r, s + f + 1]). A sample stands for the part of the ray up to halfway to
         its neighbours.
     """
-    uniforms = strata_uniforms(len(depths), count, depths, jitter, generator)
     found = resample(weights, edges, count, uniforms=uniforms, backend=backend)
     every = torch.cat((depths, found), dim=1).sort(dim=1).values
     return every, torch.cat((edges[:, :1], (every[:, 1:] + every[:, :-1]) / 2, edges[:, -1:]), dim=1)
+
+
+def colour_loss(colour: Tensor, target: Tensor) -> Tensor:
+    """The mean squared error of colours [r, 3] (NeRF, equation 6)."""
+    return (colour - target).square().mean()
 
 
 def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tensor) -> Tensor:
@@ -183,57 +185,27 @@ def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tenso
     return (missed.square() / (weights + 1e-7)).sum(dim=1).mean()
 
 
-def sighting_loss(depths: Tensor, edges: Tensor, weights: Tensor, distances: Tensor) -> Tensor:
+def seen_there(depths: Tensor, deltas: Tensor, distances: Tensor) -> Tensor:
+    """Which samples lie where a point was seen: within `NEARBY` of its distance and their own length.
+
+    Args:
+        depths: [...], of samples.
+        deltas: [...], their lengths.
+        distances: [...], of the point that the ray of each ends at; NaN for none.
+    """
+    return (depths - distances).abs() <= NEARBY * distances + deltas
+
+
+def sighting_loss(light: Tensor) -> Tensor:
     """How little of the light comes from where a point was seen, the mean over rays.
 
-    ``-log`` of the weights within `NEARBY` of the distance and a sample's own length: the likelihood of Deng et al.
-    2022, "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them.
+    ``-log`` of the weights of the samples that were `seen_there`: the likelihood of Deng et al. 2022,
+    "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them.
 
     Args:
-        depths: [r, s].
-        edges: [r, s + 1]; no gradient.
-        weights: [r, s].
-        distances: [r], of the points.
+        light: [r], the sum of these weights.
     """
-    distances = distances[:, None]
-    inside = (depths - distances).abs() <= NEARBY * distances + edges.diff(dim=1)
-    return -torch.log((weights * inside).sum(1).clamp(1e-3, 1)).mean()
-
-
-def normalised(edges: Tensor, near: Tensor, far: Tensor, spacing: str) -> Tensor:
-    """Distances as fractions of the way from near to far, in the spacing of the strata (mip-NeRF 360, equation 11).
-
-    Args:
-        edges: [r, s].
-        near: [r].
-        far: [r]; if it equals near, the fractions are 0.
-        spacing: "linear" or "disparity".
-    """
-    tiny = torch.finfo(edges.dtype).tiny
-    near, far = near[:, None], far[:, None]
-    fraction = (edges - near) / (far - near).clamp_min(tiny)
-    if spacing == "disparity":
-        fraction = fraction * far / edges.clamp_min(tiny)
-    return fraction.clamp(0, 1)
-
-
-def distortion_loss(edges: Tensor, weights: Tensor) -> Tensor:
-    """The spread of the weights along a ray (Barron et al. 2022, "Mip-NeRF 360", equation 15), the mean over rays.
-
-    The integral of ``w(u) w(v) |u - v|`` over both: ``sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 (s_i+1 - s_i) / 3``. It
-    is small if all weight is in one place, or if there is none. It removes floaters in front of surfaces.
-
-    Args:
-        edges: [r, s + 1] ascending, fractions of the way; no gradient.
-        weights: [r, s].
-    """
-    edges = edges.detach()
-    middles, widths = (edges[:, 1:] + edges[:, :-1]) / 2, edges.diff(dim=1)
-    # The middles ascend: in each pair the later one is larger, so sums over the earlier ones suffice.
-    mass = weights * middles
-    earlier, moment = weights.cumsum(1) - weights, mass.cumsum(1) - mass
-    between = 2 * (weights * (middles * earlier - moment)).sum(1)
-    return (between + (weights.square() * widths).sum(1) / 3).mean()
+    return -torch.log(light.clamp(1e-3, 1)).mean()
 
 
 def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:

@@ -1,12 +1,13 @@
-"""Volume rendering: rays to colours through a field.
+"""Volume rendering: samples of rays to colours through a field.
 
-r rays, s samples a ray, n = r * s samples. Colours are in 0..1, distances in world units along unit
-directions, densities per unit length.
+r rays, m samples of all rays (packed), s samples a ray where all have as many. Colours are in 0..1, distances in world
+units along unit directions, densities per unit length.
 """
 
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -17,21 +18,94 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.cones import frustum_gaussians
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
-from voronerf.rendering.sampling import stratified_depths
+
+
+class Samples(NamedTuple):
+    """Samples of rays, ray after ray and near to far: what every sampler gives, and what a field is asked about.
+
+    Attributes:
+        inputs: [m, 3] points, or [m, 6] Gaussians, in the space of the field.
+        ray_index: int32 [m], the ray of each sample.
+        ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
+        depths: [m], their distances.
+        deltas: [m], the lengths of the parts of the ray that they stand for.
+        edges: [r, s + 1], the ends of these parts, where all rays have s samples; else None.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Rays, Stratified
+        >>> rays = Rays(torch.zeros(2, 3), torch.tensor([[0.0, 0, 1]]).expand(2, 3))
+        >>> samples = Stratified(4).sample(rays, torch.zeros(2), torch.ones(2))
+        >>> samples.depths.shape, samples.by_ray(samples.depths).shape
+        (torch.Size([8]), torch.Size([2, 4]))
+    """
+
+    inputs: Tensor
+    ray_index: Tensor
+    ray_offsets: Tensor
+    depths: Tensor
+    deltas: Tensor
+    edges: Tensor | None = None
+
+    @property
+    def positions(self) -> Tensor:
+        """[m, 3], the points or the means of the Gaussians."""
+        return self.inputs[:, :3]
+
+    def by_ray(self, values: Tensor) -> Tensor:
+        """Values [m, ...] as [r, s, ...], where all rays have as many samples; else as they are."""
+        if self.edges is None:
+            return values
+        r, ends = self.edges.shape
+        return values.reshape(r, ends - 1, *values.shape[1:])
+
+
+@dataclass(frozen=True)
+class Space:
+    """How a scene is sampled and how a field sees it.
+
+    Args:
+        contraction: Of the space that the field works in; None for that of the world.
+        spacing: Of the strata of a ray, "linear" or "disparity".
+        cones: Whether the field is asked about Gaussians [m, 6], the frustums of cones, in place of points [m, 3].
+        full_gradient: Distance from which the gradients of samples are whole, see `gradient_shares`; None for any.
+
+    Examples:
+        >>> from voronerf.rendering import Space, Stratified
+        >>> sampler = Stratified(64, space=Space(spacing="disparity"))
+    """
+
+    contraction: Contraction | Perspective | None = None
+    spacing: str = "linear"
+    cones: bool = False
+    full_gradient: float | None = None
+
+    def samples(self, rays: Rays, depths: Tensor, edges: Tensor) -> Samples:
+        """The samples of rays at depths [r, s], which stand for the parts between edges [r, s + 1]."""
+        r, s = depths.shape
+        if self.cones:
+            inputs = frustum_gaussians(rays, edges, self.contraction)
+        else:
+            inputs = torch.addcmul(rays.origins[:, None, :], depths[:, :, None], rays.directions[:, None, :])
+            inputs = inputs if self.contraction is None else self.contraction.points(inputs)
+        # A copy of an expanded view: repeat_interleave would gather.
+        index = torch.arange(r, device=depths.device, dtype=torch.int32)[:, None].expand(-1, s).reshape(-1)
+        offsets = torch.arange(0, r * s + 1, s, device=depths.device, dtype=torch.int32)
+        inputs, deltas = inputs.reshape(r * s, inputs.shape[-1]), edges.diff(dim=-1).reshape(-1)
+        return Samples(inputs, index, offsets, depths.reshape(-1), deltas, edges)
 
 
 class Rendered(NamedTuple):
-    """What `render_rays` returns.
+    """Rays seen through a field.
 
     Attributes:
         colour: [r, 3], the background included.
         opacity: [r], 0..1: the sum of the weights.
-        depth: [r], expected distance, normalised by the opacity; the last edge for a ray with opacity 0.
-        weights: [r, s], the contribution of each sample.
-        positions: [r, s, 3].
-        rgb: [r, s, 3], the colour of each sample.
-        depths: [r, s], the distance of each sample.
-        edges: [r, s + 1], the ends of the parts of the ray that the samples stand for.
+        depth: [r], expected distance, normalised by the opacity; the far end for a ray with opacity 0.
+        weights: [m], the contribution of each sample.
+        rgb: [m, 3], the colour of each sample.
+        density: [m].
+        samples: Where the field was asked.
 
     Examples:
         >>> import torch
@@ -41,127 +115,83 @@ class Rendered(NamedTuple):
         >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
         >>> result = render_rays(wall, rays, 0.0, 2.0, samples=8)
         >>> result.depth, result.weights.shape
-        (tensor([1.1250]), torch.Size([1, 8]))
+        (tensor([1.1250]), torch.Size([8]))
     """
 
     colour: Tensor
     opacity: Tensor
     depth: Tensor
     weights: Tensor
-    positions: Tensor
     rgb: Tensor
-    depths: Tensor
-    edges: Tensor
+    density: Tensor
+    samples: Samples
 
 
-def render_rays(
-    field: Field,
-    rays: Rays,
-    near: Tensor | float,
-    far: Tensor | float,
-    *,
-    samples: int,
-    background: Tensor | None = None,
-    jitter: bool = False,
-    generator: torch.Generator | None = None,
-    spacing: str = "linear",
-    backend: str = "auto",
-) -> Rendered:
-    """Colours of rays by quadrature of the volume rendering integral (Mildenhall et al. 2020, NeRF, eq. 3).
+def ask(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tensor, Tensor]:
+    """Colours [m, 3] and densities [m] of samples, in the dtype of their depths: a field under autocast gives others.
 
-    Args:
-        field: called once, on all r * s samples; the samples of a ray are consecutive.
-        rays: r rays.
-        near: start of the integral, [r] or one for all.
-        far: end, [r] or one for all. A ray with far == near gets the background.
-        samples: s, one in each of s strata.
-        background: [3] or [r, 3], the colour behind the scene; None is black.
-        jitter: random samples in the strata, else their middles.
-        generator: of the jitter.
-        spacing: of the strata, "linear" or "disparity".
-        backend: of the composite op.
-
-    Examples:
-        >>> import torch
-        >>> from voronerf.rendering import Rays, render_rays
-        >>> def fog(positions, directions, ray_index):
-        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
-        >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
-        >>> result = render_rays(fog, rays, 0.0, 2.0, samples=64)
-        >>> result.opacity.round(decimals=4)  # 1 - exp(-0.5 * 2)
-        tensor([0.6321])
+    Their gradients shrink near the camera as `Space` says.
     """
-    near, far = per_ray(near, rays), per_ray(far, rays)
-    depths, _, edges = stratified_depths(near, far, samples, jitter=jitter, spacing=spacing, generator=generator)
-    return render_samples(field, rays, depths, edges, background=background, backend=backend)
+    found = field(samples.inputs, rays.directions, samples.ray_index)
+    rgb, density = (values.to(samples.depths.dtype) for values in found)
+    share = gradient_shares(space.full_gradient, samples.depths)
+    if share is not None:
+        for values, scale in ((rgb, share[:, None]), (density, share)):
+            if values.requires_grad:
+                values.register_hook(functools.partial(torch.mul, scale))
+    return rgb, density
 
 
 def render_samples(
     field: Field,
     rays: Rays,
-    depths: Tensor,
-    edges: Tensor,
+    far: Tensor,
+    samples: Samples,
+    space: Space,
     *,
-    cones: bool = False,
-    contraction: Contraction | Perspective | None = None,
     background: Tensor | None = None,
-    full_gradient: float | None = None,
     backend: str = "auto",
 ) -> Rendered:
-    """`render_rays` for given samples.
+    """Colours of rays from samples of a sampler (Mildenhall et al. 2020, NeRF, eq. 3).
 
     Args:
-        field: called once, on all r * s samples; the samples of a ray are consecutive. Its input is points [n, 3], or
-            with cones Gaussians [n, 6].
-        rays: r rays, with radii for cones.
-        depths: [r, s].
-        edges: [r, s + 1] around them.
-        cones: evaluate the frustums of the cones between the edges.
-        contraction: of the space that the field works in; the returned positions are contracted too.
-        background: [3] or [r, 3].
-        full_gradient: see `weaken_near`.
-        backend: of the composite op.
+        field: Called once, on all samples, possibly none.
+        rays: r rays.
+        far: [r], their ends.
+        samples: Of the rays.
+        space: Of the sampler.
+        background: [3] or [r, 3]; None is black.
+        backend: Of the composite op.
     """
-    samples = depths.shape[1]
-    if cones:
-        inputs = frustum_gaussians(rays, edges, contraction)
-    else:
-        inputs = torch.addcmul(rays.origins[:, None, :], depths[:, :, None], rays.directions[:, None, :])
-        inputs = inputs if contraction is None else contraction.points(inputs)
-    # A copy of an expanded view: repeat_interleave would gather.
-    index = torch.arange(len(rays), device=depths.device, dtype=torch.int32)[:, None].expand(-1, samples).reshape(-1)
-    rgb, sigma = field(inputs.reshape(-1, inputs.shape[-1]), rays.directions, index)
-    # under autocast the field returns a half type; the sums along a ray are float32
-    rgb = rgb.reshape(len(rays), samples, 3).to(depths.dtype)
-    sigma = sigma.reshape(len(rays), samples).to(depths.dtype)
-    weaken_near(full_gradient, depths, rgb, sigma)
-    result = composite(sigma, rgb, depths, edges.diff(dim=-1), background=background, backend=backend)
-    seen = result.opacity > 0
-    depth = torch.where(seen, result.depth / torch.where(seen, result.opacity, 1), edges[:, -1])
-    return Rendered(
-        result.colour, result.opacity, depth, result.weights, inputs[..., :3], rgb, depths=depths, edges=edges
-    )
+    rgb, density = ask(field, rays, samples, space)
+    along = (samples.by_ray(values) for values in (density, rgb, samples.depths, samples.deltas))
+    offsets = samples.ray_offsets if samples.edges is None else None
+    found = composite(*along, ray_offsets=offsets, background=background, backend=backend)
+    depth = normalised(found.depth, found.opacity, far)
+    return Rendered(found.colour, found.opacity, depth, found.weights.reshape(-1), rgb, density, samples)
 
 
-def weaken_near(full: float | None, depths: Tensor, *outputs: Tensor) -> None:
-    """Lets what a field has answered near the camera learn less: its gradients shrink with the square of the distance.
+def normalised(depth: Tensor, opacity: Tensor, far: Tensor) -> Tensor:
+    """Sums of weight times depth [r] divided by opacities [r]; the far end [r] where these are 0."""
+    seen = opacity > 0
+    return torch.where(seen, depth / torch.where(seen, opacity, 1), far)
+
+
+def gradient_shares(full: float | None, depths: Tensor) -> Tensor | None:
+    """Factors on the gradients of what a field says of samples: the square of the distance, up to 1.
 
     A camera sees the space before it with more rays, and more samples, than others do: without this, fog that only one
     view shows is learnt there first. Source: Philip and Deschaintre 2023, "Floaters No More: Radiance Field Gradient
     Scaling for Improved Near-Camera Training".
 
     Args:
-        full: the distance from which gradients are whole; None for any.
-        depths: [...], of the samples.
-        outputs: [...] or [..., f].
+        full: The distance from which gradients are whole; None for any.
+        depths: [m], of the samples.
+
+    Returns:
+        [m]; None if all are whole.
     """
-    if full is None:
-        return
-    share = (depths / full).square().clamp(max=1)
-    for output in outputs:
-        if output.requires_grad:
-            scale = share if output.dim() == share.dim() else share[..., None]
-            output.register_hook(functools.partial(torch.mul, scale))
+    return None if full is None else (depths / full).square().clamp(max=1)
 
 
 def per_ray(distance: Tensor | float, rays: Rays) -> Tensor:

@@ -9,22 +9,23 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.ops.sparse_adam import corrected, sparse_adam
+from voronerf.ops.sparse_adam import Rule, adam, sparse_adam
 
 
 class Adam(torch.optim.Adam):
     """``torch.optim.Adam``, with groups of parameters whose entries without a gradient stay as they are.
 
     A group says ``sparse=True``; see :func:`voronerf.ops.sparse_adam`. Its state has the same names as that of the
-    other groups, which are torch's. On the CPU all float32 parameters are updated in one pass of the compiled module,
-    since torch's own step takes longer to prepare than to compute for networks of this size.
+    other groups, which are torch's. On the CPU all float32 parameters are updated by one operation, since torch's own
+    step takes longer to prepare than to compute for networks of this size.
 
     Args:
-        params: As of ``torch.optim.Adam``, like the rest.
+        params: Parameters or groups of them, as ``torch.optim.Adam`` takes them.
         lr: The learning rate.
         betas: Decay of the averages of gradients and of their squares.
         eps: Added to the root of the second moment.
         capturable: Whether a CUDA graph can record a step.
+        backend: Of the operations.
     """
 
     def __init__(
@@ -35,9 +36,10 @@ class Adam(torch.optim.Adam):
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
         capturable: bool = False,
+        backend: str = "auto",
     ) -> None:
         super().__init__(params, lr=lr, betas=betas, eps=eps, capturable=capturable, fused=True)
-        self._native = backends.missing("native", torch.device("cpu")) is None
+        self.backend = backend
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Drops the gradients, or fills them with zeros; torch's takes as long as a layer of a small network."""
@@ -59,7 +61,7 @@ class Adam(torch.optim.Adam):
             self._step_on_device()
             return loss
         entries = [(p, p.grad, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        together = self._native and all(_is_plain(parameter) for parameter, _, _ in entries)
+        together = self._in_one() and all(_is_plain(parameter) for parameter, _, _ in entries)
         own = [entry for entry in entries if together or entry[2].get("sparse", False)]
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
@@ -79,17 +81,21 @@ class Adam(torch.optim.Adam):
                 parameter.grad = gradient
         return loss
 
-    def _step_together(self, entries: list[tuple[Tensor, Tensor, dict[str, Any]]]) -> None:
-        from voronerf.ops.sparse_adam.native import adam  # which is there where the compiled module is
+    def _in_one(self) -> bool:
+        """Whether one operation takes all parameters on the CPU; torch's own step is faster than the reference."""
+        chosen = backends.chosen("adam", torch.device("cpu"), torch.float32, backend=self.backend)
+        return chosen == "native" or self.backend == "reference"
 
+    def _step_together(self, entries: list[tuple[Tensor, Tensor, dict[str, Any]]]) -> None:
         rules, states = [], []
         for parameter, _, group in entries:
             state, step = self._next(parameter)
-            rate, epsilon = corrected(step, float(group["lr"]), group["betas"], group["eps"])
-            rules.append((rate, *group["betas"], epsilon, not group.get("sparse", False)))
+            every = not group.get("sparse", False)
+            rules.append(Rule(step, float(group["lr"]), group["betas"], group["eps"], every))
             states.append(state)
+        parameters, gradients = [entry[0] for entry in entries], [entry[1] for entry in entries]
         moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
-        adam(rules, [gradient for _, gradient, _ in entries], [parameter for parameter, _, _ in entries], *moments)
+        adam(rules, parameters, gradients, *moments, backend=self.backend)
 
     def _step_table(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
         state, step = self._next(parameter)
@@ -102,6 +108,7 @@ class Adam(torch.optim.Adam):
             learning_rate=group["lr"],
             betas=group["betas"],
             epsilon=group["eps"],
+            backend=self.backend,
         )
 
     def _next(self, parameter: Tensor) -> tuple[dict[str, Tensor], int]:

@@ -5,44 +5,20 @@ Letters: r rays of a batch. Colours are in 0..1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
-from torch import Tensor
 
-from voronerf import backends
 from voronerf.data import Scene
 from voronerf.data.scene import Sightings
 from voronerf.data.store import Pages
-from voronerf.ops.draw_pixels.reference import Runs, draw_pixels
+from voronerf.ops.draw_pixels import Runs, draw_pixels
 from voronerf.ops.pixel_rays import pixel_rays
 from voronerf.rendering.cameras import Rays
-from voronerf.rendering.marching import draw_seed
+from voronerf.rendering.occupancy import draw_seed
 from voronerf.rendering.rays import intersect_box
+from voronerf.step import Batch
 
 #: Share of the rays that are drawn from the sightings of points, where these are learnt from.
 SEEN = 0.25
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Rays [r], where they enter and leave the scene, and the colours to learn.
-
-    Attributes:
-        rays: Origins and unit directions.
-        near: [r] depth at which each ray enters the scene.
-        far: [r] depth at which it leaves the scene.
-        target: [r, 3], the colour of each ray's pixel over the background.
-        background: [3], or [r, 3] where it was drawn; None for none.
-        seen: [s], the distances of the points that the last s rays end at, or None.
-    """
-
-    rays: Rays
-    near: Tensor
-    far: Tensor
-    target: Tensor
-    background: Tensor | None
-    seen: Tensor | None = None
 
 
 class RayBatches:
@@ -56,10 +32,19 @@ class RayBatches:
         device: Where batches live, and images that are in memory.
         cones: Whether the rays have radii.
         sightings: Whether a share of the rays, `SEEN`, are through sightings of points.
+        backend: Of the ops.
     """
 
-    def __init__(self, scene: Scene, device: torch.device, *, cones: bool = False, sightings: bool = False) -> None:
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        device: torch.device,
+        *,
+        cones: bool = False,
+        sightings: bool = False,
+        backend: str = "auto",
+    ) -> None:
+        self.scene, self.backend = scene, backend
         self.cones = cones
         self.device = device
         self.place = torch.device("cpu") if scene.train.on_disk else device
@@ -69,11 +54,6 @@ class RayBatches:
         self.background = scene.background_colour(self.place)
         self.box = None if scene.box is None else scene.box.to(self.place)
         self.useful = self._useful_pixels()
-        self._draw_pixels = draw_pixels
-        if self.place.type == "cpu" and backends.missing("native", self.place) is None:
-            from voronerf.ops.draw_pixels.native import draw_pixels as native  # which is there where the module is
-
-            self._draw_pixels = native
         self.sightings = None
         if sightings and scene.train.sightings is not None:
             self.sightings = Sightings(*(tensor.to(self.place) for tensor in scene.train.sightings))
@@ -115,11 +95,12 @@ class RayBatches:
         over a colour that is drawn for each ray, or over that of the scene.
         """
         several = 0 if self.sightings is None else int(SEEN * count)
-        index, uniforms = self._draw_pixels(draw_seed(self.place, generator), count, len(self), self.useful)
+        seed = draw_seed(self.place, generator)
+        index, uniforms = draw_pixels(seed, count, len(self), runs=self.useful, backend=self.backend)
         seen = None
         if several and self.sightings is not None:
             seed = draw_seed(self.place, generator)
-            chosen, _ = self._draw_pixels(seed, several, len(self.sightings.pixels), None)
+            chosen, _ = draw_pixels(seed, several, len(self.sightings.pixels), backend=self.backend)
             index[count - several :] = self.sightings.pixels[chosen]
             seen = self.sightings.distances[chosen].to(self.device)
         if self.pages is not None:
@@ -137,6 +118,7 @@ class RayBatches:
             distortion=cameras.distortion,
             models=cameras.models,
             background=background,
+            backend=self.backend,
         )
         radii = None
         if self.cones:

@@ -10,13 +10,15 @@ files as ``shards``. Whoever loads it gets the tensors of all cells.
 
 from __future__ import annotations
 
+import functools
 import json
+import secrets
 import tempfile
 import threading
 import warnings
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from voronerf.distributed.group import Group, RankLost
 from voronerf.files import parse_json, rename, write_bytes
 
 FORMAT = "voronerf-checkpoint-2"
@@ -105,42 +108,93 @@ def _remove_shards(run: Path) -> None:
 class CheckpointWriter:
     """Writes the checkpoints of a run one after the other, beside what the caller does.
 
+    Over several ranks, all of which call the same methods, each writes a file for its cells; when all are there, rank 0
+    writes the checkpoint that names them. A checkpoint counts from that moment on.
+
     Args:
         run: The run directory.
         keep: How many checkpoints stay.
+        group: The ranks that write it.
     """
 
-    def __init__(self, run: Path, keep: int) -> None:
-        self.run, self.keep = run, keep
+    def __init__(self, run: Path, keep: int, group: Group) -> None:
+        self.run, self.keep, self.group = run, keep, group
         self._thread: threading.Thread | None = None
         self._error: BaseException | None = None
+        self._index: Checkpoint | None = None  # of a checkpoint whose shards are being written
 
     @property
     def busy(self) -> bool:
-        """Whether a checkpoint is being written."""
+        """Whether a checkpoint is being written; over ranks, where that differs, a new one waits for the one before."""
+        return self.group.size == 1 and self._writes
+
+    @property
+    def ready(self) -> bool:
+        """Whether this rank has written its cells, for a checkpoint that is not there yet."""
+        return self._index is not None and not self._writes and self._error is None
+
+    @property
+    def _writes(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
 
-    def write(self, checkpoint: Checkpoint) -> None:
+    def write(self, checkpoint: Checkpoint, shard: Checkpoint | None = None) -> None:
         """Begins to write a checkpoint, after the one before; its tensors must not change.
+
+        Args:
+            checkpoint: What all ranks have.
+            shard: The cells of this rank; None before they are shared.
 
         Raises:
             OSError: When the one before could not be written.
+            RankLost: When that is so on another rank.
         """
         self.wait()
-        self._begin(checkpoint)
+        if self.group.size == 1:
+            self._begin(functools.partial(keep_checkpoint, self.run, checkpoint, self.keep))
+        elif shard is None:
+            self._index = checkpoint
+        else:
+            token = self.group.from_first(f"{checkpoint.values['step']}-{secrets.token_hex(4)}")
+            paths = [shard_path(self.run, token, rank) for rank in range(self.group.size)]
+            names = [path.name for path in paths]
+            self._index = replace(checkpoint, values={**checkpoint.values, "shards": names})
+            self._begin(functools.partial(save_checkpoint, paths[self.group.rank], shard))
 
-    def _begin(self, checkpoint: Checkpoint) -> None:
-        self._error = MemoryError("no memory for the thread that writes a checkpoint")  # until that has done so
-        # The end of the process does not wait for it: a second Ctrl-C is to end it at once.
-        self._thread = threading.Thread(target=self._write, args=(checkpoint,), daemon=True)
-        self._thread.start()
+    def commit(self) -> None:
+        """Begins to write the checkpoint itself, when all ranks are :attr:`ready`."""
+        self._join()
+        index, self._index = self._index, None
+        if index is not None and self.group.rank == 0:
+            self._begin(functools.partial(keep_checkpoint, self.run, index, self.keep))
 
     def wait(self) -> None:
-        """Returns when the checkpoint is written.
+        """Returns when the checkpoint is written, on all ranks.
 
         Raises:
             OSError: When it could not be.
+            RankLost: When it could not be on another rank.
         """
+        self._join_all()
+        if self._index is not None:
+            self.commit()
+            self._join_all()
+
+    def _begin(self, work: Callable[[], None]) -> None:
+        self._error = MemoryError("no memory for the thread that writes a checkpoint")  # until that has done so
+
+        def run() -> None:
+            try:
+                work()
+            except BaseException as error:
+                self._error = error
+            else:
+                self._error = None
+
+        # The end of the process does not wait for it: a second Ctrl-C is to end it at once.
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
+
+    def _join(self) -> None:
         if self._thread is not None:
             self._thread.join()
             self._thread = None
@@ -148,16 +202,15 @@ class CheckpointWriter:
             error, self._error = self._error, None
             raise error
 
-    def _write(self, checkpoint: Checkpoint) -> None:
+    def _join_all(self) -> None:
+        failure: OSError | None = None
         try:
-            self._save(checkpoint)
-        except BaseException as error:
-            self._error = error
-        else:
-            self._error = None
-
-    def _save(self, checkpoint: Checkpoint) -> None:
-        keep_checkpoint(self.run, checkpoint, self.keep)
+            self._join()
+        except OSError as error:
+            failure = error
+        failed = torch.tensor(float(failure is not None), device=self.group.device)
+        if self.group.largest(failed) > 0:
+            raise failure or RankLost("another rank could not write the checkpoint")
 
 
 def _all(name: str) -> bool:

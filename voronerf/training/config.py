@@ -10,11 +10,18 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from voronerf.fields import FIELDS, FieldType
 from voronerf.files import parse_json
-from voronerf.training.config_checks import NETWORK_SETTINGS, ConfigError, check_config, check_field, parse_option
-from voronerf.training.schedule import PlannedSplit, TimeUnit, default_times, final_cells, plan_splits
+from voronerf.rendering.samplers import SAMPLERS
+from voronerf.step.cells import SplitRule
+from voronerf.step.schedule import PlannedSplit, TimeUnit, default_times, final_cells, plan_splits
+from voronerf.training.config_checks import (
+    NETWORK_SETTINGS,
+    ConfigError,
+    check_config,
+    check_field,
+    check_sampling,
+    parse_option,
+)
 from voronerf.training.schema import check_types
-
-SamplingName = Literal["stratified", "hierarchical", "proposal"]
 
 
 @dataclass(frozen=True)
@@ -73,23 +80,15 @@ class TrainConfig:
     (cones instead of rays), kilonerf (nerf in the size of KiloNeRF's networks), or another name in
     `voronerf.fields.FIELDS`."""
     field_options: tuple[str, ...] = ()
-    """Further options of the field, each as NAME=VALUE, such as density_scale=20."""
+    """Further options of the field, each as NAME=VALUE, such as density_scale=20, skips=(4,) or view_directions=False.
+    position_octaves is by default such that the finest wave spans two pixels of the training views, and two more for
+    mipnerf, whose cones leave nothing of finer ones (published: 16)."""
     width: int | None = None
     """Channels of the networks' hidden layers; default 32, nerf and mipnerf 64."""
     depth: int | None = None
     """Hidden layers before the heads; default 1, nerf and mipnerf 4, kilonerf 2."""
     parameters: int | None = None
     """Upper limit for the number of parameters of all final cells together; --width becomes the largest that fits."""
-    skips: tuple[int, ...] | None = None
-    """Trunk layers whose output is concatenated with the encoded position; default: 4, as published, for more than five
-    layers, else none."""
-    position_octaves: int | None = None
-    """Octaves of the positional encoding; default: until the finest wave spans two pixels of the training views, and
-    two more for mipnerf, whose cones leave nothing of finer ones (published: 16)."""
-    direction_octaves: int | None = None
-    """Octaves of the encoding of view directions; default 4."""
-    view_directions: bool = True
-    """Whether colour depends on the view direction."""
     cell_tables: bool = False
     """Each cell has all parameters of its network for itself: with hashgrid a table of features too, which the cells
     share otherwise."""
@@ -98,8 +97,6 @@ class TrainConfig:
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, no number is one network."""
     split_at: tuple[float, ...] | None = None
     """When to split, as fractions of the run, one per level; default: 0.2, or evenly spaced from 0.15 to 0.5."""
-    split_at_seconds: tuple[float, ...] | None = None
-    """When to split, in seconds of training."""
     split_at_steps: tuple[int, ...] | None = None
     """When to split, in training steps."""
     split: Literal["all", "worst"] = "all"
@@ -121,8 +118,6 @@ class TrainConfig:
     """A sample goes to the nearest cell, or, while training, to one drawn by its distances to the centres."""
     temperature: float = 0.05
     """Temperature of the stochastic assignment, in scene units."""
-    temperature_final: float = 1.0
-    """Temperature at the end, as a fraction of --temperature; it falls exponentially over the run."""
     blend: float = 0.0
     """Margin in scene units within which neighbouring cells are blended in the final scores and pictures; 0 is off.
     Training does not blend."""
@@ -139,7 +134,7 @@ class TrainConfig:
     """Where empty space is skipped, few samples of a ray are left. A step then takes more rays, up to this multiple of
     --rays, so that it has a quarter of the samples of the first steps, or half with 128 samples a ray, and so on; 1 is
     off. Default 8 for hashgrid, else 1."""
-    sampling: SamplingName = "stratified"
+    sampling: str = "stratified"
     """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
     (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""
     samples: int | None = None
@@ -147,29 +142,17 @@ class TrainConfig:
     space is skipped more for larger images: 64 at 100 pixels across the object, 128 at 400."""
     fine_samples: int = 32
     """Samples per ray of the second pass; the fine network of nerf evaluates those of the first pass too."""
-    split_proposal: bool = False
-    """Give the density network of --sampling proposal cells too; it is one network for the whole scene otherwise."""
-    proposal_rounds: int = 1
-    """How often the density network is evaluated, each time where it has found something (published: 2)."""
-    proposal_anneal: float = 0.0
-    """Slope b of the annealing of mip-NeRF 360 (published: 10): after a fraction t of the run, intervals are drawn from
-    the proposal's weights to the power of b t / ((b - 1) t + 1), so evenly at first; 0 is off."""
-    distortion: float = 0.0
-    """Factor of a loss on weights that are spread along a ray (mip-NeRF 360; published: 0.01); 0 is off."""
     sightings: float | None = None
     """Factor of a loss on light that does not come from where the points of a sparse model were seen (Deng et al. 2022,
     "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points or where empty
     space is skipped."""
-    gradient_scaling: bool = True
-    """In unbounded scenes, samples nearer to the camera than the radius of the contraction's sphere learn less, by the
-    square of their distance, against fog before the cameras (Philip and Deschaintre 2023)."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
     radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for
     fields without a grid, else ndc where the cameras face forward and the sphere elsewhere."""
     occupancy: bool = True
     """Skip samples in empty space, in training and in pictures, wherever that works: for points in a single pass, in a
-    scene with a box or with a contraction, without --distortion and --cuda-graph."""
+    scene with a box or with a contraction, without --cuda-graph."""
     occupancy_resolution: int | None = None
     """Cells of the occupancy grid along each axis; default 64, and no grid with a contraction."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
@@ -185,13 +168,9 @@ class TrainConfig:
     0."""
     lr_final: float = 0.05
     """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
-    lr_split: float = 1.0
-    """Factor on the learning rate at each split, after which the gradients of a cell come from fewer samples."""
     average: float = 0.98
     """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. It is smaller in the first
     steps. Training goes on with the weights themselves."""
-    warmup: float = 0.02
-    """Fraction of the run over which the learning rate rises from a hundredth of --lr, 100 steps at most."""
     background: Literal["random", "white"] = "random"
     """Colour behind images with an alpha channel while training: random for every ray, or white as in evaluation."""
 
@@ -216,10 +195,11 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.budget is None and self.steps is None:
             object.__setattr__(self, "budget", 480.0)
-        if self.samples is None and self.sampling != "stratified":
+        check_sampling(self)
+        if self.samples is None and SAMPLERS[self.sampling].passes > 1:
             object.__setattr__(self, "samples", 32)
         check_field(self)
-        for name in ("width", "depth", "direction_octaves"):
+        for name in ("width", "depth"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, self.field_type.options.get(name))
         for name in ("ray_growth", "lr_hold"):
@@ -257,14 +237,12 @@ class TrainConfig:
     @property
     def split_unit(self) -> TimeUnit:
         """What the times of the splits count."""
-        if self.split_at_steps is not None:
-            return "steps"
-        return "fraction" if self.split_at_seconds is None else "seconds"
+        return "fraction" if self.split_at_steps is None else "steps"
 
     @property
     def splits(self) -> tuple[float, ...]:
         """When each level is split, in ``split_unit``; with ``max_cells`` the times of the first and the last split."""
-        for times in (self.split_at, self.split_at_seconds, self.split_at_steps):
+        for times in (self.split_at, self.split_at_steps):
             if times is not None:
                 return times
         return default_times(len(self.cells) if self.max_cells is None else 2)
@@ -279,11 +257,28 @@ class TrainConfig:
         """Cells at the end, where every cell holds enough samples to be split."""
         return final_cells(self.planned_splits)
 
-    def to_json(self) -> str:
-        """The settings as JSON text, which :meth:`from_json` reads."""
+    @property
+    def split_rule(self) -> SplitRule:
+        """How the splits are made."""
+        return SplitRule(
+            centres=self.centres,
+            uniform_scale=self.uniform_scale,
+            balance=self.balance,
+            min_samples=self.min_cell_samples,
+            inherit=self.init == "inherit",
+            reservoir=self.reservoir,
+            batches=self.reservoir_batches,
+        )
+
+    def to_values(self) -> dict[str, Any]:
+        """The settings as values of JSON."""
         values = dataclasses.asdict(self)
         values |= {name: None if values[name] is None else str(values[name]) for name in PATHS}
-        return json.dumps(values, indent=2) + "\n"
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    def to_json(self) -> str:
+        """The settings as JSON text, which :meth:`from_json` reads."""
+        return json.dumps(self.to_values(), indent=2) + "\n"
 
     @staticmethod
     def from_json(text: str, source: str = "config.json") -> TrainConfig:
@@ -298,6 +293,7 @@ class TrainConfig:
                 values = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
                 paths = {name: values.get(name) for name in PATHS}
                 values |= {name: Path(text) for name, text in paths.items() if isinstance(text, str)}
+                values = without_removed(values)
             check_types("settings", TrainConfig, values, optional=True)
             if not values:
                 raise ValueError("no settings")
@@ -312,6 +308,20 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 #: Settings that are text in JSON.
 PATHS = ("out", "lpips")
+#: Settings of older versions that are gone, with what is always done in their place.
+REMOVED: dict[str, Any] = {
+    "split_proposal": False,
+    "proposal_rounds": 1,
+    "proposal_anneal": 0.0,
+    "distortion": 0.0,
+    "gradient_scaling": True,
+    "lr_split": 1.0,
+    "warmup": 0.02,
+    "temperature_final": 1.0,
+    "split_at_seconds": None,
+}
+#: Settings of older versions that are options of the field now.
+MOVED = ("skips", "position_octaves", "direction_octaves", "view_directions")
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
     {
@@ -332,6 +342,27 @@ RESUMABLE = frozenset(
     }
     | {"checkpoint_every", "keep_checkpoints", "panels", "tensorboard", "blend", "lpips"}
 )
+
+
+def without_removed(values: dict[str, Any]) -> dict[str, Any]:
+    """Settings of an older version without those that are gone, where these say what is always done now.
+
+    Raises:
+        ValueError: A setting that is gone said something else.
+    """
+    for name in sorted(REMOVED.keys() & values.keys()):
+        if values[name] != REMOVED[name]:
+            was = f"{values[name]!r:.60}, which only version 0.1 and earlier can do"
+            raise ValueError(f"{name} is gone and must be {REMOVED[name]!r}, got {was}")
+    options = list(values.get("field_options") or ())
+    given = {name: values[name] for name in MOVED if values.get(name) is not None}
+    if isinstance(values.get("field"), str) and values["field"] in FIELDS:
+        known = FIELDS[values["field"]].options
+        own = {name: value for name, value in given.items() if name in known}
+        # The octaves of positions follow from the scene: a stored number is always one that was chosen.
+        options += [f"{n}={v!r}" for n, v in own.items() if n == "position_octaves" or v != known[n]]
+    kept = {name: value for name, value in values.items() if name not in REMOVED and name not in MOVED}
+    return {**kept, "field_options": tuple(options)} if options else kept
 
 
 def differences(a: TrainConfig, b: TrainConfig) -> list[str]:

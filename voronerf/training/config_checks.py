@@ -12,12 +12,13 @@ import torch
 
 from voronerf.backends import BACKENDS
 from voronerf.fields import FIELDS
+from voronerf.rendering.samplers import SAMPLERS
 
 if TYPE_CHECKING:
     from voronerf.training.config import TrainConfig
 
 #: Settings that are options of a field where its class has an option of that name.
-NETWORK_SETTINGS = ("width", "depth", "skips", "position_octaves", "direction_octaves", "view_directions")
+NETWORK_SETTINGS = ("width", "depth")
 
 
 class ConfigError(Exception):
@@ -25,6 +26,12 @@ class ConfigError(Exception):
 
     It is not a ValueError, because the parser of the command line would catch that and print a long explanation.
     """
+
+
+def check_sampling(config: TrainConfig) -> None:
+    """Raises ConfigError for a sampler that is not in the table."""
+    if config.sampling not in SAMPLERS:
+        raise ConfigError(f"--sampling must be {either(list(SAMPLERS))}, got {config.sampling!r}")
 
 
 def check_field(config: TrainConfig) -> None:
@@ -35,7 +42,7 @@ def check_field(config: TrainConfig) -> None:
     options = config.field_type.options
     for name in NETWORK_SETTINGS:
         given = getattr(config, name)
-        if name not in options and given is not None and given is not True:  # view directions are asked for by default
+        if name not in options and given is not None:
             raise ConfigError(f"--{name.replace('_', '-')} must not come with --field {config.field}, got {given!r}")
     own = [name for name in options if name not in NETWORK_SETTINGS]
     for text in config.field_options:
@@ -81,7 +88,6 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     for name in (
         "rays",
         "fine_samples",
-        "proposal_rounds",
         "reservoir",
         "reservoir_batches",
         "evaluations",
@@ -98,19 +104,15 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.depth is None or 1 <= config.depth <= 1000, "depth", "be at least 1 and at most 1000")
     need(config.parameters is None or config.parameters >= 1, "parameters", "be at least 1")
     need(0 <= config.blend < float("inf"), "blend", "be a distance of 0 or more")
-    for name in ("position_octaves", "direction_octaves", "panels", "min_cell_samples"):
+    for name in ("panels", "min_cell_samples"):
         need((getattr(config, name) or 0) >= 0, name, "not be negative")
     need(config.eval_views >= 1, "eval_views", "be at least 1")
     need(config.final_views is None or config.final_views >= 1, "final_views", "be at least 1")
     need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
     need(config.lr_hold is not None and 0 <= config.lr_hold < 1, "lr_hold", "lie in [0, 1)")
     need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
-    need(0 < config.lr_split < float("inf"), "lr_split", "be a positive factor")
     need(0 <= config.average < 1, "average", "lie in [0, 1)")
-    need(0 <= config.warmup < 1, "warmup", "lie in [0, 1)")
     need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
-    need(0 < config.temperature_final <= 1, "temperature_final", "lie in (0, 1]")
-    need(config.temperature_final == 1 or not config.cuda_graph, "temperature_final", "be 1 with --cuda-graph")
     need(0 < config.uniform_scale < float("inf"), "uniform_scale", "be positive and finite")
     uniform = config.centres == "uniform"
     need(uniform or config.uniform_scale == 1, "uniform_scale", "be 1 without --centres uniform")
@@ -123,14 +125,6 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     _check_splits(config, need)
     shares = "share" in config.field_type.router_options
     need(shares or not config.cell_tables, "cell_tables", "come with a field whose cells share parameters, as hashgrid")
-    proposes = config.sampling == "proposal"
-    need(proposes or not config.split_proposal, "split_proposal", "come with --sampling proposal")
-    need(proposes or config.proposal_rounds == 1, "proposal_rounds", "be 1 without --sampling proposal")
-    need(proposes or config.proposal_anneal == 0, "proposal_anneal", "come with --sampling proposal")
-    anneal = config.proposal_anneal
-    need(anneal == 0 or 1 <= anneal < float("inf"), "proposal_anneal", "be 0, or a slope of at least 1")
-    need(anneal == 0 or not config.cuda_graph, "proposal_anneal", "be 0 with --cuda-graph")
-    need(0 <= config.distortion < float("inf"), "distortion", "be a factor of 0 or more")
     need(config.sightings is None or 0 <= config.sightings < float("inf"), "sightings", "be a factor of 0 or more")
 
 
@@ -138,8 +132,7 @@ def why_no_occupancy(config: TrainConfig) -> str | None:
     """What keeps a run from skipping samples in empty space, whatever its scene; None if nothing does."""
     obstacles = {
         f"--field {config.field}, which takes cones": config.field_type.cones,
-        f"--sampling {config.sampling}": config.sampling != "stratified",
-        "--distortion": config.distortion > 0,
+        f"--sampling {config.sampling}": not SAMPLERS[config.sampling].skips,
         "--cuda-graph": config.cuda_graph,
     }
     return next((name for name, there in obstacles.items() if there), None)
@@ -150,22 +143,53 @@ def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -
         need(config.split == "worst", "max_cells", "come with --split worst")
         need(len(config.cells) in (1, 2), "max_cells", "come with one or two numbers of --cells")
         need(config.max_cells > config.cells[0], "max_cells", f"exceed the {config.cells[0]} cells of the first split")
-    given = [name for name in ("split_at", "split_at_seconds", "split_at_steps") if getattr(config, name) is not None]
+    given = [name for name in ("split_at", "split_at_steps") if getattr(config, name) is not None]
     if len(given) > 1:
-        raise ConfigError("give one of --split-at, --split-at-seconds and --split-at-steps, not several")
+        raise ConfigError("give --split-at or --split-at-steps, not both")
     for name in given:
-        times, unit = getattr(config, name), {"split_at": "fraction", "split_at_seconds": "time"}.get(name, "number")
+        times, unit = getattr(config, name), {"split_at": "fraction"}.get(name, "number")
         if config.max_cells is None:
             rule = f"have one {unit} for each of the {len(config.cells)} levels of --cells"
             need(len(times) == len(config.cells), name, rule)
         else:
             need(len(times) == 2, name, f"have two {unit}s, of the first and the last split, with --max-cells")
         rising = all(a < b for a, b in itertools.pairwise(times))
-        end = 1.0 if name == "split_at" else config.budget if name == "split_at_seconds" else config.steps
+        end = 1.0 if name == "split_at" else config.steps
         inside = all(0 < at < (float("inf") if end is None else end) for at in times)
-        kind = "fractions" if name == "split_at" else "times" if name == "split_at_seconds" else "numbers"
+        kind = "fractions" if name == "split_at" else "numbers"
         bound = "above 0" if end is None else f"between 0 and {end:g}"
         need(rising and inside, name, f"be rising {kind} {bound}")
+
+
+def check_ranks(config: TrainConfig, ranks: int) -> None:
+    """Rejects settings that multi-process training does not support; there are none for a single process.
+
+    Raises:
+        ConfigError: Names the setting.
+    """
+    if ranks == 1:
+        return
+    rules = {
+        "out": (config.out is not None, "be given with torchrun: restarts resume from it"),
+        "sampling": (SAMPLERS[config.sampling].passes == 1, "take one pass, as stratified: no rank sees whole rays"),
+        "field": (
+            not config.field_type.cones,
+            "take points with several ranks: cones reach into other cells",
+        ),
+        "assignment": (config.assignment == "nearest", "be nearest with several ranks, which have cells, not samples"),
+        "init": (config.init == "inherit", "be inherit with several ranks, which would draw other parameters"),
+        "blend": (config.blend == 0, "be 0 with several ranks, which do not have each other's cells"),
+        "precision": (config.precision != "fp16", "be fp32 or bf16 with several ranks, which have a scale each"),
+        "cuda_graph": (
+            not config.cuda_graph,
+            "be off with several ranks: the host reads the sizes of their messages",
+        ),
+        "cells": (not config.cells or config.cells[0] >= ranks, f"be at least the {ranks} ranks on the first level"),
+        "rays": (config.rays >= ranks, f"be at least the {ranks} ranks"),
+    }
+    for name, (fits, rule) in rules.items():
+        if not fits:
+            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {getattr(config, name)!r}")
 
 
 def check_device(name: str) -> None:

@@ -37,25 +37,32 @@ class GradientGuard:
         self.in_a_row = torch.zeros((), device=device)
         self._found = torch.zeros((), device=device)
 
-    def watch(self, loss: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool) -> None:
+    def judge(self, total: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool = False) -> None:
         """Tells the optimiser whether to skip the step that comes; the host waits for nothing.
 
-        Gradients of tables that are updated by entries are not read, which takes time: they are products of those of
-        the first layer, which are. Scaled gradients are the scaler's own matter.
+        Args:
+            total: [], see :func:`sum_of_gradients`; over ranks the sum of all.
+            optimizer: Of the step.
+            scaled: Whether gradients are scaled, which is the scaler's own matter.
         """
-        parts = [loss.detach().float()]
-        if not scaled:
-            dense = (p.grad for g in optimizer.param_groups if not g.get("sparse") for p in g["params"])
-            parts += [gradient.sum() for gradient in dense if gradient is not None]  # a norm takes five times as long
-        self.judge(torch.stack(parts).sum(), optimizer, scaled=scaled)
-
-    def judge(self, total: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool = False) -> None:
-        """The same from the sum of the loss and of all gradients."""
         self._found.copy_(total.abs().lt(LARGEST).logical_not_())  # true for NaN
         self.skipped.add_(self._found)
         self.in_a_row.add_(1).mul_(self._found)
         if not scaled:
             optimizer.found_inf = self._found  # type: ignore[attr-defined]  # what torch's scaler sets too
+
+
+def sum_of_gradients(loss: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool) -> Tensor:
+    """The sum [] of a loss and of all gradients, which is finite only if they are.
+
+    Gradients of tables that are updated by entries are not read, which takes time: they are products of those of the
+    first layer, which are. Nor are scaled ones.
+    """
+    parts = [loss.detach().float()]
+    if not scaled:
+        dense = (p.grad for g in optimizer.param_groups if not g.get("sparse") for p in g["params"])
+        parts += [gradient.sum() for gradient in dense if gradient is not None]  # a norm takes five times as long
+    return torch.stack(parts).sum()
 
 
 def all_finite(optimizer: torch.optim.Optimizer) -> bool:

@@ -17,6 +17,7 @@ from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import DensityField
 from voronerf.rendering.contraction import Perspective
+from voronerf.rendering.samplers import SAMPLERS
 from voronerf.router import VoronoiRouter
 from voronerf.training.adam import Adam
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
@@ -121,8 +122,9 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
         config = replace(config, sightings=SIGHTINGS if seen else 0.0)
     if config.samples is None:
         config = replace(config, samples=samples_for(scene) if config.occupancy and boxed else 64)
-    if config.position_octaves is None and "position_octaves" in kind.options:
-        config = replace(config, position_octaves=kind.octaves(octaves_for(scene, config.contraction)))
+    if "position_octaves" in kind.options and "position_octaves" not in config.network_options:
+        octaves = kind.octaves(octaves_for(scene, config.contraction))
+        config = replace(config, field_options=(*config.field_options, f"position_octaves={octaves}"))
     if kind.scene_options is not None:
         contracted = config.contraction != "none"
         found = kind.scene_options(pixel_at_the_middle(scene, config.contraction), space_of(config, scene), contracted)
@@ -136,10 +138,7 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
 
 def network_names(config: TrainConfig) -> tuple[str, ...]:
     """The names of a cell's networks for :class:`voronerf.rendering.Renderer`; "field" gives the colours."""
-    if config.sampling == "proposal":
-        return ("field", "proposal")
-    # With cones one network is evaluated twice, as in mip-NeRF.
-    return ("field", "coarse") if config.sampling == "hierarchical" and not config.field_type.cones else ("field",)
+    return SAMPLERS[config.sampling].networks(config.field_type.cones)
 
 
 def make_network(config: TrainConfig, name: str = "field") -> nn.Module:
@@ -170,7 +169,7 @@ def count_parameters(config: TrainConfig, width: int | None = None) -> int:
         config = replace(config, width=width)
     total = 0
     for name in network_names(config):
-        cells = 1 if name == "proposal" and not config.split_proposal else config.final_cells
+        cells = 1 if name == "proposal" else config.final_cells
         for shape, shared in parameter_shapes(config, name).values():
             total += (1 if shared else cells) * shape.numel()
     return total
@@ -182,8 +181,8 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
     Raises:
         BackendUnavailable: names the op.
     """
-    marching = ("march_rays", "update_occupancy") if config.occupancy else ()
-    drawing = () if config.sampling == "stratified" else ("resample",)
+    marching = ("march_rays", "update_occupancy", "learn_outputs", "render_loss_gradient") if config.occupancy else ()
+    drawing = () if SAMPLERS[config.sampling].passes == 1 else ("resample",)
     assigning = ("draw_cell",) if config.assignment == "stochastic" else ()
     ops = ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite")
     for op in (*ops, *marching, *drawing, *assigning):
@@ -271,8 +270,8 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
 def computes_natively(routers: Mapping[str, VoronoiRouter], config: TrainConfig) -> bool:
     """Whether native CPU ops evaluate all networks, so that torch is left with little to do in a step."""
     device = torch.device(config.device)
-    native = config.backend in ("auto", "native") and backends.missing("native", device) is None
-    return device.type == "cpu" and native and all(router.by_table for router in routers.values())
+    chosen = backends.chosen("routed_mlp", device, torch.float32, backend=config.backend)
+    return device.type == "cpu" and chosen == "native" and all(router.by_table for router in routers.values())
 
 
 def parameter_groups(
@@ -307,7 +306,7 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) ->
     options: dict[str, Any] = {"lr": config.lr}
     if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=dense[0].device), "capturable": True}
-    return Adam(groups, betas=(0.9, 0.99), eps=1e-15, **options)
+    return Adam(groups, betas=(0.9, 0.99), eps=1e-15, backend=config.backend, **options)
 
 
 def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:

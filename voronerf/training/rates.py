@@ -1,5 +1,4 @@
-"""What changes over a run: the learning rate, the rays of a step, the temperature of the assignment, the sharpness of a
-proposal."""
+"""What changes over a run: the learning rate and the rays of a step."""
 
 from __future__ import annotations
 
@@ -10,20 +9,22 @@ from voronerf.training.config import TrainConfig
 #: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
 #: which forgets in some thirty steps, would empty itself for good.
 WARMUP_STEPS = 100
+#: The fraction of the run that it rises for, at most.
+WARMUP = 0.02
 #: The share of a step's samples that are to be left once empty space is known, if more rays can bring them, and the
 #: samples of a ray beyond which it grows with them: large images need larger tables, which larger steps keep cheap.
 FILL, FILL_SAMPLES = 0.25, 64
 
 
-def learning_rate(config: TrainConfig, done: float, step: int, splits: int) -> float:
+def learning_rate(config: TrainConfig, done: float, step: int) -> float:
     """``lr`` until ``lr_hold`` of the fraction 0..1 that is done, then exponential decay to ``lr * lr_final``, after a
-    linear rise over the warm-up, `WARMUP_STEPS` at most; ``lr_split`` of it for each split that was made."""
+    linear rise over `WARMUP` of the run, `WARMUP_STEPS` at most."""
     assert config.lr is not None and config.lr_hold is not None
     rise = 1.0
-    if done < config.warmup and step < WARMUP_STEPS:
-        rise = 0.01 + 0.99 * max(done / config.warmup, step / WARMUP_STEPS)
+    if done < WARMUP and step < WARMUP_STEPS:
+        rise = 0.01 + 0.99 * max(done / WARMUP, step / WARMUP_STEPS)
     fallen = max(0.0, done - config.lr_hold) / (1 - config.lr_hold)
-    return config.lr * rise * math.exp(math.log(config.lr_final) * fallen) * config.lr_split**splits
+    return config.lr * rise * math.exp(math.log(config.lr_final) * fallen)
 
 
 def next_rays(config: TrainConfig, rays: int, samples: int) -> int:
@@ -32,14 +33,3 @@ def next_rays(config: TrainConfig, rays: int, samples: int) -> int:
     share = FILL * max(config.samples / FILL_SAMPLES, 1.0)
     wanted = rays * share * config.rays * config.samples / max(samples, 1)
     return int(min(max(wanted, config.rays), config.rays * config.ray_growth))
-
-
-def temperature(config: TrainConfig, done: float) -> float:
-    """Of the stochastic assignment: exponential decay from ``temperature``, by ``temperature_final`` in all."""
-    return config.temperature * math.exp(math.log(config.temperature_final) * done)
-
-
-def sharpness(config: TrainConfig, done: float) -> float:
-    """Exponent of the proposal's weights (mip-NeRF 360, section 3): from 0 to 1 over the run, or 1."""
-    slope = config.proposal_anneal
-    return slope * done / ((slope - 1) * done + 1) if slope else 1.0

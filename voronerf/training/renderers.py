@@ -1,23 +1,39 @@
-"""The renderer of a configuration: how its networks become pictures of a scene."""
+"""The renderer of a configuration: how its networks become pictures of a scene, and which space it skips."""
 
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
 
 from voronerf.data import Scene
+from voronerf.fields.radiance import INITIAL_DENSITY
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import DirectionPerSample, Field
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
+from voronerf.rendering.samplers import SAMPLERS, Occupancy, Stratified
+from voronerf.rendering.volume import Space
 from voronerf.router import VoronoiRouter
+from voronerf.step.cells import DECAY
 from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.config_checks import why_no_occupancy
 
 #: Samples of a ray of a picture, for each of training: those are at random places, and meet all of a stratum in time.
 PICTURE_SAMPLES = 2
+#: A cell is empty if a sample in it would take less of the light than this, were the cell that dense throughout: for
+#: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
+#: through empty space lies between the two, and would keep a third of the samples.
+LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
+#: Density of an empty cell of contracted space, a quarter of that of an untrained field.
+FOG = INITIAL_DENSITY / 4
+#: How many samples in a row empty a new cell: about thirty steps, until which the field has said nothing about most.
+OCCUPANCY_PATIENCE = 8
+#: Of a grid made for pictures alone: cells along each axis, and points evaluated in each.
+PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 
 
 def make_renderer(
@@ -29,7 +45,6 @@ def make_renderer(
     fine_samples: int | None = None,
     occupancy: OccupancyGrid | None = None,
     backend: str | None = None,
-    kind: type[Renderer] = Renderer,
 ) -> Renderer:
     """The renderer that a configuration asks for.
 
@@ -41,31 +56,28 @@ def make_renderer(
         fine_samples: Samples per ray of the second pass; None for those of the configuration.
         occupancy: The grid of what is empty.
         backend: Of the operations; None for that of the configuration.
-        kind: The class to make.
 
     Raises:
         ConfigError: For a contraction that the scene does not allow.
     """
-    device = next(routers["field"].parameters()).device
+    device, backend = next(routers["field"].parameters()).device, backend or config.backend
     contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
     full_gradient = None
-    if config.gradient_scaling and scene.kind == "unbounded" and isinstance(contraction, Contraction):
+    if scene.kind == "unbounded" and isinstance(contraction, Contraction):
         full_gradient = contraction.radius
-    return kind(
-        {name: as_field(router) for name, router in routers.items()},
-        samples=int(config.samples or 0) if samples is None else samples,
-        fine_samples=0 if config.sampling == "stratified" else fine_samples or config.fine_samples,
-        cones=config.field_type.cones,
-        contraction=contraction,
-        spacing=scene.spacing,
-        occupancy=occupancy,
-        rounds=config.proposal_rounds,
-        distortion=config.distortion,
-        picture_samples=PICTURE_SAMPLES * int(config.samples or 0) if samples is None else samples,
-        sightings=config.sightings or 0.0,
-        full_gradient=full_gradient,
-        backend=config.backend if backend is None else backend,
-    )
+    space = Space(contraction, scene.spacing, config.field_type.cones, full_gradient)
+    counts = (samples or int(config.samples or 0), fine_samples or config.fine_samples)
+    kind = SAMPLERS[config.sampling]
+    sampler = kind(*counts[: kind.passes], space=space, backend=backend)
+    if occupancy is not None:
+        sampler = through_grid(sampler, occupancy, picture_samples=samples)
+    return Renderer({name: as_field(router) for name, router in routers.items()}, sampler, backend=backend)
+
+
+def through_grid(sampler: Stratified, grid: OccupancyGrid, *, picture_samples: int | None = None) -> Occupancy:
+    """A sampler without the samples in empty cells; pictures have `PICTURE_SAMPLES` as many strata where not said."""
+    more = picture_samples or PICTURE_SAMPLES * sampler.samples
+    return Occupancy(grid, sampler.samples, picture_samples=more, space=sampler.space, backend=sampler.backend)
 
 
 def as_field(router: VoronoiRouter) -> Field:
@@ -98,3 +110,48 @@ def make_contraction(
     if radius == 0:
         raise ConfigError(f"--contraction sphere needs cameras in several places, those of {scene.name} are in one")
     return Contraction(torch.zeros(3, device=device), radius)
+
+
+def make_grid(
+    config: TrainConfig,
+    scene: Scene,
+    device: torch.device | str,
+    resolution: int | None = None,
+    least_opacity: float = TRAINING_OPACITY,
+) -> OccupancyGrid:
+    """A grid over the scene's box, or over the cube of its contraction, that is occupied everywhere.
+
+    A cell is empty below the density with which an average stratum, the box's diagonal divided by the samples of a ray,
+    takes `least_opacity` of the light; with a contraction below `FOG`, since the thin fog that a young field fills
+    space with is at first all that it has of the scene.
+
+    Raises:
+        ConfigError: When the scene has no box and is not contracted.
+    """
+    contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
+    if contraction is not None:
+        box, threshold = contraction.cube, FOG
+    elif scene.box is not None:
+        box = scene.box
+        threshold = -math.log1p(-least_opacity) * int(config.samples or 0) / float((box[1] - box[0]).norm())
+    else:
+        raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
+    size = resolution or int(config.occupancy_resolution or 0)
+    remembered = DECAY**-OCCUPANCY_PATIENCE
+    return OccupancyGrid(box, size, threshold=threshold, remembered=remembered, contraction=contraction, device=device)
+
+
+def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> OccupancyGrid:
+    """The occupancy grid of a field that was trained without one, made by asking the field in every cell.
+
+    Raises:
+        ConfigError: As `make_grid`, or when the run's sampling has no use for a grid.
+    """
+    obstacle = why_no_occupancy(replace(config, cuda_graph=False))
+    if obstacle is not None:
+        raise ConfigError(f"--occupancy does not work with {obstacle}")
+    grid = make_grid(config, scene, renderer.device, PICTURE_RESOLUTION, LEAST_OPACITY)
+    generator = torch.Generator().manual_seed(0)
+    for points in range(PICTURE_POINTS):
+        grid.update(renderer.field, decay=float(points > 0), generator=generator, backend=renderer.backend)
+    return grid

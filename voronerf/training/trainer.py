@@ -1,16 +1,21 @@
 """The training loop: coarse stage, splits, local stages; evaluations and checkpoints on the way.
 
-Time means training time: steps and splits count, evaluations and checkpoints do not.
+Time means training time: steps and splits count, evaluations and checkpoints do not. Over several ranks every one of
+them runs this loop: they take the same steps, and each holds the networks of its own cells. A group of one rank is an
+ordinary training.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,20 +23,38 @@ from voronerf import backends
 from voronerf.data import Scene
 from voronerf.data.record import write_scene
 from voronerf.diagram import VoronoiDiagram
-from voronerf.diagram.reservoir import SampleReservoir
-from voronerf.diagram.subdivision import Split
+from voronerf.distributed.exchange import Exchange, Told
+from voronerf.distributed.group import Group
+from voronerf.distributed.sharing import Sharing
 from voronerf.evaluation.lpips import Lpips, find_lpips
-from voronerf.evaluation.scores import evaluate
-from voronerf.files import write_text
+from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
+from voronerf.files import json_text, write_bytes, write_text
 from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter
-from voronerf.training.average import averages_in_place, update_averages
+from voronerf.router.grouping import cell_parameters
+from voronerf.step import Cells, Found, Step
+from voronerf.training import state
+from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
-from voronerf.training.checkpoint import Checkpoint, CheckpointWriter, checkpoint_paths, last_checkpoint
+from voronerf.training.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    CheckpointWriter,
+    checkpoint_paths,
+    last_checkpoint,
+)
 from voronerf.training.config import TrainConfig
+from voronerf.training.config_checks import check_ranks
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
-from voronerf.training.divergence import PATIENCE, GradientGuard, all_finite
+from voronerf.training.divergence import (
+    PATIENCE,
+    SETTLED,
+    GradientGuard,
+    all_finite,
+    one_colour_psnr,
+    sum_of_gradients,
+    why_scores_are_poor,
+)
 from voronerf.training.networks import (
     check_backend,
     check_memory,
@@ -39,66 +62,63 @@ from voronerf.training.networks import (
     make_optimizer,
     make_routers,
     resolve_config,
+    restore_routers,
 )
-from voronerf.training.occupancy import make_grid, observe_samples, revisit_cells
 from voronerf.training.progress import Progress, Stage, TrainingError
-from voronerf.training.rates import learning_rate, next_rays, sharpness, temperature
-from voronerf.training.records import record_scores, summarise
-from voronerf.training.renderers import make_renderer
-from voronerf.training.resume import resume_training, resumed_checkpoint, training_state
+from voronerf.training.rates import learning_rate, next_rays
+from voronerf.training.renderers import make_grid, make_renderer
 from voronerf.training.run_directory import read_metrics
-from voronerf.training.splitting import split_by_samples, split_cells
 
-#: Steps between evaluations of random cells of the occupancy grid.
-OCCUPANCY_EVERY = 16
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
 READ_EVERY = 50
 #: The dtype of autocast for each precision but float32.
 HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
-#: Steps between tries to split the worst cell.
-SPLIT_EVERY = 5
+#: Entries of the last evaluation that summary.json repeats.
+FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views")
 
 
 class Trainer:
     """Trains one scene by the whole method and keeps its run directory.
 
+    Over ranks, the one network of the coarse stage is data-parallel. From the first split on a rank holds the
+    parameters, the moments of Adam, the averages and the occupancy of its own cells. Random numbers are the same on all
+    ranks, so that samples are those of one process, and so are the parameters but for rounding. Time is that of rank 0,
+    which writes the files.
+
     Args:
         config: The settings; ``config.out`` names the run directory.
         scene: The scene that ``config.data`` names.
+        group: The ranks that train together, each with a trainer of the same settings; None for this process alone.
         on_step: Called after every step with a :class:`Progress`.
         on_event: Called with one line of text for each split and evaluation.
         clock: Counts the seconds of training; default ``time.perf_counter``.
 
     Raises:
         CheckpointError: With ``config.resume``, when there is no checkpoint or it is of another configuration.
+        ConfigError: For settings that training over ranks does not support.
     """
-
-    #: What renders, and whether this process writes the files of the run; the ranks of a joint training have their own.
-    renderer_type: type[Renderer] = Renderer
-    writes = True
 
     def __init__(
         self,
         config: TrainConfig,
         scene: Scene,
         *,
+        group: Group | None = None,
         on_step: Callable[[Progress], None] | None = None,
         on_event: Callable[[str], None] | None = None,
         clock: Callable[[], float] | None = None,
     ) -> None:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
-        self.out = config.out
+        self.out, self.scene = config.out, scene
+        self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
+        self.device = torch.device(config.device)
+        self.group = group or Group(self.device)
+        check_ranks(config, self.group.size)
         config = resolve_config(config, scene)
         check_memory(config)
-        checkpoint = resumed_checkpoint(config, self.out) if config.resume else None
-        self.config = config
-        self.plan = config.planned_splits
-        self.scene = scene
-        self.on_step = on_step
-        self.on_event = on_event
-        self.clock = clock or time.perf_counter
-        self.device = torch.device(config.device)
+        checkpoint = state.resumed_checkpoint(config, self.out) if config.resume else None
+        self.config, self.plan = config, config.planned_splits
         check_backend(config, self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         # Random numbers are drawn on the device that uses them: the host need not wait, and a graph can draw them.
@@ -106,7 +126,13 @@ class Trainer:
         if self.device.type == "cuda":
             self.draws = torch.Generator(self.device).manual_seed(config.seed)
         self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
-        self.batches = RayBatches(scene, self.device, cones=config.field_type.cones, sightings=bool(config.sightings))
+        self.batches = RayBatches(
+            scene,
+            self.device,
+            cones=config.field_type.cones,
+            sightings=bool(config.sightings),
+            backend=config.backend,
+        )
         self.routers = make_routers(config, self.device)
         for router in self.routers.values():
             router.generator = self.draws
@@ -114,26 +140,40 @@ class Trainer:
         self.any_threads = computes_natively(self.routers, config)
         self.optimizer = make_optimizer(self.routers, config)
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=config.precision == "fp16")
-        self.reservoir = SampleReservoir(config.reservoir, config.reservoir_batches, device=self.device)
-        self.occupancy = make_grid(config, scene, self.device) if config.occupancy else None
-        self.renderer = make_renderer(config, scene, self.routers, occupancy=self.occupancy, kind=self.renderer_type)
+        grid = make_grid(config, scene, self.device) if config.occupancy else None
+        self.renderer = make_renderer(config, scene, self.routers, occupancy=grid)
+        self.sharing = Sharing(self.group)
+        self.cells = Cells(
+            self.renderer,
+            self.routers,
+            self.plan,
+            config.split_rule,
+            generator=self.generator,
+            sharing=self.sharing,
+        )
+        self.learner = Step(self.renderer, sightings=config.sightings or 0.0, sharing=self.sharing)
         self.guard = GradientGuard(self.device)
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
-        self.step = 0
-        self.seconds = 0.0
+        self.step, self.seconds = 0, 0.0
+        self._passed = 0.0  # seconds that ranks have not been told of
         #: Rays of the next step, and of all steps so far.
         self.rays, self.rays_done = config.rays, 0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
         self.evaluated = 0
         self.metrics: list[dict[str, Any]] = []
-        self.stopped = self.described = False
+        self.stopped = self._asked_to_stop = self.described = False
         self.loss = math.nan
-        self.writer = CheckpointWriter(self.out, config.keep_checkpoints)
+        self.writer = CheckpointWriter(self.out, config.keep_checkpoints, self.group)
         if checkpoint is not None:
             self._resume(checkpoint)
         self.saved_at = self.seconds
-        self._compute = self._make_step()
+        self._begin_stage()
+
+    @property
+    def writes(self) -> bool:
+        """Whether this process writes the files of the run."""
+        return self.group.rank == 0
 
     @property
     def router(self) -> VoronoiRouter:
@@ -143,12 +183,19 @@ class Trainer:
     @property
     def diagram(self) -> VoronoiDiagram:
         """All cells of the run."""
-        return self.router.diagram
+        return self.cells.diagram
+
+    @property
+    def occupancy(self) -> OccupancyGrid | None:
+        """The grid of what is empty."""
+        return self.renderer.occupancy
 
     @property
     def parameter_count(self) -> int:
         """Parameters of all networks of all cells."""
-        return sum(p.numel() for router in self.routers.values() for p in router.parameters())
+        of_cells = sum(p.numel() for p in cell_parameters(self.router.module))
+        everything = sum(p.numel() for router in self.routers.values() for p in router.parameters())
+        return everything + of_cells // self.router.num_cells * (self.diagram.num_cells - self.router.num_cells)
 
     # --- progress ------------------------------------------------------------------------------------------------
 
@@ -159,26 +206,31 @@ class Trainer:
             return min(1.0, self.step / self.config.steps)
         return min(1.0, self.seconds / float(self.config.budget or 1.0))
 
-    def _now(self) -> float:
-        """The time in the unit of the planned splits."""
-        return {"fraction": self.fraction, "seconds": self.seconds, "steps": float(self.step)}[self.config.split_unit]
-
     @property
     def level(self) -> int:
         """Splits done."""
-        return len(self.stages) - 1
+        return self.cells.splits
 
     def learning_rate(self) -> float:
         """Of the next step, see :func:`voronerf.training.rates.learning_rate`; half of it after a divergence."""
-        return learning_rate(self.config, self.fraction, self.step, self.level) * self.rate_factor
+        return learning_rate(self.config, self.fraction, self.step) * self.rate_factor
 
     def averaged(self) -> AbstractContextManager[None]:
         """A context in which the networks have their averaged weights, for pictures; not for training."""
         return averages_in_place(self.optimizer)
 
     def request_stop(self) -> None:
-        """Ends training after the step or the view in hand, with a checkpoint; what Ctrl-C does."""
-        self.stopped = True
+        """Ends training after the step or the view in hand, with a checkpoint, as Ctrl-C does; ranks stop together."""
+        self._asked_to_stop = True
+        self.stopped = self.group.size == 1
+
+    def _count(self, started: float) -> None:
+        """Counts the time since then; ranks learn with the next step what rank 0 has counted."""
+        passed = self.clock() - started
+        if self.group.size == 1:
+            self.seconds += passed
+        else:
+            self._passed += passed
 
     # --- the loop ------------------------------------------------------------------------------------------------
 
@@ -198,11 +250,11 @@ class Trainer:
             self.stopped = False  # a stop that came in the last step has nothing to end
             left = len(self.plan) - self.level
             if left:
-                self.say(f"{left} of {len(self.plan)} planned splits not made: the run ended before")
+                self.say(f"Run ended before {left} of {len(self.plan)} planned splits.")
             for router in self.routers.values():
                 router.blend = self.config.blend
             self._evaluate(self.config.final_views, self.lpips)
-        return summarise(self)
+        return self._summarise()
 
     def advance(self, until: float = math.inf) -> None:
         """Trains until ``until`` training seconds or the end of the budget, whichever comes first.
@@ -211,7 +263,8 @@ class Trainer:
         affects all of them alike.
 
         Raises:
-            As :meth:`run`.
+            TrainingError: As :meth:`run`.
+            OSError: As :meth:`run`.
         """
         loss = None
         while self.fraction < 1 and self.seconds < until and not self.stopped:
@@ -224,7 +277,7 @@ class Trainer:
             self.rays_done += self.rays
             loss = self.train_step()
             self.step += 1
-            self.seconds += self.clock() - started
+            self._count(started)
             if self.device.type == "cpu" or self.step % READ_EVERY == 0:
                 self._read(loss)
             if self.on_step is not None:
@@ -250,13 +303,15 @@ class Trainer:
         """
         started = self.clock()
         self.loss, in_a_row = torch.stack((loss.float(), self.guard.in_a_row)).tolist()
-        self.seconds += self.clock() - started
+        if self.group.size == 1:
+            self._count(started)
         if in_a_row >= PATIENCE:
             self._go_back(f"gradients of {int(in_a_row)} steps in a row not finite")
 
     def _check_moments(self) -> bool:
         """Whether parameters and moments are finite; goes back to the last checkpoint where they are not."""
-        finite = all_finite(self.optimizer)
+        broken = torch.tensor(float(not all_finite(self.optimizer)), device=self.device)
+        finite = bool(self.group.largest(broken) == 0)
         if not finite:
             self._go_back("parameters or moments of Adam not finite")
         return finite
@@ -277,87 +332,138 @@ class Trainer:
         self.guard.skipped.fill_(skipped)
         self.rate_factor = 0.5
         self.saved_at = self.seconds
-        self._compute = self._make_step()
+        self._begin_stage()
         self.say(f"{reason} at step {at}: back to step {self.step}, with half the learning rate")
 
-    def _make_step(self) -> Callable[[], tuple[Tensor, Tensor | None, Tensor | None]]:
-        """The function of a step: the plain one, or a new CUDA graph of it."""
-        return GraphedStep(self._forward_backward, [self.draws]) if self.config.cuda_graph else self._forward_backward
+    def _begin_stage(self) -> None:
+        """After parameters have become others: finds what ranks share, and ends the CUDA graph of the old ones."""
+        whole, tables = self.cells.shared_parameters(self.optimizer)
+        self.exchange = Exchange(self.group, whole, tables)
+        graphed = self.config.cuda_graph
+        self._compute = GraphedStep(self._forward_backward, [self.draws]) if graphed else self._forward_backward
 
     def train_step(self) -> Tensor:
         """One step of :meth:`advance` without its count and clock; returns the loss, which may not be computed yet."""
         with backends.torch_on_one_thread() if self.any_threads else nullcontext():
-            return self._train_step()
+            set_learning_rate(self.optimizer, self.learning_rate())
+            self.cells.revisit(self.step)
+            if not self.router.training:
+                self.renderer.train()
+            loss, kept = self._compute()
+            if self.config.average:
+                update_averages(self.optimizer, self.config.average, self.step)
+            if len(kept):
+                self.cells.reservoir.add(kept[:, :3], kept[:, 3])
+            return loss
 
-    def _train_step(self) -> Tensor:
-        set_learning_rate(self.optimizer, self.learning_rate())
-        for router in self.routers.values():
-            router.temperature = temperature(self.config, self.fraction)
-        self.renderer.sharpness = sharpness(self.config, self.fraction)
-        if self.occupancy is not None and self.step % OCCUPANCY_EVERY == 0:
-            self.router.eval()
-            self._revisit(self.occupancy)
-        if not self.router.training:
-            self.renderer.train()
-        loss, positions, importance = self._compute()
-        if self.config.average:
-            update_averages(self.optimizer, self.config.average, self.step)
-        if positions is not None and importance is not None:
-            self.reservoir.add(positions, importance)
-        return loss
-
-    def _revisit(self, grid: OccupancyGrid) -> None:
-        revisit_cells(grid, self.renderer.field, self.generator, backend=self.config.backend)
-
-    def _forward_backward(self) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """Updates the parameters; returns the loss, and until the last split positions [n, 3] and importance [n]."""
+    def _forward_backward(self) -> tuple[Tensor, Tensor]:
+        """Updates the parameters; returns the loss, and the heaviest samples [n, 4], until the last split."""
         config = self.config
         batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
         half = HALVES.get(config.precision)
         with nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False):
-            given: dict[str, Any] = {"background": batch.background, "generator": self.draws, "seen": batch.seen}
-            found = self.renderer.compare(batch.rays, batch.near, batch.far, batch.target, **given)
-        if self.occupancy is not None:
-            observe_samples(self.occupancy, found, backend=config.backend)
-            self.rays = next_rays(config, self.rays, len(found.positions))
-        loss = found.loss
+            found = self.learner.run(batch, self.draws)
         self.optimizer.zero_grad(set_to_none=True)
         # Nothing is read on the host: the fused optimiser skips a step whose gradients have overflowed by itself.
-        self.scaler.scale(loss).backward()
-        self.guard.watch(loss, self.optimizer, scaled=self.scaler.is_enabled())
+        self.scaler.scale(found.loss).backward()
+        told = self._agree(found)
+        self.cells.observe(found, told.seen if self.group.size > 1 else None)
+        if self.occupancy is not None:
+            self.rays = next_rays(config, self.rays, told.samples)
+        self.guard.judge(told.total, self.optimizer, scaled=self.scaler.is_enabled())
         self.scaler.step(self.optimizer)
         self.scaler.update()
-        if self.level >= len(self.plan):
-            return loss.detach(), None, None
-        return loss.detach(), found.positions, found.importance()
+        return told.loss, told.kept
+
+    def _agree(self, found: Found) -> Told:
+        """Adds up gradients over all ranks, and lets them agree on time, stops, checkpoints and what was found."""
+        if self.group.size > 1:
+            for parameter in self.router.parameters():
+                if parameter.grad is None:  # no sample of this rank
+                    parameter.grad = torch.zeros_like(parameter)
+        summed = self.exchange.begin()
+        loss = found.loss.detach()
+        own = Told(
+            loss=loss,
+            total=sum_of_gradients(loss, self.optimizer, scaled=self.scaler.is_enabled()),
+            kept=self.cells.heaviest(found),
+            seen=self.cells.tell(found),
+            samples=len(found.weights),
+            passed=self._passed,
+            stop=self._asked_to_stop,
+            ready=self.writer.ready,
+        )
+        told = self.exchange.agree(own)
+        if self.group.size > 1:
+            self._passed = 0.0
+            self.seconds += told.passed
+            self.stopped |= told.stop
+            if told.ready:
+                self.writer.commit()
+        summed()
+        return told
+
+    # --- cells -----------------------------------------------------------------------------------------------------
 
     def split_is_due(self) -> bool:
         """Whether :meth:`advance` splits before the next step."""
-        if self.level >= len(self.plan):
-            return False
-        planned = self.plan[self.level]
-        # While no cell holds enough samples, a split of the worst cell is tried again.
-        return self._now() >= planned.at - 1e-9 and (planned.most is None or self.step % SPLIT_EVERY == 0)
+        now = self.fraction if self.config.split_unit == "fraction" else float(self.step)
+        return self.cells.is_due(now, self.step)
 
     def split(self) -> None:
         """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
         with backends.torch_on_one_thread() if self.any_threads else nullcontext():
-            if not split_cells(self):
-                return  # the reservoir goes on collecting samples
-        self.reservoir = SampleReservoir(self.config.reservoir, self.config.reservoir_batches, device=self.device)
-        self._compute = self._make_step()  # a graph would update the parameters from before the split
+            if self._split():  # else the reservoir goes on collecting samples
+                self.cells.empty_reservoir()
+                self._begin_stage()
 
-    def find_split(self, k: int, points: Tensor, importance: Tensor) -> Split | None:
-        """The next split of every cell, or of the worst, into k; None if there are fewer samples than that."""
-        planned = self.plan[self.level]
-        return split_by_samples(self.config, planned, self.diagram, k, points, importance, self.generator)
+    def _split(self) -> bool:
+        """Makes the split that is due, as far as the cells hold enough samples; False to try again later.
 
-    def divide(self, split: Split) -> None:
-        """Gives the networks the cells of a split."""
-        inherit = self.config.init == "inherit"
-        for name, router in self.routers.items():
-            if name != "proposal" or self.config.split_proposal:
-                router.subdivide(split.diagram, split.parents, optimizer=self.optimizer, inherit=inherit)
+        Raises:
+            TrainingError: When the first split has more cells than samples; after a checkpoint.
+        """
+        cells, level, k = self.cells, self.level, self.cells.children
+        points, importance = cells.reservoir.samples()
+        if level == 0 and len(points) < k:
+            self.save()
+            raise TrainingError(
+                f"{self.out}: more cells than samples: --cells asks for {k}, {len(points)} samples were kept in "
+                f"{self.step} steps; in another --out, split later or keep more a batch (--reservoir, "
+                "--reservoir-batches)"
+            )
+        split = cells.find_split(self._positions)
+        balances = [] if split is None else list(split.balances.values())
+        if self.plan[level].most is not None and not balances:
+            return False
+        if self.writes:
+            kept = io.BytesIO()  # which benchmarks/balance.py can read
+            np.savez(kept, points=points.cpu().numpy(), importance=importance.cpu().numpy())
+            write_bytes(self.out / "samples" / f"level-{level + 1}.npz", kept.getvalue())
+        if split is not None and balances:
+            cells.divide(split, self.optimizer)
+        if self.config.init == "random":  # the averages are of other networks
+            drop_averages(self.optimizer)
+        before, after = (
+            _median([getattr(balance, name) for balance in balances])
+            for name in ("imbalance_before", "imbalance_after")
+        )
+        now, when = self.diagram.num_cells, f"at {self.seconds:.0f} s, step {self.step}"
+        self.stages.append(Stage(now, self.seconds, self.step, before, after, len(balances)))
+        cells.splits += 1
+        if balances:
+            self.say(f"{now} cells {when}, imbalance of their importance {before:.3f} -> {after:.4f}")
+        else:
+            need = max(k, self.config.min_cell_samples)
+            self.say(f"no cell split {when}: none holds {need} of the {len(points)} samples kept")
+        return True
+
+    def _positions(self) -> Tensor:
+        """Positions of a step on this rank; of a batch drawn for this alone, so that a restart finds the same."""
+        generator = torch.Generator(self.draws.device).manual_seed(self.step)
+        batch = self.batches.draw(self.rays, generator)
+        given = self.renderer.sampler, batch.rays, batch.near, batch.far
+        return self.sharing.samples(*given, jitter=True, generator=generator).positions
 
     # --- evaluation and files --------------------------------------------------------------------------------------
 
@@ -372,7 +478,50 @@ class Trainer:
         if self.stopped:
             return
         self.evaluated = self._due()
-        record_scores(self, scores)
+        self._record(scores)
+
+    def _record(self, scores: list[ViewScore]) -> None:
+        """Adds an evaluation to ``metrics.jsonl`` and tells it, with what makes it poor."""
+        now = {
+            "step": self.step,
+            "seconds": round(self.seconds, 3),
+            "cells": self.diagram.num_cells,
+            "learning_rate": self.learning_rate(),
+            "views": len(scores),
+            **mean_scores(scores),
+        }
+        self.metrics = [m for m in self.metrics if m["step"] < self.step] + [now]
+        if self.writes:
+            write_text(self.out / "metrics.jsonl", "".join(json_text(m) + "\n" for m in self.metrics))
+        self.say(
+            f"{self.seconds:7.1f} s  step {self.step:6d}  {self.diagram.num_cells:4d} cells  "
+            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
+        )
+        if self.one_colour is None:
+            self.one_colour = one_colour_psnr(self.scene)
+        settled = self.step >= SETTLED and self.fraction >= 0.5
+        poor = why_scores_are_poor(self.metrics, self.config, self.one_colour, settled=settled)
+        if poor is not None:
+            self.say(poor)
+
+    def _summarise(self) -> dict[str, Any]:
+        """Writes ``summary.json``; returns what it holds."""
+        summary = {
+            **{key: self.metrics[-1].get(key) if self.metrics else None for key in FIGURES},
+            "complete": self.fraction >= 1 and not self.stopped,
+            "seconds": self.seconds,
+            "steps": self.step,
+            "rays_per_second": self.rays_done / max(self.seconds, 1e-9),
+            "parameters": self.parameter_count,
+            "cells": self.diagram.num_cells,
+            "splits_left": len(self.plan) - self.level,
+            "skipped_steps": int(self.guard.skipped),
+            "width": self.config.width,
+            "stages": [asdict(stage) for stage in self.stages],
+        }
+        if self.writes:
+            write_text(self.out / "summary.json", json_text(summary, indent=2) + "\n")
+        return summary
 
     def save(self, *, wait: bool = True) -> None:
         """Writes ``checkpoints/last.safetensors``; without ``wait`` it is begun, and :attr:`writer` ends it."""
@@ -380,19 +529,89 @@ class Trainer:
             write_text(self.out / "config.json", self.config.to_json())
             write_scene(self.out / "scene.json", self.scene)
             self.described = True
-        self.writer.write(training_state(self))
+        checkpoint = self._state()
+        if self.sharing.diagram is None:
+            self.writer.write(checkpoint)
+        else:
+            self.writer.write(*state.apart(checkpoint, self.cells, self.optimizer))
         self.saved_at = self.seconds
         if wait:
             self.writer.wait()
 
+    def _state(self) -> Checkpoint:
+        """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
+        stored = state.Stored(
+            config=self.config.to_values(),
+            step=self.step,
+            seconds=self.seconds,
+            rays=self.rays,
+            rays_done=self.rays_done,
+            stages=tuple(asdict(stage) for stage in self.stages),
+            evaluated=self.evaluated,
+            skipped=int(self.guard.skipped),
+            rate_factor=self.rate_factor,
+            threads=torch.get_num_threads(),
+        )
+        parts = {
+            "reservoir": self.cells.reservoir.state_dict(),
+            "generator": {"state": self.generator.get_state(), "draws": self.draws.get_state()},
+        }
+        if self.occupancy is not None:
+            parts["occupancy"] = self.occupancy.state_dict()
+        if self.scaler.is_enabled():
+            parts["scaler"] = self.scaler.state_dict()
+        return state.collect(stored, self.routers, self.optimizer, parts)
+
     def _resume(self, checkpoint: Checkpoint) -> None:
-        """Goes on from a checkpoint of this run."""
-        resume_training(self, checkpoint)
-        self.evaluated = min(self.evaluated, self._due())  # fewer where the run was made longer
+        """Puts this trainer where the training was that wrote a checkpoint of its settings; it gets a new optimiser.
+
+        Raises:
+            CheckpointError: When something is missing or does not fit.
+        """
+        _, stored = state.stored_values(checkpoint)
+        self.sharing.forget()
+        restore_routers(self.routers, checkpoint)
+        self.optimizer = make_optimizer(self.routers, self.config)
+        try:
+            state.load_moments(self.optimizer, checkpoint, stored.step)
+            self.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
+            self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
+            if self.occupancy is not None:
+                self.occupancy.load_state_dict(checkpoint.group("occupancy"))
+            generators = checkpoint.group("generator")
+            self.generator.set_state(generators["state"])
+            drawn = generators["draws"]
+            if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
+                self.draws.set_state(drawn)  # else the run began on another kind of device
+        except (ValueError, KeyError, TypeError, RuntimeError) as error:
+            raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
+        threads = torch.get_num_threads()
+        if stored.threads != threads and self.device.type == "cpu" and not self.any_threads:
+            self.say(
+                f"not bit for bit: {checkpoint.source} was written on {stored.threads} threads, now there are {threads}"
+                ", and torch computes these networks"
+            )
+        self.step, self.seconds = stored.step, stored.seconds
+        self.rays, self.rays_done = stored.rays, stored.rays_done
+        self.stages = [Stage(**stage) for stage in stored.stages]
+        self.cells.splits = len(self.stages) - 1
+        self.guard = GradientGuard(self.device, stored.skipped)
+        self.rate_factor = stored.rate_factor
+        self.evaluated = min(stored.evaluated, self._due())  # fewer where the run was made longer
         # Evaluations made after the checkpoint will be made again.
         self.metrics = [m for m in read_metrics(self.out) if m["step"] <= self.step]
+        whole = self.router.diagram
+        if self.group.size > 1 and whole.num_cells > 1:
+            owner, self.cells.weights = state.ownership(checkpoint, whole, self.group.size)
+            own = (owner == self.group.rank).nonzero()[:, 0]
+            self.cells.take(whole, owner, own, self.optimizer)
 
     def say(self, line: str) -> None:
         """Tells whoever listens, see ``on_event``."""
         if self.on_event is not None:
             self.on_event(line)
+
+
+def _median(values: list[float]) -> float | None:
+    """The median, of an even number the lower middle value; None for an empty list."""
+    return float(torch.tensor(values).median()) if values else None

@@ -21,10 +21,9 @@ from voronerf.evaluation.panels import (
     picture_of_colour,
     picture_of_depth,
 )
-from voronerf.evaluation.scores import render_camera
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.field import Field
-from voronerf.rendering.renderer import RenderedImage, Renderer
+from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
 from voronerf.router import VoronoiRouter
 from voronerf.viewer.cameras import crop_camera
 from voronerf.viewer.errors import ViewErrors

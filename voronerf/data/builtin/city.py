@@ -142,7 +142,7 @@ def _above(random: np.random.Generator) -> tuple[Array, Array]:
 
 def block_caster(groups: Sequence[Sequence[Solid]]) -> Hits:
     """What finds the first solid on a ray, numbered through all groups."""
-    if not backends.missing("warp", torch.device("cpu")):
+    if not backends.why_not("cast_solids", "warp", torch.device("cpu")):
         return caster([solid for group in groups for solid in group], "warp")
     boxes = [bounds(group) for group in groups]
     starts = np.cumsum([0, *(len(group) for group in groups)])

@@ -75,7 +75,7 @@ def caster(solids: Sequence[Solid], backend: str = "auto") -> Hits:
         backend: as of `rich_scene`.
     """
     if backend == "auto":
-        backend = "numpy" if backends.missing("warp", torch.device("cpu")) else "warp"
+        backend = "numpy" if backends.why_not("cast_solids", "warp", torch.device("cpu")) else "warp"
     if backend == "numpy":
         return functools.partial(first_hits, solids)
     tables = tables_of(solids)

@@ -19,6 +19,12 @@ class Runs(NamedTuple):
         first: int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on, up to all pixels.
         bits: of `first`: about as many places as a run has.
         total: the pixels of all runs.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import Runs
+        >>> Runs.of(torch.tensor([10, 50]), torch.tensor([5, 3])).total  # pixels 10 to 14 and 50 to 52
+        8
     """
 
     ends: Tensor
@@ -39,17 +45,7 @@ class Runs(NamedTuple):
 
 
 def draw_pixels(seed: Tensor, count: int, below: int, runs: Runs | None) -> tuple[Tensor, Tensor]:
-    """Pixels, and three uniform numbers for each; all are hashes of the seed and of the number in the batch.
-
-    Args:
-        seed: int32 [1].
-        count: of pixels, b.
-        below: pixels to draw from; with runs as many as they have.
-        runs: the pixels to draw from, None for 0 to `below` - 1.
-
-    Returns:
-        int64 [b], and float32 [b, 3] in [0, 1).
-    """
+    """Pixels, and three uniform numbers for each; see ``voronerf.ops.draw_pixels``."""
     numbers = hashed_uniforms(seed, count, 5)
     place = ((numbers[:, 0].double() + numbers[:, 1].double() / 2**24) * below).long()
     if runs is not None:

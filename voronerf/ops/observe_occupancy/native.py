@@ -38,24 +38,11 @@ def observe_told(
     told: Tensor,
     reached: Tensor | None,
     samples: Samples,
-    *,
     decay: float,
     threshold: float,
     hidden: float,
 ) -> None:
-    """The same with samples of other ranks, for ``voronerf.distributed``, on the CPU.
-
-    Args:
-        density: As above, like the next two.
-        occupied: Likewise.
-        box: Likewise.
-        told: [c, 2], what :func:`tell_observed` gave on other ranks.
-        reached: bool, one for each cell: the others are left alone. None for all.
-        samples: Of this rank.
-        decay: As above, like the next two.
-        threshold: Likewise.
-        hidden: Likewise.
-    """
+    """The same with samples [c, 2] that other ranks have told, on the CPU; see ``voronerf.ops.observe_told``."""
     given = _samples(density, box, samples, decay, threshold, hidden)
     rows = len(samples[0]) + len(told)
     cells, before = density.new_empty(rows, dtype=torch.int32), density.new_empty(rows)
@@ -64,8 +51,8 @@ def observe_told(
     native.compiled.observe_told(given, told, len(told), reached.view(torch.uint8), *grid)
 
 
-def tell_observed(density: Tensor, box: Tensor, several: Tensor | None, samples: Samples, *, hidden: float) -> Tensor:
-    """Cell, as bits, and density [c, 2] of samples in cells that several ranks reach, a bool for each; None for all."""
+def tell_observed(density: Tensor, box: Tensor, several: Tensor | None, samples: Samples, hidden: float) -> Tensor:
+    """Cell, as bits of float32, and density [c, 2] of samples, on the CPU; see ``voronerf.ops.tell_observed``."""
     told = density.new_empty(len(samples[0]), 2)
     given = _samples(density, box, samples, 1.0, 1.0, hidden)
     several = None if several is None else several.view(torch.uint8)

@@ -1,1 +1,243 @@
-"""Sums over the runs of samples that each cell adds to a ray."""
+"""Rays that pass through the cells of several ranks. n known samples, m own ones, q runs, r rays, k cells.
+
+Each rank evaluates the samples in its own cells and sums them over runs, pieces of a ray on which no other rank has a
+sample in between (`own_samples`, `run_sums`). Who has the runs of all ranks puts rays together and says what each run
+must know of its ray (`compose_runs`), from which the gradients follow (`run_gradients`). Together they are
+`render_loss` (Li et al. 2024, NeRF-XL). Nothing is differentiable.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import Implementation
+from voronerf.checks import (
+    INDEX,
+    check_dtype,
+    check_flag,
+    check_integer,
+    check_number,
+    check_range,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+    check_tensor,
+)
+from voronerf.ops.composite.reference import check_ray_offsets
+from voronerf.ops.ray_runs.reference import OwnSamples
+
+_NATIVE = Implementation(("cpu",), (torch.float32,), file="ray_runs")
+_OWN, _SUMS, _COMPOSE, _GRADIENTS = (
+    backends.declare(op, native=_NATIVE, reference=Implementation(file="ray_runs"))
+    for op in ("own_samples", "run_sums", "compose_runs", "run_gradients")
+)
+
+
+def own_samples(
+    positions: Tensor,
+    ray_index: Tensor,
+    depths: Tensor,
+    deltas: Tensor,
+    cells: Tensor,
+    own: Tensor,
+    *,
+    bent: bool = False,
+    backend: str = "auto",
+) -> OwnSamples:
+    """Keeps the samples in own cells, and finds their runs; other ranks may have samples that are not among them.
+
+    No other sample lies between two that are nearer than a stratum is long, nor, since a cell is convex, between two
+    neighbours in one cell.
+
+    Args:
+        positions: float32 or float64 [n, 3], of all samples that this rank knows, ray after ray, near to far.
+        ray_index: int32 [n], their rays.
+        depths: [n].
+        deltas: [n], the lengths of their strata.
+        cells: int32 [n], the cell of each, 0 to k - 1.
+        own: int32 [k], the number of each cell among those of this rank, or -1.
+        bent: Whether rays are bent by a contraction, and may leave a cell and come back.
+        backend: "auto", "reference" or "native".
+
+    Returns:
+        OwnSamples(positions, ray_index, depths, deltas, cells, run_offsets).
+
+    Raises:
+        ValueError: Shapes, devices, on the CPU cells out of range.
+        TypeError: dtypes.
+        BackendUnavailable: The named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import own_samples
+        >>> depths = torch.tensor([0.1, 0.5, 0.9])
+        >>> cells, own = torch.tensor([0, 1, 0]).int(), torch.tensor([0, -1]).int()
+        >>> mine = own_samples(torch.rand(3, 3), torch.zeros(3).int(), depths, torch.full((3,), 0.4), cells, own)
+        >>> mine.depths, mine.run_offsets
+        (tensor([0.1000, 0.9000]), tensor([0, 1, 2], dtype=torch.int32))
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_OWN, "positions", positions, ("n", 3), sizes)
+    for name, values in (("ray_index", ray_index), ("depths", depths), ("deltas", deltas), ("cells", cells)):
+        check_shape(_OWN, name, values, ("n",), sizes)
+    check_shape(_OWN, "own", own, ("k",), sizes)
+    check_dtype(_OWN, "positions", positions, (torch.float32, torch.float64))
+    for name, values in (("ray_index", ray_index), ("cells", cells), ("own", own)):
+        check_dtype(_OWN, name, values, INDEX)
+    check_same_dtype(_OWN, positions=positions, depths=depths, deltas=deltas)
+    check_same_device(_OWN, positions=positions, ray_index=ray_index, depths=depths, cells=cells, own=own)
+    check_same_device(_OWN, positions=positions, deltas=deltas)
+    check_flag(_OWN, "bent", bent)
+    check_range(_OWN, "cells", cells, sizes["k"])
+    run = backends.resolve(_OWN, backend=backend, device=positions.device, dtype=positions.dtype)
+    found: OwnSamples = run(positions.detach(), ray_index, depths.detach(), deltas.detach(), cells, own, bent=bent)
+    return found
+
+
+def run_sums(raw: Tensor, samples: OwnSamples, *, density_scale: float, backend: str = "auto") -> tuple[Tensor, Tensor]:
+    """Partial sums of runs, from what the networks put out for their samples.
+
+    Args:
+        raw: float32 or float64 [m, 4], colour and density before their activations, as in `render_loss`.
+        samples: Of `own_samples`.
+        density_scale: Factor on the density, > 0.
+        backend: "auto", "reference" or "native".
+
+    Returns:
+        Sums [q, 6]: colour as if nothing were in front, optical depth, depth of the first sample, number of the ray;
+        and densities [m].
+
+    Raises:
+        ValueError: Shapes, devices.
+        TypeError: dtypes.
+        BackendUnavailable: The named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import own_samples, run_sums
+        >>> zeros = torch.zeros(1, dtype=torch.int32)
+        >>> mine = own_samples(torch.zeros(1, 3), zeros + 7, torch.ones(1), torch.ones(1), zeros, zeros)
+        >>> run_sums(torch.tensor([[0.0, 0, 0, 50.0]]), mine, density_scale=1.0)[0]  # half grey, opaque, at 1, of ray 7
+        tensor([[ 0.5000,  0.5000,  0.5000, 50.0000,  1.0000,  7.0000]])
+    """
+    _check_outputs(_SUMS, raw, samples, density_scale)
+    run = backends.resolve(_SUMS, backend=backend, device=raw.device, dtype=raw.dtype)
+    sums, density = run(raw.detach(), samples, float(density_scale))
+    return sums, density
+
+
+def compose_runs(
+    sums: Tensor, target: Tensor, *, background: Tensor | None = None, first: int, rays: int, backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
+    """Puts rays together from the runs of all ranks, and says what each run must know of its ray.
+
+    Args:
+        sums: float32 or float64 [q, 6], of `run_sums`, in any order.
+        target: [r, 3], the colours of these rays.
+        background: [3] or [r, 3], what is behind them, or None.
+        first: The number of the first of these rays.
+        rays: How many all ranks have.
+        backend: "auto", "reference" or "native".
+
+    Returns:
+        Answers [q, 6]: the gradient of the loss to the ray's colour, what light from behind the run adds to the loss,
+        the optical depth in front, and the squared error of the ray; and the part [] that these rays have in the loss.
+
+    Raises:
+        ValueError: Shapes, devices, on the CPU runs of other rays.
+        TypeError: dtypes.
+        BackendUnavailable: The named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import compose_runs
+        >>> sums = torch.tensor([[0.5, 0.5, 0.5, 50.0, 1.0, 0.0]])
+        >>> answers, loss = compose_runs(sums, torch.ones(1, 3), first=0, rays=1)
+        >>> float(loss), float(answers[0, 5])
+        (0.25, 0.75)
+    """
+    sizes: dict[str, int] = {}
+    check_shape(_COMPOSE, "sums", sums, ("q", 6), sizes)
+    check_shape(_COMPOSE, "target", target, ("r", 3), sizes)
+    check_dtype(_COMPOSE, "sums", sums, (torch.float32, torch.float64))
+    if background is not None:
+        check_tensor(_COMPOSE, "background", background)
+        check_shape(_COMPOSE, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
+    check_same_dtype(_COMPOSE, sums=sums, target=target, background=background)
+    check_same_device(_COMPOSE, sums=sums, target=target, background=background)
+    check_integer(_COMPOSE, "first", first, 0)
+    check_integer(_COMPOSE, "rays", rays, 1)
+    run = backends.resolve(_COMPOSE, backend=backend, device=sums.device, dtype=sums.dtype)
+    answers, loss = run(sums, target, background, first, rays)
+    return answers, loss
+
+
+def run_gradients(
+    raw: Tensor,
+    samples: OwnSamples,
+    answers: Tensor,
+    *,
+    density_scale: float,
+    hidden: float = 0.0,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Gradient of the loss to what the networks put out, from what the runs were told of their rays.
+
+    Args:
+        raw: [m, 4], as in `run_sums`.
+        samples: Of `own_samples`.
+        answers: [q, 6], of `compose_runs`.
+        density_scale: As in `run_sums`.
+        hidden: Share of the light, in [0, 1): samples that no more than it reaches have no gradient.
+        backend: "auto", "reference" or "native".
+
+    Returns:
+        Gradient [m, 4], and the contributions [m] of the samples to their rays.
+
+    Raises:
+        ValueError: Shapes, devices, numbers.
+        TypeError: dtypes.
+        BackendUnavailable: The named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import compose_runs, own_samples, run_gradients, run_sums
+        >>> zeros, raw = torch.zeros(1, dtype=torch.int32), torch.tensor([[0.0, 0, 0, 50.0]])
+        >>> mine = own_samples(torch.zeros(1, 3), zeros, torch.ones(1), torch.ones(1), zeros, zeros)
+        >>> sums, _ = run_sums(raw, mine, density_scale=1.0)
+        >>> answers, _ = compose_runs(sums, torch.ones(1, 3), first=0, rays=1)
+        >>> run_gradients(raw, mine, answers, density_scale=1.0)[0][:, :3].round(decimals=4)  # lighter
+        tensor([[-0.0833, -0.0833, -0.0833]])
+    """
+    _check_outputs(_GRADIENTS, raw, samples, density_scale)
+    check_shape(_GRADIENTS, "answers", answers, (len(samples.run_offsets) - 1, 6))
+    check_same_dtype(_GRADIENTS, raw=raw, answers=answers)
+    check_same_device(_GRADIENTS, raw=raw, answers=answers)
+    check_number(_GRADIENTS, "hidden", hidden)
+    if not 0 <= hidden < 1:
+        raise ValueError(f"{_GRADIENTS}: hidden must lie in [0, 1), got {hidden}")
+    run = backends.resolve(_GRADIENTS, backend=backend, device=raw.device, dtype=raw.dtype)
+    gradient, weights = run(raw.detach(), samples, answers, float(density_scale), float(hidden))
+    return gradient, weights
+
+
+def _check_outputs(op: str, raw: Tensor, samples: OwnSamples, density_scale: float) -> None:
+    if not isinstance(samples, OwnSamples):
+        raise TypeError(f"{op}: samples must be OwnSamples, got {type(samples).__name__}")
+    check_shape(op, "raw", raw, ("m", 4))
+    check_dtype(op, "raw", raw, (torch.float32, torch.float64))
+    sizes = {"m": len(raw)}
+    check_shape(op, "deltas", samples.deltas, ("m",), sizes)
+    check_shape(op, "depths", samples.depths, ("m",), sizes)
+    check_shape(op, "ray_index", samples.ray_index, ("m",), sizes)
+    check_shape(op, "run_offsets", samples.run_offsets, ("q+1",), sizes)
+    check_dtype(op, "ray_index", samples.ray_index, INDEX)
+    check_dtype(op, "run_offsets", samples.run_offsets, INDEX)
+    check_same_dtype(op, raw=raw, depths=samples.depths, deltas=samples.deltas)
+    check_same_device(op, raw=raw, depths=samples.depths, run_offsets=samples.run_offsets)
+    check_ray_offsets(op, samples.run_offsets, len(raw))
+    check_number(op, "density_scale", density_scale)
+    if not density_scale > 0:
+        raise ValueError(f"{op}: density_scale must be positive, got {density_scale}")

@@ -24,6 +24,11 @@ _OP = backends.declare(
     native=Implementation(EVERYWHERE, FLOATS),
     warp=Implementation(EVERYWHERE, FLOATS),
 )
+_GRADIENT = backends.declare(
+    "render_loss_gradient",
+    native=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
+    reference=Implementation(file="render_loss"),
+)
 
 
 def render_loss(
@@ -79,29 +84,89 @@ def render_loss(
         >>> raw.grad[:, :3].round(decimals=4)  # lighter
         tensor([[-0.0833, -0.0833, -0.0833]])
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "raw", raw, ("m", 4), sizes)
-    check_shape(_OP, "deltas", deltas, ("m",), sizes)
-    check_shape(_OP, "ray_offsets", ray_offsets, ("r+1",), sizes)
-    check_dtype(_OP, "raw", raw)
-    check_dtype(_OP, "ray_offsets", ray_offsets, INDEX)
-    wide = (torch.promote_types(raw.dtype, torch.float32),)
-    check_dtype(_OP, "deltas", deltas, wide)
-    check_targets(_OP, target, background, wide, sizes)
-    check_same_device(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
-    check_no_inference(_OP, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
-    check_count(_OP, "raw", raw.numel())
-    check_number(_OP, "density_scale", density_scale)
-    if not density_scale > 0:
-        raise ValueError(f"{_OP}: density_scale must be positive, got {density_scale}")
-    check_number(_OP, "hidden", hidden)
-    if not 0 <= hidden < 1:
-        raise ValueError(f"{_OP}: hidden must lie in [0, 1), got {hidden}")
+    _check(_OP, raw, deltas, ray_offsets, target, background, density_scale, hidden)
     run = backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)
     constant = (deltas.detach(), ray_offsets, target.detach())
     background = None if background is None else background.detach()
     numbers = {"density_scale": float(density_scale), "hidden": float(hidden)}
     return RenderLoss(*run(raw, *constant, background=background, **numbers))
+
+
+def render_loss_gradient(
+    raw: Tensor,
+    deltas: Tensor,
+    ray_offsets: Tensor,
+    target: Tensor,
+    *,
+    background: Tensor | None = None,
+    density_scale: float,
+    hidden: float = 0.0,
+    backend: str = "auto",
+) -> tuple[RenderLoss, Tensor]:
+    """`render_loss` and the gradient of its loss to ``raw``, for `learn_outputs`; nothing is differentiable.
+
+    Args:
+        raw: [m, 4], float32 or float64.
+        deltas: [m], as in `render_loss`.
+        ray_offsets: int32 [r + 1], as in `render_loss`.
+        target: [r, 3], the colours to learn.
+        background: [3] or [r, 3], as in `render_loss`, or None.
+        density_scale: factor on the density, > 0.
+        hidden: share of the light, as in `render_loss`.
+        backend: "auto", "reference" or "native".
+
+    Returns:
+        (RenderLoss, gradient [m, 4]).
+
+    Raises:
+        ValueError: as `render_loss`.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import render_loss_gradient
+        >>> raw, offsets = torch.tensor([[0.0, 0, 0, 50.0]]), torch.tensor([0, 1], dtype=torch.int32)
+        >>> result, gradient = render_loss_gradient(raw, torch.ones(1), offsets, torch.ones(1, 3), density_scale=1.0)
+        >>> float(result.loss), gradient[:, :3].round(decimals=4)
+        (0.25, tensor([[-0.0833, -0.0833, -0.0833]]))
+    """
+    _check(_GRADIENT, raw, deltas, ray_offsets, target, background, density_scale, hidden)
+    run = backends.resolve(_GRADIENT, backend=backend, device=raw.device, dtype=raw.dtype)
+    tensors = raw.detach(), deltas.detach(), ray_offsets, target.detach()
+    background = None if background is None else background.detach()
+    *parts, gradient = run(*tensors, background, float(density_scale), float(hidden))
+    return RenderLoss(*parts), gradient
+
+
+def _check(
+    op: str,
+    raw: Tensor,
+    deltas: Tensor,
+    ray_offsets: Tensor,
+    target: Tensor,
+    background: Tensor | None,
+    density_scale: float,
+    hidden: float,
+) -> None:
+    sizes: dict[str, int] = {}
+    check_shape(op, "raw", raw, ("m", 4), sizes)
+    check_shape(op, "deltas", deltas, ("m",), sizes)
+    check_shape(op, "ray_offsets", ray_offsets, ("r+1",), sizes)
+    check_dtype(op, "raw", raw)
+    check_dtype(op, "ray_offsets", ray_offsets, INDEX)
+    wide = (torch.promote_types(raw.dtype, torch.float32),)
+    check_dtype(op, "deltas", deltas, wide)
+    check_targets(op, target, background, wide, sizes)
+    check_same_device(op, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
+    check_no_inference(op, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
+    check_count(op, "raw", raw.numel())
+    check_number(op, "density_scale", density_scale)
+    if not density_scale > 0:
+        raise ValueError(f"{op}: density_scale must be positive, got {density_scale}")
+    check_number(op, "hidden", hidden)
+    if not 0 <= hidden < 1:
+        raise ValueError(f"{op}: hidden must lie in [0, 1), got {hidden}")
 
 
 def check_targets(

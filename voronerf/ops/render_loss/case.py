@@ -20,4 +20,9 @@ def _make(draw: Draw, n: int) -> Arguments:
     }
 
 
+def _make_plain(draw: Draw, n: int) -> Arguments:
+    return _make(Draw(n, dtype=torch.float32), n)
+
+
 CASE = Case(_make, differentiable=True)
+CASES = {"render_loss": CASE, "render_loss_gradient": Case(_make_plain, traced=False)}

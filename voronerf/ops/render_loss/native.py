@@ -65,3 +65,17 @@ def forward(
 
 
 forward.register_autograd(render_loss_backward, setup_context=render_loss_setup)
+
+
+def render_loss_gradient(
+    raw: Tensor,
+    deltas: Tensor,
+    ray_offsets: Tensor,
+    target: Tensor,
+    background: Tensor | None,
+    density_scale: float,
+    hidden: float,
+) -> tuple[Tensor, ...]:
+    """What ``forward`` gives; see ``voronerf.ops.render_loss``."""
+    found: tuple[Tensor, ...] = forward.inside(raw, deltas, ray_offsets, target, background, density_scale, hidden)
+    return found

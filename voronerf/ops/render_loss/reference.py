@@ -60,3 +60,20 @@ def render_loss(
     error = (seen.colour - target).square().sum(-1)
     rest = (seen.colour, seen.weights, density, error)
     return RenderLoss(error.mean() / 3, *(part.detach() for part in rest))
+
+
+@torch.enable_grad()
+def render_loss_gradient(
+    raw: Tensor,
+    deltas: Tensor,
+    ray_offsets: Tensor,
+    target: Tensor,
+    background: Tensor | None,
+    density_scale: float,
+    hidden: float,
+) -> tuple[Tensor, ...]:
+    """The result of `render_loss`, and the gradient of its loss to ``raw``."""
+    raw = raw.detach().requires_grad_()
+    numbers: dict[str, Any] = {"density_scale": density_scale, "hidden": hidden}
+    found = render_loss(raw, deltas, ray_offsets, target, background=background, **numbers)
+    return found.loss.detach(), *found[1:], torch.autograd.grad(found.loss, raw)[0]

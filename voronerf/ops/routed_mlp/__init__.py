@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,6 +31,19 @@ _OP = backends.declare(
     "routed_mlp",
     native=Implementation(EVERYWHERE, FLOATS),
 )
+_DEFAULTS: dict[str, Any] = {
+    "layers": None,
+    "centres": None,
+    "child_offsets": None,
+    "child": None,
+    "depth": 1,
+    "centre_weights": None,
+    "cells": None,
+    "coords": None,
+    "directions": None,
+    "direction_index": None,
+    "features": None,
+}
 
 
 def routed_mlp(
@@ -104,45 +118,8 @@ def routed_mlp(
         >>> out.flatten().round(decimals=4)  # in the order of the positions
         tensor([90.0000,  0.1000, 80.0000])
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "positions", positions, ("n", "p"), sizes)
-    check_dtype(_OP, "positions", positions)
-    check_count(_OP, "positions", sizes["n"])
-    check_network(_OP, weights, biases, layers, directions, direction_index, features, sizes)
-    _check_tables(centres, child_offsets, child, depth, centre_weights, cells, sizes)
-    if coords is not None:
-        if centres is None:
-            raise ValueError(f"{_OP}: coords must come with centres, got none to compare them with")
-        check_shape(_OP, "coords", coords, ("n", 3), sizes)
-        check_dtype(_OP, "coords", coords)
-    elif centres is not None and sizes["p"] < 3:
-        raise ValueError(f"{_OP}: coords must be given for positions of less than 3 features, got {sizes['p']}")
-    tensors = {
-        "positions": positions,
-        "coords": coords,
-        "centres": centres,
-        "child_offsets": child_offsets,
-        "child": child,
-        "centre_weights": centre_weights,
-        "cells": cells,
-        "directions": directions,
-        "direction_index": direction_index,
-        "features": features,
-        **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
-        **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
-    }
-    check_same_device(_OP, **tensors)
-    check_no_inference(_OP, **tensors)
-    if centres is not None:
-        points = positions[:, :3] if coords is None else coords
-        coords, centres, centre_weights = of_one_dtype(points, centres, centre_weights)
-    device, dtype = positions.device, weights[0].dtype
-    run: Callable[..., tuple[Tensor, Tensor]]
-    if backend == "auto" and _is_composed(device.type, device.index, dtype):
-        run = functools.partial(compose, operations=_operations(device, dtype, coords))
-    else:
-        run = backends.resolve(_OP, backend=backend, device=device, dtype=dtype)
-    out, found = run(
+    network = check_routed(
+        _OP,
         positions,
         weights,
         biases,
@@ -158,10 +135,58 @@ def routed_mlp(
         direction_index=direction_index,
         features=features,
     )
+    device, dtype = positions.device, weights[0].dtype
+    run: Callable[..., tuple[Tensor, Tensor]]
+    if backend == "auto" and _is_composed(device.type, device.index, dtype):
+        run = functools.partial(compose, operations=_operations(device, dtype, network["coords"]))
+    else:
+        run = backends.resolve(_OP, backend=backend, device=device, dtype=dtype)
+    out, found = run(**network)
     return out, found
 
 
+def check_routed(
+    op: str, positions: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor | None], **given: Any
+) -> dict[str, Any]:
+    """All arguments of `routed_mlp` but for the backend, checked; what is compared has one dtype."""
+    network = {**_DEFAULTS, **given}
+    if network.keys() != _DEFAULTS.keys():
+        raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - _DEFAULTS.keys())}")
+    tables = {name: network[name] for name in ("centres", "child_offsets", "child", "centre_weights", "cells")}
+    read = {name: network[name] for name in ("directions", "direction_index", "features")}
+    coords, centres = network["coords"], network["centres"]
+    sizes: dict[str, int] = {}
+    check_shape(op, "positions", positions, ("n", "p"), sizes)
+    check_dtype(op, "positions", positions)
+    check_count(op, "positions", sizes["n"])
+    check_network(op, weights, biases, network["layers"], **read, sizes=sizes)
+    _check_tables(op, **tables, depth=network["depth"], sizes=sizes)
+    if coords is not None:
+        if centres is None:
+            raise ValueError(f"{op}: coords must come with centres, got none to compare them with")
+        check_shape(op, "coords", coords, ("n", 3), sizes)
+        check_dtype(op, "coords", coords)
+    elif centres is not None and sizes["p"] < 3:
+        raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {sizes['p']}")
+    tensors = {
+        "positions": positions,
+        "coords": coords,
+        **tables,
+        **read,
+        **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
+        **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
+    }
+    check_same_device(op, **tensors)
+    check_no_inference(op, **tensors)
+    if centres is not None:
+        points = positions[:, :3] if coords is None else coords
+        compared = of_one_dtype(points, centres, network["centre_weights"])
+        network.update(zip(("coords", "centres", "centre_weights"), compared))
+    return {"positions": positions, "weights": weights, "biases": biases, **network}
+
+
 def _check_tables(
+    op: str,
     centres: Tensor | None,
     child_offsets: Tensor | None,
     child: Tensor | None,
@@ -172,37 +197,37 @@ def _check_tables(
 ) -> None:
     if cells is not None:
         if centres is not None:
-            raise ValueError(f"{_OP}: centres must be None where cells are given, got both")
-        check_shape(_OP, "cells", cells, ("n",), sizes)
-        check_dtype(_OP, "cells", cells, INDEX)
+            raise ValueError(f"{op}: centres must be None where cells are given, got both")
+        check_shape(op, "cells", cells, ("n",), sizes)
+        check_dtype(op, "cells", cells, INDEX)
     if centres is None:
         others = {"child_offsets": child_offsets, "child": child, "centre_weights": centre_weights}
         for name, value in others.items():
             if value is not None:
-                raise ValueError(f"{_OP}: {name} must come with centres, got no centres")
+                raise ValueError(f"{op}: {name} must come with centres, got no centres")
         if cells is None and sizes["k"] != 1:
-            raise ValueError(f"{_OP}: centres or cells must be given for {sizes['k']} cells, got neither")
+            raise ValueError(f"{op}: centres or cells must be given for {sizes['k']} cells, got neither")
         return
     if (child_offsets is None) != (child is None):
         missing = "child_offsets" if child_offsets is None else "child"
-        raise ValueError(f"{_OP}: child_offsets and child must come together, got no {missing}")
-    check_shape(_OP, "centres", centres, ("k" if child is None else "m", 3), sizes)
-    check_dtype(_OP, "centres", centres)
+        raise ValueError(f"{op}: child_offsets and child must come together, got no {missing}")
+    check_shape(op, "centres", centres, ("k" if child is None else "m", 3), sizes)
+    check_dtype(op, "centres", centres)
     if centre_weights is not None:
-        check_shape(_OP, "centre_weights", centre_weights, ("k" if child is None else "m",), sizes)
-        check_dtype(_OP, "centre_weights", centre_weights)
-    check_integer(_OP, "depth", depth, 1)
+        check_shape(op, "centre_weights", centre_weights, ("k" if child is None else "m",), sizes)
+        check_dtype(op, "centre_weights", centre_weights)
+    check_integer(op, "depth", depth, 1)
     if child_offsets is None or child is None:
         if depth != 1:
-            raise ValueError(f"{_OP}: depth must be 1 for a flat diagram, got {depth}")
+            raise ValueError(f"{op}: depth must be 1 for a flat diagram, got {depth}")
         return
-    check_shape(_OP, "child_offsets", child_offsets, ("g+1",), sizes)
-    check_dtype(_OP, "child_offsets", child_offsets, INDEX)
-    check_shape(_OP, "child", child, ("m",), sizes)
-    check_dtype(_OP, "child", child, INDEX)
+    check_shape(op, "child_offsets", child_offsets, ("g+1",), sizes)
+    check_dtype(op, "child_offsets", child_offsets, INDEX)
+    check_shape(op, "child", child, ("m",), sizes)
+    check_dtype(op, "child", child, INDEX)
     if sizes["m"] < 1 or sizes["g"] < 1:
         count = f"{sizes['m']} centres in {sizes['g']} diagrams"
-        raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
+        raise ValueError(f"{op}: centres must hold at least one centre of one diagram, got {count}")
 
 
 def of_one_dtype(coords: Tensor, centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:

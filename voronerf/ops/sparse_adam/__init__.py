@@ -1,6 +1,9 @@
-"""A step of Adam on the entries of a table that have a gradient."""
+"""A step of Adam, of whole parameters or on the entries of a table that have a gradient."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +17,86 @@ _OP = backends.declare(
     native=Implementation(EVERYWHERE, (torch.float32,)),
     warp=Implementation(EVERYWHERE, (torch.float32,)),
 )
+_ALL = backends.declare(
+    "adam",
+    native=Implementation(("cpu",), (torch.float32,), file="sparse_adam"),
+    reference=Implementation(file="sparse_adam"),
+)
+
+
+class Rule(NamedTuple):
+    """How a parameter moves.
+
+    Attributes:
+        step: the number of this step, from 1.
+        learning_rate: the rate.
+        betas: decay of the two moments, in [0, 1).
+        epsilon: > 0, added outside of the root.
+        every: whether entries without a gradient move too, as in ``torch.optim.Adam``.
+
+    Examples:
+        >>> from voronerf.ops import Rule
+        >>> Rule(step=1, learning_rate=0.02, every=False).betas
+        (0.9, 0.999)
+    """
+
+    step: int
+    learning_rate: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    epsilon: float = 1e-8
+    every: bool = True
+
+
+@torch.no_grad()
+def adam(
+    rules: Sequence[Rule],
+    parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    means: Sequence[Tensor],
+    squares: Sequence[Tensor],
+    *,
+    backend: str = "auto",
+) -> None:
+    """A step of Adam (Kingma and Ba 2015, algorithm 1) of several parameters, in place.
+
+    Args:
+        rules: One for each parameter.
+        parameters: float32, any shapes, contiguous.
+        gradients: float32, of the same shapes. Not differentiable.
+        means: float32, of the same shapes, contiguous: the first moments.
+        squares: float32, of the same shapes, contiguous, >= 0: the second moments.
+        backend: "auto", "reference" or "native".
+
+    Raises:
+        ValueError: shapes, devices, a tensor that is not contiguous, lists of other lengths, numbers out of range.
+        TypeError: dtypes.
+        BackendUnavailable: the named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import Rule, adam
+        >>> weight, mean, square = torch.zeros(2), torch.zeros(2), torch.zeros(2)
+        >>> adam([Rule(1, 0.25)], [weight], [torch.tensor([0.5, -2.0])], [mean], [square])
+        >>> weight
+        tensor([-0.2500,  0.2500])
+    """
+    lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
+    for name, tensors in lists.items():
+        if len(tensors) != len(rules):
+            raise ValueError(f"{_ALL}: {name} must be as many as the {len(rules)} rules, got {len(tensors)}")
+    if not rules:
+        return
+    for index, rule in enumerate(rules):
+        if not isinstance(rule, Rule):
+            raise TypeError(f"{_ALL}: rules must hold a Rule for each parameter, got {type(rule).__name__}")
+        _check(_ALL, {name: tensors[index] for name, tensors in lists.items()}, rule)
+    check_same_device(_ALL, **{f"parameters[{index}]": tensor for index, tensor in enumerate(parameters)})
+    run = backends.resolve(_ALL, backend=backend, device=parameters[0].device, dtype=torch.float32)
+    given = []
+    for rule in rules:
+        rate, epsilon = corrected(*rule[:4])
+        given.append((rate, *rule.betas, epsilon, rule.every))
+    run(given, [gradient.contiguous() for gradient in gradients], parameters, means, squares)
 
 
 @torch.no_grad()
@@ -69,30 +152,37 @@ def sparse_adam(
                 [-0.2500,  0.2500],
                 [ 0.0000,  0.0000]])
     """
-    tensors = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square}
-    for name, tensor in tensors.items():
-        check_tensor(_OP, name, tensor)
-        check_dtype(_OP, name, tensor, (torch.float32,))
-        if tensor.shape != parameter.shape:
-            raise ValueError(f"{_OP}: {name} must have shape {list(parameter.shape)}, got {list(tensor.shape)}")
-        if name != "gradient":
-            check_writable(_OP, name, tensor)
-    check_same_device(_OP, **tensors)
-    check_integer(_OP, "step", step, 1)
-    check_number(_OP, "learning_rate", learning_rate)
-    check_number(_OP, "epsilon", epsilon)
-    if not isinstance(betas, (tuple, list)) or len(betas) != 2:
-        raise TypeError(f"{_OP}: betas must be a pair of numbers, got {betas!r:.60}")
-    for beta in betas:
-        check_number(_OP, "betas", beta)
-        if not 0 <= beta < 1:
-            raise ValueError(f"{_OP}: betas must lie in [0, 1), got {betas}")
-    if not epsilon > 0:
-        raise ValueError(f"{_OP}: epsilon must be positive, got {epsilon}")
+    tensors = {"parameters": parameter, "gradients": gradient, "means": mean, "squares": square}
+    _check(_OP, tensors, Rule(step, learning_rate, betas, epsilon))
     run = backends.resolve(_OP, backend=backend, device=parameter.device, dtype=torch.float32)
     first, second = betas
     rate, epsilon = corrected(step, learning_rate, betas, epsilon)
     run(parameter, gradient.contiguous(), mean, square, rate, first, second, epsilon)
+
+
+def _check(op: str, tensors: dict[str, Tensor], rule: Rule) -> None:
+    """Checks the tensors of one parameter, named after their lists, and its rule."""
+    shape = tensors["parameters"].shape
+    for name, tensor in tensors.items():
+        one = name[:-1]
+        check_tensor(op, one, tensor)
+        check_dtype(op, one, tensor, (torch.float32,))
+        if tensor.shape != shape:
+            raise ValueError(f"{op}: {one} must have shape {list(shape)}, got {list(tensor.shape)}")
+        if one != "gradient":
+            check_writable(op, one, tensor)
+    check_same_device(op, **{name[:-1]: tensor for name, tensor in tensors.items()})
+    check_integer(op, "step", rule.step, 1)
+    check_number(op, "learning_rate", rule.learning_rate)
+    check_number(op, "epsilon", rule.epsilon)
+    if not isinstance(rule.betas, (tuple, list)) or len(rule.betas) != 2:
+        raise TypeError(f"{op}: betas must be a pair of numbers, got {rule.betas!r:.60}")
+    for beta in rule.betas:
+        check_number(op, "betas", beta)
+        if not 0 <= beta < 1:
+            raise ValueError(f"{op}: betas must lie in [0, 1), got {rule.betas}")
+    if not rule.epsilon > 0:
+        raise ValueError(f"{op}: epsilon must be positive, got {rule.epsilon}")
 
 
 def corrected(step: int, learning_rate: float, betas: tuple[float, float], epsilon: float) -> tuple[float, float]:

@@ -1,8 +1,9 @@
-"""The case of ``sparse_adam``."""
+"""The cases of ``sparse_adam`` and ``adam``."""
 
 from __future__ import annotations
 
 from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops.sparse_adam import Rule
 
 
 def _make(draw: Draw, n: int) -> Arguments:
@@ -20,4 +21,11 @@ def _make(draw: Draw, n: int) -> Arguments:
     }
 
 
+def _make_lists(draw: Draw, n: int) -> Arguments:
+    one, other = _make(draw, n), _make(draw, 3)
+    lists = {f"{name}s": [one[name], other[name]] for name in ("parameter", "gradient", "mean", "square")}
+    return {"rules": [Rule(3, 0.01), Rule(1, 0.02, every=False)], **lists}
+
+
 CASE = Case(_make, refused={"learning_rate must be a number, got str": {"learning_rate": "x"}}, in_place=True)
+CASES = {"sparse_adam": CASE, "adam": Case(_make_lists, in_place=True)}

@@ -1,1 +1,88 @@
-"""Entries of tables that a step has touched, for the exchange among ranks."""
+"""Gradients of tables that all ranks have, of which a step touches few entries: these alone travel. n entries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import Implementation
+from voronerf.checks import check_count, check_dtype, check_same_device, check_shape
+
+_NATIVE = Implementation(("cpu",), (torch.float32,), file="touched_entries")
+_PACK, _ADD = (
+    backends.declare(op, native=_NATIVE, reference=Implementation(file="touched_entries"))
+    for op in ("pack_entries", "add_entries")
+)
+
+
+def pack_entries(gradient: Tensor, *, backend: str = "auto") -> Tensor:
+    """What another rank must be told of a gradient.
+
+    Args:
+        gradient: float32 [n], n < 2**31.
+        backend: "auto", "reference" or "native".
+
+    Returns:
+        float32: a bit for each entry that says whether it is not zero, as bits of float32, and behind them the values
+        of these; the gradient itself where that would be as long.
+
+    Raises:
+        ValueError: A shape.
+        TypeError: A dtype.
+        BackendUnavailable: The named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import pack_entries
+        >>> len(pack_entries(torch.tensor([0.0, 0, 0, 2, 0]))), len(pack_entries(torch.ones(5)))
+        (2, 5)
+    """
+    check_shape(_PACK, "gradient", gradient, ("n",))
+    check_dtype(_PACK, "gradient", gradient, (torch.float32,))
+    check_count(_PACK, "gradient", len(gradient))
+    run = backends.resolve(_PACK, backend=backend, device=gradient.device, dtype=gradient.dtype)
+    message: Tensor = run(gradient.detach())
+    return message if len(message) < len(gradient) else gradient
+
+
+def add_entries(parts: Sequence[Tensor], n: int, *, backend: str = "auto") -> Tensor:
+    """The sum of what `pack_entries` gave on each rank, in their order, so that all ranks get the same.
+
+    Args:
+        parts: float32, one message for each rank, at least one.
+        n: Entries of the gradient.
+        backend: "auto", "reference" or "native".
+
+    Returns:
+        float32 [n].
+
+    Raises:
+        ValueError: A message of another length; devices.
+        TypeError: dtypes.
+        BackendUnavailable: The named backend cannot run here.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import add_entries, pack_entries
+        >>> first, second = torch.tensor([0.0, 0, 0, 2, 0]), torch.tensor([1.0, 2, 3, 4, 5])
+        >>> add_entries([pack_entries(first), pack_entries(second)], 5)
+        tensor([1., 2., 3., 6., 5.])
+    """
+    if not parts:
+        raise ValueError(f"{_ADD}: parts must hold at least one message, got none")
+    named = {f"parts[{index}]": part for index, part in enumerate(parts)}
+    for name, part in named.items():
+        check_shape(_ADD, name, part, ("length",))
+        check_dtype(_ADD, name, part, (torch.float32,))
+    check_same_device(_ADD, **named)
+    run = backends.resolve(_ADD, backend=backend, device=parts[0].device, dtype=parts[0].dtype)
+    total = parts[0].new_zeros(n)
+    for part in parts:
+        if len(part) == n:
+            total += part
+        else:
+            run(part, total)
+    return total

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 SplitKind = Literal["all", "worst"]
-TimeUnit = Literal["fraction", "seconds", "steps"]
+TimeUnit = Literal["fraction", "steps"]
 
 #: Default times as fractions of a run: of a single split, and of the first and last of several.
 ONLY, FIRST, LAST = 0.2, 0.15, 0.5

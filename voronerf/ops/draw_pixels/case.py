@@ -1,0 +1,18 @@
+"""The case of ``draw_pixels``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops.draw_pixels.reference import Runs
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    runs = Runs.of(torch.tensor([3, 20, 90]), torch.tensor([5, 1, 40]))
+    some = draw.among("runs", runs, None)
+    below = draw.number("below", 50, 1, 1000) if some is None else runs.total
+    return {"seed": draw.integers(-100, 100, 1), "count": n + 1, "below": below, "runs": some}
+
+
+CASE = Case(_make, refused={"below must be at least 1, got 0": {"below": 0, "runs": None}}, traced=False)

@@ -1,1 +1,0 @@
-"""A whole training step of a fused network, over its rays."""

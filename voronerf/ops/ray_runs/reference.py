@@ -1,0 +1,224 @@
+"""Partial sums: what a rank knows of a ray that passes through its cells, and how those of all ranks become a colour.
+
+r rays, n known samples, m own ones (packed), q runs, c colours. A run is a piece of a ray on which no other rank has a
+sample between two of its own. With the optical depth tau of the runs before, a ray has the colour ``sum exp(-tau) *
+colour of run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from voronerf.ops.composite.reference import Composite, composite
+
+#: Stands for infinite density, as in `composite`.
+_OPAQUE = 1e30
+
+
+class OwnSamples(NamedTuple):
+    """Samples of this rank, ray after ray, near to far.
+
+    Attributes:
+        positions: [m, 3].
+        ray_index: int32 [m].
+        depths: [m].
+        deltas: [m], the lengths of their strata.
+        cells: int32 [m], among those of this rank.
+        run_offsets: int32 [q + 1], where each run begins, and the end of the last.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import own_samples
+        >>> zeros = torch.zeros(1, dtype=torch.int32)
+        >>> own_samples(torch.zeros(1, 3), zeros, torch.ones(1), torch.ones(1), zeros, zeros).run_offsets
+        tensor([0, 1], dtype=torch.int32)
+    """
+
+    positions: Tensor
+    ray_index: Tensor
+    depths: Tensor
+    deltas: Tensor
+    cells: Tensor
+    run_offsets: Tensor
+
+
+class Runs(NamedTuple):
+    """The partial sums of runs. The first two have gradients.
+
+    Attributes:
+        colour: [q, c], as if nothing were in front.
+        optical: [q], the optical depth.
+        depth: [q], the sum of weight times depth.
+        ray: int64 [q].
+        start: [q], the depth of the first sample.
+        weights: [m], contributions of the samples, as if nothing were in front of their run.
+    """
+
+    colour: Tensor
+    optical: Tensor
+    depth: Tensor
+    ray: Tensor
+    start: Tensor
+    weights: Tensor
+
+
+class Composed(NamedTuple):
+    """Rays made of runs.
+
+    Attributes:
+        colour: [r, c], without a background.
+        through: [r], the light that passes all of them.
+        before: [q], the optical depth in front of each run.
+        place: int64 [q], where each run is in a table with a row for each ray.
+        width: The columns of the table.
+    """
+
+    colour: Tensor
+    through: Tensor
+    before: Tensor
+    place: Tensor
+    width: int
+
+    @property
+    def front(self) -> Tensor:
+        """[q], the light that arrives at each run."""
+        return torch.exp(-self.before)
+
+    def behind(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
+        """What the light from behind each run [q] adds to the loss, which more optical depth takes away.
+
+        Args:
+            colour: [q, c], of the runs.
+            ray: int64 [q], their rays.
+            slopes: [r, c], the gradient of each ray's colour over its background.
+            background: [r, c].
+        """
+        table = slopes.new_zeros(len(slopes), self.width)
+        table.view(-1)[self.place] = self.front * (slopes[ray] * colour).sum(1)
+        table = torch.cat((table[:, 1:], (self.through * (slopes * background).sum(1))[:, None]), 1)
+        return table.flip(1).cumsum(1).flip(1).view(-1)[self.place]
+
+
+def own_samples(
+    positions: Tensor,
+    ray_index: Tensor,
+    depths: Tensor,
+    deltas: Tensor,
+    cells: Tensor,
+    own: Tensor,
+    *,
+    bent: bool,
+    hidden: bool = True,
+) -> OwnSamples:
+    """Keeps the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``.
+
+    With ``hidden`` other ranks may have samples that are not among these. None lies between two neighbouring strata,
+    nor, since a cell is convex, between two samples in one cell.
+    """
+    numbers = own[cells.long()]
+    kept = (numbers >= 0).nonzero()[:, 0]
+    ray, at, length, cell = ray_index[kept], depths[kept], deltas[kept], numbers[kept]
+    begins = (kept.diff() != 1) | (ray.diff() != 0)
+    if hidden:
+        near = at.diff() < torch.minimum(length[1:], length[:-1])  # less than the stratum between would be long
+        begins |= ~near if bent else (cell.diff() != 0) & ~near
+    first = 1 + begins.nonzero()[:, 0]
+    ends = torch.tensor([len(kept)], device=kept.device)
+    offsets = torch.cat((ends.new_zeros(min(len(kept), 1)), first, ends)).to(torch.int32)
+    return OwnSamples(positions[kept], ray, at, length, cell, offsets)
+
+
+def sum_runs(samples: OwnSamples, colour: Tensor, density: Tensor, blend: Callable[..., Composite] = composite) -> Runs:
+    """The partial sums of the runs of samples with these colours [m, c] and densities [m]; ``blend`` is `composite`."""
+    offsets = samples.run_offsets
+    first = offsets[:-1].long()
+    run = torch.repeat_interleave(offsets.diff())
+    found = blend(density, colour, samples.depths, samples.deltas, ray_offsets=offsets)
+    optical = torch.zeros_like(samples.depths[first]).index_add(0, run, density.clamp(max=_OPAQUE) * samples.deltas)
+    ray, start = samples.ray_index[first].long(), samples.depths[first]
+    return Runs(found.colour, optical, found.depth.detach(), ray, start, found.weights.detach())
+
+
+def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed:
+    """Puts runs together, without gradients of its own.
+
+    Args:
+        colour: [q, c].
+        optical: [q].
+        ray: int64 [q], ascending; the runs of a ray from near to far.
+        rays: r.
+    """
+    counts = torch.bincount(ray, minlength=rays)
+    slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
+    width = int(counts.max()) if len(ray) else 1
+    place = ray * width + slot
+    table = optical.new_zeros(rays, width)
+    table.view(-1)[place] = optical
+    # The sum is shifted: less its last term it would be inf - inf for an opaque run.
+    before = F.pad(table[:, :-1], (1, 0)).cumsum(1).view(-1)[place]
+    whole = colour.new_zeros(rays, colour.shape[1]).index_add(0, ray, torch.exp(-before)[:, None] * colour)
+    return Composed(whole, torch.exp(-table.sum(1)), before, place, width)
+
+
+def along_rays(ray: Tensor, start: Tensor) -> Tensor:
+    """The order of runs [q] by their rays, int64, and from near to far, by their starts >= 0."""
+    bits = start.float().view(torch.int32)  # as large as the floats themselves
+    return ((ray << 32) + bits).argsort(stable=True)
+
+
+def _activated(raw: Tensor, density_scale: float) -> tuple[Tensor, Tensor]:
+    return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
+
+
+def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Tensor, Tensor]:
+    """Partial sums [q, 6] and densities [m]; see ``voronerf.ops.run_sums``."""
+    colour, density = _activated(raw, density_scale)
+    runs = sum_runs(samples, colour, density)
+    return torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1), density
+
+
+def compose_runs(
+    sums: Tensor, target: Tensor, background: Tensor | None, first: int, rays: int
+) -> tuple[Tensor, Tensor]:
+    """Answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
+    ray = sums[:, 5].long() - first
+    wrong = sums[(ray < 0) | (ray >= len(target)), 5]
+    if len(wrong):
+        allowed = f"{first} to {first + len(target) - 1}"
+        raise ValueError(f"compose_runs: rays must be {allowed}, got {int(wrong[0])}")
+    order = along_rays(ray, sums[:, 4])
+    part, optical, ray = sums[order, :3], sums[order, 3], ray[order]
+    whole = compose(part, optical, ray, len(target))
+    behind = torch.zeros_like(target) if background is None else background.expand_as(target)
+    off = whole.colour + whole.through[:, None] * behind - target
+    error, slopes = off.square().sum(-1), off * (2 / (3 * rays))
+    return answer(order, whole, whole.behind(part, ray, slopes, behind), slopes[ray], error[ray]), error.sum() / (
+        3 * rays
+    )
+
+
+def answer(order: Tensor, whole: Composed, behind: Tensor, slopes: Tensor, error: Tensor) -> Tensor:
+    """What runs must be told [q, c + 3], from what is known of them along their rays, in the order of their sums."""
+    told = torch.cat((slopes, behind[:, None], whole.before[:, None], error[:, None]), 1)
+    return torch.empty_like(told).index_copy(0, order, told)
+
+
+@torch.enable_grad()
+def run_gradients(
+    raw: Tensor, samples: OwnSamples, answers: Tensor, density_scale: float, hidden: float
+) -> tuple[Tensor, Tensor]:
+    """Gradient of the loss to the outputs [m, 4], and weights [m]; see ``voronerf.ops.run_gradients``."""
+    raw = raw.detach().requires_grad_()
+    colour, density = _activated(raw, density_scale)
+    runs, front = sum_runs(samples, colour, density), torch.exp(-answers[:, 4])
+    run = torch.repeat_interleave(samples.run_offsets.diff())
+    weights = runs.weights * front[run]
+    of_sums = front[:, None] * answers[:, :3], -answers[:, 3]
+    (gradient,) = torch.autograd.grad((runs.colour, runs.optical), raw, of_sums)
+    unseen = weights <= hidden * -torch.expm1(-density.detach() * samples.deltas)
+    return gradient.masked_fill(unseen[:, None], 0), weights

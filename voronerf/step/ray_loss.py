@@ -1,0 +1,193 @@
+"""The loss of a batch of rays, with gradients: one contract, and the ways to it in one process.
+
+r rays, m samples of all rays. A way takes a :class:`Batch`, samples its rays, asks the field and gives a
+:class:`Found`; ``why_not`` says what keeps a renderer from it. :mod:`voronerf.step.ray_runs` has the way over ranks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, cast
+
+import torch
+from torch import Tensor
+
+from voronerf.fields.radiance import activate_radiance
+from voronerf.ops.learn_outputs import learn_outputs
+from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.occupancy import HIDDEN
+from voronerf.rendering.renderer import Renderer
+from voronerf.rendering.samplers import Occupancy
+from voronerf.rendering.sampling import colour_loss, seen_there, sighting_loss
+from voronerf.rendering.volume import Samples, gradient_shares
+from voronerf.router import VoronoiRouter
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays [r], where they enter and leave the scene, and the colours to learn.
+
+    Attributes:
+        rays: Origins and unit directions; radii for cones.
+        near: [r], the depth at which each ray enters the scene.
+        far: [r], the depth at which it leaves the scene.
+        target: [r, 3], the colour of each ray's pixel over the background.
+        background: [3], or [r, 3] where it was drawn; None for black.
+        seen: [s], the distances of the points that the last s rays end at, or None.
+    """
+
+    rays: Rays
+    near: Tensor
+    far: Tensor
+    target: Tensor
+    background: Tensor | None = None
+    seen: Tensor | None = None
+
+
+class Found(NamedTuple):
+    """What a step finds. Only the loss has gradients.
+
+    Attributes:
+        loss: []; over ranks the part of the rays that this one puts together.
+        error: [r], the squared error of the colour of each ray, summed over the channels; over ranks 0 for rays without
+            samples of this one.
+        weights: [m], contributions of the samples to their rays.
+        density: [m].
+        samples: Those of the last pass.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF
+        >>> from voronerf.rendering import Rays, Renderer, Stratified
+        >>> from voronerf.step import Batch, Step
+        >>> step = Step(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)))
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> found = step.run(Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3)))
+        >>> found.loss.requires_grad, found.error.shape, found.importance().shape
+        (True, torch.Size([5]), torch.Size([40]))
+    """
+
+    loss: Tensor
+    error: Tensor
+    weights: Tensor
+    density: Tensor
+    samples: Samples
+
+    def importance(self) -> Tensor:
+        """[m]: the weight of each sample times the error of its ray (Elsner et al. 2023, section 3.1)."""
+        return self.weights * self.error.index_select(0, self.samples.ray_index)
+
+
+class RayLoss(Protocol):
+    """A way to the loss of a batch."""
+
+    def __call__(self, batch: Batch, generator: torch.Generator | None) -> Found:
+        """The loss of rays at random samples; ``loss.backward()`` gives the gradients of all parameters.
+
+        Args:
+            batch: The rays.
+            generator: Of the samples.
+        """
+        ...
+
+    def explain(self) -> str:
+        """This way in a line."""
+        ...
+
+
+def why_not_fused(renderer: Renderer) -> str | None:
+    """What keeps networks, colours, loss and gradients from being one operation; None if nothing does."""
+    field = renderer.field
+    if not isinstance(renderer.sampler, Occupancy):
+        return "empty space is not skipped"
+    if not isinstance(field, VoronoiRouter):
+        return f"the field is a {type(field).__name__}, no router"
+    if getattr(type(field.module), "activate", None) is not activate_radiance:
+        return f"{type(field.module).__name__} does not say what its outputs mean (activate = activate_radiance)"
+    if field.coords not in (None, "first3"):
+        return "other positions than those of the samples decide the cells"
+    return None if field.by_table else f"{type(field.module).__name__} does more than its layer table says"
+
+
+class Fused:
+    """Networks, colours, loss and gradients in one operation, from what the networks put out.
+
+    Args:
+        renderer: For which :func:`why_not_fused` is None.
+    """
+
+    def __init__(self, renderer: Renderer) -> None:
+        self.renderer = renderer
+
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, kept: slice = slice(None)) -> Found:
+        """As of :class:`RayLoss`, for the rays ``kept`` alone, which have the samples that they have among all."""
+        renderer, rays = self.renderer, batch.rays[kept]
+        field = cast(VoronoiRouter, renderer.field)
+        given: dict[str, Any] = {"jitter": True, "generator": generator, "kept": kept}
+        samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, **given)
+        background = batch.background
+        if background is not None and background.dim() == 2:
+            background = background[kept]
+        shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
+        found: list[RenderLoss] = []
+
+        def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
+            result, gradient = render_loss_gradient(
+                raw,
+                samples.deltas,
+                samples.ray_offsets,
+                batch.target[kept],
+                background=background,
+                density_scale=density_scale(field),
+                hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
+                backend=renderer.backend,
+            )
+            found.append(result)
+            return result.loss, gradient if shares is None else gradient * shares[:, None]
+
+        network = field.table_arguments(samples.inputs, rays.directions, samples.ray_index)
+        assert network is not None
+        total = learn_outputs(network, loss, backend=renderer.backend)
+        return Found(total, found[0].error, found[0].weights, found[0].density, samples)
+
+    def explain(self) -> str:
+        """As of :class:`RayLoss`."""
+        return "networks, colours, loss and gradients in one operation"
+
+
+class Composed:
+    """Each pass along the rays by itself, differentiated by torch.
+
+    Args:
+        renderer: Of any kind.
+        sightings: Factor of the `sighting_loss`; 0 is off.
+    """
+
+    def __init__(self, renderer: Renderer, sightings: float) -> None:
+        self.renderer, self.sightings = renderer, sightings
+
+    def __call__(self, batch: Batch, generator: torch.Generator | None) -> Found:
+        """As of :class:`RayLoss`."""
+        given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
+        *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
+        loss, samples = colour_loss(last.colour, batch.target), last.samples
+        if self.sightings and batch.seen is not None and samples.edges is not None:
+            depths, deltas, weights = (
+                samples.by_ray(values)[-len(batch.seen) :] for values in (samples.depths, samples.deltas, last.weights)
+            )
+            light = (weights * seen_there(depths, deltas, batch.seen[:, None])).sum(1)
+            loss = loss + self.sightings * sighting_loss(light)
+        for first in before:
+            loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
+        error = (last.colour.detach() - batch.target).square().sum(-1)
+        return Found(loss, error, last.weights.detach(), last.density.detach(), samples)
+
+    def explain(self) -> str:
+        """As of :class:`RayLoss`."""
+        return "networks, colours and loss are separate operations"
+
+
+def density_scale(field: VoronoiRouter) -> float:
+    """The factor on the density of a radiance field."""
+    return float(cast(Any, field.module).density_scale)

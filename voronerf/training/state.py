@@ -1,0 +1,156 @@
+"""What a checkpoint keeps of a training, and what of it goes into the files of several ranks."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.diagram import VoronoiDiagram
+from voronerf.distributed.sharing import assign_cells
+from voronerf.router import VoronoiRouter
+from voronerf.router.grouping import cell_parameters
+from voronerf.step import Cells
+from voronerf.training.checkpoint import (
+    VOXELS,
+    Checkpoint,
+    CheckpointError,
+    last_checkpoint,
+    load_optimizer_tensors,
+    optimizer_tensors,
+)
+from voronerf.training.config import TrainConfig, differences
+from voronerf.training.networks import check_shapes, router_states
+from voronerf.training.progress import Stage
+from voronerf.training.schema import check_types
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a checkpoint keeps beside its tensors, by the names of a trainer."""
+
+    config: dict[str, Any]
+    step: int
+    seconds: float
+    rays: int
+    rays_done: int
+    stages: tuple[dict[str, Any], ...]
+    evaluated: int
+    skipped: int
+    rate_factor: float
+    threads: int
+
+
+def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
+    """The settings of a checkpoint's training, and how far it is.
+
+    Raises:
+        CheckpointError: When a value is missing or of another type.
+    """
+    source, values = checkpoint.source, dict(checkpoint.values)
+    try:
+        if isinstance(values.get("stages"), list):
+            values["stages"] = tuple(values["stages"])
+        check_types(source, Stored, values)
+        for number, stage in enumerate(values["stages"]):
+            check_types(f"{source}: stage {number}", Stage, stage)
+        if not (values["step"] >= 0 and 0 <= values["seconds"] < math.inf and values["stages"]):
+            step, seconds, count = values["step"], values["seconds"], len(values["stages"])
+            raise ValueError(f"{source}: step, seconds and stages must be counts, got {step}, {seconds} and {count}")
+    except ValueError as error:
+        raise CheckpointError(str(error)) from None
+    stored = Stored(**values)
+    config = TrainConfig.from_json(json.dumps(stored.config), source)
+    most = int(config.rays * (config.ray_growth or 1))
+    if not config.rays <= stored.rays <= most:
+        raise CheckpointError(f"{source}: rays must lie in {config.rays} to {most} by its settings, got {stored.rays}")
+    return config, stored
+
+
+def collect(
+    stored: Stored,
+    routers: Mapping[str, VoronoiRouter],
+    optimizer: torch.optim.Optimizer,
+    parts: Mapping[str, Mapping[str, Any]],
+) -> Checkpoint:
+    """A checkpoint of values, networks, moments and further tensors by the first words of their names."""
+    every = {**router_states(routers), "optimizer": optimizer_tensors(optimizer), **parts}
+    tensors = {
+        f"{prefix}.{name}": torch.as_tensor(value).detach().to("cpu", copy=True).contiguous()  # training goes on
+        for prefix, group in every.items()
+        for name, value in group.items()
+    }
+    return Checkpoint(tensors, {**asdict(stored), "stages": list(stored.stages)})
+
+
+def resumed_checkpoint(config: TrainConfig, run: Path) -> Checkpoint:
+    """The last checkpoint of a run, whose networks are those of the settings to continue it with.
+
+    Raises:
+        CheckpointError: When there is no checkpoint, or one of another configuration.
+    """
+    checkpoint = last_checkpoint(run)
+    stored, _ = stored_values(checkpoint)
+    different = differences(stored, config)
+    if different:
+        raise CheckpointError(f"{checkpoint.source}: a checkpoint of another configuration: {'; '.join(different)}")
+    check_shapes(stored, checkpoint)
+    return checkpoint
+
+
+def load_moments(optimizer: torch.optim.Optimizer, checkpoint: Checkpoint, step: int) -> None:
+    """Loads the moments of an optimiser after some steps.
+
+    Raises:
+        ValueError: When they are missing, or do not fit.
+    """
+    if step and not checkpoint.group("optimizer"):
+        raise ValueError(f"no moments of the optimiser after {step} steps")
+    load_optimizer_tensors(optimizer, checkpoint.group("optimizer"))
+
+
+# Several ranks --------------------------------------------------------------------------------------------------------
+
+
+def apart(checkpoint: Checkpoint, cells: Cells, optimizer: torch.optim.Optimizer) -> tuple[Checkpoint, Checkpoint]:
+    """Divides the checkpoint of a rank into what all ranks have, with the diagram of all cells, and its own cells."""
+    module, sharing = cells.routers["field"].module, cells.sharing
+    own = {id(parameter) for parameter in cell_parameters(module)}
+    names = {f"router.module.{name}" for name, p in module.named_parameters() if id(p) in own}
+    for number, parameter in enumerate(p for group in optimizer.param_groups for p in group["params"]):
+        moments = optimizer.state.get(parameter, {}) if id(parameter) in own else {}
+        names |= {f"optimizer.{number}.{key}" for key, value in moments.items() if value.dim() > 0}
+    if cells.grid is not None:
+        names.add(VOXELS)
+    kept = {n: t for n, t in checkpoint.tensors.items() if n not in names and not n.startswith("router.diagram.")}
+    for name, tensor in cells.diagram.state_dict().items():
+        kept[f"router.diagram.{name}"] = tensor.detach().to("cpu", copy=True)
+    kept |= {"sharing.owner": sharing.owner.cpu(), "sharing.weights": cells.weights}
+    shard = {name: tensor for name, tensor in checkpoint.tensors.items() if name in names}
+    return Checkpoint(kept, checkpoint.values), Checkpoint(shard, {"cells": sharing.cells().tolist()})
+
+
+def ownership(checkpoint: Checkpoint, diagram: VoronoiDiagram, ranks: int) -> tuple[Tensor, Tensor]:
+    """The rank of each cell and the weights of the cells, for a training that goes on.
+
+    With as many ranks as before they keep their cells; another number shares them anew, by the importance that they had
+    at the last split.
+
+    Raises:
+        CheckpointError: For more ranks than cells.
+    """
+    k, stored = diagram.num_cells, checkpoint.group("sharing")
+    if k < ranks:
+        raise CheckpointError(f"{checkpoint.source}: --nproc-per-node must be at most its {k} cells, got {ranks} ranks")
+    weights = stored.get("weights", torch.ones(k))
+    weights = weights if len(weights) == k else torch.ones(k)
+    owner = stored.get("owner", torch.zeros(0, dtype=torch.int64))
+    if len(owner) == k and torch.equal(owner.unique(), torch.arange(ranks)):
+        return owner, weights
+    return assign_cells(diagram.leaf_centres, weights, ranks), weights
