@@ -293,6 +293,19 @@ class PixelRaysOutputs(NamedTuple):
     far: Tensor | None  # float32*
     colour: Tensor | None  # float32*
 
+class ProgramInputs(NamedTuple):
+    code: Tensor | None  # const int32*
+    constants: Tensor | None  # const float32*
+    inputs: Sequence[Tensor | None] | None  # const float32**
+    parameters: Sequence[Tensor | None] | None  # const float32**
+    strides: Tensor | None  # const int64*
+    widths: Tensor | None  # const int64*
+    outputs: int  # int64
+    offsets: Tensor | None  # const int32*
+    order: Tensor | None  # const int32*
+    n: int  # int64
+    k: int  # int64
+
 class RenderLossInputs(NamedTuple):
     raw: Tensor | None  # const float32*
     deltas: Tensor | None  # const float32*
@@ -445,6 +458,9 @@ def grouped_mlp_hashes(_0: MlpTable, _1: str, _2: str, _3: Cuda) -> bool: ...
 
 # MlpTable, int64, int64, bool, bool, MlpPrecision, MlpCudaWay, Cuda
 def grouped_mlp_workspace(_0: MlpTable, _1: int, _2: int, _3: bool, _4: bool, _5: str, _6: str, _7: Cuda) -> int: ...
+
+# ProgramInputs, float32**, float32**, Cpu
+def grouped_program(_0: ProgramInputs, _1: Sequence[Tensor | None] | None, _2: Sequence[Tensor | None] | None, _3: Cpu) -> None: ...
 
 # HashInputs, HashGrid, float32*, Cpu
 @overload

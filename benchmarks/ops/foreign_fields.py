@@ -385,3 +385,141 @@ class KAN(nn.Module):
         for layer in self.layers:
             x = layer(x)
         return x
+
+
+class Activated(nn.Module):
+    """A plain network with any activation between its layers: instant-nsr (SiLU), IBRNet (ELU), IDR (LeakyReLU)."""
+
+    def __init__(self, activation: nn.Module, width: int = 64, outputs: int = 4) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList([nn.Linear(39 if i == 0 else width, width) for i in range(4)])
+        self.activation, self.head = activation, nn.Linear(width, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = frequencies(x, 6)
+        for layer in self.layers:
+            x = self.activation(layer(x))
+        return cast(Tensor, self.head(x))
+
+
+class WeightNormed(nn.Module):
+    """IDR and VolSDF: weight norm, softplus(100), several outputs."""
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        norm = nn.utils.parametrizations.weight_norm
+        self.layers = nn.ModuleList([norm(nn.Linear(39 if i == 0 else width, width)) for i in range(4)])
+        self.head, self.softplus = norm(nn.Linear(width, 1 + width)), nn.Softplus(beta=100)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = frequencies(x, 6)
+        for layer in self.layers:
+            x = self.softplus(layer(x))
+        sdf, features = torch.split(self.head(x), [1, x.shape[-1]], dim=-1)
+        return torch.cat([sdf, features / features.norm(dim=-1, keepdim=True)], -1)
+
+
+class DNeRF(nn.Module):
+    """D-NeRF: a network moves the positions, which are encoded again before the second."""
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.time = nn.Sequential(
+            nn.Linear(40, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 3)
+        )
+        self.layers = nn.ModuleList([nn.Linear(39 if i == 0 else width, width) for i in range(3)])
+        self.head = nn.Linear(width, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        moved = x + self.time(torch.cat([frequencies(x, 6), torch.ones_like(x[..., :1]) * 0.5], -1))
+        h = frequencies(moved, 6)
+        for layer in self.layers:
+            h = F.relu(layer(h), inplace=True)
+        return torch.cat([torch.sigmoid(self.head(h)[..., :3]), F.softplus(self.head(h)[..., 3:] - 1)], -1)
+
+
+class Bacon(nn.Module):
+    """BACON: products of sines of the position with layers."""
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.filters = nn.ModuleList([nn.Linear(3, width) for _ in range(4)])
+        self.layers = nn.ModuleList([nn.Linear(width, width) for _ in range(3)])
+        self.head = nn.Linear(width, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = torch.sin(self.filters[0](x))
+        for filter, layer in zip(list(self.filters)[1:], self.layers):
+            out = torch.sin(filter(x)) * layer(out)
+        return cast(Tensor, self.head(out))
+
+
+class FiLM(nn.Module):
+    """pi-GAN: sines whose frequency and phase come from a code."""
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList([nn.Linear(3 if i == 0 else width, width) for i in range(4)])
+        self.frequencies, self.shifts = nn.Parameter(torch.rand(4, width)), nn.Parameter(torch.rand(4, width))
+        self.head = nn.Linear(width, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        for i, layer in enumerate(self.layers):
+            h = layer(x)
+            x = torch.sin(self.frequencies[i].unsqueeze(0).expand_as(h) * 15 * h + self.shifts[i])
+        return cast(Tensor, self.head(x))
+
+
+class Normed(nn.Module):
+    """stable-dreamfusion's ResBlocks: LayerNorm without an affine part of its own, SiLU, skips."""
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.first, self.head = nn.Linear(39, width), nn.Linear(width, 4)
+        self.dense = nn.ModuleList([nn.Linear(width, width) for _ in range(3)])
+        self.norm = nn.ModuleList([nn.LayerNorm(width) for _ in range(3)])
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.first(frequencies(x, 6))
+        for dense, norm in zip(self.dense, self.norm):
+            h = F.silu(norm(dense(h)) + h)
+        return cast(Tensor, self.head(h))
+
+
+class RawWeights(nn.Module):
+    """kilonerf-like code with weights of its own: ``x @ W``, ``addmm``, ``einsum``, ``matmul`` of a turned weight."""
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        sizes = [(3, width), (width, width), (width, width), (width, 4)]
+        self.w = nn.ParameterList([nn.Parameter(torch.randn(i, o) / math.sqrt(i)) for i, o in sizes])
+        self.b = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = torch.tanh(x @ self.w[0])
+        x = F.gelu(torch.addmm(self.b, x, self.w[1]), approximate="tanh")
+        x = F.leaky_relu(torch.einsum("ni,io->no", x, self.w[2]), 0.2)
+        return x.matmul(self.w[3].permute(1, 0).t())
+
+
+class Barf(nn.Module):
+    """BARF: an encoding whose octaves are weighted by how far the training is, and constants of the type of x."""
+
+    progress: Tensor
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.register_buffer("progress", torch.tensor(0.4))
+        self.layers = nn.ModuleList([nn.Linear(39 if i == 0 else width, width) for i in range(3)])
+        self.head = nn.Linear(width, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.no_grad():
+            octaves = torch.arange(6, dtype=torch.float32).type_as(x)
+            weights = (1 - ((self.progress * 6 - octaves).clamp(0, 1) * math.pi).cos()) / 2
+        angles = x[..., None] * 2.0**octaves * math.pi
+        waves = torch.stack([angles.sin(), angles.cos()], -2) * weights
+        h = torch.cat([x, waves.flatten(-3)], -1)
+        for layer in self.layers:
+            h = torch.relu(layer(h))
+        return cast(Tensor, self.head(h))

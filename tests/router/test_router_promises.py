@@ -76,15 +76,11 @@ class Forward(nn.Module):
 @pytest.mark.parametrize(
     ("step", "says"),
     [
-        (lambda net, h: torch.tanh(h), r"reads the result of torch.tanh \(test_router_promises.py:\d+: \(lambda"),
-        (lambda net, h: net.norm(h), "parameters meet samples in torch.nn.functional.layer_norm"),
-        (lambda net, h: h * net.gain, r"parameters meet samples in torch.Tensor.mul \(test_router_promises.py"),
         (lambda net, h: h + torch.rand_like(h), r"draws random numbers"),
         (lambda net, h: F.dropout(h, 0.5), r"torch.nn.functional.dropout draws random numbers"),
-        (lambda net, h: h[:, None].expand(-1, 2, -1), "on other than one row for each sample"),
-        (lambda net, h: h if h.max() > 0 else -h, r"has no row for each of 37 samples"),
+        (lambda net, h: h if h.max() > 0 else -h, r"has no row for each of 37 samples: it mixes or selects them"),
+        (lambda net, h: h if (h > 0).any() else -h, r"promise what it gives by assume="),
         (lambda net, h: torch.autograd.grad(h.sum(0)[None].sum(), h)[0], "no row for each"),
-        (lambda net, h: h.detach() if torch.set_grad_enabled(False) else h, "no"),
     ],
 )
 def test_what_does_not_fuse_is_refused_with_its_line(step: Any, says: str) -> None:
@@ -339,3 +335,18 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
     assert not torch.equal(before, router.module.weight)
     with pytest.raises(ValueError, match="load_state_dict: optimizer must hold the router's parameters"):
         router.load_state_dict(state, optimizer=torch.optim.SGD([nn.Parameter(torch.zeros(2))]))
+
+
+def test_a_promise_about_samples_lets_a_module_fuse() -> None:
+    class Masked(Forward):
+        def forward(self, x: Tensor) -> Tensor:
+            mask = x[:, 0] < 5
+            if not mask.any():
+                return self.b(self.a(x))
+            return super().forward(x)
+
+    field = Masked(lambda net, h: torch.tanh(h))
+    router = VoronoiRouter(field, centres(), coords="first3", fuse=True, assume={"mask.any()": True}, way="fused")
+    x = uniform((50,))
+    torch.testing.assert_close(router(x), router.cell(0)(x))
+    assert router.explain() == "forward: fused"

@@ -68,7 +68,7 @@ def custom_op(
         schema = torch.library.infer_schema(flat, mutates_args=())
         op = torch.library.custom_op(f"voronerf::{name}", flat, mutates_args=(), device_types=devices, schema=schema)
         op.register_fake(fake or (lambda *arguments: next(steps(*structs.packed(arguments)))))
-        return Op(op, run, devices, structs, direct=typing.get_origin(results) is not list)
+        return Op(op, run, devices, structs, listed=typing.get_origin(results) is list)
 
     return declare
 
@@ -122,9 +122,9 @@ class Op:
     """
 
     def __init__(
-        self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], structs: Structs, direct: bool
+        self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], structs: Structs, listed: bool
     ) -> None:
-        self._op, self._run, self._devices, self._structs, self._direct = op, run, devices, structs, direct
+        self._op, self._run, self._devices, self._structs, self._listed = op, run, devices, structs, listed
         self._function: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
@@ -144,7 +144,8 @@ class Op:
         if self._function is None:
             return self._op(*flat)
         entries, lengths = _flattened(flat)
-        return self._function.apply(*entries, lengths)
+        results = self._function.apply(*entries, lengths)
+        return list(results) if self._listed else results
 
     def inside(self, *arguments: Any) -> Any:
         """What the op gives, for a node of autograd that has looked at its arguments itself."""
@@ -162,18 +163,18 @@ class Op:
             return tuple(structs.flat(found if isinstance(found, tuple) else (found,)))
 
         self._op.register_autograd(unpacked, setup_context=setup)
-        if not self._direct:  # autograd.Function knows no lists of results
-            return
 
         def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
             *given, lengths = flat
-            arguments = structs.packed(_nested(given, lengths))
+            arguments, ctx.lengths = structs.packed(_nested(given, lengths)), lengths
             result = self._run(*arguments)
             setup_context(ctx, arguments, result)
-            return result
+            return tuple(result) if self._listed else result  # autograd.Function knows no lists
 
         def gradients(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
-            return (*_flattened(unpacked(ctx, *of_results))[0], None)
+            found = unpacked(ctx, of_results) if self._listed else unpacked(ctx, *of_results)
+            lists = zip(found, ctx.lengths, strict=True)
+            return (*_flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0], None)
 
         parts = {"forward": staticmethod(forward), "backward": staticmethod(gradients)}
         self._function = type("Direct", (torch.autograd.Function,), parts)

@@ -19,6 +19,7 @@ from voronerf.ops.draw_pixels.reference import Runs
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
+from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.hash_encode import hash_encode
 from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.learn_outputs import learn_outputs
@@ -64,6 +65,7 @@ __all__ = [
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",
+    "grouped_program",
     "hash_encode",
     "integrated_encode",
     "learn_outputs",

@@ -1,186 +1,374 @@
-"""The network of a module whose ``forward`` is fixed, as one operation.
+"""A module whose ``forward`` is fixed, fused: whole, or in runs.
 
-The module is traced once (:mod:`voronerf.router.trace`). Later calls run its layers as one operation, and do the
-steps before and behind them again as they were, on rows in the original order. There, samples may meet parameters that
-all cells share: tables, planes.
+The module is traced once (:mod:`voronerf.router.trace`). What of it can be steps of a program (``router/lower.py``) is
+cut into the largest runs, each of which is one operation. What lies between, such as look-ups, runs for the rows of all
+cells at once, by the rules of :mod:`voronerf.router.rules` where it meets the parameters of cells.
 
-Letters: n samples, k cells.
+Letters: n samples, k cells, w columns.
 """
 
 from __future__ import annotations
 
-import itertools
 import operator
-from collections.abc import Iterable
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor, fx
 from torch.fx.node import map_arg
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.ops.routed_mlp import routed_mlp
-from voronerf.router.grouped import PerCell, for_all_cells
+from voronerf.ops.grouped_program import grouped_program
+from voronerf.program import VALUE, Builder, Columns, Program, Step
+from voronerf.router.grouped import GroupedRun, PerCell, for_all_cells, name_of
 from voronerf.router.grouping import Grouping, owned_parameters
-from voronerf.router.layout import Call, Results, map_tensors, map_tree
-from voronerf.router.trace import BEFORE, BEHIND, CELLS, LAYERS, Column, Linear, Trace, Unfusable
+from voronerf.router.layout import Call, Results, map_tensors, map_tree, tensors_of
+from voronerf.router.lower import ROWS, Entries, Lowering, NotAStep
+from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable
 
 
-def fuse(call: Call, given: list[Tensor]) -> Program:
+def fuse(call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> Fused:
     """The fused way of a call, traced for the first cell on ``ROWS`` rows of its arguments, or raises Unfusable."""
-    return Program(call, given)
+    return Fused(call, given, assume)
 
 
-class Program:
-    """The layer table of one call of the routed module, and the steps before and behind it.
+@dataclass
+class Run:
+    """One program and where its tensors come from and go to."""
+
+    program: Program
+    inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
+    parameters: list[tuple[Any, Tensor]] = field(default_factory=list)  # nodes or tensors, and numbers of entries
+    outputs: list[Any] = field(default_factory=list)
+
+
+class Fused:
+    """A call of the routed module as runs of programs, and the functions between them.
 
     Args:
         call: The call, which runs with the parameters of the first cell.
         given: The rows of the arguments, for ``ROWS`` samples.
+        assume: What ``any()`` and ``all()`` of samples give, by their code.
 
     Raises:
-        Unfusable: For a step that is no such network, or that cannot be done again for other samples.
+        Unfusable: Where nothing can be fused, or a step cannot be done again for other samples.
     """
 
-    name, why = "fused", ""
-
-    def __init__(self, call: Call, given: list[Tensor]) -> None:
+    def __init__(self, call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> None:
         self._module = call.module
-        trace = Trace(call, given)
+        trace = Trace(call, given, assume)
         self._n, self._inputs, self._parameters = trace.n, trace.inputs, trace.parameters
         self._result, self._outputs = trace.result, trace.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
-        if not all(isinstance(value, fx.Node) and value.meta["rows"] for value in self._outputs):
+        if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
-        nodes = list(trace.graph.nodes)
-        self._weights, self._before = (
-            [node for node in nodes if node.op == "call_function" and node.meta["stage"] == stage]
-            for stage in (CELLS, BEFORE)
-        )
-        self._writes = any(node.meta.get("inplace") for node in self._before)
-        needed, returned = set(self._outputs), dict[fx.Node, list[Column]]()
-        self._behind: list[fx.Node] = []
-        for node in reversed(nodes):
-            stage, writes = node.meta["stage"], node.meta.get("inplace")
-            if stage not in (LAYERS, BEHIND) or not (node in needed or (stage == BEHIND and writes)):
-                continue
-            columns = trace.features(node) if stage == LAYERS else []
-            if columns:
-                returned[node] = columns
-            else:  # what moves columns of several layers is done again, too
-                self._behind.insert(0, node)
-                needed.update(node.all_input_nodes)
-        self._make_table(trace, returned)
-        for node in nodes:
-            node.meta.pop("value", None)
+        self._lowering = Lowering()
+        self._entries: dict[fx.Node, Entries] = {}  # of values that steps make or move
+        self._ready: dict[fx.Node, int] = {}  # of what PyTorch makes: the first run that can read it
+        self._why: dict[fx.Node, str] = {}
+        for node in trace.graph.nodes:
+            self._add(node)
+        needed = self._needed()
+        nodes = [node for node in trace.graph.nodes if node in needed and node.op == "call_function"]
+        self._weights = [node for node in nodes if node.meta["on"] != SAMPLES]
+        self._between = [node for node in nodes if node.meta["on"] == SAMPLES]
+        self._writes = any(node.meta.get("inplace") for node in self._between)
+        self._runs = self._cut()
+        if not any(step.op == "linear" for run in self._runs.values() for step in run.program.steps):
+            first = next(iter(self._why.values()), "nothing that is returned comes from a layer")
+            raise Unfusable(f"no layer can be part of a run: {first}")
+        self._sorted = any(self._meets_cells(node) for node in self._between)
+        said = list(dict.fromkeys(self._why[node] for node in self._between if node in self._why))
+        self.name = "fused in runs" if len(self._runs) > 1 or said else "fused"
+        self.why = f"{len(self._runs)} run{'s' * (len(self._runs) > 1)}, between them {'; '.join(said)}" if said else ""
+        for node in trace.graph.nodes:
+            if isinstance(node.meta.get("value"), Tensor):
+                node.meta["dtype"] = node.meta.pop("value").dtype
+        del self._lowering, self._entries
 
-    def _make_table(self, trace: Trace, returned: dict[fx.Node, list[Column]]) -> None:
-        """The table of the layers that some values come from. Layers read others, and blocks of values, whole."""
-        if not returned:
-            raise Unfusable("nothing that is returned comes from a layer")
-        parts = {}
-        for li in _sources([columns[0] for columns in returned.values()], Linear):
-            parts[li] = li.part([i for columns in returned.values() for source, i in columns if source is li])
-        used, layers = set(parts.values()), list(dict.fromkeys([*trace.layers, *parts.values()]))
-        for layer in reversed(layers):
-            used.update(_sources(layer.inputs, Linear) if layer in used else ())
-        self._layers = [layer for layer in layers if layer in used]
-        reads = [_sources(layer.inputs, fx.Node) for layer in self._layers]
-        first = next((read for read in reads if read), [])
-        others = [value for value in dict.fromkeys(itertools.chain(*reads)) if value not in first]
-        if not first:
-            raise Unfusable("no layer reads the samples")
-        self._blocks = [first, others] if others else [first]
-        widths: dict[int | str, int] = {number: layer.width for number, layer in enumerate(self._layers)}
-        places: dict[Linear | fx.Node, tuple[int | str, int]] = {layer: (i, 0) for i, layer in enumerate(self._layers)}
-        for name, block in zip((POSITIONS, DIRECTIONS), self._blocks):
-            for value in block:
-                places[value] = name, widths.get(name, 0)
-                widths[name] = widths.get(name, 0) + value.meta["value"].shape[1:].numel()
-        table = []
-        self._orders: list[tuple[Tensor, int] | None] = []  # where the columns of a weight go among those of its inputs
-        for layer in self._layers:
-            read = [(places[source][0], places[source][1] + i) for source, i in layer.inputs]
-            inputs = list(dict.fromkeys(name for name, _ in read))
-            starts = dict(zip(inputs, itertools.accumulate((widths[name] for name in inputs), initial=0)))
-            order, total = [starts[name] + i for name, i in read], sum(widths[name] for name in inputs)
-            self._orders.append(None if order == list(range(total)) else (torch.tensor(order), total))
-            table.append(Layer(tuple(inputs), layer.width, layer.activation))
-        self._table = MLP(tuple(table), tuple(self._layers.index(part) for part in parts.values()))
-        ends = itertools.accumulate(part.width for part in parts.values())
-        begins = {li: end - part.width - part.start + li.start for (li, part), end in zip(parts.items(), ends)}
-        self._values = []  # with their shapes, and the columns of raw outputs that make them
-        for value, ((source, i), *more) in returned.items():
-            start = begins[source] + i
-            self._values.append((value, value.meta["value"].shape[1:], start, start + 1 + len(more)))
+    # Cutting ----------------------------------------------------------------------------------------------------------
+
+    def _add(self, node: fx.Node) -> None:
+        """Notes how a node is computed: by steps, or by PyTorch between runs."""
+        if node.meta["on"] != SAMPLES or node.op == "placeholder" or isinstance(node.meta.get("value"), int):
+            self._ready[node] = 0
+            return
+        if "results" not in node.meta:  # a part of a result
+            return
+        try:
+            self._lower(node)
+        except (NotAStep, RuntimeError, TypeError, IndexError, ValueError) as error:
+            why = str(error) if isinstance(error, NotAStep) else type(error).__name__
+            self._why[node] = f"{name_of(node.target)}{node.meta['line']}, which is no step: {why}"
+            self._ready[node] = max((self._at(source) for source in node.all_input_nodes), default=0)
+            for value in node.meta["results"]:
+                self._ready[value] = self._ready[node]
+                self._entries.pop(value, None)
+
+    def _at(self, node: fx.Node) -> int:
+        """The first run before which a value is there."""
+        if node in self._ready:
+            return self._ready[node]
+        lowering, found = self._lowering, [0]
+        for value in {lowering.columns[i][0] for i in lowering.order(self._entries[node].codes)[1].tolist()}:
+            found.append(lowering.level(value) + (value not in lowering.sources))
+        return max(found)
+
+    def _known(self, node: fx.Node) -> Entries:
+        """Where the entries of a node's value come from."""
+        if node not in self._entries:
+            value = node.meta["value"]
+            if not value.is_floating_point():
+                raise NotAStep(f"a tensor of {value.dtype}")
+            self._entries[node] = (
+                self._lowering.input(node, value.shape, self._ready[node])
+                if node.meta["on"] == SAMPLES
+                else Entries(torch.arange(value.numel()).reshape(value.shape), node)
+            )
+        return self._entries[node]
+
+    def _lower(self, node: fx.Node) -> None:
+        values: dict[int, fx.Node] = {}
+
+        def own(source: fx.Node) -> Any:
+            value = source.meta["value"]
+            if isinstance(value, Tensor):
+                values[id(value)] = source
+            return value
+
+        if getattr(node.target, "__name__", "") == "apply":
+            raise NotAStep("a custom function")
+        if any(source.meta.get("value") is None for source in node.all_input_nodes):
+            raise NotAStep("a part of a result")
+        args, kwargs = map_arg((node.args, node.kwargs), own)
+
+        def known(value: Tensor) -> Entries | None:
+            return self._known(values[id(value)]) if id(value) in values else None
+
+        function: Any = node.target
+        result, args, entries = self._lowering.run(function, args, kwargs, known)
+        found = [args[0]] if node.meta["inplace"] else tensors_of(result)
+        made = [entries(tensor) for tensor in found]
+        for value, known_as in zip(node.meta["results"], made, strict=True):
+            if known_as is None or known_as.of is not None:
+                raise NotAStep("a result without samples")
+            if torch.is_grad_enabled() and not node.meta["grad"]:
+                places, numbers = self._lowering.order(known_as.codes)
+                b = self._lowering.builder
+                stopped = b.apply("stop", self._lowering.operand(numbers))
+                codes = torch.empty_like(known_as.codes).flatten()
+                codes[places] = self._lowering._codes(stopped)
+                known_as = Entries(codes.reshape(known_as.codes.shape))
+            self._entries[value] = known_as
+
+    def _needed(self) -> set[fx.Node]:
+        """The nodes that PyTorch computes; notes what they and the results read of steps, and the steps for that."""
+        needed: set[fx.Node] = set()
+        lowering, steps = self._lowering, self._lowering.builder.steps
+        self._made: dict[fx.Node, Columns] = {}
+        self._live: set[int] = set()
+        waiting = list(self._outputs)
+        while waiting:
+            node = waiting.pop()
+            if node in needed or node in self._made:
+                continue
+            if node in self._ready or self._only_moves(node):
+                needed.add(node)
+                self._ready.setdefault(node, self._at(node) if node.meta["on"] == SAMPLES else 0)
+                waiting += node.all_input_nodes
+                continue
+            self._made[node] = self._whole(node)
+            values = [self._made[node].index]
+            while values:
+                step = steps[values.pop()]
+                if step.out in self._live:
+                    continue
+                self._live.add(step.out)
+                values += [c.index for c in step.operands if c.of == VALUE]
+                used = [c.index for c in step.operands if c.of != VALUE]
+                used += [int(step.numbers[0])] if step.op == "linear" else []
+                sources = [lowering.parameters[index][0] for index in used]
+                sources += [lowering.sources[step.out]] if step.op == "input" else []
+                waiting += [source for source in sources if isinstance(source, fx.Node)]
+        return needed
+
+    def _whole(self, node: fx.Node) -> Columns:
+        """The columns that make a node's value, and how they are laid out in it."""
+        codes = self._entries[node].codes
+        shape, at = codes.shape, _sample_dimension(codes.shape)
+        turned = codes.movedim(at, 0).reshape(ROWS, -1)
+        if not torch.equal(turned >> 32, torch.arange(ROWS)[:, None].expand_as(turned)):
+            raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} mixes samples")
+        node.meta["layout"] = [*shape[:at], *shape[at + 1 :]], at, shape[at] // ROWS
+        return self._lowering.operand(turned[0] & ((1 << 32) - 1))
+
+    def _only_moves(self, node: fx.Node) -> bool:
+        """Whether a value is made of what PyTorch makes without any step."""
+        lowering = self._lowering
+        numbers = lowering.order(self._entries[node].codes)[1].tolist()
+        return all(lowering.columns[i][0] in lowering.sources for i in numbers)
+
+    def _meets_cells(self, node: fx.Node) -> bool:
+        return any(source.meta["on"] == CELLS for source in node.all_input_nodes)
+
+    def _cut(self) -> dict[int, Run]:
+        """The steps in runs, by their level."""
+        lowering, steps = self._lowering, self._lowering.builder.steps
+        live = self._live
+        level = {value: lowering.level(value) for value in live}
+        runs: dict[int, Run] = {}
+        for number in sorted({level[v] for v in live if v not in lowering.sources}):
+            own = [steps[v] for v in sorted(live) if level[v] == number and v not in lowering.sources]
+            later = {c.index for v in live if level[v] > number for c in steps[v].operands if c.of == VALUE}
+            outputs: list[Any] = [step.out for step in own if step.out in later]
+            kept = [Columns(VALUE, v, 0, steps[v].width) for v in outputs]
+            for node, columns in self._made.items():
+                if level[columns.index] == number and columns.index not in lowering.sources:
+                    outputs.append(node)
+                    kept.append(columns)
+            runs[number] = _renumbered(own, kept, lowering, outputs)
+        for node, columns in self._made.items():
+            if columns.index in lowering.sources:
+                raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} returns an argument")
+        return runs
 
     # Running ----------------------------------------------------------------------------------------------------------
 
     def run(self, call: Call, grouping: Grouping) -> Results:
-        """The method's results, in the order of the call, but for entries and placeholders."""
-        order = grouping if grouping.rows is not None or not call.layout.n else None
-        inputs, owned = call.arranged(order), self._owned
+        """The method's results: in the order of the call, where nothing between runs needs rows by cell."""
+        sort = self._sorted or grouping.rows is not None or not call.layout.n
+        rows = call.arranged(grouping if sort else None)
+        owned = self._owned
         if call.module is not self._module:  # a copy of the module, with parameters of its own
             owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
-        n = inputs[0].shape[0]
-        values: dict[fx.Node, Any] = {self._n: n}
-        values.update(zip(self._inputs, [x.clone() for x in inputs] if self._writes else inputs))
+        values: dict[Any, Any] = {self._n: rows[0].shape[0]}
+        values.update(zip(self._inputs, [x.clone() for x in rows] if self._writes else rows))
         for node, place in self._parameters.items():
             owner, name = owned[place]
             values[node] = owner._parameters[name]
-        _run(self._before, values)
-        blocks = [_joined([values[value].reshape(n, -1) for value in block]).contiguous() for block in self._blocks]
-        weights, biases = self._stacked(values, grouping.k)
-        where = grouping.where if grouping.rows is None else {"cells": grouping.sorted_cells.int()}
-        directions = blocks[1] if len(blocks) > 1 else None
-        raw, cells = routed_mlp(
-            blocks[0], weights, biases, layers=self._table, directions=directions, backend=grouping.backend, **where
+        self._compute_weights(values)
+        grouped = GroupedRun(grouping, {}) if self._sorted else None
+        last = max(self._runs, default=-1)
+        for number in range(last + 2):
+            for node in self._between:
+                if self._ready[node] == number or (number > last and self._ready[node] > last):
+                    _compute(node, values, grouped)
+            if number in self._runs:
+                self._compute_run(self._runs[number], values, grouping, None if sort else grouping.source)
+        found = [values[node] for node in self._outputs]
+        return Results(self._result, found, grouping if sort else None)
+
+    def _compute_run(self, run: Run, values: dict[Any, Any], grouping: Grouping, order: Tensor | None) -> None:
+        n = values[self._n]
+        rows = [_flat(values[source], n) for source in run.inputs]
+        dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
+        parameters = [_taken(values.get(of, of), of, codes).to(dtype) for of, codes in run.parameters]
+        found = grouped_program(
+            [x.to(dtype) for x in rows],
+            parameters,
+            grouping.offsets,
+            program=run.program,
+            order=order,
+            backend=grouping.backend,
         )
-        if where and grouping.rows is None:
-            grouping.where = {"cells": cells}
-        for value, shape, start, stop in self._values:
-            values[value] = raw[:, start:stop].reshape(n, *shape)
-        _run(self._behind, values)
-        return Results(self._result, [values[value] for value in self._outputs], order)
+        for of, tensor in zip(run.outputs, found, strict=True):
+            if isinstance(of, fx.Node):
+                shape, at, m = of.meta["layout"]
+                tensor = tensor.reshape(n * m, *shape).movedim(0, at) if at else tensor.reshape(n * m, *shape)
+                half = of.meta["dtype"] in (torch.bfloat16, torch.float16)
+                tensor = tensor.to(of.meta["dtype"]) if half else tensor
+            values[of] = tensor
 
-    def _stacked(self, values: dict[fx.Node, Any], k: int) -> tuple[list[Tensor], list[Tensor | None]]:
-        """Weights [k, o, i] and biases [k, o] of the table, in its order."""
-
-        def of_cells(node: fx.Node) -> Any:
-            value = values[node]
-            return value if node.meta["stage"] == CELLS else value.expand(k, *value.shape)
-
+    def _compute_weights(self, values: dict[Any, Any]) -> None:
+        """What is made of parameters alone."""
         for node in self._weights:
-            args, kwargs = map_arg((node.args, node.kwargs), lambda node: map_tensors(of_cells(node), PerCell))
-            made = args[0][args[1]] if node.target is operator.getitem else for_all_cells(node.target, args, kwargs)
+            if node in values:
+                continue
+            if node.meta["on"] != CELLS:
+                _compute(node, values, None)
+                continue
+
+            def of_cells(source: fx.Node) -> Any:
+                value = values[source]
+                return map_tensors(value, PerCell) if source.meta["on"] == CELLS else value
+
+            args, kwargs = map_arg((node.args, node.kwargs), of_cells)
+            single = node.target is operator.getitem and not isinstance(values[node.args[0]], Tensor)
+            made = args[0][args[1]] if single else for_all_cells(node.target, args, kwargs)
             values[node] = map_tree(made, lambda _, own, nested: own.stacked if isinstance(own, PerCell) else own)
-        weights: list[Tensor] = []
-        biases: list[Tensor | None] = []
-        for layer, order in zip(self._layers, self._orders, strict=True):
-            weight, bias = of_cells(layer.weight), None if layer.bias is None else of_cells(layer.bias)
-            if layer.width < weight.shape[1]:
-                weight = weight[:, layer.start : layer.start + layer.width]
-                bias = None if bias is None else bias[:, layer.start : layer.start + layer.width]
-            if order is not None:
-                weight = weight.new_zeros(*weight.shape[:2], order[1]).index_add(2, order[0].to(weight.device), weight)
-            plain = layer.factor == 1
-            weights.append(weight if plain else weight * layer.factor)
-            biases.append(bias if plain or bias is None else bias * layer.factor)
-        return weights, biases
 
 
-def _run(nodes: list[fx.Node], values: dict[fx.Node, Any]) -> None:
-    """Calls the functions of some nodes in turn."""
-    for node in nodes:
-        args, kwargs = map_arg((node.args, node.kwargs), values.__getitem__)
+def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outputs: list[Any]) -> Run:
+    """Some steps of all as a program of their own."""
+    b, run = Builder(), Run(Program((), (), (), ()), outputs=outputs)
+    values: dict[int, int] = {}
+    parameters: dict[int, int] = {}
+
+    def parameter(index: int) -> int:
+        if index not in parameters:
+            parameters[index] = b.parameter(*lowering.builder.parameters[index])
+            run.parameters.append(lowering.parameters[index])
+        return parameters[index]
+
+    def columns(c: Columns) -> Columns:
+        if c.of != VALUE:
+            return c._replace(index=parameter(c.index))
+        if c.index not in values:  # made before this run
+            values[c.index] = b.input(lowering.builder.steps[c.index].width).index
+            run.inputs.append(lowering.sources.get(c.index, c.index))
+        return c._replace(index=values[c.index])
+
+    for step in steps:
+        operands, numbers = tuple(map(columns, step.operands)), step.numbers
+        if step.op == "linear":
+            numbers = (parameter(int(numbers[0])), *numbers[1:])
+        values[step.out] = b.emit(step.op, step.width, operands, numbers, step.name).index
+    run.program = b.program([columns(c) for c in kept])
+    return run
+
+
+def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun | None) -> None:
+    """Calls the function of a node, for all cells at once where it meets their parameters."""
+
+    def given(source: fx.Node) -> Any:
+        value = values[source]
+        if grouped is not None and source.meta["on"] == CELLS:
+            return map_tensors(value, PerCell)
+        if grouped is not None and source.meta["on"] == SAMPLES:
+            for tensor in tensors_of(value):
+                grouped.mark(tensor)
+        return value
+
+    args, kwargs = map_arg((node.args, node.kwargs), given)
+    if grouped is None:
         result = node.target(*args, **kwargs)  # type: ignore[operator]
-        values[node] = args[0] if node.meta.get("inplace") else result
+    else:
+        with grouped, torch.set_grad_enabled(torch.is_grad_enabled() and node.meta.get("grad", True)):
+            result = node.target(*args, **kwargs)  # type: ignore[operator]
+    values[node] = args[0] if node.meta.get("inplace") else result
 
 
-def _sources(columns: Iterable[Column], kind: type[Any]) -> list[Any]:
-    """Layers, or values, that columns belong to, each once."""
-    return list(dict.fromkeys(source for source, _ in columns if isinstance(source, kind)))
+def _flat(value: Tensor, n: int) -> Tensor:
+    """[n, w] of a tensor whose first dimension is n * m, or of one with n somewhere else."""
+    if value.shape[:1] != (n,) and (not value.shape or n == 0 or value.shape[0] % n):
+        at = next(d for d, size in enumerate(value.shape) if size == n)
+        value = value.movedim(at, 0)
+    return value.reshape(n, -1) if n else value.reshape(0, max(value.shape[1:].numel(), 1))
 
 
-def _joined(parts: list[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+def _taken(value: Tensor, of: Any, codes: Tensor) -> Tensor:
+    """Entries of a parameter, [k, ...], or [1, ...] of one that cells share."""
+    cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
+    flat = value.flatten(1) if cells else value.reshape(1, -1)
+    numbers = codes.flatten()
+    if len(numbers) == flat.shape[1] and torch.equal(numbers, torch.arange(len(numbers))):
+        return flat.reshape(-1, *codes.shape)
+    if codes.dim() == 2 and len(numbers) == flat.shape[1]:
+        o, i = codes.shape
+        if torch.equal(codes.t().flatten(), torch.arange(len(numbers))):
+            return flat.reshape(-1, i, o).transpose(1, 2)
+    return flat.index_select(1, numbers.to(flat.device)).reshape(-1, *codes.shape)
+
+
+def _sample_dimension(shape: torch.Size) -> int:
+    return next(d for d, size in enumerate(shape) if size and size % ROWS == 0)

@@ -14,6 +14,7 @@ import os
 import threading
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -110,11 +111,13 @@ class Wish:
         fuse: Whether ``forward`` does the same in every call.
         way: "fastest", or the way that is taken without measuring: "fused", "grouped" or "loop".
         several: Whether methods besides ``forward`` are routed; then one that cannot be fused leaves the others fused.
+        assume: What ``any()`` and ``all()`` of samples give in a fused method, by their code.
     """
 
     fuse: bool
     way: str
     several: bool
+    assume: Mapping[str, bool] = field(default_factory=dict)
 
 
 def kind_of(call: Call, device: torch.device, fused: bool) -> Any:
@@ -358,11 +361,11 @@ class Trial:
             return False
         return True
 
-    def fused(self, loop: Way, expected: Outcome) -> Way:
+    def fused(self, loop: Way, expected: Outcome, assume: Mapping[str, bool]) -> Way:
         """The network as one operation; raises where something stands in the way."""
         with NoRandomness():
             rows = [rows[:ROWS] for rows in self.call.arranged(self.entries)]
-            way = fuse(replace(self.call, module=self.made_of[0].module), rows)
+            way = fuse(replace(self.call, module=self.made_of[0].module), rows, assume)
         if not self.agrees(way, loop, expected):
             raise Unfusable("the traced network gives other results than its forward")
         return way
@@ -417,12 +420,12 @@ def admitted(trial: Trial, choices: Choices, wish: Wish) -> Kind:
     ways, is_open = list[Way](), False
     if wish.fuse and wish.way in ("fastest", "fused"):
         try:
-            ways.append(trial.fused(loop, expected))
+            ways.append(trial.fused(loop, expected, wish.assume))
             choices.fused.add(trial.call.method)
         except Exception as error:
             trial.check_rows(loop)
             why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
-            says = f"fuse=True needs a network that a layer table describes, but in {trial.call.name} {why}"
+            says = f"fuse=True needs a network that can be fused, but in {trial.call.name} {why}"
             if not wish.several:
                 raise ValueError(f"{_OP}: {says}") from error
             choices.say_once(f"fuse {trial.call.method}", says)

@@ -1,0 +1,67 @@
+// Programs over threads, task by task (row_tasks.h).
+#include "network/program.h"
+
+#include <algorithm>
+
+#include "common/common.h"
+#include "common/parallel.h"
+#include "network/cpu/program_code.h"
+#include "network/cpu/row_tasks.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr RowLimits kRows{96, 1024}, kSumRows{384, 4096};
+constexpr int64_t kTaskUnit = 48, kGranule = 16, kSlack = 128;
+
+void pack(Isa isa, const ProgramCall& call, int64_t cell, float* packed) {
+  VN_FOR_ISA(isa, program_pack(call, cell, packed))
+}
+void run(Isa isa, const ProgramCall& call, const RowTask& task, const float* packed, float* tiles, float* partial) {
+  VN_FOR_ISA(isa, program_run(call, task.begin, task.end, packed, tiles, partial))
+}
+void reduce(Isa isa, const ProgramCall& call, int64_t cell, float* partials, int64_t count) {
+  VN_FOR_ISA(isa, program_reduce(call, cell, partials, count))
+}
+
+}  // namespace
+
+void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads) {
+  check_offsets("grouped_program", in.offsets, in.k, in.n);
+  const auto& header = *reinterpret_cast<const ProgramHeader*>(in.code);
+  const ProgramCall call{in.code, in.constants, in.inputs, outputs, sums, in.parameters, in.strides, in.order};
+  const auto clear = [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      for (int64_t o = 0; o < in.outputs; ++o) {
+        std::fill_n(outputs[o] + (in.order == nullptr ? i : in.order[i]) * in.widths[o], in.widths[o], 0.0f);
+      }
+    }
+  };
+  clear(0, in.offsets[0]);
+  clear(in.offsets[in.k], in.n);
+  const bool summed = header.sums > 0;
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, summed ? kSumRows : kRows, kTaskUnit, header.partial);
+  const int64_t tiles = header.packed, own_partial = tiles + int64_t{header.columns} * header.tile + kSlack;
+  const int64_t stride = ceil_div(own_partial + header.partial, kGranule) * kGranule;
+  const int64_t partials = summed ? tasks.first_partial[in.k] : 0;
+  const Workspace workspace(stride * threads + partials * header.partial);
+  float* partial = workspace.data() + stride * threads;
+  for_each_task(
+      tasks, workspace.data(), stride, threads, [&](int64_t cell, float* own, bool) { pack(isa, call, cell, own); },
+      [](int64_t) {},
+      [&](const RowTask& task, float* own) {
+        const bool alone = task.partial < 0;
+        float* to = alone ? own + own_partial : partial + task.partial * header.partial;
+        run(isa, call, task, own, own + tiles, to);
+        if (alone && summed) reduce(isa, call, task.cell, to, 1);
+      });
+  if (!summed) return;
+  parallel_for(in.k, 1, threads, [&](int64_t cell) {
+    const int64_t count = tasks.partials(cell);
+    const bool empty = in.offsets[cell + 1] == in.offsets[cell];
+    if (count > 0 || empty) reduce(isa, call, cell, partial + tasks.first_partial[cell] * header.partial, count);
+  });
+}
+
+}  // namespace voronerf

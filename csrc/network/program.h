@@ -1,0 +1,32 @@
+// A program of steps on the rows of each cell, with the values of a tile of rows in cache; see voronerf/program.py for
+// the steps. The gradient of a program is a program, so there is one function for all derivatives.
+//
+// n rows, k cells, w columns. All tensors are float32 and contiguous. Rows outside all cells (before offsets[0], from
+// offsets[k] on) give 0. Results do not depend on the number of threads. With `order` [n], the row i that the offsets
+// speak of is row order[i] of inputs and outputs.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "common/isa.h"
+
+namespace voronerf {
+
+struct ProgramInputs {
+  const int32_t* code;     // as voronerf/ops/grouped_program/native.py writes it and program_code.h reads it
+  const float* constants;  // the numbers of functions
+  const float* const* inputs;
+  const float* const* parameters;
+  const int64_t* strides;  // floats from one cell's parameter to the next: 0 where all cells share it
+  const int64_t* widths;   // columns of each output
+  int64_t outputs;
+  const int32_t* offsets;
+  const int32_t* order;  // or null
+  int64_t n, k;
+};
+
+// Throws std::invalid_argument for offsets that fall or exceed n.
+void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads);
+
+}  // namespace voronerf

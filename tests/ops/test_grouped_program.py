@@ -1,0 +1,237 @@
+"""grouped_program: each step against autograd in float64, and random programs against the reference."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import torch
+from torch import Tensor
+
+from voronerf import native
+from voronerf.ops import grouped_program
+from voronerf.ops.grouped_program.case import every_step
+from voronerf.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
+
+NUMBERS = {"softplus": (3.0, 20.0), "sine": (1.7, 0.3), "clamp": (-0.5, 0.6), "power": (1.5, 0.0), "affine": (2.0, 1.0)}
+SIZES = ([0], [1], [5, 0, 24], [96, 1], [97, 0, 3], [0, 95, 200, 23])
+
+
+def offsets_of(sizes: list[int]) -> Tensor:
+    return torch.tensor([0, *sizes], dtype=torch.int32).cumsum(0).int()
+
+
+def random_program(seed: int) -> Program:
+    """Steps drawn at random, each of values drawn at random."""
+    draw, b = random.Random(seed), Builder()
+    values = [b.input(draw.choice([1, 3, 16, 33])) for _ in range(draw.randint(1, 3))]
+    smooth = ["softplus", "sigmoid", "tanh", "silu", "gelu", "sine", "elu", "copy"]
+    for _ in range(draw.randint(4, 14)):
+        x = draw.choice(values)
+        kind = draw.choice(["linear", "function", "binary", "total", "move", "vector"])
+        if kind == "linear":
+            width = draw.choice([1, 4, 17, 64, 70])
+            bias = Columns(PARAMETER, b.parameter(width), 0, width) if draw.random() < 0.5 else None
+            values.append(b.linear(x, b.parameter(width, x.width), width, add=bias))
+        elif kind == "function":
+            name = draw.choice(smooth)
+            values.append(b.apply(name, x, *NUMBERS.get(name, (0.7, 0.0))))
+        elif kind == "binary":
+            same = [v for v in values if v.width == x.width]
+            values.append(b.binary(draw.choice(["add", "sub", "mul"]), x, draw.choice(same)))
+        elif kind == "vector":
+            values.append(b.binary("mul", x, Columns(PARAMETER, b.parameter(x.width), 0, x.width)))
+        elif kind == "total":
+            values.append(b.total(x, x.width))
+        else:
+            y, start = draw.choice(values), draw.randrange(x.width)
+            parts = [(x.part(start, x.width - start), 0), (y, x.width - start)]
+            values.append(b.move(x.width - start + y.width, parts))
+    return b.program(values[-2:])
+
+
+def arguments(
+    program: Program, sizes: list[int], dtype: torch.dtype, shared: bool = False
+) -> tuple[list, list, Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    k, n = len(sizes), sum(sizes)
+    rows = [torch.randn(n, w, generator=generator, dtype=torch.float64) for w in program.inputs]
+    parameters = []
+    for i, shape in enumerate(program.parameters):
+        few = 1 if shared and i % 2 == 0 else k
+        p = torch.randn(few, *shape, generator=generator, dtype=torch.float64) / shape[-1] ** 0.5
+        parameters.append(p)
+    return [x.to(dtype) for x in rows], [p.to(dtype) for p in parameters], offsets_of(sizes)
+
+
+def derivatives(program: Program, rows: list, parameters: list, offsets: Tensor, backend: str, order=None) -> list:
+    """Results, their gradients, and the gradients of a function of those."""
+    leaves = [t.clone().requires_grad_() for t in (*rows, *parameters)]
+    given = leaves[: len(rows)], leaves[len(rows) :]
+    results = grouped_program(*given, offsets, program=program, order=order, backend=backend)
+    generator = torch.Generator().manual_seed(5)
+
+    def weighted(tensors: list) -> Tensor:
+        parts = []
+        for t in tensors:
+            weights = torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t.dtype)
+            if t.requires_grad:
+                parts.append((t * weights).sum())
+        return torch.stack(parts).sum() if parts else 0 * leaves[0].sum()
+
+    firsts = torch.autograd.grad(
+        weighted(results), leaves, create_graph=True, allow_unused=True, materialize_grads=True
+    )
+    seconds = torch.autograd.grad(weighted(firsts), leaves, allow_unused=True, materialize_grads=True)
+    return [t.detach() for t in (*results, *firsts, *seconds)]
+
+
+def check(program: Program, sizes: list[int], shared: bool = False, order: Tensor | None = None) -> None:
+    """Native against the reference in float64, relative to what the reference in float32 reaches."""
+    wide = derivatives(program, *arguments(program, sizes, torch.float64, shared), "reference", order)
+    narrow = derivatives(program, *arguments(program, sizes, torch.float32, shared), "reference", order)
+    native = derivatives(program, *arguments(program, sizes, torch.float32, shared), "native", order)
+    for exact, other, ours in zip(wide, narrow, native, strict=True):
+        assert ours.shape == exact.shape
+        if exact.numel():
+            size = float(exact.abs().max())
+            allowed = 2 * float((other - exact).abs().max()) + 4e-6 * size + 1e-6
+            assert float((ours - exact).abs().max()) <= allowed
+
+
+@pytest.mark.parametrize(
+    ("name", "order"),
+    [(name, i) for name, f in FUNCTIONS.items() if name != "stop" for i in range(min(f.orders, 3) + 1)],
+)
+def test_derivative_of_every_function(name: str, order: int) -> None:
+    """Each line of functions_tile.h against autograd of the formula."""
+    b = Builder()
+    x = b.input(19)
+    found = b.function(name, x, *NUMBERS.get(name, (0.7, 0.0)), order=order)
+    assert found is not None
+    program = b.program([found])
+    generator = torch.Generator().manual_seed(1)
+    rows = 3 * torch.randn(101, 19, generator=generator, dtype=torch.float64)
+    rows = rows.abs() + 0.1 if name in ("log", "power") else rows
+    offsets = offsets_of([40, 61])
+    (exact,) = grouped_program([rows], [], offsets, program=program, backend="reference")
+    (ours,) = grouped_program([rows.float()], [], offsets, program=program, backend="native")
+    torch.testing.assert_close(ours.double(), exact, rtol=3e-6, atol=3e-6 * max(1.0, float(exact.abs().max())))
+
+
+@pytest.mark.parametrize("sizes", SIZES)
+@pytest.mark.parametrize("shared", [False, True])
+def test_every_step(sizes: list[int], shared: bool) -> None:
+    """Values, gradients and their gradients, for cells of all sizes."""
+    check(every_step(), sizes, shared)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_programs(seed: int) -> None:
+    """Values, gradients and their gradients of programs that nobody has thought of."""
+    check(random_program(seed), [97, 0, 30])
+
+
+@pytest.mark.parametrize("order_of", [1, 2])
+@pytest.mark.parametrize("seed", range(12))
+def test_gradient_program_against_autograd(seed: int, order_of: int) -> None:
+    """The program of a gradient, run in PyTorch, against autograd of the program; twice, too."""
+    program = every_step() if seed == 0 else random_program(100 + seed)
+    rows, parameters, offsets = arguments(program, [9, 0, 6], torch.float64)
+    for _ in range(order_of):
+        asked = (True,) * len(rows), (True,) * len(parameters)
+        arriving = (True,) * len(program.outputs), (True,) * len(program.sums)
+        leaves = [t.clone().requires_grad_() for t in (*rows, *parameters)]
+        results = grouped_program(leaves[: len(rows)], leaves[len(rows) :], offsets, program=program)
+        gradients = [torch.randn_like(t) for t in results]
+        used = [(r, g) for r, g in zip(results, gradients) if r.requires_grad]
+        expected = torch.autograd.grad(
+            [r for r, _ in used], leaves, [g for _, g in used], allow_unused=True, materialize_grads=True
+        )
+        split = len(program.outputs)
+        program = gradient(program, *asked, *arriving)
+        rows, parameters = [*rows, *gradients[:split]], [*parameters, *gradients[split:]]
+        found = grouped_program(rows, parameters, offsets, program=program, backend="reference")
+        for ours, exact in zip(found, expected, strict=True):
+            torch.testing.assert_close(ours, exact, rtol=1e-9, atol=1e-9)
+
+
+def test_order_strays_and_layouts() -> None:
+    """Rows anywhere, rows of no cell, and inputs that are not contiguous."""
+    program = every_step()
+    sizes = [30, 0, 71]
+    check(program, sizes, order=torch.randperm(101, generator=torch.Generator().manual_seed(0)).int())
+    rows, parameters, offsets = arguments(program, sizes, torch.float32)
+    strays = torch.tensor([2, 40, 40, 90], dtype=torch.int32)
+    both = [grouped_program(rows, parameters, strays, program=program, backend=b) for b in ("native", "reference")]
+    for ours, theirs in zip(*both):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
+        assert not ours[:2].any() and not ours[90:].any()
+    turned = [x.t().contiguous().t() for x in rows]
+    for ours, theirs in zip(*(grouped_program(r, parameters, offsets, program=program) for r in (turned, rows))):
+        assert torch.equal(ours, theirs)
+
+
+@pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)
+def test_instruction_sets(isa: str) -> None:
+    """Every instruction set of this machine."""
+    program = every_step()
+    with native.using_isa(isa):
+        check(program, [97, 0, 30])
+        check(random_program(7), [97, 0, 30])
+
+
+def test_results_do_not_depend_on_threads() -> None:
+    """Bit for bit."""
+    program, threads = every_step(), torch.get_num_threads()
+    given = arguments(program, [3000, 0, 5000, 17], torch.float32)
+    found = []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            found.append(derivatives(program, *given, "native"))
+    finally:
+        torch.set_num_threads(threads)
+    for others in found[1:]:
+        assert all(map(torch.equal, found[0], others))
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_types(dtype: torch.dtype) -> None:
+    """By conversion: what float32 gives for the rounded arguments."""
+    program = random_program(3)
+    rows, parameters, offsets = arguments(program, [40, 9], dtype)
+    wide = [[t.float() for t in part] for part in (rows, parameters)]
+    for ours, exact in zip(
+        grouped_program(rows, parameters, offsets, program=program), grouped_program(*wide, offsets, program=program)
+    ):
+        assert torch.equal(ours, exact.to(dtype))
+
+
+def test_compiled_whole() -> None:
+    """In a full graph of torch.compile, forward and backward."""
+    program = random_program(3)
+    rows, parameters, offsets = arguments(program, [40, 9], torch.float32)
+    parameters = [p.requires_grad_() for p in parameters]
+
+    def loss(parameters: list[Tensor]) -> Tensor:
+        return sum(r.square().sum() for r in grouped_program(rows, parameters, offsets, program=program))
+
+    expected = torch.autograd.grad(loss(parameters), parameters, allow_unused=True)
+    found = torch.autograd.grad(
+        torch.compile(loss, backend="aot_eager", fullgraph=True)(parameters), parameters, allow_unused=True
+    )
+    for ours, theirs in zip(found, expected):
+        torch.testing.assert_close(ours, theirs)
+
+
+def test_refuses_what_is_no_program() -> None:
+    """The other rules are in the op's case."""
+    with pytest.raises(TypeError, match="grouped_program: program must be a Program, got str"):
+        grouped_program([torch.ones(2, 2)], [], offsets_of([2]), program="x")  # type: ignore[arg-type]
+    rows, parameters, _ = arguments(every_step(), [6], torch.float32)
+    for offsets in ([0, 7], [0, 3, 2], [-1, 6]):
+        for backend in ("native", "reference"):
+            with pytest.raises(ValueError, match="grouped_program: offsets must rise from 0 or more to at most"):
+                given = torch.tensor(offsets, dtype=torch.int32)
+                grouped_program(rows, [p[:1] for p in parameters], given, program=every_step(), backend=backend)

@@ -1,0 +1,78 @@
+"""The case of ``grouped_program``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.program import PARAMETER, Builder, Columns, Program
+
+
+def every_step() -> Program:
+    """A program with every kind of step, and operands of every kind."""
+    b = Builder()
+    x, y = b.input(5), b.input(3)
+    weight, vector = b.parameter(7, 8), b.parameter(7)
+    h = b.linear(x, weight, 7, add=Columns(PARAMETER, vector, 0, 7))
+    h = b.linear(y, weight, 7, 5, add=h)
+    h = b.apply("relu", h)
+    scaled = b.binary("mul", h, Columns(PARAMETER, vector, 0, 7))
+    shifted = b.binary("add", scaled, Columns(PARAMETER, vector, 2, 7, True))
+    back = b.linear(shifted, weight, 6, 1, transposed=True)
+    total = b.total(back, 3)
+    one = b.total(back, 6)
+    squared = b.apply("power", one._replace(width=6, spread=True), 2.0)
+    share = b.binary("div", back, b.apply("affine", squared, 1.0, 3.0))
+    moved = b.move(12, [(share.part(1, 4), 0), (y, 5), (total, 8), (one, 11)])
+    added = b.move(4, [(moved.part(0, 3), 1), (share.part(2, 3), 0)])
+    gated = b.binary("gate", added, b.apply("step", share.part(0, 4)))
+    return b.program([b.binary("sub", gated, moved.part(7, 4)), shifted, one])
+
+
+def smooth(width: int = 9) -> Program:
+    """Layers with smooth activations, a skip connection between them."""
+    b = Builder()
+    x = b.input(4)
+    h = b.apply("softplus", b.linear(x, b.parameter(width, 4), width), 5.0, 20.0)
+    h = b.apply("gelu", b.linear(b.move(width + 4, [(h, 0), (x, width)]), b.parameter(3, width + 4), 3))
+    return b.program([b.apply("tanh", b.linear(h, b.parameter(2, 3), 2))])
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    k, dtype = draw.among("k", 3, 1, 2, 17), draw.dtype()
+    program = (
+        every_step() if draw.among("program", "steps", "smooth") == "steps" else smooth(draw.number("w", 9, 1, 70))
+    )
+    inputs = [draw.normal(n, width, dtype=dtype) for width in program.inputs]
+    parameters = []
+    for shape in program.parameters:
+        few = draw.among("shared", k, 1)
+        parameters.append((draw.normal(few, *shape, dtype=torch.float64) / shape[-1] ** 0.5).to(dtype))
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(n)).int()
+    return {
+        "inputs": inputs,
+        "parameters": parameters,
+        "offsets": draw.offsets(n, k),
+        "program": program,
+        "order": order if draw.among("ordered", False, True) else None,
+    }
+
+
+CASE = Case(
+    _make,
+    {"": {}, "shared, in any order": {"shared": 1, "ordered": True}, "smooth": {"program": "smooth"}},
+    refused={
+        "inputs must be 2 tensors (inputs at least one), got 0": {"inputs": []},
+        "parameters must be 2 tensors (inputs at least one), got 0": {"parameters": []},
+        "inputs[0] must have shape [n, 5], got [6, 3]": {"inputs": [torch.ones(6, 3), torch.ones(6, 3)]},
+        "parameters[0] must have shape [k, 7, 8] with k = 3, got [4, 7, 8]": {
+            "parameters": [torch.ones(4, 7, 8), torch.ones(3, 7)]
+        },
+        "parameters[0] must have dtype float32, got float64": {
+            "parameters": [torch.ones(3, 7, 8).double(), torch.ones(3, 7)]
+        },
+        "order must have shape [n] with n = 6, got [3]": {"order": torch.zeros(3, dtype=torch.int32)},
+    },
+    differentiable=True,
+    compiles=False,
+)

@@ -1,0 +1,277 @@
+"""Programs of the compiled module. n rows, k cells, w columns of a value.
+
+The gradient of a program is a program, and runs by the same op; so do further derivatives. Tensors are cast to float32
+on the way in and back on the way out. A program with higher derivatives of a function than the compiled module has runs
+in PyTorch.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf import native
+from voronerf.derivatives import asked_for
+from voronerf.native.custom_op import custom_op, on_huge_pages
+from voronerf.ops.grouped_program.reference import grouped_program as in_torch
+from voronerf.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient, merged
+
+_OPS = ("input", "output", "linear", "function", "binary", "total", "move", "outer", "columns")
+_ORDERS = 3  # of derivatives that the compiled module has
+_FLOATS = 96 << 10  # of the values of a tile: they share the second cache level with the weights
+_ROWS = (24, 96)  # of a tile, whole blocks of the products (gemm_tile.h)
+_GRANULE = 16
+
+
+def grouped_program(
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    offsets: Tensor,
+    *,
+    program: Program,
+    order: Tensor | None = None,
+) -> list[Tensor]:
+    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
+    dtype = inputs[0].dtype
+    if program.orders > _ORDERS:
+        return in_torch(inputs, parameters, offsets, program=program, order=order)
+    wide = [x.to(torch.float32) for x in inputs], [p.to(torch.float32) for p in parameters]
+    found: list[Tensor] = _run(*wide, offsets, order, program.text)
+    return [tensor.to(dtype) for tensor in found]
+
+
+@custom_op("grouped_program_native", devices=("cpu",))
+def _run(
+    inputs: Sequence[Tensor], parameters: Sequence[Tensor], offsets: Tensor, order: Tensor | None, text: str
+) -> Iterator[list[Tensor]]:
+    program, n, k = Program.parse(text), inputs[0].shape[0], offsets.shape[0] - 1
+    results = [inputs[0].new_empty(n, columns.width) for columns in program.outputs]
+    sums = [inputs[0].new_empty(k, *shape) for shape in program.sums]
+    yield [*results, *sums]
+    for result in results:
+        on_huge_pages(result)
+    plan = _plan(text)
+    given = native.compiled.ProgramInputs(
+        code=plan.code,
+        constants=plan.constants,
+        inputs=inputs,
+        parameters=parameters,
+        strides=torch.tensor([p[0].numel() if p.shape[0] > 1 else 0 for p in parameters], dtype=torch.int64),
+        widths=plan.widths,
+        outputs=len(results),
+        offsets=offsets,
+        order=order,
+        n=n,
+        k=k,
+    )
+    native.compiled.grouped_program(given, results, sums, native.cpu())
+
+
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
+    rows, parameters, offsets, order, ctx.text = inputs
+    ctx.count, ctx.k = len(rows), offsets.shape[0] - 1
+    ctx.shared = [p.shape[0] == 1 for p in parameters]
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*rows, *parameters, offsets, order)
+
+
+def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
+    *saved, offsets, order = ctx.saved_tensors
+    rows, parameters, count = saved[: ctx.count], saved[ctx.count :], ctx.count
+    wanted = asked_for(ctx, saved)
+    found: list[Tensor | None] = [None] * len(saved)
+    program = Program.parse(ctx.text)
+    given, split = [g is not None for g in arriving], len(program.outputs)
+    if any(given) and any(wanted):
+        which = tuple(wanted[:count]), tuple(wanted[count:]), tuple(given[:split]), tuple(given[split:])
+        more = [[g.contiguous() for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
+        own = gradient(program, *which)
+        results = grouped_program([*rows, *more[0]], [*parameters, *more[1]], offsets, program=own, order=order)
+        following = iter(results)
+        found = [next(following) if want else None for want in wanted]
+        for i, shared in enumerate(ctx.shared, start=count):
+            if shared and ctx.k > 1 and found[i] is not None:
+                found[i] = found[i].sum(0, keepdim=True)  # type: ignore[union-attr]
+    return found[:count], found[count:], None, None, None
+
+
+_run.register_autograd(_gradients, setup_context=_keep)
+
+
+# Plans ----------------------------------------------------------------------------------------------------------------
+
+
+class Plan(NamedTuple):
+    """A program as the compiled module reads it (csrc/network/cpu/program_code.h)."""
+
+    code: Tensor
+    constants: Tensor
+    widths: Tensor
+
+
+class _Slots:
+    """Places of values in the workspace of a tile, in columns; one that is free again is used again."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._free: list[tuple[int, int]] = []  # (width, place)
+
+    def take(self, width: int) -> int:
+        """A place for so many columns."""
+        fitting = [slot for slot in self._free if slot[0] == width]
+        if fitting:
+            self._free.remove(fitting[-1])
+            return fitting[-1][1]
+        self.size += width
+        return self.size - width
+
+    def give(self, width: int, place: int) -> None:
+        """It is free again."""
+        self._free.append((width, place))
+
+
+def _padded(width: int) -> int:
+    return -(-width // _GRANULE) * _GRANULE
+
+
+@functools.lru_cache(maxsize=1024)
+def _plan(text: str) -> Plan:
+    program = merged(Program.parse(text))
+    writing = _Writing(program)
+    outputs = [Step("output", i, c.width, (c,), (i,)) for i, c in enumerate(program.outputs)]
+    steps = [*program.steps, *outputs]
+    last = {c.index: at for at, step in enumerate(steps) for c in step.operands if c.of != PARAMETER}
+    for at, step in enumerate(steps):
+        dying = {c.index for c in step.operands if c.of != PARAMETER and last[c.index] == at}
+        writing.step(step, dying)
+        if step.op not in ("outer", "columns", "output") and step.out not in last:
+            writing.free(step.out)
+    return writing.plan()
+
+
+class _Writing:
+    """A plan on its way."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.slots, self.where, self.packed, self.partial = _Slots(), dict[int, tuple[int, int]](), 0, 0
+        self.packs: dict[tuple[int, ...], int] = {}
+        self.code: list[int] = []
+        self.constants: list[float] = [0.0, 0.0]
+        self.sums: list[tuple[int, ...]] = []
+        self.count = 0
+
+    def free(self, value: int) -> None:
+        """A value is not needed any more."""
+        place, width = self.where[value]
+        self.slots.give(width, place)
+
+    def pack(self, kind: int, parameter: int, start: int, width: int, floats: int) -> int:
+        """Where a part of a parameter is packed."""
+        shape = self.program.parameters[parameter]
+        o, i = shape if len(shape) == 2 else (1, shape[0])
+        key = (kind, parameter, o, i, start, width)
+        if key not in self.packs:
+            self.packs[key] = self.packed
+            self.packed += floats
+        return self.packs[key]
+
+    def operand(self, c: Columns, place: int = 0) -> list[int]:
+        """One operand's record."""
+        if c.of == PARAMETER:
+            width = 1 if c.spread else c.width
+            at = self.pack(2, c.index, c.start, width, _padded(width))
+            return [1, at, 0, 0, c.width, int(c.spread), place]
+        at, stride = self.where[c.index]
+        return [0, at, c.start, stride, c.width, int(c.spread), place]
+
+    def step(self, step: Step, dying: set[int]) -> None:
+        """Writes a step; values that are ``dying`` give their place to what it makes, if it is of their kind."""
+        padded, number, depth, finish, constants, order, name = _padded(step.width), 0, 0, 0, 0, 0, 0
+        places = [0] * len(step.operands)
+        operands = [self.operand(c) for c in step.operands]
+        slot = 0
+        if step.op in ("input", "output"):
+            number = int(step.numbers[0])
+        elif step.op == "linear":
+            matrix, start, transposed = map(int, step.numbers)
+            o, _ = self.program.parameters[matrix]
+            x = step.operands[0]
+            depth, finish = x.width, ("", "relu", "relu_slope").index(step.name)
+            width = step.width if transposed else depth
+            floats = o * padded if transposed else padded * depth
+            number = self.pack(transposed, matrix, start, width, floats)
+        elif step.op == "function":
+            order, name, constants = int(step.numbers[0]), list(FUNCTIONS).index(step.name), len(self.constants)
+            self.constants += step.numbers[1:]
+        elif step.op == "binary":
+            name = list(BINARY).index(step.name)
+        elif step.op == "total":
+            number = int(step.numbers[0])
+        elif step.op == "move":
+            places = [int(at) for at in step.numbers]
+            taken = [column for c, at in zip(step.operands, places) for column in range(at, at + c.width)]
+            order = int(sorted(taken) == list(range(step.width)))
+        else:
+            number, padded, depth = self.sum(step)
+        if step.op not in ("output", "outer", "columns"):
+            slot = self._slot(step, padded, dying)
+        for value in dying:
+            self.free(value)
+        for record, place in zip(operands, places):
+            record[-1] = place
+        self.code += [_OPS.index(step.op), name, order, step.width, slot, padded, number, depth, finish, constants]
+        self.code += [len(operands), *(entry for record in operands for entry in record)]
+        self.count += 1
+
+    def _slot(self, step: Step, padded: int, dying: set[int]) -> int:
+        """The place of a step's value: that of an operand that is read entry by entry and not needed any more."""
+        entrywise = step.operands if step.op in ("function", "binary") else ()
+        if step.op == "linear":
+            entrywise = tuple(c for c in step.operands[1:] if c[:2] != step.operands[0][:2])
+        for c in entrywise:
+            if c.of != PARAMETER and c.index in dying and not c.spread and c.start == 0:
+                place, width = self.where[c.index]
+                others = [other for other in step.operands if other.of != PARAMETER and other.index == c.index]
+                if width == padded and all(other.start == 0 and not other.spread for other in others):
+                    dying.discard(c.index)
+                    self.where[step.out] = place, padded
+                    return place
+        self.where[step.out] = self.slots.take(padded), padded
+        return self.where[step.out][0]
+
+    def sum(self, step: Step) -> tuple[int, int, int]:
+        """The place of a sum in the partial, its stride, and whether its inputs are next to each other."""
+        shape, start, at = self.program.sums[step.out], int(step.numbers[0]), self.partial
+        size = shape[0] * (shape[1] if len(shape) > 1 else 1)
+        if step.op == "columns":
+            padded = _padded(step.width)
+            self.partial += padded
+            self.sums.append((step.out, 2, at, 1, size, start, step.width, padded, size))
+            return at, padded, 0
+        o, i = step.operands[0].width, step.operands[1].width
+        by_outputs = int(o * _padded(i) < i * _padded(o))
+        padded = _padded(i if by_outputs else o)
+        self.partial += padded * (o if by_outputs else i)
+        self.sums.append((step.out, by_outputs, at, o, shape[1], start, i, padded, size))
+        return at, padded, by_outputs
+
+    def plan(self) -> Plan:
+        """What has been written."""
+        for i, shape in enumerate(self.program.sums):
+            if not any(record[0] == i for record in self.sums):
+                size = shape[0] * (shape[1] if len(shape) > 1 else 1)
+                self.sums.append((i, -1, 0, 0, 0, 0, 0, 0, size))
+        self.sums.sort()
+        fitting = _FLOATS // max(self.slots.size, 1) // _ROWS[0] * _ROWS[0]
+        tile = min(max(fitting, _ROWS[0]), _ROWS[1])
+        header = [tile, self.slots.size, self.packed, self.partial, len(self.packs), self.count, len(self.sums)]
+        packs = [entry for key, at in self.packs.items() for entry in (*key, at)]
+        sums = [entry for record in self.sums for entry in record]
+        code = torch.tensor([*header, *packs, *self.code, *sums], dtype=torch.int32)
+        widths = torch.tensor([c.width for c in self.program.outputs], dtype=torch.int64)
+        return Plan(code, torch.tensor(self.constants), widths)

@@ -1,0 +1,542 @@
+"""Functions of PyTorch as steps of a program.
+
+A function of the trace runs once on ``ROWS`` samples, and what it calls of ATen is taken down. A tensor that depends on
+samples has a code for each of its entries, the number of its sample and of its column; what only moves entries (views,
+``cat``, ``permute``) runs on the codes. A parameter has the number of the entry. Entries of one sample that are
+computed from others become a value of the program.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from voronerf.program import PARAMETER, VALUE, Builder, Columns
+from voronerf.router.layout import map_tensors, tensors_of
+
+ROWS = 37  # samples of a trace: no other size is a multiple
+_LOW = (1 << 32) - 1
+_FEW, _PRODUCTS = 3, 16  # parts of an input that a layer reads one by one; layers that one function makes
+
+_MOVERS = frozenset(
+    """
+    view _unsafe_view reshape expand permute transpose t unsqueeze squeeze slice select cat stack split split_with_sizes
+    unbind clone contiguous alias repeat flip roll lift_fresh index index_select narrow expand_copy detach unfold
+    """.split()  # noqa: SIM905
+)
+_FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
+    **{
+        name: lambda *_, name=name, **__: [(name, 0, 0)]
+        for name in ("relu", "sigmoid", "tanh", "silu", "exp", "log", "abs", "floor")
+    },
+    "sin": lambda: [("sine", 1, 0)],
+    "cos": lambda: [("sine", 1, math.pi / 2)],
+    "neg": lambda: [("affine", -1, 0)],
+    "expm1": lambda: [("exp", 0, 0), ("affine", 1, -1)],
+    "log1p": lambda: [("affine", 1, 1), ("log", 0, 0)],
+    "exp2": lambda: [("affine", math.log(2), 0), ("exp", 0, 0)],
+    "square": lambda: [("power", 2, 0)],
+    "sqrt": lambda: [("power", 0.5, 0)],
+    "rsqrt": lambda: [("power", -0.5, 0)],
+    "reciprocal": lambda: [("power", -1, 0)],
+    "pow": lambda p: [("power", p, 0)],
+    "leaky_relu": lambda slope=0.01: [("leaky_relu", slope, 0)],
+    "elu": lambda a=1, scale=1, by=1: [("affine", by, 0), ("elu", a, 0), ("affine", scale, 0)],
+    "softplus": lambda beta=1, threshold=20: [("softplus", beta, threshold)],
+    "gelu": lambda approximate="none": [("gelu" if approximate == "none" else "gelu_tanh", 0, 0)],
+    "clamp": lambda low=None, high=None: [
+        ("clamp", -math.inf if low is None else low, math.inf if high is None else high)
+    ],
+    "clamp_min": lambda low: [("clamp", low, math.inf)],
+    "clamp_max": lambda high: [("clamp", -math.inf, high)],
+    "hardtanh": lambda low=-1, high=1: [("clamp", low, high)],
+    "gt": lambda c: [("affine", 1, -c), ("step", 0, 0)],
+    "ge": lambda c: [("affine", 1, -c), ("at_least", 0, 0)],
+    "lt": lambda c: [("affine", -1, c), ("step", 0, 0)],
+    "le": lambda c: [("affine", -1, c), ("at_least", 0, 0)],
+    "logical_not": lambda: [("affine", -1, 1)],
+    "bitwise_not": lambda: [("affine", -1, 1)],
+}
+"""Functions of one tensor and numbers, as functions of programs in turn."""
+_BINARY = {
+    **{name: name for name in ("add", "sub", "mul", "div")},
+    **dict.fromkeys(("bitwise_and", "logical_and"), "mul"),
+    **{name: name for name in ("gt", "ge", "lt", "le", "rsub")},
+}
+_CONSTANT = {"zeros_like": 0.0, "ones_like": 1.0, "new_zeros": 0.0, "new_ones": 1.0}
+
+
+class NotAStep(Exception):
+    """A function is no step of a program; the message says why."""
+
+
+class Entries:
+    """Where the entries of a tensor come from.
+
+    Attributes:
+        codes: like the tensor: (sample << 32) + column of samples, or the number of the entry of a parameter.
+        of: None for samples, else the parameter: a node of the trace, or a tensor.
+    """
+
+    def __init__(self, codes: Tensor, of: Any = None) -> None:
+        self.codes, self.of = codes, of
+
+
+class Lowering:
+    """Steps of all functions of a trace so far, as of one program; later they are shared out among runs.
+
+    Attributes:
+        levels: of each value: the number of the run that makes it.
+        sources: of each input, the node of the trace whose rows it is.
+        columns: (value, column) of each number of a column.
+        parameters: of each parameter of the program: the node or tensor, numbers of entries, whether they are a matrix.
+    """
+
+    def __init__(self) -> None:
+        self.builder = Builder()
+        self.levels: dict[int, int] = {}
+        self.sources: dict[int, Any] = {}
+        self.columns: list[tuple[int, int]] = []
+        self.parameters: list[tuple[Any, Tensor]] = []
+        self._known: dict[Any, int] = {}
+        self._numbered: dict[int, int] = {}
+        self._leveled = 0
+
+    # Values -----------------------------------------------------------------------------------------------------------
+
+    def input(self, node: Any, shape: Sequence[int], level: int) -> Entries:
+        """The rows of a node as an input of the program, [ROWS * m, ...] for m entries of a sample."""
+        if not shape or shape[0] % ROWS or math.prod(shape) == 0:
+            at = next((d for d, size in enumerate(shape) if size == ROWS), None)
+            if at is None or math.prod(shape) == 0:
+                raise NotAStep(f"a tensor of shape {list(shape)} has no row for each sample")
+            moved = [shape[at], *shape[:at], *shape[at + 1 :]]
+            return Entries(self.input(node, moved, level).codes.movedim(0, at))
+        width = math.prod(shape) // ROWS
+        x = self.builder.input(width)
+        self.sources[x.index], self.levels[x.index] = node, level
+        return Entries(self._codes(x).reshape(list(shape)))
+
+    def _codes(self, x: Columns) -> Tensor:
+        """[ROWS, w] of a whole value."""
+        if x.index not in self._numbered:
+            self._numbered[x.index] = len(self.columns)
+            self.columns += [(x.index, i) for i in range(x.start + x.width)]
+        first = self._numbered[x.index] + x.start
+        return (torch.arange(ROWS)[:, None] << 32) + torch.arange(first, first + x.width)
+
+    def level(self, value: int) -> int:
+        """The number of the run that makes a value."""
+        for step in self.builder.steps[self._leveled :]:
+            self.levels.setdefault(
+                step.out, max((self.levels[c.index] for c in step.operands if c.of == VALUE), default=0)
+            )
+        self._leveled = len(self.builder.steps)
+        return self.levels[value]
+
+    def order(self, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """The places of a tensor's entries sample by sample, [ROWS, w], and the numbers of the columns, [w]."""
+        rows = (codes >> 32).flatten()
+        if rows.numel() % ROWS or not rows.numel():
+            raise NotAStep("entries of a tensor do not belong to single samples")
+        places = torch.argsort(rows, stable=True).reshape(ROWS, -1)
+        numbers = codes.flatten()[places]
+        if not torch.equal(numbers >> 32, torch.arange(ROWS)[:, None].expand_as(numbers)):
+            raise NotAStep("entries of a tensor do not belong to single samples")
+        columns = numbers & _LOW
+        if not (columns == columns[:1]).all():
+            raise NotAStep("the samples of a tensor differ in more than their values")
+        return places, columns[0]
+
+    def parts(self, numbers: Tensor) -> list[tuple[Columns, int]]:
+        """Columns by their numbers, in as few pieces as may be, each with its place."""
+        found: list[tuple[Columns, int]] = []
+        for at, number in enumerate(numbers.tolist()):
+            value, column = self.columns[number]
+            last = found[-1][0] if found else None
+            if last is not None and last.index == value:
+                if not last.spread and last.start + last.width == column:
+                    found[-1] = last._replace(width=last.width + 1), found[-1][1]
+                    continue
+                if last.start == column and (last.spread or last.width == 1):
+                    found[-1] = last._replace(width=last.width + 1, spread=True), found[-1][1]
+                    continue
+            found.append((Columns(VALUE, value, column, 1), at))
+        return found
+
+    def operand(self, numbers: Tensor) -> Columns:
+        """Columns by their numbers, as an operand."""
+        parts = self.parts(numbers)
+        return parts[0][0] if len(parts) == 1 else self.builder.move(len(numbers), parts)
+
+    def parameter(self, entries: Entries, matrix: bool = False) -> int:
+        """The number of a parameter that holds these entries, [w] or [o, i]."""
+        shape = tuple(entries.codes.shape) if matrix else (entries.codes.numel(),)
+        key = (id(entries.of), shape, bytes(entries.codes.contiguous().numpy()))
+        if key not in self._known:
+            self._known[key] = self.builder.parameter(*shape)
+            self.parameters.append((entries.of, entries.codes.reshape(shape).clone()))
+        return self._known[key]
+
+    def vector(self, entries: Entries, codes: Tensor) -> Columns:
+        """Entries of a parameter as an operand, ``codes`` [w]."""
+        low, width = int(codes.min()), len(codes)
+        if bool((codes == low).all()):
+            one = Entries(codes[:1], entries.of)
+            return Columns(PARAMETER, self.parameter(one), 0, width, width > 1)
+        return Columns(PARAMETER, self.parameter(Entries(codes, entries.of)), 0, width)
+
+    # Functions --------------------------------------------------------------------------------------------------------
+
+    def run(self, function: Callable[..., Any], args: Any, kwargs: Any, known: Callable[[Any], Entries | None]) -> Any:
+        """Runs a function and gives its result, and a look-up of where the entries of a tensor come from.
+
+        ``known`` gives the entries of a tensor among the arguments. Raises :class:`NotAStep`.
+        """
+        device = next((t.device.type for t in tensors_of((args, kwargs))), "cpu")
+        with torch.inference_mode(), torch.autocast(device, enabled=False):
+            mode = _Recording(self)
+
+            def own(value: Tensor) -> Tensor:
+                copied = value.detach().clone()
+                copied = copied.float() if copied.is_floating_point() else copied
+                entries = known(value)
+                mode.keep(copied, entries)
+                mode.originals[id(copied)] = value
+                return copied
+
+            args, kwargs = map_tensors((args, kwargs), own)
+            with mode:
+                result = function(*args, **kwargs)
+        return result, args, mode.entries
+
+
+class _Recording(TorchDispatchMode):
+    """Takes down what a function calls of ATen."""
+
+    def __init__(self, lowering: Lowering) -> None:
+        super().__init__()
+        self.lowering, self.b = lowering, lowering.builder
+        self._kept: dict[int, tuple[Tensor, Entries | None]] = {}
+        self.originals: dict[int, Tensor] = {}  # of the copies of arguments
+
+    def keep(self, tensor: Tensor, entries: Entries | None) -> None:
+        """Notes where the entries of a tensor come from; None for a constant."""
+        self._kept[id(tensor)] = tensor, entries
+
+    def entries(self, tensor: Tensor) -> Entries | None:
+        """Where the entries of a tensor come from; None for a constant."""
+        return self._kept.get(id(tensor), (None, None))[1]
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        name = func.overloadpacket.__name__
+        found = [self.entries(tensor) for tensor in tensors_of((args, kwargs))]
+        if not any(found):
+            return func(*args, **kwargs)
+        rows = any(e is not None and e.of is None for e in found)
+        if name not in ("linear", "rsub") and name not in _MOVERS and func._can_decompose():
+            with self:
+                return func.decompose(*args, **kwargs)
+        result = func(*args, **kwargs)
+        inplace = name.endswith("_") and not name.startswith("_")
+        base = name.rstrip("_") if inplace else name
+        made = self._made(base, func, args, kwargs, result, rows)
+        for tensor, entries in zip(tensors_of(result), made, strict=True):
+            self.keep(tensor, entries)
+        return result
+
+    def _made(self, name: str, func: Any, args: Any, kwargs: Any, result: Any, rows: bool) -> list[Entries]:
+        """Where the entries of a function's results come from."""
+        if name in _MOVERS and func.overloadpacket.__name__ == name:
+            return self._moved(func, args, kwargs, rows, name)
+        if not rows:
+            raise NotAStep(f"{name} of parameters")
+        if name == "_to_copy":
+            kinds = (args[0].dtype, result.dtype)
+            if any(k not in (torch.float32, torch.bool) for k in kinds) or kinds[1] == torch.bool:
+                raise NotAStep(f"a conversion to {kinds[1]}")
+            return [self._known(args[0])]
+        if name in _CONSTANT or name == "full_like":
+            return [self._constant(result, _CONSTANT.get(name, args[1] if name == "full_like" else 0.0))]
+        if not isinstance(result, Tensor) and name != "native_layer_norm":
+            raise NotAStep(f"{name} is no step")
+        if name in ("mm", "linear", "addmm", "bmm", "baddbmm"):
+            return [self._product(name, args, kwargs, result)]
+        numbers = [v for v in args if not isinstance(v, Tensor)]
+        if name in _FUNCTIONS and isinstance(args[0], Tensor) and not any(isinstance(v, Tensor) for v in args[1:]):
+            places, columns = self.lowering.order(self._known(args[0]).codes)
+            return [self._chain(self.lowering.operand(columns), _FUNCTIONS[name](*numbers, **kwargs), places, result)]
+        if name in _BINARY:
+            return [self._binary(name, args, kwargs, result)]
+        if name == "where":
+            return [self._where(args, result)]
+        if name in ("sum", "mean", "linalg_vector_norm"):
+            return [self._reduced(name, args, kwargs, result)]
+        if name == "native_layer_norm":
+            return self._layer_norm(args, result)
+        raise NotAStep(f"{name} is no step")
+
+    def _known(self, tensor: Tensor) -> Entries:
+        """Entries of a tensor of samples."""
+        entries = self.entries(tensor)
+        if entries is None or entries.of is not None:
+            raise NotAStep("a product with a tensor that does not depend on samples")
+        return entries
+
+    def _of_constant(self, tensor: Tensor) -> Entries:
+        """Entries of a tensor that depends on nothing."""
+        with torch.inference_mode(False):
+            of = self.originals[id(tensor)] if id(tensor) in self.originals else tensor.clone()
+        return Entries(torch.arange(tensor.numel()).reshape(tensor.shape), of)
+
+    def _moved(self, func: Any, args: Any, kwargs: Any, rows: bool, name: str) -> list[Entries]:
+        given = tensors_of((args, kwargs))
+        sources = {id(e.of) for t in given if (e := self.entries(t)) is not None}
+        if len(sources) > 1:
+            raise NotAStep("parameters beside samples in one tensor")
+        of = next(e.of for t in given if (e := self.entries(t)) is not None)
+        indexed = args[1] if name in ("index",) else [args[2]] if name == "index_select" else []
+        indices = {id(t) for t in indexed if isinstance(t, Tensor)}
+
+        def codes(tensor: Tensor) -> Tensor:
+            entries = self.entries(tensor)
+            if entries is not None:
+                if id(tensor) in indices:
+                    raise NotAStep("a look-up at places that depend on samples")
+                return entries.codes
+            if id(tensor) in indices:
+                return tensor
+            return self._constants(tensor, rows)
+
+        args, kwargs = map_tensors((args, {k: v for k, v in kwargs.items() if k != "memory_format"}), codes)
+        moved = [Entries(t.clone(), of) for t in tensors_of(func(*args, **kwargs))]
+        if name == "detach" and of is None:
+            places, numbers = self.lowering.order(moved[0].codes)
+            stopped = self.b.apply("stop", self.lowering.operand(numbers))
+            return [self._placed(stopped, places, moved[0].codes.shape)]
+        return moved
+
+    def _constants(self, tensor: Tensor, rows: bool) -> Tensor:
+        """Codes of a constant that stands beside samples: the same number in every sample."""
+        values = tensor.unique()
+        if not rows or len(values) != 1 or not tensor.is_floating_point():
+            raise NotAStep("constants beside samples in one tensor")
+        return self._constant(tensor, float(values)).codes
+
+    def _constant(self, like: Tensor, value: float) -> Entries:
+        """A number as a tensor of samples, in the first of its dimensions that they can be."""
+        at = next((d for d, size in enumerate(like.shape) if size and size % ROWS == 0), None)
+        if at is None:
+            raise NotAStep("a constant without samples")
+        column = self.b.apply("affine", self.b.move(1, []), 0.0, value)
+        rows = torch.arange(ROWS).repeat_interleave(like.shape[at] // ROWS)
+        shape = [1] * like.dim()
+        shape[at] = like.shape[at]
+        number = int(self.lowering._codes(column)[0, 0])
+        return Entries(((rows << 32) + number).reshape(shape).expand(like.shape).clone())
+
+    def _placed(self, value: Columns, places: Tensor, shape: Sequence[int]) -> Entries:
+        """A value's entries at their places in a tensor."""
+        codes = torch.empty(math.prod(shape), dtype=torch.int64)
+        whole = self.b.rows(value)
+        codes[places] = self.lowering._codes(whole).expand(places.shape) if whole.width > 0 else 0
+        return Entries(codes.reshape(list(shape)))
+
+    def _chain(self, x: Columns, functions: Any, places: Tensor, result: Tensor) -> Entries:
+        if not result.is_floating_point() and result.dtype != torch.bool:
+            raise NotAStep(f"a function that gives {result.dtype}")
+        for name, a, b in functions:
+            if not all(isinstance(v, (int, float)) for v in (a, b)):
+                raise NotAStep("a function with other than numbers")
+            if name == "power" and (2 * a != int(2 * a) or abs(a) > 8):
+                raise NotAStep(f"a power of {a}")
+            if name == "affine" and (a, b) == (1, 0):
+                continue
+            x = self.b.apply(name, x, min(max(a, -3e38), 3e38), min(max(b, -3e38), 3e38))
+        return self._placed(x, places, result.shape)
+
+    def _operands(self, tensors: Sequence[Any], shape: Sequence[int]) -> tuple[list[Columns], Tensor]:
+        """Operands of one width from tensors that are broadcast to a shape, and the places of entries."""
+        found: list[Columns] = []
+        first = next(e for t in tensors if isinstance(t, Tensor) and (e := self.entries(t)) and e.of is None)
+        places, _ = self.lowering.order(first.codes.expand(list(shape)))
+        for tensor in tensors:
+            entries = self.entries(tensor)
+            if entries is not None and entries.of is None:
+                own, numbers = self.lowering.order(entries.codes.expand(list(shape)))
+                if not torch.equal(own, places):
+                    raise NotAStep("it mixes samples")
+                found.append(self.lowering.operand(numbers))
+                continue
+            if entries is None:
+                entries = self._of_constant(tensor)
+            by_sample = entries.codes.expand(list(shape)).flatten()[places]
+            if not (by_sample == by_sample[:1]).all():
+                raise NotAStep("a constant with other numbers for each sample")
+            found.append(self.lowering.vector(entries, by_sample[0]))
+        return found, places
+
+    def _binary(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
+        if (not result.is_floating_point() and result.dtype != torch.bool) or kwargs.get("rounding_mode"):
+            raise NotAStep(f"{name} that gives {result.dtype}")
+        x, y = args[:2]
+        alpha = kwargs.get("alpha", args[2] if len(args) > 2 else 1)
+        if name == "rsub":
+            x, y, name = y, x, "sub"
+        numbers = [isinstance(v, Tensor) and v.dim() == 0 and self.entries(v) is None for v in (x, y)]
+        x, y = (v.item() if single else v for v, single in zip((x, y), numbers))
+        kind = _BINARY[name]
+        if not isinstance(x, Tensor) or not isinstance(y, Tensor):
+            places, columns = self.lowering.order(self._known(x if isinstance(x, Tensor) else y).codes)
+            operand = self.lowering.operand(columns)
+            steps: dict[str, Any] = {
+                "add": lambda: [("affine", 1, alpha * y)] if isinstance(x, Tensor) else [("affine", alpha, x)],
+                "sub": lambda: [("affine", 1, -alpha * y)] if isinstance(x, Tensor) else [("affine", -alpha, x)],
+                "mul": lambda: [("affine", y if isinstance(x, Tensor) else x, 0)],
+                "div": lambda: (
+                    [("affine", 1 / y, 0)] if isinstance(x, Tensor) else [("power", -1, 0), ("affine", x, 0)]
+                ),
+            }
+            return self._chain(operand, steps[kind](), places, result)
+        (a, b), places = self._operands((x, y), result.shape)
+        if alpha != 1:
+            b = self.b.apply("affine", b, alpha)
+        if kind in ("gt", "ge", "lt", "le"):
+            a, b = (a, b) if kind[0] == "g" else (b, a)
+            made = self.b.apply("step" if kind[1] == "t" else "at_least", self.b.binary("sub", a, b))
+        else:
+            made = self.b.binary(kind, a, b)
+        return self._placed(made, places, result.shape)
+
+    def _where(self, args: Any, result: Tensor) -> Entries:
+        (condition, yes, no), places = self._operands(args, result.shape)
+        other = self.b.apply("affine", condition, -1, 1)
+        made = self.b.binary("add", self.b.binary("gate", yes, condition), self.b.binary("gate", no, other))
+        return self._placed(made, places, result.shape)
+
+    def _groups(self, tensor: Tensor, dims: Any) -> tuple[Tensor, Columns, int]:
+        """A tensor with the entries that are summed next to each other: places of sums, operand, how many."""
+        dims = [dims] if isinstance(dims, int) else dims or range(tensor.dim())
+        dims = [d % tensor.dim() for d in dims]
+        kept = [d for d in range(tensor.dim()) if d not in dims]
+        codes = self._known(tensor).codes.permute([*kept, *dims])
+        group = math.prod(tensor.shape[d] for d in dims)
+        codes = codes.reshape(-1, group)
+        rows = codes[:, :1] >> 32
+        if not torch.equal(codes >> 32, rows.expand_as(codes)):
+            raise NotAStep("it sums over samples")
+        places, _ = self.lowering.order((rows << 32)[:, 0])
+        numbers = codes[places] & _LOW  # [ROWS, m, group]
+        if not (numbers == numbers[:1]).all():
+            raise NotAStep("the samples of a tensor differ in more than their values")
+        return places, self.lowering.operand(numbers[0].flatten()), group
+
+    def _reduced(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
+        if name == "linalg_vector_norm":
+            p, dims = (args[1] if len(args) > 1 else 2), (args[2] if len(args) > 2 else kwargs.get("dim"))
+            if p != 2:
+                raise NotAStep(f"a norm of order {p}")
+        else:
+            p, dims = 0, (args[1] if len(args) > 1 else kwargs.get("dim"))
+        places, x, group = self._groups(args[0], dims)
+        x = self.b.apply("power", x, 2.0) if p else x
+        made = self.b.total(x, group)
+        if p:
+            made = self.b.apply("power", made, 0.5)
+        elif name == "mean":
+            made = self.b.apply("affine", made, 1 / group)
+        return self._placed(made, places, result.shape)
+
+    def _layer_norm(self, args: Any, result: Any) -> list[Entries]:
+        tensor, shape, weight, bias, eps = args
+        dims = list(range(tensor.dim() - len(shape), tensor.dim()))
+        places, x, group = self._groups(tensor, dims)
+        if x.width != group:
+            raise NotAStep("a norm of several parts of a sample")
+        scale = 1 / group
+        mean = self.b.apply("affine", self.b.total(x, group), scale)
+        centred = self.b.binary("sub", x, mean._replace(width=group, spread=True))
+        variance = self.b.apply("affine", self.b.total(self.b.apply("power", centred, 2.0), group), scale, eps)
+        inverse = self.b.apply("power", variance, -0.5)
+        made = self.b.binary("mul", centred, inverse._replace(width=group, spread=True))
+        for name, given in (("mul", weight), ("add", bias)):
+            if given is not None:
+                entries = self.entries(given) or self._of_constant(given)
+                made = self.b.binary(name, made, self.lowering.vector(entries, entries.codes.flatten()))
+        whole, _ = self.lowering.order(self._known(tensor).codes)
+        small = [self._placed(value, places, part.shape) for value, part in zip((mean, inverse), result[1:])]
+        return [self._placed(made, whole, result[0].shape), *small]
+
+    def _product(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
+        """Rows times a matrix of the cell, in any of the ways to write it."""
+        bias = None
+        if name == "linear":
+            x, weight, bias = (*args, None)[:3]
+        elif name in ("addmm", "baddbmm"):
+            bias, x, weight = args[:3]
+            if any(v != 1 for v in kwargs.values()):
+                raise NotAStep("a product with factors")
+        else:
+            x, weight = args[:2]
+        of_x, of_weight = self.entries(x), self.entries(weight)
+        if of_x is None or of_x.of is not None:  # W x^T
+            if name != "mm" or of_weight is None or of_weight.of is not None:
+                raise NotAStep("a product of parameters with samples")
+            turned = self._rows_times(
+                of_weight.codes.t(), self._matrix(x, of_x), None, (result.shape[1], result.shape[0])
+            )
+            return Entries(turned.codes.t().clone())
+        matrix = self._matrix(weight, of_weight)
+        if name in ("mm", "addmm", "bmm", "baddbmm"):
+            matrix = Entries(matrix.codes.transpose(-1, -2), matrix.of)
+        added = None if bias is None else self.entries(bias) or self._matrix(bias, None)
+        if added is not None and added.of is None:
+            raise NotAStep("a product that is added to samples")
+        if name in ("bmm", "baddbmm"):
+            if added is not None or len(x) > _PRODUCTS:
+                raise NotAStep("a product of many matrices")
+            each = [
+                self._rows_times(own, Entries(codes, matrix.of), None, result.shape[1:]).codes
+                for own, codes in zip(of_x.codes, matrix.codes, strict=True)
+            ]
+            return Entries(torch.stack(each))
+        return self._rows_times(of_x.codes, matrix, added, result.shape)
+
+    def _matrix(self, tensor: Tensor, entries: Entries | None) -> Entries:
+        if entries is None:
+            return self._of_constant(tensor)
+        if entries.of is None:
+            raise NotAStep("a product of two tensors of samples")
+        return entries
+
+    def _rows_times(self, codes: Tensor, matrix: Entries, bias: Entries | None, shape: Sequence[int]) -> Entries:
+        """Codes [..., i] times a matrix [o, i]."""
+        flat = codes.reshape(-1, codes.shape[-1])
+        m = len(flat) // ROWS
+        rows = flat[:, :1] >> 32
+        if len(flat) % ROWS or not torch.equal(flat >> 32, rows.expand_as(flat)):
+            raise NotAStep("it mixes samples")
+        places, _ = self.lowering.order((rows << 32)[:, 0])
+        numbers = flat[places] & _LOW  # [ROWS, m, i]
+        if m > _PRODUCTS or not (numbers == numbers[:1]).all():
+            raise NotAStep("the samples of a tensor differ in more than their values")
+        weight, (width, _) = self.lowering.parameter(matrix, matrix=True), matrix.codes.shape
+        found = torch.empty(len(flat), width, dtype=torch.int64)
+        for i in range(m):
+            add = None
+            if bias is not None:
+                add = self.lowering.vector(bias, bias.codes.expand(width).flatten())
+            parts = self.lowering.parts(numbers[0, i])
+            if len(parts) > _FEW:
+                parts = [(self.b.move(flat.shape[1], parts), 0)]
+            for x, at in parts:
+                add = self.b.linear(x, weight, width, at, add=add)
+            assert add is not None
+            found[places[:, i]] = self.lowering._codes(add)
+        return Entries(found.reshape(list(shape)))
