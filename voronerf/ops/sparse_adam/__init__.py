@@ -81,6 +81,9 @@ def adam(
         tensor([-0.2500,  0.2500])
     """
     lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
+    for name, given_list in {"rules": rules, **lists}.items():
+        if not isinstance(given_list, Sequence):
+            raise TypeError(f"{_ALL}: {name} must be a list, got {type(given_list).__name__}")
     for name, tensors in lists.items():
         if len(tensors) != len(rules):
             raise ValueError(f"{_ALL}: {name} must be as many as the {len(rules)} rules, got {len(tensors)}")
