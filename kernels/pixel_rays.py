@@ -11,7 +11,7 @@ from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
 from voronerf.kernels.camera_rays import camera_rays
-from voronerf.ops.pixel_rays.reference import PixelRays
+from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,20 +69,9 @@ def _colour_kernel(
         colour[i, channel] = value
 
 
-def pixel_rays(
-    poses: Tensor,
-    intrinsics: Tensor,
-    images: Tensor,
-    index: Tensor,
-    *,
-    near: float,
-    far: float,
-    box: Tensor | None,
-    distortion: Tensor | None,
-    models: Tensor | None,
-    background: Tensor | None,
-) -> PixelRays:
+def pixel_rays(pixels: Pixels) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
+    poses, intrinsics, images, index, box, distortion, models, background, near, far = pixels
     _, h, w, _ = images.shape
     pixel = index % (h * w)
     x, y = ((place + 0.5).to(poses.dtype) for place in (pixel % w, pixel // w))

@@ -123,6 +123,62 @@ def test_faults_are_found(source: str, module: str, fault: str) -> None:
     assert any(fault in found for found in faults(source, module))
 
 
+def needed(source: str, module: str, known: set[str]) -> set[str]:
+    """The modules that one imports when it runs, at any depth of the file; not those for types alone."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            node.body = []
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+            found.update(name if name in known else node.module for name in names.values())
+    return (found & known) - {module, "voronerf"}
+
+
+def circles(graph: dict[str, set[str]]) -> list[str]:
+    """Modules that need themselves by way of others."""
+
+    def reached(module: str) -> set[str]:
+        seen: set[str] = set()
+        waiting = [module]
+        while waiting:
+            for name in graph[waiting.pop()] - seen:
+                seen.add(name)
+                waiting.append(name)
+        return seen
+
+    return sorted(module for module in graph if module in reached(module))
+
+
+def test_no_module_needs_itself() -> None:
+    names = {path: module_name(path).removesuffix(".__init__") for path in SOURCES}
+    known = set(names.values())
+    found = circles({name: needed(path.read_text(), name, known) for path, name in names.items()})
+    assert [name for name in found if name not in ("voronerf.data.scene", "voronerf.data.store")] == []
+
+
+def test_circles_are_found() -> None:
+    sources = {
+        "a.b": "def f():\n    from a import c",
+        "a.c": "from a.d import x",
+        "a.d": "import a.b",
+        "a.e": "import a.b",
+    }
+    graph = {name: needed(source, name, set(sources)) for name, source in sources.items()}
+    assert circles(graph) == ["a.b", "a.c", "a.d"]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_table_alone_asks_whether_a_backend_is_there(path: Path) -> None:
+    """A fast path is an op, which `backends.resolve` chooses or refuses."""
+    if room(module_name(path)) not in ("backends", "cli"):
+        assert "backends.missing(" not in path.read_text()
+
+
 @pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
 def test_core_knows_no_framework(path: Path) -> None:
     includes = re.findall(r'^\s*#\s*include\s*[<"]([^>"]+)', path.read_text(), re.MULTILINE)

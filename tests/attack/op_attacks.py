@@ -80,7 +80,7 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tup
 
         own = tree_map(leaf, own)
     returned = called(op)(**own, backend=backend)
-    found = [part for part in tree_leaves(own if case.in_place else returned) if isinstance(part, Tensor)]
+    found = [part for part in tree_leaves((own, returned) if case.in_place else returned) if isinstance(part, Tensor)]
     smooth = [part for part in found if part.requires_grad and part.numel()]
     if not smooth:
         return found, []
@@ -113,7 +113,9 @@ def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
 def check_message(op: str, call: dict[str, Any], name: str, error: Exception) -> None:
     """The error names the op, or one that it is composed of, and an argument, in a line of some length."""
     text = str(error)
-    arguments = inspect.signature(called(op)).parameters
+    arguments = set(inspect.signature(called(op)).parameters)
+    arguments |= {argument.removesuffix("s") for argument in arguments}  # an entry of a list
+    arguments |= {field for value in call.values() for field in getattr(value, "_fields", ())}
     named = re.match(rf"({'|'.join(backends.ops())})(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
     if not named or "\n" in text or len(text) > 500:
         raise Failed(f"{op}: the error for {name} is not clear: {type(error).__name__}: {text:.300}; {describe(call)}")
@@ -151,7 +153,7 @@ def other_argument(rng: random.Random, op: str, name: str, value: Any) -> Any:
         return rng.choice((3, "x", other_tensor(rng, torch.ones(2, 3)), [1.0]))
     # A count of steps is worked off, however large.
     numbers = [one for one in NUMBERS if name != "steps" or not isinstance(one, int) or one < 3]
-    return rng.choice((*numbers, None, "x", True, torch.ones(2), [1], 1j, np.float32(2), type(value)(2)))
+    return rng.choice((*numbers, None, "x", True, torch.ones(2), [1], 1j, np.float32(2), float(2)))
 
 
 def other_tensor(rng: random.Random, tensor: Tensor) -> Any:

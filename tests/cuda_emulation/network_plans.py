@@ -35,7 +35,8 @@ def table(layers, d=None):
     d = d or (6 if layers.integrated else 3)
     seen = torch.zeros(1, 3) if layers.uses_directions else None
     weights = [torch.zeros(1, o, i) for o, i in layers.weight_shapes(d, 3 if layers.uses_directions else 0)]
-    given = layer_table.network(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
+    call = layer_table.Given(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
+    given, _ = layer_table.network(call, None, hashed_before=False)
     return layer_table.compiled_table(given.table, given.positions, given.weights, given.directions)
 
 

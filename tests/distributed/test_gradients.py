@@ -24,5 +24,5 @@ def test_what_ranks_tell_adds_up(n):
 def test_a_message_of_another_table():
     pytest.importorskip("voronerf.native", reason="the extension is not built")
     message = pack_entries(torch.cat((torch.ones(700), torch.zeros(4300))))
-    with pytest.raises(ValueError, match="bits of a message must tell its length, got 858 numbers for 5000"):
+    with pytest.raises(ValueError, match="must be as long as its bits tell, got 858 numbers for 5000"):
         add_entries([torch.cat((message, torch.zeros(1)))], 5000)

@@ -357,17 +357,17 @@ def test_opcheck() -> None:
     layer_table, ops = pytest.importorskip("voronerf.ops.grouped_mlp.layer_table"), torch.ops.voronerf
     given = cast(arguments(nerf(6, 2), [5, 0, 8], rays=4), torch.float32)
     passed = [given[name] for name in ("positions", "weights", "biases", "layers", "directions")]
-    table = layer_table.network(*passed).table
-    shared = (given["positions"], given["offsets"], given["weights"], given["biases"], table)
-    directions = (given["directions"], given["direction_index"], None)
-    torch.library.opcheck(ops.grouped_mlp_native.default, (*shared, *directions, False))
+    table = layer_table.network(layer_table.Given(*passed), None, hashed_before=False)[0].table
+    network = (given["positions"], given["weights"], given["biases"], table)
+    network, offsets = (*network, given["directions"], given["direction_index"], None), given["offsets"]
+    torch.library.opcheck(ops.grouped_mlp_native.default, (*network, offsets, False))
     # Gradients that are differentiated again are not this op's.
-    shared, directions = torch.utils._pytree.tree_map_only(Tensor, Tensor.detach, (shared, directions))
+    network = torch.utils._pytree.tree_map_only(Tensor, Tensor.detach, network)
     gradient, order, encoded = torch.randn(13, 4), torch.randperm(13, dtype=torch.int32), torch.empty(0)
     backward = ops.grouped_mlp_native_backward.default
-    torch.library.opcheck(backward, (gradient, *shared, *directions, order, encoded, [True, True, True, False]))
+    torch.library.opcheck(backward, (gradient, *network, offsets, order, encoded, [True, True, True, False]))
     # Memory only for the gradients that are asked for.
-    found = backward(gradient, *shared, *directions, None, encoded, [False, True, False, False])
+    found = backward(gradient, *network, offsets, None, encoded, [False, True, False, False])
     assert [each.numel() > 0 for each in found] == [False] * (len(found) - 3) + [True, False, False]
     assert layer_table.Table.parse(table).with_widths(given["weights"]) == given["layers"]
 

@@ -170,7 +170,7 @@ def test_refuses(op, message):
     name, given = case.call or op, case.make(Draw(), 6)
     getattr(ops, name)(**given)
     of_types = re.search(
-        "dtype|must be (an integer|a number|a tensor|a list|an MLP|a HashGrid|a CentreGrid|True)", message
+        "dtype|must be (an integer|an MLP|OwnSamples|True|a (number|tensor|list|function|HashGrid|CentreGrid))", message
     )
     with refused(TypeError if of_types else ValueError, f"{name}: {message}"):
         getattr(ops, name)(**{**given, **case.refused[message]})

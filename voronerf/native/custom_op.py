@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -80,6 +79,7 @@ class Structs:
     def __init__(self, signature: inspect.Signature) -> None:
         self._parameters = list(signature.parameters.values())
         self._kinds = [kind if hasattr(kind := given.annotation, "_fields") else None for given in self._parameters]
+        self._widths = [1 if kind is None else len(kind._fields) for kind in self._kinds]
         self._any = any(kind is not None for kind in self._kinds)
 
     def flat_signature(self, results: Any) -> inspect.Signature:
@@ -94,16 +94,23 @@ class Structs:
         """The arguments of the function."""
         if not self._any:
             return flat
-        values = iter(flat)
-        return [
-            next(values) if kind is None else kind(*itertools.islice(values, len(kind._fields))) for kind in self._kinds
-        ]
+        found, at = [], 0
+        for kind, width in zip(self._kinds, self._widths):
+            found.append(flat[at] if kind is None else kind._make(flat[at : at + width]))
+            at += width
+        return found
 
     def flat(self, packed: Sequence[Any]) -> Sequence[Any]:
         """The arguments of the custom op."""
         if not self._any:
             return packed
-        return [value for given in packed for value in (given if hasattr(given, "_fields") else (given,))]
+        found: list[Any] = []
+        for given, kind in zip(packed, self._kinds):
+            if kind is None:
+                found.append(given)
+            else:
+                found += given
+        return found
 
 
 class Op:

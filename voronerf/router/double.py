@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import types
+from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -18,6 +19,7 @@ from voronerf.router.layout import Call, map_tree
 _OP = "VoronoiRouter"
 _PLAIN = {type(None), bool, int, float, str, type, torch.dtype, torch.device, torch.Size, types.FunctionType, Tensor}
 _LAYERS = "torch.nn.modules."  # whose classes assign nothing in ``forward``
+_REGISTRIES, _OF_HOOKS = ("_parameters", "_buffers", "_modules"), (OrderedDict, dict, set)
 _SEARCHED = 1000  # objects of an attribute that are searched for parts of the module
 
 
@@ -55,8 +57,10 @@ class Double:
             registry = own["_parameters"] = dict(part._parameters)
             own["_buffers"] = dict(part._buffers)
             own["_modules"] = {name: twins.get(id(child), child) for name, child in part._modules.items()}
-            others = own.keys() - {"_parameters", "_buffers", "_modules"}
-            own.update({name: _moved(own[name], twins) for name in others if _reaches(own[name], parts)})
+            others = [item for item in own.items() if type(item[1]) not in _PLAIN]
+            for name, value in others:  # nearly all of them are empty dicts of hooks
+                if (type(value) not in _OF_HOOKS or value) and name not in _REGISTRIES and _reaches(value, parts):
+                    own[name] = _moved(value, twins)
             vars(twin).update(own)
             if not type(part).__module__.startswith(_LAYERS) or part._forward_pre_hooks:
                 self._kept.append((twin, own))
@@ -148,8 +152,6 @@ def _version(value: Any) -> int:
 
 def _reaches(value: Any, parts: Mapping[int, nn.Module]) -> bool:
     """Whether a value holds a part of the module."""
-    if type(value) in _PLAIN or (not value and isinstance(value, (dict, list, set))):
-        return False
     left, seen = [value], set[int]()
     while left and len(seen) < _SEARCHED:
         item = left.pop()

@@ -24,35 +24,50 @@ from voronerf.ops.hash_encode.native import compiled_grid, hash_encode
 _OUTSIDE = {POSITIONS: -1, DIRECTIONS: -2}
 
 
-class Network(NamedTuple):
-    """Arguments of the ops, in float32, and the storage type of their result (autocast's, where it is on)."""
+class Given(NamedTuple):
+    """Samples and parameters as the public functions take them."""
 
     positions: Tensor
-    weights: list[Tensor]
-    biases: list[Tensor]  # Autograd takes no list of optional tensors; an empty one stands for no bias.
+    weights: Sequence[Tensor]
+    biases: Sequence[Tensor | None]
+    layers: MLP
+    directions: Tensor | None = None
+    direction_index: Tensor | None = None
+    features: Tensor | None = None
+
+
+class Network(NamedTuple):
+    """Samples and parameters as the ops take them, in float32.
+
+    Attributes:
+        positions: [n, p].
+        weights: one [k, o, i] for each layer.
+        biases: one [k, o] for each layer. Autograd takes no list of optional tensors; an empty one stands for no bias.
+        table: the layers; see `Table`.
+        directions: [n, q] or [r, q], or None.
+        direction_index: int32 [n] or None.
+        features: of a hash grid, unless positions are encoded already; not in float32. Or None.
+    """
+
+    positions: Tensor
+    weights: Sequence[Tensor]
+    biases: Sequence[Tensor]
     table: str
     directions: Tensor | None
-    features: Tensor | None  # Of a hash grid, unless positions are encoded already; not in float32.
-    dtype: torch.dtype
+    direction_index: Tensor | None
+    features: Tensor | None
 
 
 def network(
-    positions: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor | None],
-    layers: MLP,
-    directions: Tensor | None,
-    features: Tensor | None = None,
-    cells: Tensor | None = None,
-    caller: str = "grouped_mlp",
-    hashed_before: bool = False,
-) -> Network:
-    """What the ops take for a layer table.
+    given: Given, cells: Tensor | None, caller: str = "grouped_mlp", *, hashed_before: bool
+) -> tuple[Network, torch.dtype]:
+    """What the ops take for a layer table, and the storage type of their result (autocast's, where it is on).
 
     Octaves and harmonics of float64 are computed in float64, beforehand. So are positions that are hashed, where
     ``hashed_before`` says so; ``cells`` says their tables where each cell has one.
     """
     encoded = ""
+    positions, weights, biases, layers, directions, index, features = given
     if features is not None and features.dtype == torch.float64:
         features = features.float()
     if hashed_before:
@@ -68,34 +83,28 @@ def network(
         if wide and (layers.direction_octaves is not None or layers.direction_degree is not None):
             directions = encode_directions(directions, layers)
             encoded += DIRECTIONS
-    return in_float32(positions, weights, biases, layers.text, directions, caller, features, encoded)
+    now = Given(positions, weights, biases, layers, directions, index, features)
+    return in_float32(now, layers.text, caller, encoded)
 
 
-def in_float32(
-    positions: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor | None],
-    text: str,
-    directions: Tensor | None,
-    caller: str,
-    features: Tensor | None = None,
-    encoded: str = "",
-) -> Network:
-    """Everything in float32, with a table of which the layers are ``text`` (``MLP.text``).
+def in_float32(given: Given, text: str, caller: str, encoded: str = "") -> tuple[Network, torch.dtype]:
+    """Everything in float32, with a table of which the layers are ``text`` (``MLP.text``), whatever those given are.
 
     No number is written into it, since it may be symbolic under ``torch.compile``; widths are those of the weights.
     ``encoded``: what is encoded already, whatever ``text`` says.
     """
+    positions, weights, directions = given.positions, given.weights, given.directions
     dtype = storage(positions, weights)
-    return Network(
+    found = Network(
         positions.float(),
         [weight.float() for weight in weights],
-        [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in biases],
+        [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in given.biases],
         table_text(text, caller, operands(positions, dtype), encoded),
         None if directions is None else directions.float(),
-        features,
-        dtype,
+        given.direction_index,
+        given.features,
     )
+    return found, dtype
 
 
 def table_text(layers: str, caller: str, multiplied: str, encoded: str) -> str:

@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.layers import DIRECTIONS, POSITIONS
 from voronerf.ops.grouped_linear.activation import activate
-from voronerf.ops.grouped_linear.native import _forward as linear
+from voronerf.ops.grouped_linear.cpu import layer as linear
 from voronerf.ops.grouped_linear.reference import grouped_linear as _reference
-from voronerf.ops.grouped_mlp.layer_table import encoded_already
+from voronerf.ops.grouped_mlp.layer_table import Network, Table, encoded_already
 from voronerf.ops.grouped_mlp.reference import cells_of
 from voronerf.ops.grouped_mlp.reference import grouped_mlp as compose
 from voronerf.ops.hash_encode.native import hash_encode
@@ -28,34 +28,19 @@ _PIECE = 8192
 
 
 def gradients(
-    gradient: Tensor,
-    positions: Tensor,
-    offsets: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    layers: MLP,
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    features: Tensor | None,
-    order: Tensor | None,
-    *,
-    asked: Sequence[bool],
+    gradient: Tensor, network: Network, offsets: Tensor, order: Tensor | None, *, asked: Sequence[bool]
 ) -> list[Tensor | None]:
     """Gradients of weights, biases, positions, directions and features, None where they are not asked for.
 
     Args:
         gradient: [n, out], the incoming one.
-        positions: [n, p].
+        network: samples and parameters.
         offsets: int32 [k + 1].
-        weights: one [k, o, i] for each layer.
-        biases: one [k, o] for each layer, empty for none.
-        layers: the layer table, with the widths of the weights.
-        directions: [n, q] or [r, q].
-        direction_index: int32 [n] or None.
-        features: of a hash grid, [e, f] or [k, e, f], or None.
         order: int32 [n] that sorts the rows by cell, or None where they are sorted.
         asked: which gradients, in the order of the results.
     """
+    positions, weights, biases, text, directions, direction_index, features = network
+    layers = Table.parse(text).with_widths(weights)
     count = len(weights)
     present = [bias if bias.numel() else None for bias in biases]
     # Aliases: where one input was computed from another, that path is the caller's.

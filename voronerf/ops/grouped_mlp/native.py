@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from voronerf.derivatives import asked_for
 from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 from voronerf.native.custom_op import custom_op, on_huge_pages
 from voronerf.ops.grouped_mlp.layer_table import (
+    Given,
     Network,
     Table,
     compiled_table,
@@ -31,10 +32,11 @@ from voronerf.ops.grouped_mlp.layer_table import (
     storage,
     table_text,
 )
+from voronerf.ops.grouped_mlp.layerwise import gradients as differentiable
 from voronerf.ops.grouped_mlp.reference import cells_of
 
 # Of one layer, whose width does not matter here.
-_LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
+_LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)) for activation in ACTIVATIONS}
 WAYS = native.compiled.MlpCudaWay
 """Through a network on CUDA (csrc/network/grouped_mlp.h)."""
 
@@ -78,22 +80,13 @@ def grouped_mlp(
 
     Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
     """
-    own, before = features is not None and features.dim() == 3, hashes_before(positions, weights, layers, directions)
+    given = Given(positions, weights, biases, layers, directions, direction_index, features)
+    own, before = features is not None and features.dim() == 3, hashes_before(given)
     cells = cells_of(offsets, positions) if own and before else None
-    given = network(positions, weights, biases, layers, directions, features, cells, hashed_before=before)
+    taken, dtype = network(given, cells, hashed_before=before)
     out: Tensor
-    out, _ = _forward(
-        given.positions,
-        offsets,
-        given.weights,
-        given.biases,
-        given.table,
-        given.directions,
-        direction_index,
-        given.features,
-        keeps_encoded(given),
-    )
-    return out.to(given.dtype)
+    out, _ = _forward(taken, offsets, keeps_encoded(taken))
+    return out.to(dtype)
 
 
 def grouped_linear(
@@ -101,40 +94,33 @@ def grouped_linear(
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``. A network of one layer.
 
-    For CUDA; the CPU has kernels of one layer (``voronerf/ops/grouped_linear/native.py``).
+    For CUDA; the CPU has kernels of one layer (``voronerf/ops/grouped_linear/cpu.py``).
     """
-    given = in_float32(x, [weight], [bias], _LINEAR[activation], None, "grouped_linear")
+    layers = _LINEAR[activation]
+    taken, dtype = in_float32(Given(x, [weight], [bias], layers), layers.text, "grouped_linear")
     out: Tensor
-    out, _ = _forward(given.positions, offsets, given.weights, given.biases, given.table, None, None, None, False)
-    return out.to(given.dtype)
+    out, _ = _forward(taken, offsets, False)
+    return out.to(dtype)
 
 
 @custom_op("grouped_mlp_native")
-def _forward(
-    positions: Tensor,
-    offsets: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    table: str,
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    features: Tensor | None,
-    keep: bool,
-) -> Iterator[tuple[Tensor, Tensor]]:
+def _forward(network: Network, offsets: Tensor, keep: bool) -> Iterator[tuple[Tensor, Tensor]]:
     """Output, and for the backward pass what `new_encoded` says."""
-    out, encoded = new_output(positions, table, weights), new_encoded(positions, table, keep)
+    out, encoded = new_output(network), new_encoded(network, keep)
     yield out, encoded
-    run(out, encoded, positions, offsets, weights, biases, table, directions, direction_index, features, None)
+    run(out, encoded, network, offsets, None)
 
 
-def hashes_before(positions: Tensor, weights: Sequence[Tensor], layers: MLP, directions: Tensor | None) -> bool:
+def hashes_before(given: Given) -> bool:
     """Whether a hash grid is looked up before the network: on CUDA, where its kernels do not do it themselves."""
+    positions, weights, layers = given.positions, given.weights, given.layers
     if layers.grid is None or not native.on_cuda(positions):
         return False
     if torch.compiler.is_compiling():  # which cannot ask the compiled module
         return True
     multiplied = operands(positions, storage(positions, weights))
-    table = compiled_table(table_text(layers.text, "grouped_mlp", multiplied, ""), positions, weights, directions)
+    text = table_text(layers.text, "grouped_mlp", multiplied, "")
+    table = compiled_table(text, positions, weights, given.directions)
     machine = native.machine(positions)
     assert isinstance(machine, native.compiled.Cuda)
     return not native.compiled.grouped_mlp_hashes(table, _precision(multiplied), _way, machine)
@@ -150,41 +136,29 @@ def keeps_encoded(given: Network) -> bool:
     return given.features is not None and torch.is_grad_enabled() and differentiable
 
 
-def new_encoded(positions: Tensor, table: str, keep: bool) -> Tensor:
+def new_encoded(network: Network, keep: bool) -> Tensor:
     """For hashed positions in the order of their cells, [n, features rounded up to 16]; empty if they are not kept."""
-    grid = Table.parse(table).layers.grid
+    grid, positions = Table.parse(network.table).layers.grid, network.positions
     if grid is None or not keep:
         return positions.new_empty(0)
     return positions.new_empty(positions.shape[0], -(-grid.out_features // 16) * 16)
 
 
-def new_output(positions: Tensor, table: str, weights: Sequence[Tensor]) -> Tensor:
+def new_output(network: Network) -> Tensor:
     """[n, features of all outputs]."""
-    features = sum(weights[output].shape[1] for output in Table.parse(table).layers.outputs)
-    return positions.new_empty(positions.shape[0], features)
+    outputs = Table.parse(network.table).layers.outputs
+    features = sum(network.weights[output].shape[1] for output in outputs)
+    return network.positions.new_empty(network.positions.shape[0], features)
 
 
-def run(
-    out: Tensor,
-    encoded: Tensor,
-    positions: Tensor,
-    offsets: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    table: str,
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    features: Tensor | None,
-    order: Tensor | None,
-) -> None:
+def run(out: Tensor, encoded: Tensor, network: Network, offsets: Tensor, order: Tensor | None) -> None:
     """Fills the output of sorted rows, or of those that ``order`` int32 [n] sorts."""
     on_huge_pages(out)
     on_huge_pages(encoded)
-    given = compiled_table(table, positions, weights, directions)
-    inputs = _inputs(positions, offsets, weights, biases, directions, direction_index, features, order, encoded)
-    compiled, machine = native.compiled, native.machine(positions)
+    given, inputs = _compiled_table(network), _inputs(network, offsets, order, encoded)
+    compiled, machine = native.compiled, native.machine(network.positions)
     if isinstance(machine, compiled.Cuda):
-        rest = _on_cuda(table, given, inputs, machine, backward=False, parameters=False)
+        rest = _on_cuda(network.table, given, inputs, machine, backward=False, parameters=False)
         compiled.grouped_mlp(given, inputs, out, *rest, machine)
     else:
         compiled.grouped_mlp(given, inputs, out, machine)
@@ -192,23 +166,13 @@ def run(
 
 @custom_op("grouped_mlp_native_backward")
 def backward(
-    gradient: Tensor,
-    positions: Tensor,
-    offsets: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    table: str,
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    features: Tensor | None,
-    order: Tensor | None,
-    encoded: Tensor,
-    wanted: Sequence[bool],
+    gradient: Tensor, network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor, wanted: Sequence[bool]
 ) -> Iterator[list[Tensor]]:
     """Gradients of weights, biases, positions, directions and features, in float32.
 
     They are empty unless wanted: (parameters, positions, directions, features).
     """
+    positions, weights, biases, _, directions, direction_index, features = network
     count = len(weights)
     chosen = [wanted[0]] * (2 * count) + list(wanted[1:])
     results = [
@@ -219,8 +183,7 @@ def backward(
     for result in results:
         on_huge_pages(result)
     compiled, machine = native.compiled, native.machine(positions)
-    given = compiled_table(table, positions, weights, directions)
-    inputs = _inputs(positions, offsets, weights, biases, directions, direction_index, features, order, encoded)
+    given, inputs = _compiled_table(network), _inputs(network, offsets, order, encoded)
     to_directions = results[-2] if wanted[2] else None
     of_samples = None
     if isinstance(machine, compiled.Cuda) and wanted[2] and direction_index is not None and directions is not None:
@@ -234,9 +197,7 @@ def backward(
         features=results[-1] if wanted[3] else None,
     )
     if isinstance(machine, compiled.Cuda):
-        if wanted[3]:
-            native.refuse_where_deterministic("grouped_mlp", positions)
-        rest = _on_cuda(table, given, inputs, machine, backward=True, parameters=wanted[0])
+        rest = _on_cuda(network.table, given, inputs, machine, backward=True, parameters=wanted[0])
         compiled.grouped_mlp_backward(given, inputs, gradients, *rest, machine)
     else:
         compiled.grouped_mlp_backward(given, inputs, gradients, machine)
@@ -245,25 +206,20 @@ def backward(
         results[-2].zero_().index_add_(0, direction_index, of_samples)
 
 
-def _inputs(
-    positions: Tensor,
-    offsets: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    features: Tensor | None,
-    order: Tensor | None,
-    encoded: Tensor,
-) -> native.compiled.MlpInputs:
+def _compiled_table(network: Network) -> native.compiled.MlpTable:
+    return compiled_table(network.table, network.positions, network.weights, network.directions)
+
+
+def _inputs(network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor) -> native.compiled.MlpInputs:
+    directions, features = network.directions, network.features
     return native.compiled.MlpInputs(
-        positions=positions,
+        positions=network.positions,
         directions=directions,
-        direction_index=direction_index,
+        direction_index=network.direction_index,
         offsets=offsets,
-        weights=weights,
-        biases=_present(biases),
-        n=positions.shape[0],
+        weights=network.weights,
+        biases=_present(network.biases),
+        n=network.positions.shape[0],
         r=0 if directions is None else directions.shape[0],
         k=offsets.shape[0] - 1,
         order=order,
@@ -303,57 +259,61 @@ def _precision(multiplied: str) -> str:
     return "tf32" if tf32 else multiplied
 
 
-def _forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-    positions, offsets, weights, biases, ctx.table, directions, direction_index, features, _ = inputs
-    ctx.count = len(weights)
+def _forward_setup(ctx: Any, inputs: tuple[Network, Tensor, bool], output: tuple[Tensor, Tensor]) -> None:
+    network, offsets, _ = inputs
     ctx.mark_non_differentiable(output[1])
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(output[1], positions, offsets, *weights, *biases, directions, direction_index, features)
+    keep_network(ctx, network, offsets, output[1])
 
 
 def _forward_backward(ctx: Any, gradient: Tensor | None, _of_encoded: None) -> tuple[Any, ...]:
+    network, (offsets, encoded) = kept_network(ctx)
+    return gradients_of_network(ctx, gradient, network, offsets, None, encoded), None, None
+
+
+def keep_network(ctx: Any, network: Network, *others: Tensor) -> None:
+    """Saves a network and other tensors for the backward pass."""
+    ctx.table, ctx.count = network.table, len(network.weights)
+    positions, weights, biases, _, *rest = network
+    ctx.save_for_backward(positions, *weights, *biases, *rest, *others)
+
+
+def kept_network(ctx: Any) -> tuple[Network, Sequence[Tensor]]:
+    """What `keep_network` saved."""
+    saved, count = ctx.saved_tensors, ctx.count
+    weights, biases = saved[1 : 1 + count], saved[1 + count : 1 + 2 * count]
+    directions, index, features, *others = saved[1 + 2 * count :]
+    return Network(saved[0], weights, biases, ctx.table, directions, index, features), others
+
+
+def gradients_of_network(
+    ctx: Any, gradient: Tensor | None, network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor
+) -> Network:
+    """Gradients in the place of what they are of, None where there is none; ``ctx``: whom the engine asks for them."""
+    count = ctx.count
     if gradient is None:
-        return (None, None, [None] * ctx.count, [None] * ctx.count, *[None] * 5)
-    encoded, *saved = ctx.saved_tensors
-    positions, offsets, *parameters, directions, direction_index, features = saved
-    to_positions, _, *to_parameters, to_directions, _, to_features = asked_for(ctx, saved)
-    network = positions, offsets, parameters[: ctx.count], parameters[ctx.count :], ctx.table, directions
-    asked = *to_parameters, to_positions, to_directions, to_features
-    found = gradients(gradient, *network, direction_index, features, None, encoded, asked=asked)
-    *of_parameters, of_positions, of_directions, of_features = found
-    of_weights, of_biases = of_parameters[: ctx.count], of_parameters[ctx.count :]
-    return of_positions, None, of_weights, of_biases, None, of_directions, None, of_features, None
+        return Network(*cast(Any, (None, [None] * count, [None] * count, None, None, None, None)))
+    positions, weights, biases, _, directions, index, features = network
+    asked = asked_for(ctx, (positions, *weights, *biases, directions, index, features))
+    to_positions, *to_parameters, to_directions, _, to_features = asked
+    wanted = *to_parameters, to_positions, to_directions, to_features
+    *found, of_positions, of_directions, of_features = gradients(
+        gradient, network, offsets, order, encoded, asked=wanted
+    )
+    return Network(*cast(Any, (of_positions, found[:count], found[count:], None, of_directions, None, of_features)))
 
 
 def gradients(
-    gradient: Tensor,
-    positions: Tensor,
-    offsets: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    table: str,
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    features: Tensor | None,
-    order: Tensor | None,
-    encoded: Tensor,
-    *,
-    asked: Sequence[bool],
+    gradient: Tensor, network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor, *, asked: Sequence[bool]
 ) -> list[Tensor | None]:
     """Gradients of weights, biases, positions, directions and features, None for those that are not asked for."""
     if torch.is_grad_enabled():
-        # Late: that module takes grouped_linear, which takes this one for CUDA.
-        from voronerf.ops.grouped_mlp.layerwise import gradients as differentiable
-
-        layers = Table.parse(table).with_widths(weights)
-        given = gradient, positions, offsets, weights, biases, layers, directions, direction_index, features, order
-        return differentiable(*given, asked=asked)
+        return differentiable(gradient, network, offsets, order, asked=asked)
     *parameters, to_positions, to_directions, to_features = asked
     wanted = [any(parameters), to_positions, to_directions, to_features]
-    network = positions, offsets, weights, biases, table, directions, direction_index, features, order
-    *results, of_features = backward(gradient, *network, encoded, wanted)
-    if features is not None and to_features:
-        of_features = of_features.to(features.dtype)
+    *results, of_features = backward(gradient, network, offsets, order, encoded, wanted)
+    if network.features is not None and to_features:
+        of_features = of_features.to(network.features.dtype)
     return [result if want else None for result, want in zip((*results, of_features), asked)]
 
 

@@ -24,7 +24,9 @@ CASE = Case(
     _make,
     refused={
         "loss must be a function, got int": {"loss": 3},
-        "loss must return": {"loss": lambda out: (torch.zeros(2), out)},
+        "loss must return a loss [] and a gradient [6, 4], got [2] and [6, 4]": {
+            "loss": lambda out: (torch.zeros(2), out)
+        },
     },
     traced=False,
 )

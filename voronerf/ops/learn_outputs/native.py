@@ -27,23 +27,22 @@ def learn_outputs(network: Mapping[str, Any], loss: Loss) -> Tensor:
     names = routed_mlp.Where._fields
     where = routed_mlp.Where(**{name: network[name] for name in names if name in network})
     rest = {name: value for name, value in network.items() if name not in names}
-    arguments, _ = routed_mlp.prepared(**rest, where=where)
-    _, weights, biases, *_ = arguments
-    total: Tensor = _Learn.apply(arguments, loss, *weights, *biases, arguments[6])
+    call, _ = routed_mlp.prepared(**rest, where=where)
+    taken = call.network
+    total: Tensor = _Learn.apply(call, loss, *taken.weights, *taken.biases, taken.features)
     return total
 
 
 class _Learn(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, arguments: tuple[Any, ...], loss: Loss, *parameters: Tensor | None) -> Tensor:
-        out, _, order, offsets, encoded = routed_mlp.forward.inside(*arguments)
+    def forward(ctx: Any, call: routed_mlp.Call, loss: Loss, *parameters: Tensor | None) -> Tensor:
+        out, _, order, offsets, encoded = routed_mlp.forward.inside(*call)
         total, gradient = loss(out)
         *needs, to_features = ctx.needs_input_grad[2:]
         if any(needs) or to_features:
-            network, order = arguments[:7], order if order.numel() else None
-            positions, *rest = network
             wanted = [any(needs), False, False, to_features]
-            results = grouped_mlp.backward.inside(gradient, positions, offsets, *rest, order, encoded, wanted)
+            sorted_by = order if order.numel() else None
+            results = grouped_mlp.backward.inside(gradient, call.network, offsets, sorted_by, encoded, wanted)
             *of_parameters, _, _, of_features = results
             ctx.gradients = [*of_parameters, of_features]
         return total

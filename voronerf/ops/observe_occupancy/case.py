@@ -35,5 +35,5 @@ CASE = Case(_make, in_place=True)
 CASES = {
     "observe_occupancy": CASE,
     "observe_told": Case(_make_told, in_place=True),
-    "tell_observed": Case(_make_teller, traced=False),
+    "tell_observed": Case(_make_teller, in_place=True),
 }

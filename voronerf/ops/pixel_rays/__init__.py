@@ -17,7 +17,7 @@ from voronerf.checks import (
     check_tensor,
 )
 from voronerf.ops.camera_rays import check_lenses
-from voronerf.ops.pixel_rays.reference import PixelRays
+from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
 _OP = backends.declare(
     "pixel_rays",
@@ -112,16 +112,18 @@ def pixel_rays(
     if torch.finfo(torch.float32).max < far < float("inf"):
         raise ValueError(f"{_OP}: far must be at most 3.4e+38 or infinite, got {far}")
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
-    found = run(
-        poses.detach(),
-        intrinsics.detach(),
-        images,
-        index,
-        near=float(near),
-        far=float(far),
-        box=None if box is None else box.detach(),
-        distortion=None if distortion is None else distortion.detach(),
-        models=models,
-        background=None if background is None else background.detach(),
+    found: PixelRays = run(
+        Pixels(
+            poses=poses.detach(),
+            intrinsics=intrinsics.detach(),
+            images=images,
+            numbers=index,
+            box=None if box is None else box.detach(),
+            distortion=None if distortion is None else distortion.detach(),
+            models=models,
+            background=None if background is None else background.detach(),
+            near=float(near),
+            far=float(far),
+        )
     )
-    return PixelRays(*found)
+    return found

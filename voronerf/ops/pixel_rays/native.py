@@ -9,39 +9,17 @@ from torch import Tensor
 from voronerf import native
 from voronerf.checks import check_range
 from voronerf.native.custom_op import custom_op
-from voronerf.ops.pixel_rays.reference import PixelRays
+from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
 
-def pixel_rays(
-    poses: Tensor,
-    intrinsics: Tensor,
-    images: Tensor,
-    index: Tensor,
-    *,
-    near: float,
-    far: float,
-    box: Tensor | None,
-    distortion: Tensor | None,
-    models: Tensor | None,
-    background: Tensor | None,
-) -> PixelRays:
+def pixel_rays(pixels: Pixels) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    return PixelRays(*_pixel_rays(poses, intrinsics, images, index, box, distortion, models, background, near, far))
+    return PixelRays(*_pixel_rays(pixels))
 
 
 @custom_op("pixel_rays_native")
-def _pixel_rays(
-    poses: Tensor,
-    intrinsics: Tensor,
-    images: Tensor,
-    index: Tensor,
-    box: Tensor | None,
-    distortion: Tensor | None,
-    models: Tensor | None,
-    background: Tensor | None,
-    near: float,
-    far: float,
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+def _pixel_rays(pixels: Pixels) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    poses, intrinsics, images, index, box, distortion, models, background, near, far = pixels
     b = index.shape[0]
     origins, directions, colour = poses.new_empty(b, 3), poses.new_empty(b, 3), poses.new_empty(b, 3)
     first, last = poses.new_empty(b), poses.new_empty(b)

@@ -38,21 +38,38 @@ class PixelRays(NamedTuple):
     colour: Tensor
 
 
+class Pixels(NamedTuple):
+    """What ``pixel_rays`` reads; ``voronerf.ops.pixel_rays`` says what each is.
+
+    Attributes:
+        poses: [c, 4, 4].
+        intrinsics: [c, 4].
+        images: uint8 [c, h, w, 3 or 4].
+        numbers: int64 [b], of the pixels.
+        box: [2, 3] or None.
+        distortion: [c, 8] or None.
+        models: int32 [c] or None.
+        background: [3], [b, 3] or None.
+        near: nearest distance.
+        far: farthest.
+    """
+
+    poses: Tensor
+    intrinsics: Tensor
+    images: Tensor
+    numbers: Tensor
+    box: Tensor | None
+    distortion: Tensor | None
+    models: Tensor | None
+    background: Tensor | None
+    near: float
+    far: float
+
+
 @torch.no_grad()
-def pixel_rays(
-    poses: Tensor,
-    intrinsics: Tensor,
-    images: Tensor,
-    index: Tensor,
-    *,
-    near: float,
-    far: float,
-    box: Tensor | None,
-    distortion: Tensor | None,
-    models: Tensor | None,
-    background: Tensor | None,
-) -> PixelRays:
+def pixel_rays(pixels: Pixels) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
+    poses, intrinsics, images, index, box, distortion, models, background, near, far = pixels
     c, h, w, channels = images.shape
     check_range("pixel_rays", "index", index, c * h * w)
     pixel = index % (h * w)

@@ -65,7 +65,7 @@ def compose_runs(
         r=len(target),
         rays=rays,
     )
-    return answers, sums.new_tensor(native.compiled.compose_runs(given, answers, native.cpu()))
+    return answers, torch.tensor(native.compiled.compose_runs(given, answers, native.cpu()), dtype=sums.dtype)
 
 
 def run_gradients(

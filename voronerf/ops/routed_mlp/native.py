@@ -10,17 +10,16 @@ read on the host. The backward op is that of ``grouped_mlp``, given the order. S
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
-from voronerf.derivatives import asked_for
 from voronerf.layers import MLP
 from voronerf.native.custom_op import custom_op
 from voronerf.ops.cell_sort import native as cell_sort
 from voronerf.ops.grouped_mlp import native as grouped_mlp
-from voronerf.ops.grouped_mlp.layer_table import network
+from voronerf.ops.grouped_mlp.layer_table import Given, Network, network
 from voronerf.ops.locate_cell import native as locate_cell
 from voronerf.ops.nearest_centre import native as nearest_centre
 
@@ -44,10 +43,9 @@ def routed_mlp(
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
     where = Where(centres, child_offsets, child, depth, centre_weights, cells, coords)
-    arguments, dtype = prepared(positions, weights, biases, layers, where, directions, direction_index, features)
-    out, found, *_ = forward(*arguments)
-    given = arguments[7]
-    return out.to(dtype), found if given is None else given
+    call, dtype = prepared(positions, weights, biases, layers, where, directions, direction_index, features)
+    out, found, *_ = forward(*call)
+    return out.to(dtype), found if call.where.cells is None else call.where.cells
 
 
 class Where(NamedTuple):
@@ -62,6 +60,14 @@ class Where(NamedTuple):
     coords: Tensor | None = None
 
 
+class Call(NamedTuple):
+    """The arguments of ``forward``."""
+
+    network: Network
+    where: Where
+    keep: bool
+
+
 def prepared(
     positions: Tensor,
     weights: Sequence[Tensor],
@@ -71,11 +77,12 @@ def prepared(
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
-) -> tuple[tuple[Any, ...], torch.dtype]:
+) -> tuple[Call, torch.dtype]:
     """The arguments of ``forward``, and the type of the result."""
     centres, child_offsets, child, depth, centre_weights, cells, coords = where
     own = features is not None and features.dim() == 3
-    before = grouped_mlp.hashes_before(positions, weights, layers, directions)
+    given = Given(positions, weights, biases, layers, directions, direction_index, features)
+    before = grouped_mlp.hashes_before(given)
     if own and before and weights[0].shape[0] > 1 and cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
@@ -84,45 +91,30 @@ def prepared(
             cells = locate_cell.locate_cell(coords, centres, child_offsets, child, depth=depth, weights=centre_weights)
         centres = None
     if features is not None and own and weights[0].shape[0] == 1:
-        features = features[0]
-    given = network(positions, weights, biases, layers, directions, features, cells, "routed_mlp", before)
-    tables = centres, child_offsets, child, centre_weights
+        given = given._replace(features=features[0])
+    taken, dtype = network(given, cells, "routed_mlp", hashed_before=before)
     if cells is None and weights[0].shape[0] == 1:
-        coords, tables = None, (None, None, None, None)
-    samples = given.positions, given.weights, given.biases, given.table, given.directions, direction_index
-    keep = grouped_mlp.keeps_encoded(given)
-    return (*samples, given.features, cells, coords, *tables, depth, keep), given.dtype
+        where = Where(depth=depth)
+    elif cells is not where.cells:
+        where = where._replace(centres=None, cells=cells)
+    return Call(taken, where, grouped_mlp.keeps_encoded(taken)), dtype
 
 
 @custom_op("routed_mlp_native")
-def forward(
-    positions: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    table: str,
-    directions: Tensor | None,
-    direction_index: Tensor | None,
-    features: Tensor | None,
-    cells: Tensor | None,
-    coords: Tensor | None,
-    centres: Tensor | None,
-    child_offsets: Tensor | None,
-    child: Tensor | None,
-    centre_weights: Tensor | None,
-    depth: int,
-    keep: bool,
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
     """Output, cells (empty where they are given), order (empty where there is one cell), offsets, encoded positions.
 
     With neither cells nor centres there is one cell.
     """
-    n, k = positions.shape[0], weights[0].shape[0]
+    centres, child_offsets, child, depth, centre_weights, cells, coords = where
+    positions = network.positions
+    n, k = positions.shape[0], network.weights[0].shape[0]
     alone = cells is None and centres is None
-    out = grouped_mlp.new_output(positions, table, weights)
+    out = grouped_mlp.new_output(network)
     found = positions.new_empty(n if cells is None else 0, dtype=torch.int32)
     order = positions.new_empty(0 if alone else n, dtype=torch.int32)
     offsets = positions.new_empty(k + 1, dtype=torch.int32)
-    encoded = grouped_mlp.new_encoded(positions, table, keep)
+    encoded = grouped_mlp.new_encoded(network, keep)
     yield out, found, order, offsets, encoded
     if alone:
         found.zero_()
@@ -134,42 +126,23 @@ def forward(
             else:
                 locate_cell.find(found, coords, centres, child_offsets, child, depth, centre_weights, "routed_mlp")
         cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
-    network = positions, offsets, weights, biases, table, directions, direction_index, features
-    grouped_mlp.run(out, encoded, *network, None if alone else order)
+    grouped_mlp.run(out, encoded, network, offsets, None if alone else order)
 
 
-def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    positions, weights, biases, ctx.table, directions, direction_index, features, cells, _, centres, *_ = inputs
+def _setup(ctx: Any, inputs: Call, output: tuple[Tensor, ...]) -> None:
+    network, where, _ = inputs
     _, found, order, offsets, encoded = output
-    ctx.count, ctx.alone = len(weights), cells is None and centres is None
+    ctx.alone = where.cells is None and where.centres is None
     ctx.mark_non_differentiable(found, order, offsets, encoded)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(order, offsets, encoded, positions, *weights, *biases, directions, direction_index, features)
+    grouped_mlp.keep_network(ctx, network, order, offsets, encoded)
 
 
 def _backward(ctx: Any, gradient: Tensor | None, *_others: None) -> tuple[Any, ...]:
-    count = ctx.count
-    if gradient is None:
-        return (None, [None] * count, [None] * count, *[None] * 12)
-    order, offsets, encoded, *inputs = ctx.saved_tensors
-    positions, *parameters, directions, direction_index, features = inputs
-    to_positions, *to_parameters, to_directions, _, to_features = asked_for(ctx, inputs)
-    *of_parameters, of_positions, of_directions, of_features = grouped_mlp.gradients(
-        gradient,
-        positions,
-        offsets,
-        parameters[:count],
-        parameters[count:],
-        ctx.table,
-        directions,
-        direction_index,
-        features,
-        None if ctx.alone else order,
-        encoded,
-        asked=(*to_parameters, to_positions, to_directions, to_features),
-    )
-    of_weights, of_biases = of_parameters[:count], of_parameters[count:]
-    return of_positions, of_weights, of_biases, None, of_directions, None, of_features, *[None] * 8
+    network, (order, offsets, encoded) = grouped_mlp.kept_network(ctx)
+    sorted_by = None if ctx.alone else order
+    found = grouped_mlp.gradients_of_network(ctx, gradient, network, offsets, sorted_by, encoded)
+    return found, Where(*cast(Any, (None,) * len(Where._fields))), None
 
 
 forward.register_autograd(_backward, setup_context=_setup)

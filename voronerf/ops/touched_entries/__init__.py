@@ -9,7 +9,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import check_count, check_dtype, check_same_device, check_shape
+from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_shape
 
 _NATIVE = Implementation(("cpu",), (torch.float32,), file="touched_entries")
 _PACK, _ADD = (
@@ -71,6 +71,9 @@ def add_entries(parts: Sequence[Tensor], n: int, *, backend: str = "auto") -> Te
         >>> add_entries([pack_entries(first), pack_entries(second)], 5)
         tensor([1., 2., 3., 6., 5.])
     """
+    if not isinstance(parts, Sequence):
+        raise TypeError(f"{_ADD}: parts must be a list, got {type(parts).__name__}")
+    check_integer(_ADD, "n", n, 0)
     if not parts:
         raise ValueError(f"{_ADD}: parts must hold at least one message, got none")
     named = {f"parts[{index}]": part for index, part in enumerate(parts)}
@@ -80,9 +83,14 @@ def add_entries(parts: Sequence[Tensor], n: int, *, backend: str = "auto") -> Te
     check_same_device(_ADD, **named)
     run = backends.resolve(_ADD, backend=backend, device=parts[0].device, dtype=parts[0].dtype)
     total = parts[0].new_zeros(n)
-    for part in parts:
+    for index, part in enumerate(parts):
         if len(part) == n:
             total += part
-        else:
+            continue
+        try:
             run(part, total)
+        except ValueError:
+            raise ValueError(
+                f"{_ADD}: parts[{index}] must be as long as its bits tell, got {len(part)} numbers for {n} entries"
+            ) from None
     return total
