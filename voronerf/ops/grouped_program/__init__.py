@@ -15,6 +15,7 @@ from voronerf.checks import (
     check_no_inference,
     check_same_device,
     check_shape,
+    check_tensor,
 )
 from voronerf.program import Program
 
@@ -76,6 +77,8 @@ def grouped_program(
     if not isinstance(program, Program):
         raise TypeError(f"{_OP}: program must be a Program, got {type(program).__name__}")
     for name, given, wanted in (("inputs", inputs, program.inputs), ("parameters", parameters, program.parameters)):
+        if not isinstance(given, Sequence):
+            raise TypeError(f"{_OP}: {name} must be a list, got {type(given).__name__}")
         if len(given) != len(wanted) or not (wanted or name == "parameters"):
             raise ValueError(f"{_OP}: {name} must be {len(wanted)} tensors (inputs at least one), got {len(given)}")
     check_shape(_OP, "offsets", offsets, ("k+1",), sizes)
@@ -86,6 +89,7 @@ def grouped_program(
         check_shape(_OP, f"inputs[{i}]", x, ("n", width), sizes)
         check_dtype(_OP, f"inputs[{i}]", x, backends.COORDINATES if i == 0 else (inputs[0].dtype,))
     for i, (p, shape) in enumerate(zip(parameters, program.parameters)):
+        check_tensor(_OP, f"parameters[{i}]", p)
         check_shape(_OP, f"parameters[{i}]", p, (1 if p.shape[:1] == (1,) else "k", *shape), sizes)
         check_dtype(_OP, f"parameters[{i}]", p, (inputs[0].dtype,))
     if order is not None:

@@ -54,7 +54,7 @@ def compose_runs(
     sums: Tensor, target: Tensor, background: Tensor | None, first: int, rays: int
 ) -> tuple[Tensor, Tensor]:
     """Answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
-    answers = torch.empty_like(sums)
+    answers = sums.new_empty(sums.shape)
     given = native.compiled.RunsOfRays(
         sums=sums,
         target=target,
@@ -72,7 +72,7 @@ def run_gradients(
     raw: Tensor, samples: OwnSamples, answers: Tensor, density_scale: float, hidden: float
 ) -> tuple[Tensor, Tensor]:
     """Gradient of the loss to the outputs [m, 4], and weights [m]; see ``voronerf.ops.run_gradients``."""
-    gradient, (weights, importance) = torch.empty_like(raw), raw.new_empty(2, len(raw))
+    gradient, (weights, importance) = raw.new_empty(raw.shape), raw.new_empty(2, len(raw))
     given = _inputs(raw, samples, density_scale, hidden)
     native.compiled.run_gradients(given, answers, gradient, weights, importance, native.cpu())
     return gradient, weights

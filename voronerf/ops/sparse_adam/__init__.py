@@ -181,6 +181,7 @@ def _is_plain(tensors: Sequence[Tensor]) -> bool:
 
 def _check(op: str, tensors: dict[str, Tensor], rule: Rule) -> None:
     """Checks the tensors of one parameter, named after their lists, and its rule."""
+    check_tensor(op, "parameter", tensors["parameters"])
     shape = tensors["parameters"].shape
     for name, tensor in tensors.items():
         one = name[:-1]

@@ -43,6 +43,8 @@ def pack_entries(gradient: Tensor, *, backend: str = "auto") -> Tensor:
     check_shape(_PACK, "gradient", gradient, ("n",))
     check_dtype(_PACK, "gradient", gradient, (torch.float32,))
     check_count(_PACK, "gradient", len(gradient))
+    if gradient.is_meta:
+        raise ValueError(f"{_PACK}: gradient must have values, got a tensor on meta")
     run = backends.resolve(_PACK, backend=backend, device=gradient.device, dtype=gradient.dtype)
     message: Tensor = run(gradient.detach())
     return message if len(message) < len(gradient) else gradient
