@@ -184,7 +184,7 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
     fails("--cells must be at least 2", "train --cells 0", *small)
     fails("--device must name a device", "train --device gpu", *small)
     fails("must not hold a run already", "train --downscale 20 --out", run)
-    fails("--resume needs a checkpoint", "train --resume", *small)
+    fails("--resume needs a checkpoint in --out: there is nothing to resume in", "train --resume", *small)
     fails("--resume needs --out", "train --resume")
     fails("there is no checkpoint", "eval", tmp_path)
     fails("there is no checkpoint", "render", out)
