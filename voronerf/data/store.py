@@ -88,7 +88,9 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
             finally:
                 os.close(file)
     except OSError as error:
-        raise SceneError(f"{folder}: cannot hold the {size / 2**30:.2f} GiB of images: {error.strerror}") from None
+        raise SceneError(
+            f"{error.filename or folder}: cannot hold the {size / 2**30:.2f} GiB of images: {error.strerror}"
+        ) from None
     _mapped.add(mapped)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch, that the array is read-only

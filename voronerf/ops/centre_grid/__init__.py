@@ -157,6 +157,8 @@ def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str 
     sizes: dict[str, int] = {}
     check_shape(_OP, "centres", centres, ("k", 3), sizes)
     check_dtype(_OP, "centres", centres)
+    if centres.is_meta:
+        raise ValueError(f"{_OP}: centres must have values, got a tensor on the device meta")
     if weights is not None:
         check_shape(_OP, "weights", weights, ("k",), sizes)
         check_dtype(_OP, "weights", weights)

@@ -15,7 +15,10 @@ def _make(draw: Draw, n: int) -> Arguments:
 
 CASE = Case(
     _make,
-    refused={"centres must have shape [k, 3], got [2]": {"centres": torch.zeros(2)}},
+    refused={
+        "centres must have shape [k, 3], got [2]": {"centres": torch.zeros(2)},
+        "centres must have values, got a tensor on the device meta": {"centres": torch.zeros(2, 3, device="meta")},
+    },
     compiles=False,
     comparable=False,
 )
