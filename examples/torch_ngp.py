@@ -117,12 +117,13 @@ def main() -> None:
 
     # after
     centres = torch.rand(16, 3) * 2 - 1
-    model = VoronoiRouter(model, centres, coords="first3", methods=["density"], share=["encoder.*"], fuse=True)
+    options = {"methods": ["density"], "share": ["encoder.*"], "fuse": True, "way": "fused"}
+    model = VoronoiRouter(model, centres, coords="first3", **options)
     routed_sigma, routed_rgb = model(x, d)
     routed_density = model.density(x)
 
     torch.testing.assert_close((routed_sigma, routed_rgb, routed_density), (sigma, rgb, density))
-    assert model.explain() == "forward: fused\ndensity: fused"
+    assert model.explain().startswith("forward: fused in runs")
     shapes = [list(model.module.get_parameter(name).shape) for name in ("encoder.embeddings", "sigma_net.0.weight")]
     print(f"one hash grid {shapes[0]} for all cells, sigma_net {shapes[1]}")
     print(f"torch-ngp: {model.num_cells} cells, sigma {list(routed_sigma.shape)}, rgb {list(routed_rgb.shape)}")

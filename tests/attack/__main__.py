@@ -14,6 +14,7 @@ import given
 import op_attacks
 import run_attacks
 import scene_attacks
+import store_attacks
 import torch
 import training_attacks
 import viewer_attacks
@@ -30,6 +31,7 @@ PARTS = {
         (Part("bits", run_attacks.flipped_bit, 60, 20, given.prepare_runs), 500, 15),
         (Part("scenes", scene_attacks.stranger_scene, 60, 1, given.prepare_photographs), 150, 6),
         (Part("runs", run_attacks.stranger_run, 60, 1, given.prepare_runs), 150, 6),
+        (Part("stores", store_attacks.harmed_store, 60, 1, given.prepare_scenes), 150, 6),
         (Part("clients", viewer_attacks.hostile_client, 60, 1, given.prepare_runs), 150, 3),
         (Part("stress", training_attacks.stressed_command, 60, 1, given.prepare_scenes), 150, 6),
     )

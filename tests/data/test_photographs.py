@@ -88,7 +88,8 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     scene = load_scene(tmp_path, downscale=4)
     points = torch.from_numpy(POINTS) @ scene.transform[:3, :3].T + scene.transform[:3, 3]
     config = resolve_config(TrainConfig(), scene)
-    assert (config.sightings, make_renderer(config, scene, make_routers(config, "cpu")).full_gradient) == (0.003, 1.0)
+    space = make_renderer(config, scene, make_routers(config, "cpu")).sampler.space
+    assert (config.sightings, space.full_gradient) == (0.003, 1.0)
     batch = RayBatches(scene, torch.device("cpu"), sightings=True).draw(400, torch.Generator().manual_seed(0))
     assert len(batch.rays) == 400 and len(batch.seen) == 100
     rays = batch.rays[300:]

@@ -13,8 +13,8 @@ from scene_files import rewrite, write_blender, write_capture
 
 from voronerf.data import builtin_scene, load_scene
 from voronerf.data.photographs import find_frame
+from voronerf.rendering import Space, Stratified, render_rays
 from voronerf.rendering.cameras import Cameras, focus_point, orbit_cameras
-from voronerf.rendering.volume import render_rays
 
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 
@@ -165,10 +165,10 @@ def test_rays_of_a_capture_without_a_common_focus_are_finite(tmp_path, rig):
         return torch.full_like(positions, 0.5), torch.ones(len(positions))
 
     rays = scene.test.cameras.image_rays(0)
-    options = {"samples": 8, "spacing": scene.spacing, "backend": "reference"}
+    sampler = Stratified(8, space=Space(spacing=scene.spacing), backend="reference")
     for jitter in (False, True):
-        rendered = render_rays(field, rays, scene.near, scene.far, jitter=jitter, **options)
-        assert all(part.isfinite().all() for part in rendered)
+        rendered = render_rays(field, rays, scene.near, scene.far, jitter=jitter, samples=sampler)
+        assert all(part.isfinite().all() for part in rendered[:-1])
         assert (rendered.depth > scene.near).all() and (rendered.depth < scene.far).all()
 
 

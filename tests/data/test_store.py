@@ -139,11 +139,14 @@ def test_what_is_damaged_is_made_again(folder, cache, caplog):
 
 
 def test_an_image_replaced_at_equal_size_and_time_is_noticed(folder, cache):
-    first = folder / "train" / "r_0.png"
+    first, second = folder / "train" / "r_0.png", folder / "train" / "r_1.png"
+    size = max(path.stat().st_size for path in (first, second))
+    for path in (first, second):
+        path.write_bytes(path.read_bytes().ljust(size, b"\0"))
     load_scene(folder, images="disk")
-    stat, data = first.stat(), bytearray((folder / "train" / "r_1.png").read_bytes())
-    data += bytes(stat.st_size - len(data)) if stat.st_size > len(data) else b""
-    first.write_bytes(data)
+    stat = first.stat()
+    first.write_bytes(second.read_bytes())
+    assert first.stat().st_size == size
     os.utime(first, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     assert torch.equal(*load_scene(folder, images="disk").train.images[:2])
 

@@ -335,6 +335,10 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
     assert not torch.equal(before, router.module.weight)
     with pytest.raises(ValueError, match="load_state_dict: optimizer must hold the router's parameters"):
         router.load_state_dict(state, optimizer=torch.optim.SGD([nn.Parameter(torch.zeros(2))]))
+    number = {**state, 3: torch.ones(2)}
+    for wrong, rule in ((number, "have strings as keys, got 3"), ([state], "be a mapping, got list")):
+        with pytest.raises(TypeError, match=f"load_state_dict: state_dict must {rule}"):
+            router.load_state_dict(wrong)
 
 
 def test_a_promise_about_samples_lets_a_module_fuse() -> None:

@@ -78,7 +78,11 @@ class Fused:
             first = next(iter(self._why.values()), "nothing that is returned comes from a layer")
             raise Unfusable(f"no layer can be part of a run: {first}")
         self._sorted = any(self._meets_cells(node) for node in self._between)
-        said = list(dict.fromkeys(self._why[node] for node in self._between if node in self._why))
+        lines: dict[str, dict[str, None]] = {}  # of the module, with the functions that are no steps
+        for node in self._between:
+            if node in self._why:
+                lines.setdefault(node.meta["line"], {})[name_of(node.target)] = None
+        said = [f"{', '.join(functions)}{line}" for line, functions in lines.items()]
         self.name = "fused in runs" if len(self._runs) > 1 or said else "fused"
         self.why = f"{len(self._runs)} run{'s' * (len(self._runs) > 1)}, between them {'; '.join(said)}" if said else ""
         for node in trace.graph.nodes:

@@ -312,8 +312,13 @@ class VoronoiRouter(nn.Module):
             Missing and unexpected keys.
 
         Raises:
+            TypeError: If the state is no mapping, or one of its keys no string.
             ValueError: If the optimiser holds none of the router's parameters.
         """
+        if not isinstance(state_dict, Mapping):
+            raise TypeError(f"load_state_dict: state_dict must be a mapping, got {type(state_dict).__name__}")
+        if other := [key for key in state_dict if not isinstance(key, str)]:
+            raise TypeError(f"load_state_dict: state_dict must have strings as keys, got {other[0]!r:.60}")
         check_optimizer(optimizer, self.module, "load_state_dict")
         result = super().load_state_dict(state_dict, strict, assign)
         if optimizer is not None:

@@ -75,7 +75,7 @@ def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
     elif not config.resume and checkpoint_paths(out):
         raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
     elif config.resume and not checkpoint_paths(out):
-        raise ConfigError(f"--resume needs a checkpoint in --out, got {out}")
+        raise ConfigError(f"--resume needs a checkpoint in --out: there is nothing to resume in {out} yet")
     return replace(config, out=out)
 
 

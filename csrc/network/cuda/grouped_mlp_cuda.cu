@@ -110,7 +110,7 @@ void grouped_mlp_backward_cuda(const MlpTable& table, const MlpInputs& in, const
     return mlp_layers_backward_cuda(choice.layers, data, layers_of(table, in), count == 0 ? nullptr : &results,
                                     workspace, stream);
   }
-  if (table.position.kind == MlpEncodingKind::hash && in.encoded == nullptr) {
+  if (in.n > 0 && table.position.kind == MlpEncodingKind::hash && in.encoded == nullptr) {
     throw std::invalid_argument("grouped_mlp: encoded must be what the forward pass kept of the hash grid, got none");
   }
   const HashEncoding grid = grid_of(table, in);

@@ -103,7 +103,7 @@ def draw_cell(
         weights = weights.detach().to(dtype)
     points, centres, uniforms = (tensor.detach().to(dtype) for tensor in (points, centres, uniforms))
     run = backends.resolve(_OP, backend=backend, device=points.device, dtype=dtype)
-    host = points.device.type == "cpu" and not torch.compiler.is_compiling()
+    host = _on_host(points)
     if host:
         _check_tree(child_offsets, child)
     leaf: Tensor = run(
@@ -112,6 +112,11 @@ def draw_cell(
     if host and bool((leaf < 0).any()):
         raise ValueError(f"{_OP}: depth must be the number of levels of the tree, got {depth}, which is too few")
     return leaf
+
+
+def _on_host(points: Tensor) -> bool:
+    """Whether values can be looked at without waiting for a device."""
+    return points.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 def _check_tree(child_offsets: Tensor, child: Tensor) -> None:

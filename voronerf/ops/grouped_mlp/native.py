@@ -180,6 +180,10 @@ def backward(
         for tensor, want in zip((*weights, *biases, positions, directions, features), chosen)
     ]
     yield results
+    if positions.shape[0] == 0:  # where nothing of a hash grid could be kept
+        for result in results:
+            result.zero_()
+        return
     for result in results:
         on_huge_pages(result)
     compiled, machine = native.compiled, native.machine(positions)
