@@ -183,3 +183,25 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
     refuses("matching must be one of auto", process.process, tmp_path, tmp_path / "out", matching="all")
     refuses("max_features must be at least 100, got 5", process.process, tmp_path, tmp_path / "out", max_features=5)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, pictures):
+    Image.open(pictures / "01.png").save(tmp_path / "whole.jpg")
+    jpeg, png = (tmp_path / "whole.jpg").read_bytes(), (pictures / "01.png").read_bytes()
+    for number, (content, reason) in enumerate(
+        (
+            (jpeg[: len(jpeg) // 2], "cannot be read: image file is truncated"),
+            (png[: len(png) // 2], "cannot be read: image file is truncated"),
+            (b"no image" * 9, "is not an image in PNG or JPEG format"),
+            (b"", "is not an image in PNG or JPEG format"),
+            (png[:24] + b"\x10" + png[25:], "has more than 8 bits a channel"),
+            (png[:16] + b"\x7f" + png[17:], "is not an image in PNG or JPEG format"),
+        )
+    ):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        for name in ("00.png", "02.png", "03.png"):
+            (folder / name).write_bytes((pictures / name).read_bytes())
+        (folder / "bad.jpg").write_bytes(content)
+        refuses(f"{folder}/bad.jpg: {reason}", process.process, folder, tmp_path / "out", error=SceneError)
+        assert not (tmp_path / "out").exists()

@@ -32,7 +32,7 @@ from PIL import Image
 
 from voronerf.data.colmap import FILES, ColmapImage, depth_bounds, points_seen, read_model
 from voronerf.data.folders import listed_images
-from voronerf.data.images import read_header
+from voronerf.data.images import read_header, read_image
 from voronerf.data.lenses import COEFFICIENTS, MODELS
 from voronerf.data.scene import SceneError
 from voronerf.data.soundness import camera_faults, lost_cameras
@@ -150,7 +150,7 @@ def process(
     settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features)
     work = _begin(out, settings)
     level = pycolmap.logging.Level
-    pycolmap.logging.minloglevel = (level.INFO if verbose else level.ERROR).value
+    pycolmap.logging.minloglevel = (level.INFO if verbose else level.FATAL).value
     pycolmap.logging.alsologtostderr = verbose
     if not (images := out / "images").is_dir():
         _gather(source, out, frames)
@@ -219,6 +219,7 @@ def _gather(source: Path, out: Path, frames: int) -> None:
     try:
         if source.is_dir():
             for path in listed_images(source):
+                read_image(path, min(8, *read_header(path, 1).size))  # COLMAP would take one that is cut off
                 shutil.copyfile(path, part / path.name)
         else:
             _take_frames(source, part, frames)
