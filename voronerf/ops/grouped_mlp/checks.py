@@ -54,7 +54,7 @@ def check_network(
 
 
 def _fits(tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> bool:
-    """Whether a parameter keeps all rules, in a fifth of the time of a message for it."""
+    """Whether a parameter keeps all rules; its name for a message is not made."""
     if not isinstance(tensor, Tensor) or tensor.layout is not torch.strided or tensor.is_nested:
         return False
     return tensor.dtype == dtype and tensor.shape == shape

@@ -169,7 +169,7 @@ def sparse_adam(
 
 
 def _are_plain(*lists: Sequence[Any]) -> bool:
-    """Whether the tensors of all parameters keep all rules, in a twentieth of the time of a message for each."""
+    """Whether the tensors of all parameters keep all rules, found in one pass without names for messages."""
     if not isinstance(lists[0][0], Tensor):
         return False
     device = lists[0][0].device
