@@ -183,8 +183,11 @@ class Occupancy(Stratified):
     ) -> Samples:
         """As that of `Stratified`."""
         # A ray's jitter follows from the sum of the seed and of its number.
-        seed = draw_seed(near.device, generator) + (kept.start or 0) if jitter else None
-        return self.march(rays[kept], near[kept], far[kept], seed=seed)[0]
+        seed = draw_seed(near.device, generator) if jitter else None
+        if kept != slice(None):
+            rays, near, far = rays[kept], near[kept], far[kept]
+            seed = None if seed is None else seed + (kept.start or 0)
+        return self.march(rays, near, far, seed=seed)[0]
 
     def march(
         self,

@@ -50,7 +50,7 @@ class Samples(NamedTuple):
     @property
     def positions(self) -> Tensor:
         """[m, 3], the points or the means of the Gaussians."""
-        return self.inputs[:, :3]
+        return self.inputs if self.inputs.shape[1] == 3 else self.inputs[:, :3]
 
     def by_ray(self, values: Tensor) -> Tensor:
         """Values [m, ...] as [r, s, ...], where all rays have as many samples; else as they are."""

@@ -143,10 +143,11 @@ class Cells:
     def heaviest(self, found: Found) -> Tensor:
         """The own samples [n, 4] that may be kept, with their importance, as many on each rank; none after the last
         split."""
-        kept = found.weights.new_zeros(0 if self.planned is None else self.reservoir.quota, 4)
-        if len(kept):
-            points, importance = select_heaviest(found.samples.positions, found.importance(), len(kept))
-            kept[: len(points), :3], kept[: len(points), 3] = points, importance
+        if self.planned is None:
+            return found.weights.new_empty(0, 4)
+        kept = found.weights.new_zeros(self.reservoir.quota, 4)
+        points, importance = select_heaviest(found.samples.positions, found.importance(), len(kept))
+        kept[: len(points), :3], kept[: len(points), 3] = points, importance
         return kept
 
     def tell(self, found: Found) -> Tensor:

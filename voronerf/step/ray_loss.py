@@ -122,13 +122,14 @@ class Fused:
 
     def __call__(self, batch: Batch, generator: torch.Generator | None, *, kept: slice = slice(None)) -> Found:
         """As of :class:`RayLoss`, for the rays ``kept`` alone, which have the samples that they have among all."""
-        renderer, rays = self.renderer, batch.rays[kept]
+        renderer, directions, target, background = self.renderer, batch.rays.directions, batch.target, batch.background
         field = cast(VoronoiRouter, renderer.field)
         given: dict[str, Any] = {"jitter": True, "generator": generator, "kept": kept}
         samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, **given)
-        background = batch.background
-        if background is not None and background.dim() == 2:
-            background = background[kept]
+        if kept != slice(None):
+            directions, target = directions[kept], target[kept]
+            if background is not None and background.dim() == 2:
+                background = background[kept]
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
         found: list[RenderLoss] = []
 
@@ -137,7 +138,7 @@ class Fused:
                 raw,
                 samples.deltas,
                 samples.ray_offsets,
-                batch.target[kept],
+                target,
                 background=background,
                 density_scale=density_scale(field),
                 hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
@@ -146,7 +147,7 @@ class Fused:
             found.append(result)
             return result.loss, gradient if shares is None else gradient * shares[:, None]
 
-        network = field.table_arguments(samples.inputs, rays.directions, samples.ray_index)
+        network = field.table_arguments(samples.inputs, directions, samples.ray_index)
         assert network is not None
         total = learn_outputs(network, loss, backend=renderer.backend)
         return Found(total, found[0].error, found[0].weights, found[0].density, samples)

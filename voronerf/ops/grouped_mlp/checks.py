@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from voronerf.checks import FLOATS, INDEX, check_dtype, check_same_dtype, check_shape, check_tensor
@@ -41,14 +42,22 @@ def check_network(
         if width < 1 and any(source in layer.inputs for layer in layers.layers):
             raise ValueError(f"{op}: {source} must have at least one feature where a layer reads them, got {width}")
     for index, (o, i) in enumerate(layers.weight_shapes(sizes["p"], sizes["q"])):
-        check_shape(op, f"weights[{index}]", weights[index], ("k", o, i), sizes)
-        check_dtype(op, f"weights[{index}]", weights[index], FLOATS if index == 0 else (weights[0].dtype,))
-        bias = biases[index]
-        if bias is not None:
+        weight, bias = weights[index], biases[index]
+        if index == 0 or not _fits(weight, (sizes["k"], o, i), weights[0].dtype):
+            check_shape(op, f"weights[{index}]", weight, ("k", o, i), sizes)
+            check_dtype(op, f"weights[{index}]", weight, FLOATS if index == 0 else (weights[0].dtype,))
+        if bias is not None and not _fits(bias, (sizes["k"], o), weights[0].dtype):
             check_shape(op, f"biases[{index}]", bias, ("k", o), sizes)
             check_same_dtype(op, **{"weights[0]": weights[0], f"biases[{index}]": bias})
     if sizes["k"] < 1:
         raise ValueError(f"{op}: weights[0] must hold at least one cell, got {list(weights[0].shape)}")
+
+
+def _fits(tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> bool:
+    """Whether a parameter keeps all rules; its name for a message is not made."""
+    if not isinstance(tensor, Tensor) or tensor.layout is not torch.strided or tensor.is_nested:
+        return False
+    return tensor.dtype == dtype and tensor.shape == shape
 
 
 def _check_directions(

@@ -168,16 +168,18 @@ def check_routed(
         check_dtype(op, "coords", coords)
     elif centres is not None and sizes["p"] < 3:
         raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {sizes['p']}")
-    tensors = {
-        "positions": positions,
-        "coords": coords,
-        **tables,
-        **read,
-        **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
-        **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
-    }
-    check_same_device(op, **tensors)
-    check_no_inference(op, **tensors)
+    every, device = (positions, coords, *tables.values(), *read.values(), *weights, *biases), positions.device
+    if torch.compiler.is_compiling() or any(t is not None and (t.device != device or t.is_inference()) for t in every):
+        tensors = {  # named for an error alone
+            "positions": positions,
+            "coords": coords,
+            **tables,
+            **read,
+            **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
+            **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
+        }
+        check_same_device(op, **tensors)
+        check_no_inference(op, **tensors)
     if centres is not None:
         points = positions[:, :3] if coords is None else coords
         compared = of_one_dtype(points, centres, network["centre_weights"])

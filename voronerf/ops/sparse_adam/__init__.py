@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -92,10 +92,12 @@ def adam(
     for index, rule in enumerate(rules):
         if not isinstance(rule, Rule):
             raise TypeError(f"{_ALL}: rules must hold a Rule for each parameter, got {type(rule).__name__}")
-        own = parameters[index], gradients[index], means[index], squares[index]
-        if not _is_plain(own) or index == 0 or rule != rules[index - 1]:  # a training has the same rule many times
-            _check(_ALL, dict(zip(lists, own, strict=True)), rule)
-    check_same_device(_ALL, **{f"parameters[{index}]": tensor for index, tensor in enumerate(parameters)})
+        if index == 0 or rule != rules[index - 1]:  # a training has the same rule many times
+            _check_rule(_ALL, rule)
+    if not _are_plain(parameters, gradients, means, squares):
+        for own in zip(*lists.values(), strict=True):
+            _check(_ALL, dict(zip(lists, own, strict=True)))
+        check_same_device(_ALL, **{f"parameters[{index}]": tensor for index, tensor in enumerate(parameters)})
     run = backends.resolve(_ALL, backend=backend, device=parameters[0].device, dtype=torch.float32)
     given = []
     for rule in rules:
@@ -158,29 +160,34 @@ def sparse_adam(
                 [ 0.0000,  0.0000]])
     """
     tensors = {"parameters": parameter, "gradients": gradient, "means": mean, "squares": square}
-    _check(_OP, tensors, Rule(step, learning_rate, betas, epsilon))
+    _check(_OP, tensors)
+    _check_rule(_OP, Rule(step, learning_rate, betas, epsilon))
     run = backends.resolve(_OP, backend=backend, device=parameter.device, dtype=torch.float32)
     first, second = betas
     rate, epsilon = corrected(step, learning_rate, betas, epsilon)
     run(parameter, gradient.contiguous(), mean, square, rate, first, second, epsilon)
 
 
-def _is_plain(tensors: Sequence[Tensor]) -> bool:
-    """Whether the tensors of one parameter keep all rules, in a tenth of the time of a message for each."""
-    first = tensors[0]
-    return all(
-        isinstance(tensor, Tensor)
-        and tensor.dtype == torch.float32
-        and tensor.shape == first.shape
-        and tensor.device == first.device
-        and tensor.is_contiguous()
-        and not tensor.is_neg()
-        for tensor in tensors
-    )
+def _are_plain(*lists: Sequence[Any]) -> bool:
+    """Whether the tensors of all parameters keep all rules, found in one pass without names for messages."""
+    if not isinstance(lists[0][0], Tensor):
+        return False
+    device = lists[0][0].device
+    for own in zip(*lists, strict=True):
+        shape: torch.Size | None = None
+        for tensor in own:
+            if not isinstance(tensor, Tensor) or tensor.layout is not torch.strided or tensor.is_nested:
+                return False
+            shape = tensor.shape if shape is None else shape
+            if tensor.dtype is not torch.float32 or tensor.shape != shape or tensor.device != device:
+                return False
+            if not tensor.is_contiguous() or tensor.is_neg():
+                return False
+    return True
 
 
-def _check(op: str, tensors: dict[str, Tensor], rule: Rule) -> None:
-    """Checks the tensors of one parameter, named after their lists, and its rule."""
+def _check(op: str, tensors: dict[str, Tensor]) -> None:
+    """Checks the tensors of one parameter, named after their lists."""
     check_tensor(op, "parameter", tensors["parameters"])
     shape = tensors["parameters"].shape
     for name, tensor in tensors.items():
@@ -192,6 +199,9 @@ def _check(op: str, tensors: dict[str, Tensor], rule: Rule) -> None:
         if one != "gradient":
             check_writable(op, one, tensor)
     check_same_device(op, **{name[:-1]: tensor for name, tensor in tensors.items()})
+
+
+def _check_rule(op: str, rule: Rule) -> None:
     check_integer(op, "step", rule.step, 1)
     check_number(op, "learning_rate", rule.learning_rate)
     check_number(op, "epsilon", rule.epsilon)
