@@ -39,10 +39,9 @@ def smooth(width: int = 9) -> Program:
 
 
 def _make(draw: Draw, n: int) -> Arguments:
-    k, dtype = draw.among("k", 3, 1, 2, 17), draw.dtype()
-    program = (
-        every_step() if draw.among("program", "steps", "smooth") == "steps" else smooth(draw.number("w", 9, 1, 70))
-    )
+    k, jumps = draw.among("k", 3, 1, 2, 17), draw.among("program", "steps", "smooth") == "steps"
+    program = every_step() if jumps else smooth(draw.number("w", 9, 1, 70))
+    dtype = torch.float32 if jumps else draw.dtype()  # half precision may fall on the other side of a jump
     inputs = [draw.normal(n, width, dtype=dtype) for width in program.inputs]
     parameters = []
     for shape in program.parameters:
