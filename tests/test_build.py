@@ -26,7 +26,8 @@ def build(monkeypatch):
 
 
 def commands(build, cuda):
-    """Command of every rule."""
+    """Command of every rule; the compiler, which is asked for its architecture, need not exist."""
+    build["ninja_file"].__globals__["isas"] = lambda: {"portable": ["-DVN_ISA=0"]}
     lines = build["ninja_file"](Path("_C.so"), cuda).splitlines()
     rules = [line.removeprefix("rule ") for line in lines if line.startswith("rule ")]
     texts = [line.removeprefix("  command = ") for line in lines if line.startswith("  command = ")]

@@ -219,6 +219,11 @@ class Lowering:
 class _Recording(TorchDispatchMode):
     """Takes down what a function calls of ATen."""
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """To be skipped by torch.compile is the default, and imports it at the first call, which takes a second."""
+        return False
+
     def __init__(self, lowering: Lowering) -> None:
         super().__init__()
         self.lowering, self.b = lowering, lowering.builder
