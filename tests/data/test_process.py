@@ -49,7 +49,7 @@ def pictures(tmp_path_factory):
         v = np.where(to_floor < to_wall, point[:, 1], point[:, 2])
         column, row = ((np.clip(x / 8 + 0.5, 0, 0.999) * 512).astype(int) for x in (u, v))
         grey = np.where(to_floor < to_wall, floor[row, column], wall[row, column])
-        Image.fromarray(grey.reshape(HEIGHT, WIDTH)).convert("RGB").save(folder / f"{index:02}.png")
+        Image.fromarray(grey.reshape(HEIGHT, WIDTH)).convert("RGB").save(folder / f"{index:02} a.png")
     return folder
 
 
@@ -81,7 +81,7 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     assert said[-1].startswith(f"wrote {out}: cameras of {COUNT} of {COUNT} images")
     kept = {"images", "images_2", "sparse", "transforms.json", "colmap"}
     assert {path.name for path in out.iterdir()} == kept
-    assert Image.open(out / "images_2/00.png").size == (WIDTH // 2, HEIGHT // 2)
+    assert Image.open(out / "images_2/00_a.png").size == (WIDTH // 2, HEIGHT // 2)
     refuses("is a scene already", process.process, pictures, out, error=SceneError)
 
     images = read_model(out / "sparse/0").images
@@ -186,8 +186,8 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
 
 
 def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, pictures):
-    Image.open(pictures / "01.png").save(tmp_path / "whole.jpg")
-    jpeg, png = (tmp_path / "whole.jpg").read_bytes(), (pictures / "01.png").read_bytes()
+    Image.open(pictures / "01 a.png").save(tmp_path / "whole.jpg")
+    jpeg, png = (tmp_path / "whole.jpg").read_bytes(), (pictures / "01 a.png").read_bytes()
     for number, (content, reason) in enumerate(
         (
             (jpeg[: len(jpeg) // 2], "cannot be read: image file is truncated"),
@@ -200,7 +200,7 @@ def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, p
     ):
         folder = tmp_path / str(number)
         folder.mkdir()
-        for name in ("00.png", "02.png", "03.png"):
+        for name in ("00 a.png", "02 a.png", "03 a.png"):
             (folder / name).write_bytes((pictures / name).read_bytes())
         (folder / "bad.jpg").write_bytes(content)
         refuses(f"{folder}/bad.jpg: {reason}", process.process, folder, tmp_path / "out", error=SceneError)

@@ -212,7 +212,10 @@ def _begin(out: Path, settings: Settings) -> Path:
 
 
 def _gather(source: Path, out: Path, frames: int) -> None:
-    """Copies the images of a folder, or takes those of a video, to `out/images`."""
+    """Copies the images of a folder, or takes those of a video, to `out/images`.
+
+    COLMAP's lists of pairs separate names by spaces: names have `_` in their place.
+    """
     part = out / ".images"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
@@ -220,14 +223,20 @@ def _gather(source: Path, out: Path, frames: int) -> None:
         if source.is_dir():
             for path in listed_images(source):
                 read_image(path, min(8, *read_header(path, 1).size))  # COLMAP would take one that is cut off
-                shutil.copyfile(path, part / path.name)
+                copy = part / "_".join(path.name.split())
+                if copy.exists():
+                    raise SceneError(f"{path}: another image has this name with _ in the place of spaces")
+                shutil.copyfile(path, copy)
         else:
             _take_frames(source, part, frames)
         count = len(listed_images(part))
         if count < LEAST_IMAGES:
             raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}")
     except BaseException:
-        shutil.rmtree(out, ignore_errors=True)  # it holds nothing else yet
+        for made in (part, out / "colmap"):
+            shutil.rmtree(made, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            out.rmdir()
         raise
     os.replace(part, out / "images")
 
