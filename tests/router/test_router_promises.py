@@ -354,3 +354,14 @@ def test_a_promise_about_samples_lets_a_module_fuse() -> None:
     x = uniform((50,))
     torch.testing.assert_close(router(x), router.cell(0)(x))
     assert router.explain() == "forward: fused"
+
+
+@pytest.mark.parametrize("width", [37, 74, 259, 1147])
+def test_widths_that_are_numbers_of_samples_of_a_trace(width):
+    """1147 is a multiple of the first two of them."""
+    torch.manual_seed(0)
+    field = nn.Sequential(nn.Linear(3, width), nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, 4))
+    router = VoronoiRouter(field, torch.rand(3, 3), coords="first3", fuse=True, way="fused")
+    x = torch.rand(50, 3)
+    torch.testing.assert_close(router(x), field(x))
+    assert router.explain() == "forward: fused"

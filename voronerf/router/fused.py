@@ -23,12 +23,12 @@ from voronerf.program import VALUE, Builder, Columns, Program, Step
 from voronerf.router.grouped import GroupedRun, PerCell, for_all_cells, name_of
 from voronerf.router.grouping import Grouping, owned_parameters
 from voronerf.router.layout import Call, Results, map_tensors, map_tree, tensors_of
-from voronerf.router.lower import ROWS, Entries, Lowering, NotAStep
+from voronerf.router.lower import Entries, Lowering, NotAStep
 from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable
 
 
 def fuse(call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> Fused:
-    """The fused way of a call, traced for the first cell on ``ROWS`` rows of its arguments, or raises Unfusable."""
+    """The fused way of a call, traced for the first cell on some rows of its arguments, or raises Unfusable."""
     return Fused(call, given, assume)
 
 
@@ -47,7 +47,7 @@ class Fused:
 
     Args:
         call: The call, which runs with the parameters of the first cell.
-        given: The rows of the arguments, for ``ROWS`` samples.
+        given: The rows of the arguments, for as many samples as ``rows_for`` gives.
         assume: What ``any()`` and ``all()`` of samples give, by their code.
 
     Raises:
@@ -62,7 +62,7 @@ class Fused:
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
-        self._lowering = Lowering()
+        self._lowering = Lowering(trace.rows)
         self._entries: dict[fx.Node, Entries] = {}  # of values that steps make or move
         self._ready: dict[fx.Node, int] = {}  # of what PyTorch makes: the first run that can read it
         self._why: dict[fx.Node, str] = {}
@@ -150,7 +150,8 @@ class Fused:
             return self._known(values[id(value)]) if id(value) in values else None
 
         function: Any = node.target
-        result, args, entries = self._lowering.run(function, args, kwargs, known)
+        # As an ordinary dict, of which a changed copy can be made.
+        result, args, entries = self._lowering.run(function, args, dict(kwargs), known)
         found = [args[0]] if node.meta["inplace"] else tensors_of(result)
         made = [entries(tensor) for tensor in found]
         for value, known_as in zip(node.meta["results"], made, strict=True):
@@ -199,11 +200,11 @@ class Fused:
     def _whole(self, node: fx.Node) -> Columns:
         """The columns that make a node's value, and how they are laid out in it."""
         codes = self._entries[node].codes
-        shape, at = codes.shape, _sample_dimension(codes.shape)
-        turned = codes.movedim(at, 0).reshape(ROWS, -1)
-        if not torch.equal(turned >> 32, torch.arange(ROWS)[:, None].expand_as(turned)):
+        shape, at = codes.shape, _sample_dimension(codes.shape, self._lowering.rows)
+        turned = codes.movedim(at, 0).reshape(self._lowering.rows, -1)
+        if not torch.equal(turned >> 32, torch.arange(self._lowering.rows)[:, None].expand_as(turned)):
             raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} mixes samples")
-        node.meta["layout"] = [*shape[:at], *shape[at + 1 :]], at, shape[at] // ROWS
+        node.meta["layout"] = [*shape[:at], *shape[at + 1 :]], at, shape[at] // self._lowering.rows
         return self._lowering.operand(turned[0] & ((1 << 32) - 1))
 
     def _only_moves(self, node: fx.Node) -> bool:
@@ -374,5 +375,5 @@ def _taken(value: Tensor, of: Any, codes: Tensor) -> Tensor:
     return flat.index_select(1, numbers.to(flat.device)).reshape(-1, *codes.shape)
 
 
-def _sample_dimension(shape: torch.Size) -> int:
-    return next(d for d, size in enumerate(shape) if size and size % ROWS == 0)
+def _sample_dimension(shape: torch.Size, rows: int) -> int:
+    return next(d for d, size in enumerate(shape) if size and size % rows == 0)

@@ -1,6 +1,6 @@
 """Functions of PyTorch as steps of a program.
 
-A function of the trace runs once on ``ROWS`` samples, and what it calls of ATen is taken down. A tensor that depends on
+A function of the trace runs once on a few samples, and what it calls of ATen is taken down. A tensor that depends on
 samples has a code for each of its entries, the number of its sample and of its column; what only moves entries (views,
 ``cat``, ``permute``) runs on the codes. A parameter has the number of the entry. Entries of one sample that are
 computed from others become a value of the program.
@@ -19,7 +19,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from voronerf.program import PARAMETER, VALUE, Builder, Columns
 from voronerf.router.layout import map_tensors, tensors_of
 
-ROWS = 37  # samples of a trace: no other size is a multiple
 _LOW = (1 << 32) - 1
 _FEW, _PRODUCTS = 3, 16  # parts of an input that a layer reads one by one; layers that one function makes
 
@@ -91,13 +90,15 @@ class Lowering:
     """Steps of all functions of a trace so far, as of one program; later they are shared out among runs.
 
     Attributes:
+        rows: the samples of the trace.
         levels: of each value: the number of the run that makes it.
         sources: of each input, the node of the trace whose rows it is.
         columns: (value, column) of each number of a column.
         parameters: of each parameter of the program: the node or tensor, numbers of entries, whether they are a matrix.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rows: int) -> None:
+        self.rows = rows
         self.builder = Builder()
         self.levels: dict[int, int] = {}
         self.sources: dict[int, Any] = {}
@@ -110,25 +111,25 @@ class Lowering:
     # Values -----------------------------------------------------------------------------------------------------------
 
     def input(self, node: Any, shape: Sequence[int], level: int) -> Entries:
-        """The rows of a node as an input of the program, [ROWS * m, ...] for m entries of a sample."""
-        if not shape or shape[0] % ROWS or math.prod(shape) == 0:
-            at = next((d for d, size in enumerate(shape) if size == ROWS), None)
+        """The rows of a node as an input of the program, [rows * m, ...] for m entries of a sample."""
+        if not shape or shape[0] % self.rows or math.prod(shape) == 0:
+            at = next((d for d, size in enumerate(shape) if size == self.rows), None)
             if at is None or math.prod(shape) == 0:
                 raise NotAStep(f"a tensor of shape {list(shape)} has no row for each sample")
             moved = [shape[at], *shape[:at], *shape[at + 1 :]]
             return Entries(self.input(node, moved, level).codes.movedim(0, at))
-        width = math.prod(shape) // ROWS
+        width = math.prod(shape) // self.rows
         x = self.builder.input(width)
         self.sources[x.index], self.levels[x.index] = node, level
         return Entries(self._codes(x).reshape(list(shape)))
 
     def _codes(self, x: Columns) -> Tensor:
-        """[ROWS, w] of a whole value."""
+        """[rows, w] of a whole value."""
         if x.index not in self._numbered:
             self._numbered[x.index] = len(self.columns)
             self.columns += [(x.index, i) for i in range(x.start + x.width)]
         first = self._numbered[x.index] + x.start
-        return (torch.arange(ROWS)[:, None] << 32) + torch.arange(first, first + x.width)
+        return (torch.arange(self.rows)[:, None] << 32) + torch.arange(first, first + x.width)
 
     def level(self, value: int) -> int:
         """The number of the run that makes a value."""
@@ -140,13 +141,13 @@ class Lowering:
         return self.levels[value]
 
     def order(self, codes: Tensor) -> tuple[Tensor, Tensor]:
-        """The places of a tensor's entries sample by sample, [ROWS, w], and the numbers of the columns, [w]."""
+        """The places of a tensor's entries sample by sample, [rows, w], and the numbers of the columns, [w]."""
         rows = (codes >> 32).flatten()
-        if rows.numel() % ROWS or not rows.numel():
+        if rows.numel() % self.rows or not rows.numel():
             raise NotAStep("entries of a tensor do not belong to single samples")
-        places = torch.argsort(rows, stable=True).reshape(ROWS, -1)
+        places = torch.argsort(rows, stable=True).reshape(self.rows, -1)
         numbers = codes.flatten()[places]
-        if not torch.equal(numbers >> 32, torch.arange(ROWS)[:, None].expand_as(numbers)):
+        if not torch.equal(numbers >> 32, torch.arange(self.rows)[:, None].expand_as(numbers)):
             raise NotAStep("entries of a tensor do not belong to single samples")
         columns = numbers & _LOW
         if not (columns == columns[:1]).all():
@@ -336,11 +337,11 @@ class _Recording(TorchDispatchMode):
 
     def _constant(self, like: Tensor, value: float) -> Entries:
         """A number as a tensor of samples, in the first of its dimensions that they can be."""
-        at = next((d for d, size in enumerate(like.shape) if size and size % ROWS == 0), None)
+        at = next((d for d, size in enumerate(like.shape) if size and size % self.lowering.rows == 0), None)
         if at is None:
             raise NotAStep("a constant without samples")
         column = self.b.apply("affine", self.b.move(1, []), 0.0, value)
-        rows = torch.arange(ROWS).repeat_interleave(like.shape[at] // ROWS)
+        rows = torch.arange(self.lowering.rows).repeat_interleave(like.shape[at] // self.lowering.rows)
         shape = [1] * like.dim()
         shape[at] = like.shape[at]
         number = int(self.lowering._codes(column)[0, 0])
@@ -437,7 +438,7 @@ class _Recording(TorchDispatchMode):
         if not torch.equal(codes >> 32, rows.expand_as(codes)):
             raise NotAStep("it sums over samples")
         places, _ = self.lowering.order((rows << 32)[:, 0])
-        numbers = codes[places] & _LOW  # [ROWS, m, group]
+        numbers = codes[places] & _LOW  # [rows, m, group]
         if not (numbers == numbers[:1]).all():
             raise NotAStep("the samples of a tensor differ in more than their values")
         return places, self.lowering.operand(numbers[0].flatten()), group
@@ -523,12 +524,12 @@ class _Recording(TorchDispatchMode):
     def _rows_times(self, codes: Tensor, matrix: Entries, bias: Entries | None, shape: Sequence[int]) -> Entries:
         """Codes [..., i] times a matrix [o, i]."""
         flat = codes.reshape(-1, codes.shape[-1])
-        m = len(flat) // ROWS
+        m = len(flat) // self.lowering.rows
         rows = flat[:, :1] >> 32
-        if len(flat) % ROWS or not torch.equal(flat >> 32, rows.expand_as(flat)):
+        if len(flat) % self.lowering.rows or not torch.equal(flat >> 32, rows.expand_as(flat)):
             raise NotAStep("it mixes samples")
         places, _ = self.lowering.order((rows << 32)[:, 0])
-        numbers = flat[places] & _LOW  # [ROWS, m, i]
+        numbers = flat[places] & _LOW  # [rows, m, i]
         if m > _PRODUCTS or not (numbers == numbers[:1]).all():
             raise NotAStep("the samples of a tensor differ in more than their values")
         weight, (width, _) = self.lowering.parameter(matrix, matrix=True), matrix.codes.shape

@@ -16,7 +16,7 @@ from unittest import mock
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, fx
+from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate
 from torch.overrides import TorchFunctionMode
 
@@ -24,16 +24,23 @@ from voronerf.router.double import Double
 from voronerf.router.grouped import METADATA, RANDOM, find, name_of, user_line, writes_in_place
 from voronerf.router.grouping import cell_parameters, owned_parameters
 from voronerf.router.layout import Call, rebuild, tensors_of
-from voronerf.router.lower import ROWS
 
 CONSTANTS, CELLS, SAMPLES = range(3)  # what a value depends on: the latter of these
 _PATCHES = threading.RLock()  # one thread at a time changes what torch calls for a custom function
+_PRIMES = (37, 31, 29, 23)  # numbers of samples of a trace, see `rows_for`
 _LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
 _VERDICTS = find("any all", torch, torch.Tensor)
 
 
 class Unfusable(Exception):
     """A module cannot be fused; the message says where, and what to write instead."""
+
+
+def rows_for(module: nn.Module, given: list[Tensor]) -> int:
+    """The number of samples of a trace: a prime of which no size of the module and its arguments is a multiple."""
+    sizes = {size for tensor in (*module.parameters(), *module.buffers()) for size in tensor.shape}
+    sizes.update(size for tensor in given for size in tensor.shape[1:])
+    return next((rows for rows in _PRIMES if all(size % rows or not size for size in sizes)), _PRIMES[0])
 
 
 class Trace(TorchFunctionMode):
@@ -44,7 +51,7 @@ class Trace(TorchFunctionMode):
 
     Args:
         call: The call, which runs with the parameters of the first cell.
-        given: The rows of the arguments, for ``ROWS`` samples.
+        given: The rows of the arguments, for ``self.rows`` samples.
         assume: What ``any()`` and ``all()`` of samples give, by their code or a part of it.
 
     Raises:
@@ -62,7 +69,8 @@ class Trace(TorchFunctionMode):
         self.parameters: dict[fx.Node, int] = {}  # with their place among ``owned_parameters``
         self._running = False
         self._nodes: dict[int, fx.Node] = {}  # by the id of their tensor, which ``meta`` keeps
-        self.n = self._new(ROWS)
+        self.rows = rows_for(module, given)
+        self.n = self._new(self.rows)
         self.inputs = [self._new(tensor) for tensor in given]
         double = Double(module)
         with _custom_functions(self), self:
@@ -76,27 +84,28 @@ class Trace(TorchFunctionMode):
         node.meta.update(value=value, on=on)
         if isinstance(value, Tensor):
             self._nodes[id(value)] = node
-            if on == SAMPLES and not any(size and size % ROWS == 0 for size in value.shape):
+            if on == SAMPLES and not any(size and size % self.rows == 0 for size in value.shape):
                 name = name_of(node.target)
                 if node.target in _VERDICTS and value.dim() == 0:
                     return node  # which may be promised
                 raise Unfusable(
                     f"{name}{node.meta.get('line', '')} gives a tensor of shape {list(value.shape)}, which has no row "
-                    f"for each of {ROWS} samples: it mixes or selects them; keep a row for each, as torch.where does"
+                    f"for each of {self.rows} samples: it mixes or selects them; keep a row for each, as torch.where "
+                    "does"
                 )
         return node
 
     def _argument(self, value: Any) -> Any:
         """What stands for an argument in the graph."""
-        if type(value) is int and value and value % ROWS == 0:
-            return self._new(value, self.graph.call_function(operator.mul, (self.n, value // ROWS)))
+        if type(value) is int and value and value % self.rows == 0:
+            return self._new(value, self.graph.call_function(operator.mul, (self.n, value // self.rows)))
         if not isinstance(value, Tensor) or id(value) in self._nodes:
             return self._nodes.get(id(value), value)
         if id(value) in self._places:
             node = self._new(value, on=CELLS if id(value) in self._of_cells else CONSTANTS)
             self.parameters[node] = self._places[id(value)]
             return node
-        if value.requires_grad or value.shape[:1] == (ROWS,):
+        if value.requires_grad or value.shape[:1] == (self.rows,):
             raise Unfusable(f"a tensor comes from what is no PyTorch function{user_line()}")
         return value
 
@@ -125,7 +134,7 @@ class Trace(TorchFunctionMode):
             raise Unfusable(f"{name_of(func)} draws random numbers{line}; pass them as an argument")
         if used and not found and result is not None:
             return self._read(node, result, line)
-        alone = func in _LIKE and not any(size and size % ROWS == 0 for size in found[0].shape)
+        alone = func in _LIKE and not any(size and size % self.rows == 0 for size in found[0].shape)
         if not used or alone or not found or (not inplace and any(result is tensor for tensor in operands)):
             self.graph.erase_node(node)
             return result

@@ -31,7 +31,7 @@ from voronerf.router.fused import fuse
 from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
 from voronerf.router.layout import RAY, Call, Results, map_tensors, rebuild, tensors_of
-from voronerf.router.trace import ROWS, Unfusable
+from voronerf.router.trace import Unfusable, rows_for
 from voronerf.tolerances import agree, agree_gradients
 
 _OP = "VoronoiRouter"
@@ -364,8 +364,9 @@ class Trial:
     def fused(self, loop: Way, expected: Outcome, assume: Mapping[str, bool]) -> Way:
         """The network as one operation; raises where something stands in the way."""
         with NoRandomness():
-            rows = [rows[:ROWS] for rows in self.call.arranged(self.entries)]
-            way = fuse(replace(self.call, module=self.made_of[0].module), rows, assume)
+            module, given = self.made_of[0].module, self.call.arranged(self.entries)
+            count = rows_for(module, given)
+            way = fuse(replace(self.call, module=module), [rows[:count] for rows in given], assume)
         if not self.agrees(way, loop, expected):
             raise Unfusable("the traced network gives other results than its forward")
         return way
