@@ -173,7 +173,8 @@ VN_FUNCTION(tanh, hyperbolic_tangent(x), tangent_slope(x), splat(-2.0f) * hyperb
             tangent_slope(x) * (splat(4.0f) - splat(6.0f) * tangent_slope(x)))
 VN_FUNCTION(silu, x* logistic<0>(x), logistic<0>(x) + x * logistic<1>(x),
             logistic<1>(x) * splat(2.0f) + x * logistic<2>(x), logistic<2>(x) * splat(3.0f) + x * logistic<3>(x))
-VN_FUNCTION(gelu, x* distribution(x), distribution(x) + x * density(x), density(x) * (splat(2.0f) - nearby(x) * nearby(x)),
+VN_FUNCTION(gelu, x* distribution(x), distribution(x) + x * density(x),
+            density(x) * (splat(2.0f) - nearby(x) * nearby(x)),
             density(x) * nearby(x) * (nearby(x) * nearby(x) - splat(4.0f)))
 VN_FUNCTION(gelu_tanh, gelu_by_tanh<0>(x), gelu_by_tanh<1>(x), gelu_by_tanh<2>(x), gelu_by_tanh<3>(x))
 VN_FUNCTION(sine, any_sine(fma(splat(a), x, splat(b)), false), splat(a) * any_sine(fma(splat(a), x, splat(b)), true),
