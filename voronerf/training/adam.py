@@ -10,6 +10,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.ops.sparse_adam import Rule, adam, sparse_adam
+from voronerf.router.optimizers import trained_parts
 
 
 class Adam(torch.optim.Adam):
@@ -61,7 +62,7 @@ class Adam(torch.optim.Adam):
             self._step_on_device()
             return loss
         entries = [(p, p.grad, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        together = self._in_one() and all(_is_plain(parameter) for parameter, _, _ in entries)
+        together = self.leaves_frozen()
         own = [entry for entry in entries if together or entry[2].get("sparse", False)]
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
@@ -81,21 +82,25 @@ class Adam(torch.optim.Adam):
                 parameter.grad = gradient
         return loss
 
+    def leaves_frozen(self) -> bool:
+        """Whether one operation takes all parameters, and passes over frozen cells (`VoronoiRouter.freeze`)."""
+        held = (p for group in self.param_groups for p in group["params"] if p.grad is not None)
+        return self._in_one() and all(_is_plain(parameter) for parameter in held)
+
     def _in_one(self) -> bool:
         """Whether one operation takes all parameters on the CPU; torch's own step is faster than the reference."""
         chosen = backends.chosen("adam", torch.device("cpu"), torch.float32, backend=self.backend)
         return chosen == "native" or self.backend == "reference"
 
     def _step_together(self, entries: list[tuple[Tensor, Tensor, dict[str, Any]]]) -> None:
-        rules, states = [], []
-        for parameter, _, group in entries:
+        rules, tensors = [], []
+        for (parameter, gradient, group), parts in zip(entries, trained_parts([entry[0] for entry in entries])):
             state, step = self._next(parameter)
-            every = not group.get("sparse", False)
-            rules.append(Rule(step, float(group["lr"]), group["betas"], group["eps"], every))
-            states.append(state)
-        parameters, gradients = [entry[0] for entry in entries], [entry[1] for entry in entries]
-        moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
-        adam(rules, parameters, gradients, *moments, backend=self.backend)
+            rule = Rule(step, float(group["lr"]), group["betas"], group["eps"], not group.get("sparse", False))
+            own = parameter, gradient, state["exp_avg"], state["exp_avg_sq"]
+            rules += [rule] * len(parts)
+            tensors += [[tensor[part] for tensor in own] for part in parts]
+        adam(rules, *(list(column) for column in zip(*tensors)), backend=self.backend)
 
     def _step_table(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
         state, step = self._next(parameter)
