@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.ops.sparse_adam import Rule, adam, sparse_adam
+from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
+from voronerf.ops.sparse_adam.reference import judge
 
 
 class Adam(torch.optim.Adam):
     """``torch.optim.Adam``, with groups of parameters whose entries without a gradient stay as they are.
 
     A group says ``sparse=True``; see :func:`voronerf.ops.sparse_adam`. Its state has the same names as that of the
-    other groups, which are torch's. On the CPU all float32 parameters are updated by one operation, since torch's own
-    step takes longer to prepare than to compute for networks of this size.
+    other groups, which are torch's. All float32 parameters are updated by one operation, since torch's own step takes
+    longer to prepare than to compute for networks of this size.
 
     Args:
         params: Parameters or groups of them, as ``torch.optim.Adam`` takes them.
@@ -52,113 +53,75 @@ class Adam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Updates the parameters."""
+        """Updates the parameters, as of ``torch.optim.Adam``."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        if self._is_on_device():
-            self._step_on_device()
-            return loss
-        entries = [(p, p.grad, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        together = self._in_one() and all(_is_plain(parameter) for parameter, _, _ in entries)
-        own = [entry for entry in entries if together or entry[2].get("sparse", False)]
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
-        if own and (overflow is None or not overflow.item()):
-            if scale is not None:
-                own = [(parameter, gradient / scale, group) for parameter, gradient, group in own]
-            if together:
-                self._step_together(own)
-            else:
-                for parameter, gradient, group in own:
-                    self._step_table(parameter, gradient, group)
-        if not together:
-            for parameter, _, _ in own:
-                parameter.grad = None  # torch's step passes them over
-            super().step()
-            for parameter, gradient, _ in own:
-                parameter.grad = gradient
+        # Without a loss nothing is counted.
+        self.update(None if overflow is None else Guard(overflow, overflow, overflow, scale))
         return loss
 
-    def _in_one(self) -> bool:
-        """Whether one operation takes all parameters on the CPU; torch's own step is faster than the reference."""
-        chosen = backends.chosen("adam", torch.device("cpu"), torch.float32, backend=self.backend)
-        return chosen == "native" or self.backend == "reference"
+    @torch.no_grad()
+    def update(self, guard: Guard | None = None, loss: Tensor | None = None) -> None:
+        """Updates the parameters, without the hooks of ``step``, which take as long as a layer of a small network.
 
-    def _step_together(self, entries: list[tuple[Tensor, Tensor, dict[str, Any]]]) -> None:
-        rules, states = [], []
-        for parameter, _, group in entries:
-            state, step = self._next(parameter)
-            every = not group.get("sparse", False)
-            rules.append(Rule(step, float(group["lr"]), group["betas"], group["eps"], every))
-            states.append(state)
-        parameters, gradients = [entry[0] for entry in entries], [entry[1] for entry in entries]
-        moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
-        adam(rules, parameters, gradients, *moments, backend=self.backend)
-
-    def _step_table(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
-        state, step = self._next(parameter)
-        sparse_adam(
-            parameter,
-            gradient,
-            state["exp_avg"],
-            state["exp_avg_sq"],
-            step=step,
-            learning_rate=group["lr"],
-            betas=group["betas"],
-            epsilon=group["eps"],
-            backend=self.backend,
-        )
-
-    def _next(self, parameter: Tensor) -> tuple[dict[str, Tensor], int]:
-        """The state of a parameter, and the number of the step that comes, which is counted."""
-        state = self.state[parameter]
-        if not state:
-            state["step"] = torch.tensor(0.0)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        step = state["step"] = state["step"].cpu()  # a fused optimiser loads it to the parameter's device
-        step += 1
-        return state, int(step)
-
-    def _is_on_device(self) -> bool:
-        """Whether the compiled module's CUDA step takes all parameters, for which the host does not wait."""
-        parameters = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
-        if not parameters or backends.why_not("sparse_adam", "native", parameters[0].device) is not None:
-            return False
-        from voronerf import native
-
-        return all(native.on_cuda(p) and p.dtype == torch.float32 and p.is_contiguous() for p in parameters)
-
-    def _step_on_device(self) -> None:
-        from voronerf.ops.sparse_adam.native import Judged, Rule, adam_on_device
-
-        rates: dict[float, Tensor] = {}
+        Args:
+            guard: Leaves out the step, see :func:`voronerf.ops.adam`.
+            loss: [], of the step; with it the guard judges first.
+        """
         rules, tensors = [], []
         for group in self.param_groups:
+            rule = group["lr"], group["betas"], group["eps"], not group.get("sparse", False)
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
-                rate, device, state = group["lr"], parameter.device, self.state[parameter]
-                if not isinstance(rate, Tensor):
-                    if rate not in rates:
-                        rates[rate] = torch.full((), rate, device=device)
-                    rate = rates[rate]
+                state = self.state[parameter]
                 if not state:
-                    state["step"] = torch.zeros((), device=device)
+                    state["step"] = torch.zeros((), device=parameter.device)
                     state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-                state["step"] = state["step"].to(device)  # a checkpoint of a CPU has it there
-                first, second = group["betas"]
-                every = not group.get("sparse", False)
-                rules.append(Rule(rate.to(device), state["step"], first, second, group["eps"], every))
-                tensors.append((parameter.grad, parameter, state["exp_avg"], state["exp_avg_sq"]))
-        found = getattr(self, "found_inf", None)
-        judged = None if found is None else Judged(found)
-        gradients, parameters, means, squares = zip(*tensors, strict=True)
-        adam_on_device(
-            rules, gradients, parameters, means, squares, judged=judged, scale=getattr(self, "grad_scale", None)
-        )
+                if state["step"].device != parameter.device:  # a checkpoint has it on the CPU
+                    state["step"] = state["step"].to(parameter.device)
+                rules.append(Rule(state["step"], *rule))
+                tensors.append((parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]))
+        if not rules:
+            return
+        if self._in_one([entry[0] for entry in tensors]):
+            adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)
+        else:
+            self._one_by_one(rules, tensors, guard, loss)
 
+    def _in_one(self, parameters: Sequence[Tensor]) -> bool:
+        """Whether one operation takes all parameters; torch's own step is faster than the reference."""
+        if not all(parameter.dtype is torch.float32 and parameter.is_contiguous() for parameter in parameters):
+            return False
+        chosen = backends.chosen("adam", parameters[0].device, torch.float32, backend=self.backend)
+        return chosen == "native" or self.backend == "reference"
 
-def _is_plain(parameter: Tensor) -> bool:
-    return parameter.is_cpu and parameter.dtype == torch.float32 and parameter.is_contiguous()
+    def _one_by_one(
+        self, rules: list[Rule], tensors: Sequence[tuple[Tensor, ...]], guard: Guard | None, loss: Tensor | None
+    ) -> None:
+        """Tables by their operation, the rest by torch's step."""
+        scale = None
+        if guard is not None:
+            judge(guard, loss, [entry[1] for rule, entry in zip(rules, tensors) if rule.every])
+            scale = guard.scale
+        tables = [(rule, entry) for rule, entry in zip(rules, tensors) if not rule.every]
+        for rule, (parameter, gradient, mean, square) in tables:
+            if guard is None or not guard.found.item():
+                rule.step.add_(1)
+                given = gradient if scale is None else gradient / scale
+                numbers: dict[str, Any] = {"step": int(rule.step), "learning_rate": float(rule.learning_rate)}
+                options: dict[str, Any] = {"betas": rule.betas, "epsilon": rule.epsilon, "backend": self.backend}
+                sparse_adam(parameter, given, mean, square, **numbers, **options)
+            parameter.grad = None  # torch's step passes them over
+        scaled = hasattr(self, "found_inf")  # by torch's scaler
+        if guard is not None:
+            self.found_inf = guard.found
+        super().step()
+        if guard is not None and not scaled:
+            del self.found_inf
+        for _, (parameter, gradient, *_) in tables:
+            parameter.grad = gradient

@@ -15,13 +15,20 @@ Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def learn_outputs(
-    network: Mapping[str, Any], loss: Loss, evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp
+    network: Mapping[str, Any],
+    loss: Loss,
+    backward: bool,
+    evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp,
 ) -> Tensor:
     """The loss, with gradients; see ``voronerf.ops.learn_outputs``."""
     out, _ = evaluate(**network)
     with torch.no_grad():
         total, gradient = loss(out.detach().float())
-    return with_gradients(total, [out], [gradient])
+    total = with_gradients(total, [out], [gradient])
+    if not backward:
+        return total
+    total.backward()
+    return total.detach()
 
 
 def with_gradients(loss: Tensor, tensors: list[Tensor], gradients: list[Tensor]) -> Tensor:
@@ -38,5 +45,7 @@ class _Known(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # what the gradients follow from is not known here
+            raise RuntimeError("learn_outputs: gradients are differentiable no further, got create_graph=True")
         found = zip(ctx.gradients, ctx.dtypes, strict=True)  # narrowed last: a scaled loss keeps small ones
         return (None, None, *((gradient * of_loss).to(dtype) for gradient, dtype in found))
