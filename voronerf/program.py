@@ -216,13 +216,15 @@ class Builder:
         self, x: Columns, matrix: int, width: int, start: int = 0, transposed: bool = False, add: Columns | None = None
     ) -> Columns:
         """``x W[:, start:]^T``, or ``x W[:, start:]`` if transposed, of so many columns, and what is added to it."""
-        operands = (self.rows(x),) if add is None else (self.rows(x), add)
+        operands = (self.rows(x),) if add is None else (self.rows(x), self.rows(add) if add.spread else add)
         return self.emit("linear", width, operands, (matrix, start, int(transposed)))
 
     def function(
         self, name: str, x: Columns, a: float = 0.0, b: float = 0.0, order: int = 0, times: Columns | None = None
     ) -> Columns | None:
-        """A derivative of a function, times a value; None where it is 0."""
+        """A derivative of a function, times a value; None where it is 0. Powers are whole or half ones."""
+        if name == "power" and not (abs(a) <= 64 and 2 * a == int(2 * a)):
+            raise ValueError(f"a power must be a multiple of 0.5 from -64 to 64, got {a}")
         if order > FUNCTIONS[name].orders or (name == "power" and a == int(a) and 0 <= a < order):
             return None
         if order == 1 and times is not None and name in ("copy", "affine"):
@@ -232,7 +234,9 @@ class Builder:
 
     def apply(self, name: str, x: Columns, a: float = 0.0, b: float = 0.0) -> Columns:
         """A function itself."""
-        return self.emit("function", x.width, (x,), (0, float(a), float(b)), name)
+        made = self.function(name, x, a, b)
+        assert made is not None
+        return made
 
     def binary(self, name: str, x: Columns, y: Columns) -> Columns:
         """One of :data:`BINARY`."""
@@ -482,7 +486,7 @@ def merged(program: Program) -> Program:
             kept[made[source.index]] = before._replace(
                 out=step.out, operands=(*before.operands, known), name="relu_slope"
             )
-        elif not plain or step.numbers[0]:
+        elif not plain or step.numbers[0] or len(step.operands) > 1:
             continue
         else:
             kept[made[source.index]] = before._replace(out=step.out, name="relu")

@@ -55,6 +55,9 @@ class Batch:
 class Found(NamedTuple):
     """What a step finds. Only the loss has gradients.
 
+    Where cells of the field are frozen, a faster way may leave out rays that meet none of the others; the entries of
+    ``error`` are then those of the rays of ``samples``.
+
     Attributes:
         loss: []; over ranks the part of the rays that this one puts together.
         error: [r], the squared error of the colour of each ray, summed over the channels; over ranks 0 for rays without
@@ -148,6 +151,12 @@ class Fused:
             directions, target = directions[kept], target[kept]
             if background is not None and background.dim() == 2:
                 background = background[kept]
+        all_rays = len(samples.ray_offsets) - 1
+        if field.frozen_cells is not None:
+            rays = _rays_to_learn(field, samples)
+            samples, directions, target = samples.of_rays(rays), directions[rays], target[rays]
+            if background is not None and background.dim() == 2:
+                background = background[rays]
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
         found: list[RenderLoss] = []
 
@@ -163,7 +172,12 @@ class Fused:
                 backend=renderer.backend,
             )
             found.append(result)
-            return result.loss, gradient if shares is None else gradient * shares[:, None]
+            total = result.loss
+            if shares is not None:
+                gradient = gradient * shares[:, None]
+            if len(target) < all_rays:  # the others count, but learn nothing
+                total, gradient = (values * (len(target) / all_rays) for values in (total, gradient))
+            return total, gradient
 
         network = field.table_arguments(samples.inputs, directions, samples.ray_index)
         assert network is not None
@@ -173,6 +187,17 @@ class Fused:
     def explain(self) -> str:
         """As of :class:`RayLoss`."""
         return "networks, colours, loss and gradients in one operation"
+
+
+def _rays_to_learn(field: VoronoiRouter, samples: Samples) -> Tensor:
+    """The rays with a sample in a cell that is not frozen, one at least; the others have no gradient."""
+    frozen = field.frozen_cells
+    assert frozen is not None
+    learns = ~frozen.index_select(0, field.diagram.locate(samples.positions, backend=field.backend))
+    rays = torch.zeros(len(samples.ray_offsets) - 1, dtype=torch.bool, device=learns.device)
+    rays[samples.ray_index[learns]] = True
+    rays[:1] |= ~rays.any()
+    return rays.nonzero()[:, 0]
 
 
 class Composed:

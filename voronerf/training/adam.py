@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 from voronerf import backends
 from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
 from voronerf.ops.sparse_adam.reference import judge
+from voronerf.router.optimizers import trained_parts
 
 
 class Adam(torch.optim.Adam):
@@ -60,68 +61,85 @@ class Adam(torch.optim.Adam):
                 loss = closure()
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
-        # Without a loss nothing is counted.
-        self.update(None if overflow is None else Guard(overflow, overflow, overflow, scale))
+        if self.leaves_frozen():
+            # Without a loss nothing is counted.
+            self._together(None if overflow is None else Guard(overflow, overflow, overflow, scale), None)
+            return loss
+        tables = self._step_tables(scale, overflow)
+        super().step()
+        for parameter, gradient in tables:
+            parameter.grad = gradient
         return loss
 
     @torch.no_grad()
-    def update(self, guard: Guard | None = None, loss: Tensor | None = None) -> None:
-        """Updates the parameters, without the hooks of ``step``, which take as long as a layer of a small network.
+    def update(self, guard: Guard, loss: Tensor | None = None) -> None:
+        """:meth:`step` without its hooks, which take as long as a layer of a small network.
 
         Args:
             guard: Leaves out the step, see :func:`voronerf.ops.adam`.
             loss: [], of the step; with it the guard judges first.
         """
+        if self.leaves_frozen():
+            self._together(guard, loss)
+            return
+        dense = (p.grad for group in self.param_groups if not group.get("sparse") for p in group["params"])
+        judge(guard, loss, [gradient for gradient in dense if gradient is not None])
+        self.found_inf = guard.found
+        self.step()
+        del self.found_inf
+
+    def leaves_frozen(self) -> bool:
+        """Whether one operation takes all parameters, and passes over frozen cells (`VoronoiRouter.freeze`)."""
+        held = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
+        if not held or not all(p.dtype is torch.float32 and p.is_contiguous() for p in held):
+            return False
+        chosen = backends.chosen("adam", held[0].device, torch.float32, backend=self.backend)
+        return chosen == "native" or self.backend == "reference"  # torch's own step is faster than the reference
+
+    def _together(self, guard: Guard | None, loss: Tensor | None) -> None:
         rules, tensors = [], []
-        for group in self.param_groups:
-            rule = group["lr"], group["betas"], group["eps"], not group.get("sparse", False)
-            for parameter in group["params"]:
+        held = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        for (parameter, group), parts in zip(held, trained_parts([entry[0] for entry in held]), strict=True):
+            state = self._state(parameter)
+            step, every = state["step"], not group.get("sparse", False)
+            own = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
+            for number, part in enumerate(parts):
+                counted = step.clone() if number else step  # once for a parameter
+                rules.append(Rule(counted, group["lr"], group["betas"], group["eps"], every))
+                tensors.append(own if part is ... else tuple(tensor[part] for tensor in own))
+        if rules:
+            adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)
+
+    def _step_tables(self, scale: Tensor | None, overflow: Tensor | None) -> list[tuple[Tensor, Tensor]]:
+        """Updates tables by entries, and takes their gradients, so that torch's step passes them over."""
+        taken = []
+        for group in self.param_groups if overflow is None or not overflow.item() else ():
+            for parameter in group["params"] if group.get("sparse", False) else ():
                 if parameter.grad is None:
                     continue
-                state = self.state[parameter]
-                if not state:
-                    state["step"] = torch.zeros((), device=parameter.device)
-                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-                if state["step"].device != parameter.device:  # a checkpoint has it on the CPU
-                    state["step"] = state["step"].to(parameter.device)
-                rules.append(Rule(state["step"], *rule))
-                tensors.append((parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]))
-        if not rules:
-            return
-        if self._in_one([entry[0] for entry in tensors]):
-            adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)
-        else:
-            self._one_by_one(rules, tensors, guard, loss)
+                state, gradient = self._state(parameter), parameter.grad
+                state["step"].add_(1)
+                sparse_adam(
+                    parameter,
+                    gradient if scale is None else gradient / scale,
+                    state["exp_avg"],
+                    state["exp_avg_sq"],
+                    step=int(state["step"]),
+                    learning_rate=float(group["lr"]),
+                    betas=group["betas"],
+                    epsilon=group["eps"],
+                    backend=self.backend,
+                )
+                taken.append((parameter, gradient))
+                parameter.grad = None
+        return taken
 
-    def _in_one(self, parameters: Sequence[Tensor]) -> bool:
-        """Whether one operation takes all parameters; torch's own step is faster than the reference."""
-        if not all(parameter.dtype is torch.float32 and parameter.is_contiguous() for parameter in parameters):
-            return False
-        chosen = backends.chosen("adam", parameters[0].device, torch.float32, backend=self.backend)
-        return chosen == "native" or self.backend == "reference"
-
-    def _one_by_one(
-        self, rules: list[Rule], tensors: Sequence[tuple[Tensor, ...]], guard: Guard | None, loss: Tensor | None
-    ) -> None:
-        """Tables by their operation, the rest by torch's step."""
-        scale = None
-        if guard is not None:
-            judge(guard, loss, [entry[1] for rule, entry in zip(rules, tensors) if rule.every])
-            scale = guard.scale
-        tables = [(rule, entry) for rule, entry in zip(rules, tensors) if not rule.every]
-        for rule, (parameter, gradient, mean, square) in tables:
-            if guard is None or not guard.found.item():
-                rule.step.add_(1)
-                given = gradient if scale is None else gradient / scale
-                numbers: dict[str, Any] = {"step": int(rule.step), "learning_rate": float(rule.learning_rate)}
-                options: dict[str, Any] = {"betas": rule.betas, "epsilon": rule.epsilon, "backend": self.backend}
-                sparse_adam(parameter, given, mean, square, **numbers, **options)
-            parameter.grad = None  # torch's step passes them over
-        scaled = hasattr(self, "found_inf")  # by torch's scaler
-        if guard is not None:
-            self.found_inf = guard.found
-        super().step()
-        if guard is not None and not scaled:
-            del self.found_inf
-        for _, (parameter, gradient, *_) in tables:
-            parameter.grad = gradient
+    def _state(self, parameter: Tensor) -> dict[str, Tensor]:
+        """The state of a parameter, on its device: a checkpoint has the steps done on the CPU."""
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), device=parameter.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        if state["step"].device != parameter.device:
+            state["step"] = state["step"].to(parameter.device)
+        return state

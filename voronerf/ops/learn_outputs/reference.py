@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf.ops.routed_mlp import of_samples
 from voronerf.ops.routed_mlp.reference import routed_mlp
 
 #: Loss [] and its gradient [n, out], given outputs [n, out].
@@ -21,9 +22,13 @@ def learn_outputs(
     evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp,
 ) -> Tensor:
     """The loss, with gradients; see ``voronerf.ops.learn_outputs``."""
-    out, _ = evaluate(**network)
+    network = dict(network)
+    frozen = network.pop("frozen", None)
+    out, cells = evaluate(**network)
     with torch.no_grad():
         total, gradient = loss(out.detach().float())
+        if frozen is not None:
+            gradient = gradient.masked_fill(of_samples(frozen, cells), 0)
     total = with_gradients(total, [out], [gradient])
     if not backward:
         return total
