@@ -33,13 +33,40 @@ def fuse(call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> Fu
     return Fused(call, given, assume)
 
 
+class Taken:
+    """A parameter of a program: entries of a parameter of the module.
+
+    Args:
+        of: A node of the trace whose value it is, or a tensor.
+        codes: [o, i] or [w], the number of each entry among those of one cell.
+    """
+
+    def __init__(self, of: Any, codes: Tensor) -> None:
+        self._of, self._shape, numbers = of, codes.shape, codes.flatten()
+        self._of_cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
+        every = torch.arange((of.meta["value"] if isinstance(of, fx.Node) else of).numel())
+        self._whole = torch.equal(numbers, every)
+        self._turned = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
+        self._numbers = numbers
+
+    def of_values(self, values: Mapping[Any, Any]) -> Tensor:
+        """Its entries, [k, ...], or [1, ...] where cells share it."""
+        value = values.get(self._of, self._of)
+        flat = value.flatten(1) if self._of_cells else value.reshape(1, -1)
+        if self._whole:
+            return flat.reshape(-1, *self._shape)
+        if self._turned:
+            return flat.reshape(-1, *self._shape[::-1]).transpose(1, 2)
+        return flat.index_select(1, self._numbers.to(flat.device)).reshape(-1, *self._shape)
+
+
 @dataclass
 class Run:
     """One program and where its tensors come from and go to."""
 
     program: Program
     inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
-    parameters: list[tuple[Any, Tensor]] = field(default_factory=list)  # nodes or tensors, and numbers of entries
+    parameters: list[Taken] = field(default_factory=list)
     outputs: list[Any] = field(default_factory=list)
 
 
@@ -274,7 +301,7 @@ class Fused:
         n = values[self._n]
         rows = [_flat(values[source], n) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
-        parameters = [_taken(values.get(of, of), of, codes).to(dtype) for of, codes in run.parameters]
+        parameters = [taken.of_values(values).to(dtype) for taken in run.parameters]
         found = grouped_program(
             [x.to(dtype) for x in rows],
             parameters,
@@ -319,7 +346,7 @@ def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outp
     def parameter(index: int) -> int:
         if index not in parameters:
             parameters[index] = b.parameter(*lowering.builder.parameters[index])
-            run.parameters.append(lowering.parameters[index])
+            run.parameters.append(Taken(*lowering.parameters[index]))
         return parameters[index]
 
     def columns(c: Columns) -> Columns:
@@ -364,20 +391,6 @@ def _flat(value: Tensor, n: int) -> Tensor:
         at = next(d for d, size in enumerate(value.shape) if size == n)
         value = value.movedim(at, 0)
     return value.reshape(n, -1) if n else value.reshape(0, max(value.shape[1:].numel(), 1))
-
-
-def _taken(value: Tensor, of: Any, codes: Tensor) -> Tensor:
-    """Entries of a parameter, [k, ...], or [1, ...] of one that cells share."""
-    cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
-    flat = value.flatten(1) if cells else value.reshape(1, -1)
-    numbers = codes.flatten()
-    if len(numbers) == flat.shape[1] and torch.equal(numbers, torch.arange(len(numbers))):
-        return flat.reshape(-1, *codes.shape)
-    if codes.dim() == 2 and len(numbers) == flat.shape[1]:
-        o, i = codes.shape
-        if torch.equal(codes.t().flatten(), torch.arange(len(numbers))):
-            return flat.reshape(-1, i, o).transpose(1, 2)
-    return flat.index_select(1, numbers.to(flat.device)).reshape(-1, *codes.shape)
 
 
 def _sample_dimension(shape: torch.Size, rows: int) -> int:

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import inspect
 import math
+import types
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -350,7 +351,14 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Te
 
 
 def argument_names(function: Callable[..., Any]) -> list[str]:
-    """Names of the positional arguments of a function."""
+    """Names of the positional arguments of a function, of a class's methods found out once."""
+    return list(
+        _names(function.__func__)[1:] if isinstance(function, types.MethodType) else _names.__wrapped__(function)
+    )
+
+
+@functools.lru_cache(maxsize=256)
+def _names(function: Callable[..., Any]) -> list[str]:
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return [parameter.name for parameter in inspect.signature(function).parameters.values() if parameter.kind in kinds]
 
