@@ -56,10 +56,12 @@ def _run(
     for result in results:
         on_huge_pages(result)
     plan = _plan(text)
+    turned = [not x.is_contiguous() and x.t().is_contiguous() for x in inputs]
     given = native.compiled.ProgramInputs(
         code=plan.code,
         constants=plan.constants,
-        inputs=inputs,
+        inputs=[x.t() if turn else x for x, turn in zip(inputs, turned)],
+        turned=torch.tensor(turned, dtype=torch.int32),
         parameters=parameters,
         strides=torch.tensor([p[0].numel() if p.shape[0] > 1 else 0 for p in parameters], dtype=torch.int64),
         widths=plan.widths,
