@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.data import Scene
-from voronerf.data.record import write_scene
+from voronerf.data.record import within, write_scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.distributed.exchange import Exchange, Told
 from voronerf.distributed.group import Group
@@ -29,10 +29,8 @@ from voronerf.distributed.sharing import Sharing
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
 from voronerf.files import json_text, write_bytes, write_text
-from voronerf.ops import Guard
-from voronerf.ops.sparse_adam.reference import judge
 from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.router.grouping import cell_parameters
 from voronerf.step import Cells, Found, Step
 from voronerf.training import state
@@ -45,12 +43,13 @@ from voronerf.training.checkpoint import (
     checkpoint_paths,
     last_checkpoint,
 )
-from voronerf.training.config import TrainConfig
+from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_ranks
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.divergence import (
     PATIENCE,
     SETTLED,
+    GradientGuard,
     all_finite,
     one_colour_psnr,
     sum_of_gradients,
@@ -61,7 +60,7 @@ from voronerf.training.networks import (
     check_memory,
     computes_natively,
     make_optimizer,
-    make_routers,
+    open_routers,
     resolve_config,
     restore_routers,
 )
@@ -111,6 +110,8 @@ class Trainer:
     ) -> None:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
+        if config.resume:  # the space is that of the run, whatever the views
+            scene = within(scene, config.out)
         self.out, self.scene = config.out, scene
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)
@@ -134,7 +135,9 @@ class Trainer:
             sightings=bool(config.sightings),
             backend=config.backend,
         )
-        self.routers = make_routers(config, self.device)
+        self.routers = open_routers(config, self.device, checkpoint)
+        if self.group.size > 1 and isinstance(self.routers["field"], Parts):
+            raise ConfigError(f"--resume of {self.out} must be one process: it is a run of several parts")
         for router in self.routers.values():
             router.generator = self.draws
         #: Whether native ops compute the networks: then steps are the same bit for bit on any number of threads.
@@ -146,14 +149,14 @@ class Trainer:
         self.sharing = Sharing(self.group)
         self.cells = Cells(
             self.renderer,
-            self.routers,
+            cast(dict[str, VoronoiRouter], self.routers),  # of parts it asks for what they have alone
             self.plan,
             config.split_rule,
             generator=self.generator,
             sharing=self.sharing,
         )
         self.learner = Step(self.renderer, sightings=config.sightings or 0.0, sharing=self.sharing)
-        self.guard = Guard.on(self.device)  # of steps whose loss or gradients are not finite
+        self.guard = GradientGuard(self.device)
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
         self.step, self.seconds = 0, 0.0
@@ -177,13 +180,8 @@ class Trainer:
         return self.group.rank == 0
 
     @property
-    def skipped(self) -> int:
-        """Steps that were left out, since a loss or gradients were not finite; waits for the device."""
-        return int(self.guard.skipped)
-
-    @property
-    def router(self) -> VoronoiRouter:
-        """The router whose colours count."""
+    def router(self) -> VoronoiRouter | Parts:
+        """The router whose colours count, or the parts of a run that was joined."""
         return self.routers["field"]
 
     @property
@@ -199,8 +197,10 @@ class Trainer:
     @property
     def parameter_count(self) -> int:
         """Parameters of all networks of all cells."""
-        of_cells = sum(p.numel() for p in cell_parameters(self.router.module))
         everything = sum(p.numel() for router in self.routers.values() for p in router.parameters())
+        if isinstance(self.router, Parts):
+            return everything
+        of_cells = sum(p.numel() for p in cell_parameters(self.router.module))
         return everything + of_cells // self.router.num_cells * (self.diagram.num_cells - self.router.num_cells)
 
     # --- progress ------------------------------------------------------------------------------------------------
@@ -333,9 +333,9 @@ class Trainer:
         if self.rate_factor < 1 or not there:
             kept = "with half the rate again; the checkpoint is as it was" if there else "there is no checkpoint"
             raise TrainingError(f"{self.out}: {reason} at step {at}, try a smaller --lr; {kept}")
-        skipped = self.skipped
+        skipped = int(self.guard.skipped)
         self._resume(last_checkpoint(self.out))
-        self.guard = Guard.on(self.device, skipped)
+        self.guard.skipped.fill_(skipped)
         self.rate_factor = 0.5
         self.saved_at = self.seconds
         self._begin_stage()
@@ -367,29 +367,19 @@ class Trainer:
         config = self.config
         batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
         half = HALVES.get(config.precision)
-        self.optimizer.zero_grad(set_to_none=True)
         with nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False):
-            found = self.learner.run(batch, self.draws, backward=half is None)
-        if half is not None:
-            self.scaler.scale(found.loss).backward()
-        if self.group.size > 1:
-            told = self._agree(found)
-            loss, kept, samples, seen = told.loss, told.kept, told.samples, told.seen
-            judge(self.guard, told.total, [])
-        else:
-            loss, kept, samples, seen = found.loss.detach(), self.cells.heaviest(found), len(found.weights), None
-        self.cells.observe(found, seen)
+            found = self.learner.run(batch, self.draws)
+        self.optimizer.zero_grad(set_to_none=True)
+        # Nothing is read on the host: the fused optimiser skips a step whose gradients have overflowed by itself.
+        self.scaler.scale(found.loss).backward()
+        told = self._agree(found)
+        self.cells.observe(found, told.seen if self.group.size > 1 else None)
         if self.occupancy is not None:
-            self.rays = next_rays(config, self.rays, samples)
-        # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
-        if self.scaler.is_enabled():
-            if self.group.size == 1:
-                judge(self.guard, loss, [])
-            self.scaler.step(self.optimizer)
-            self.scaler.update()
-        else:
-            self.optimizer.update(self.guard, loss if self.group.size == 1 else None)
-        return loss, kept
+            self.rays = next_rays(config, self.rays, told.samples)
+        self.guard.judge(told.total, self.optimizer, scaled=self.scaler.is_enabled())
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
+        return told.loss, told.kept
 
     def _agree(self, found: Found) -> Told:
         """Adds up gradients over all ranks, and lets them agree on time, stops, checkpoints and what was found."""
@@ -531,7 +521,7 @@ class Trainer:
             "parameters": self.parameter_count,
             "cells": self.diagram.num_cells,
             "splits_left": len(self.plan) - self.level,
-            "skipped_steps": self.skipped,
+            "skipped_steps": int(self.guard.skipped),
             "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
         }
@@ -564,7 +554,7 @@ class Trainer:
             rays_done=self.rays_done,
             stages=tuple(asdict(stage) for stage in self.stages),
             evaluated=self.evaluated,
-            skipped=self.skipped,
+            skipped=int(self.guard.skipped),
             rate_factor=self.rate_factor,
             threads=torch.get_num_threads(),
         )
@@ -591,14 +581,17 @@ class Trainer:
         try:
             state.load_moments(self.optimizer, checkpoint, stored.step)
             self.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
-            self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
             if self.occupancy is not None:
                 self.occupancy.load_state_dict(checkpoint.group("occupancy"))
-            generators = checkpoint.group("generator")
-            self.generator.set_state(generators["state"])
-            drawn = generators["draws"]
-            if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
-                self.draws.set_state(drawn)  # else the run began on another kind of device
+            if (
+                stored.stages[0]["cells"] == 1 or stored.step
+            ):  # else nothing was trained since it was made of other runs
+                self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
+                generators = checkpoint.group("generator")
+                self.generator.set_state(generators["state"])
+                drawn = generators["draws"]
+                if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
+                    self.draws.set_state(drawn)  # else the run began on another kind of device
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
         threads = torch.get_num_threads()
@@ -611,7 +604,7 @@ class Trainer:
         self.rays, self.rays_done = stored.rays, stored.rays_done
         self.stages = [Stage(**stage) for stage in stored.stages]
         self.cells.splits = len(self.stages) - 1
-        self.guard = Guard.on(self.device, stored.skipped)
+        self.guard = GradientGuard(self.device, stored.skipped)
         self.rate_factor = stored.rate_factor
         self.evaluated = min(stored.evaluated, self._due())  # fewer where the run was made longer
         # Evaluations made after the checkpoint will be made again.

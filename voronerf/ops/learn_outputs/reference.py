@@ -16,10 +16,7 @@ Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def learn_outputs(
-    network: Mapping[str, Any],
-    loss: Loss,
-    backward: bool,
-    evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp,
+    network: Mapping[str, Any], loss: Loss, evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp
 ) -> Tensor:
     """The loss, with gradients; see ``voronerf.ops.learn_outputs``."""
     network = dict(network)
@@ -29,11 +26,7 @@ def learn_outputs(
         total, gradient = loss(out.detach().float())
         if frozen is not None:
             gradient = gradient.masked_fill(of_samples(frozen, cells), 0)
-    total = with_gradients(total, [out], [gradient])
-    if not backward:
-        return total
-    total.backward()
-    return total.detach()
+    return with_gradients(total, [out], [gradient])
 
 
 def with_gradients(loss: Tensor, tensors: list[Tensor], gradients: list[Tensor]) -> Tensor:
@@ -50,7 +43,5 @@ class _Known(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():  # what the gradients follow from is not known here
-            raise RuntimeError("learn_outputs: gradients are differentiable no further, got create_graph=True")
         found = zip(ctx.gradients, ctx.dtypes, strict=True)  # narrowed last: a scaled loss keeps small ones
         return (None, None, *((gradient * of_loss).to(dtype) for gradient, dtype in found))
