@@ -216,7 +216,7 @@ class VoronoiRouter(nn.Module):
             >>> whole = VoronoiRouter(torch.nn.Linear(3, 1), torch.rand(8, 3), coords="first3")
             >>> halves = whole.part(torch.arange(4)), whole.part(torch.arange(4, 8))
             >>> joined, points = VoronoiRouter.join(*halves), torch.rand(100, 3)
-            >>> bool((joined(points) == whole(points)).all())
+            >>> torch.allclose(joined(points), whole(points))
             True
         """
         if not routers:
