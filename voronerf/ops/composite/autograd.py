@@ -43,12 +43,13 @@ def composite_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Ten
 
 def composite_backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tuple[Tensor | None, ...]:
     """Derivative of the gradients of composite."""
-    saved = ctx.saved_tensors
-    ray_offsets = saved[8]
-    leaves, graph = aliases([None if i == 8 else tensor for i, tensor in enumerate(saved)])
+    *smooth, ray_offsets, background = ctx.saved_tensors
+    leaves, graph = aliases([*smooth, None, background])
     with torch.enable_grad():
-        gradients, inputs = leaves[:4], [*leaves[4:8], leaves[9]]
-        parts = composite(*inputs[:4], ray_offsets=ray_offsets, background=inputs[4])  # type: ignore[arg-type]
+        *gradients, sigma, rgb, depths, deltas, _, background = leaves
+        samples = sigma, rgb, depths, deltas
+        parts = composite(*samples, ray_offsets=ray_offsets, background=background)  # type: ignore[arg-type]
+        inputs = *samples, background
         outputs = [(part, gradient) for part, gradient in zip(parts, gradients) if gradient is not None]
         pairs = [
             (tensor, cotangent)

@@ -48,7 +48,5 @@ def encode_backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor
         else:
             out = integrated_encode(x, variances, ctx.octaves)
             inputs = [x, variances]
-        if not out.requires_grad:
-            return (None,) * 5
         pairs = list(zip(inputs, cotangents))
         return (*second_derivatives([(out, gradient)], pairs, leaves, graph), None, None)
