@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # From the bottom up; a module may import its own layer and those below.
 LAYERS = (
-    {"backends", "checks", "compiler", "derivatives", "files", "grids", "layers", "program", "tolerances"},
+    {"backends", "checks", "compiler", "custom_op", "derivatives", "files", "grids", "layers", "program", "tolerances"},
     {"native", "_C"},
     {"ops", "kernels"},
     {"diagram"},

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True) -> Tensor:
+def frequency_encode(x: Tensor, octaves: int, include_input: bool = True) -> Tensor:
     """``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``; see ``voronerf.ops.frequency_encode``."""
     wide = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
     parts = [wide if include_input else wide[:, :0]]
