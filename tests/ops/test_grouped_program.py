@@ -119,6 +119,62 @@ def test_derivative_of_every_function(name: str, order: int) -> None:
     torch.testing.assert_close(ours.double(), exact, rtol=3e-6, atol=3e-6 * max(1.0, float(exact.abs().max())))
 
 
+FAR = [*(sign * 10.0**size for size in (-30, -3, 0, 1, 1.5, 2, 3, 10, 19, 30, 38) for sign in (-1, 1)), 0.0, 88.5]
+
+
+@pytest.mark.parametrize("order", range(4))
+@pytest.mark.parametrize("name", ["exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu", "clamp", "relu", "abs"])
+def test_derivatives_far_away_and_at_borders(name: str, order: int) -> None:
+    """Of arguments as large as they come, at 0, and where a function has its kinks."""
+    b = Builder()
+    found = b.function(name, b.input(1), *{"clamp": (-1.0, 10.0)}.get(name, (1.0, 20.0)), order=order)
+    if found is None:
+        return
+    rows = torch.tensor([*FAR, float("nan")] if name == "clamp" else FAR)[:, None]
+    given = [], offsets_of([len(rows)])
+    (exact,) = grouped_program([rows.double()], *given, program=b.program([found]), backend="reference")
+    for isa in native.SUPPORTED_ISAS:
+        with native.using_isa(isa):
+            (ours,) = grouped_program([rows], *given, program=b.program([found]), backend="native")
+        torch.testing.assert_close(ours, exact.float(), rtol=2e-5, atol=3e-7, equal_nan=True)
+
+
+@pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)
+@pytest.mark.parametrize("name", list(FUNCTIONS))
+def test_columns_do_not_touch_each_other(name: str, isa: str) -> None:
+    """A column's bits are the same whatever stands beside it, as old floats stand behind the last one."""
+    b = Builder()
+    program = b.program([b.apply(name, b.input(5), *NUMBERS.get(name, (0.7, 0.0)))])
+    rows = 3 * torch.randn(64, 5, generator=torch.Generator().manual_seed(0))
+    found = []
+    for odd in (1.0, 1e5, 1e30, torch.nan):
+        rows[:, 4] = odd
+        with native.using_isa(isa):
+            (result,) = grouped_program([rows], [], offsets_of([64]), program=program, backend="native")
+        found.append(result[:, :4].clone())
+    for others in found[1:]:
+        torch.testing.assert_close(others, found[0], rtol=0, atol=0, equal_nan=True)
+
+
+def test_sums_spread_over_a_layer_and_products_with_relu() -> None:
+    """Operands that a layer and a merged ReLU once left out."""
+    b = Builder()
+    x, y = b.input(5), b.input(7)
+    one = b.total(x, 5)._replace(width=7, spread=True)
+    h = b.linear(x, b.parameter(7, 5), 7, add=one)
+    gated = b.function("relu", b.linear(x, b.parameter(7, 5), 7), times=y)
+    assert gated is not None
+    check(b.program([h, gated]), [97, 0, 30])
+
+
+@pytest.mark.parametrize("power", [0.3, -1.25, 64.5, float("nan")])
+def test_refuses_powers_that_are_not_whole_or_half(power: float) -> None:
+    """Which the compiled module would round."""
+    b = Builder()
+    with pytest.raises(ValueError, match=r"a power must be a multiple of 0\.5 from -64 to 64, got"):
+        b.apply("power", b.input(1), power)
+
+
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("shared", [False, True])
 def test_every_step(sizes: list[int], shared: bool) -> None:
@@ -168,8 +224,10 @@ def test_order_strays_and_layouts() -> None:
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
         assert not ours[:2].any() and not ours[90:].any()
     turned = [x.t().contiguous().t() for x in rows]
-    for ours, theirs in zip(*(grouped_program(r, parameters, offsets, program=program) for r in (turned, rows))):
-        assert torch.equal(ours, theirs)
+    for order in (None, torch.randperm(101, generator=torch.Generator().manual_seed(0)).int()):
+        given = {"program": program, "order": order, "backend": "native"}
+        for ours, theirs in zip(*(grouped_program(r, parameters, offsets, **given) for r in (turned, rows))):
+            assert torch.equal(ours, theirs)
 
 
 @pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)

@@ -1,14 +1,16 @@
-"""The state that optimisers keep for the parameters of cells, when cells are split, moved or loaded."""
+"""What optimisers keep for the parameters of cells: when cells are split, moved or loaded, and when they are frozen."""
 
 from __future__ import annotations
 
+import functools
 import warnings
 import weakref
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.optimizer import register_optimizer_step_pre_hook
+from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
 from voronerf.router.grouping import cell_parameters
 
@@ -104,3 +106,78 @@ def watch_optimizers(module: nn.Module, line: str) -> Any:
     handle = register_optimizer_step_pre_hook(check)
     weakref.finalize(module, handle.remove)
     return handle
+
+
+# Frozen cells ---------------------------------------------------------------------------------------------------------
+
+#: The frozen cells, bool [k], of every routed module that has some.
+_FROZEN: weakref.WeakKeyDictionary[nn.Module, Tensor] = weakref.WeakKeyDictionary()
+#: What a step must leave as it is: tensors, their frozen cells, and the values of those before the step.
+_HELD: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
+
+
+def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
+    """Has every optimiser leave some cells of a routed module as they are, bool [k], or none.
+
+    A stacked parameter is one tensor to an optimiser, which moves all of its cells: by weight decay and momentum also
+    those without a gradient. What it changed in frozen cells is therefore put back after its step; an optimiser with
+    ``leaves_frozen()`` passes them over by itself.
+    """
+    if frozen is None:
+        _FROZEN.pop(module, None)
+        return
+    _FROZEN[module] = frozen
+    _watch_steps()
+
+
+@functools.cache
+def _watch_steps() -> None:
+    register_optimizer_step_pre_hook(_before_step)
+    register_optimizer_step_post_hook(_after_step)
+
+
+def _frozen_parameters(optimizer: torch.optim.Optimizer) -> list[tuple[Tensor, Tensor]]:
+    frozen = {id(p): mask for module, mask in _FROZEN.items() for p in cell_parameters(module)}
+    every = (p for group in optimizer.param_groups for p in group["params"]) if frozen else ()
+    return [(p, frozen[id(p)]) for p in every if id(p) in frozen]
+
+
+def _of_cells(optimizer: torch.optim.Optimizer, parameter: Tensor) -> list[Tensor]:
+    state = optimizer.state.get(parameter, {}).values()
+    return [value for value in state if isinstance(value, Tensor) and value.shape == parameter.shape]
+
+
+def _before_step(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+    if not _FROZEN or (hasattr(optimizer, "leaves_frozen") and optimizer.leaves_frozen()):
+        return
+    held = []
+    for parameter, frozen in _frozen_parameters(optimizer):
+        for tensor in (parameter.detach(), *_of_cells(optimizer, parameter)):
+            held.append((tensor, frozen, tensor[frozen]))
+    if held:
+        _HELD[id(optimizer)] = held
+
+
+@torch.no_grad()
+def _after_step(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+    held = _HELD.pop(id(optimizer), None)
+    if held is None:
+        return
+    for tensor, frozen, values in held:
+        tensor[frozen] = values
+    known = {tensor.data_ptr() for tensor, _, _ in held}
+    for parameter, frozen in _frozen_parameters(optimizer):
+        for tensor in _of_cells(optimizer, parameter):
+            if tensor.data_ptr() not in known:  # made in this step
+                tensor[frozen] = 0
+
+
+def trained_parts(parameters: Sequence[Tensor]) -> list[list[Any]]:
+    """For each parameter the parts of its first dimension that an optimiser may change: those of cells not frozen."""
+    parts: dict[int, list[Any]] = {}
+    for module, frozen in _FROZEN.items():
+        edges = torch.nn.functional.pad((~frozen).int(), (1, 1)).diff()
+        pairs = zip((edges > 0).nonzero()[:, 0].tolist(), (edges < 0).nonzero()[:, 0].tolist(), strict=True)
+        own = [slice(*pair) for pair in pairs]
+        parts.update((id(parameter), own) for parameter in cell_parameters(module))
+    return [parts.get(id(parameter), [...]) for parameter in parameters]

@@ -33,7 +33,7 @@ from voronerf.router.cells import (
 from voronerf.router.compiled import Known, built, spec_of, structure_of
 from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
-from voronerf.router.optimizers import check_optimizer, drop_state, move_state, watch_optimizers
+from voronerf.router.optimizers import check_optimizer, drop_state, freeze_cells, move_state, watch_optimizers
 from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
 from voronerf.router.ways import Choices, Wish, evaluate
 
@@ -41,7 +41,8 @@ from voronerf.router.ways import Choices, Wish, evaluate
 _MANY = 256
 _NO_GRAPH = (
     "VoronoiRouter: a graph without breaks takes a router with fuse=True that has made such a call before, of tensors, "
-    "numbers and strings, without blend and autocast; its results are tensors, or tuples, lists and dicts of them"
+    "numbers and strings, without blend, frozen cells and autocast; its results are tensors, or tuples, lists and "
+    "dicts of them"
 )
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
@@ -165,6 +166,7 @@ class VoronoiRouter(nn.Module):
         self._layered = isinstance(module, LayeredField)
         self._choices, self._known = Choices(), Known(self)
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
+        self.register_buffer("frozen_cells", None, persistent=False)
         self._by_table = self._layered and described_by_table(self.module)
 
     @classmethod
@@ -219,6 +221,69 @@ class VoronoiRouter(nn.Module):
         if not -self.num_cells <= index < self.num_cells:
             raise IndexError(f"VoronoiRouter.{method}: index must be below {self.num_cells}, got {index}")
         return index
+
+    @property
+    def frozen(self) -> Tensor:
+        """The cells that :meth:`freeze` keeps as they are, bool [k]."""
+        device = self.diagram.centres.device
+        none = torch.zeros(self.num_cells, dtype=torch.bool, device=device)
+        return none if self.frozen_cells is None else self.frozen_cells.clone()
+
+    def freeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
+        """Keeps the parameters of some cells as they are: the same bits after any step of any optimiser.
+
+        Results of samples in frozen cells are constants: they have no gradient, neither to parameters nor to arguments,
+        and take no part in the backward pass. Momentum, weight decay and the moments of Adam leave frozen cells alone.
+        Other cells train as ever. Parameters that all cells share (``share=``, such as the table of a hash grid) cannot
+        be frozen for some cells: they learn from the samples in the other cells, and what frozen cells give changes
+        with them.
+
+        Args:
+            cells: Numbers of cells, or bool [k]; None for all. Cells that were frozen before stay frozen.
+
+        Raises:
+            ValueError: For a cell that there is not, or a mask of another length.
+            TypeError: For what are neither numbers of cells nor a mask.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.rand(4, 3), coords="first3", way="grouped")
+            >>> optimizer = torch.optim.AdamW(router.parameters())
+            >>> router.freeze([0, 1, 2])
+            >>> before = router.module.weight.detach().clone()
+            >>> router(torch.rand(64, 3)).square().mean().backward()
+            >>> optimizer.step()
+            >>> (router.module.weight == before).all(dim=2).all(dim=1)
+            tensor([ True,  True,  True, False])
+        """
+        self._set_frozen(self.frozen | self._mask("freeze", cells))
+
+    def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
+        """Lets frozen cells learn again, with the optimiser's moments that they had; arguments as of :meth:`freeze`."""
+        self._set_frozen(self.frozen & ~self._mask("unfreeze", cells))
+
+    def _mask(self, method: str, cells: Sequence[int] | Tensor | None) -> Tensor:
+        """bool [k] of cells."""
+        device, k = self.diagram.centres.device, self.num_cells
+        if cells is None:
+            return torch.ones(k, dtype=torch.bool, device=device)
+        given = torch.as_tensor(cells if len(cells) else torch.zeros(0, dtype=torch.int64), device=device)
+        rule = f"VoronoiRouter.{method}: cells must be"
+        if given.dtype == torch.bool:
+            if given.shape != (k,):
+                raise ValueError(f"{rule} bool [{k}], got {list(given.shape)}")
+            return given
+        if given.is_floating_point() or given.is_complex() or given.dim() != 1:
+            raise TypeError(f"{rule} numbers of cells or bool [{k}], got {given.dtype} {list(given.shape)}")
+        for number in given.tolist():
+            if not 0 <= number < k:
+                raise ValueError(f"{rule} numbers below {k}, got {number}")
+        return torch.zeros(k, dtype=torch.bool, device=device).index_fill(0, given.long(), True)
+
+    def _set_frozen(self, frozen: Tensor | None) -> None:
+        self.frozen_cells = frozen if frozen is not None and bool(frozen.any()) else None
+        freeze_cells(self.module, self.frozen_cells)
 
     @torch.no_grad()
     def subdivide(
@@ -278,6 +343,8 @@ class VoronoiRouter(nn.Module):
         fresh = None if inherit else draw_parameters(plain_cell(self.module, 0), len(new), self.generator)
         renew_cells(self.module, parents, new, fresh)
         self.diagram = copy.deepcopy(finer).to(self.diagram.centres.device)
+        if self.frozen_cells is not None:
+            self._set_frozen(self.frozen_cells[parents.to(self.frozen_cells.device)])
         if optimizer is not None:
             move_state(optimizer, self.module, parents, k, None if fresh is None else new)
         else:
@@ -333,6 +400,7 @@ class VoronoiRouter(nn.Module):
             if diagram.num_cells != k:
                 parents = torch.zeros(diagram.num_cells, dtype=torch.int64)
                 renew_cells(self.module, parents, parents > 0)
+                self._set_frozen(None)
                 self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
@@ -414,8 +482,9 @@ class VoronoiRouter(nn.Module):
         mixture = None if raw else self._mixture(positions[:, :3] if coords is None else coords)
 
         def run(positions: Tensor, directions: Any, ray_index: Any, where: dict[str, Any]) -> Any:
-            given: dict[str, Any] = {"directions": directions, "direction_index": ray_index, "backend": self.backend}
-            outputs = routed_mlp(positions, **parameters_of_table(field, self.num_cells), **given, **where)[0]
+            given: dict[str, Any] = {"directions": directions, "direction_index": ray_index, **where}
+            given.update(frozen=self.frozen_cells, backend=self.backend)
+            outputs = routed_mlp(positions, **parameters_of_table(field, self.num_cells), **given)[0]
             return outputs if raw else field.activate(outputs)
 
         own = run(positions, directions, ray_index, self._where(positions, coords))
@@ -435,7 +504,7 @@ class VoronoiRouter(nn.Module):
         """
         if not self.by_table or self._coords_of_table(None, (positions,), {}) is not None:
             return None
-        given = {"positions": positions, **parameters_of_table(self.field, self.num_cells)}
+        given = {"positions": positions, **parameters_of_table(self.field, self.num_cells), "frozen": self.frozen_cells}
         if self.field.layers.uses_directions:
             given.update(directions=directions, direction_index=ray_index)
         where = self._where(positions, None)
@@ -457,6 +526,7 @@ class VoronoiRouter(nn.Module):
             return None
         given = parameters_of_table(self.field, self.num_cells)
         given.update({name: [given[name][i] for i in kept] for name in ("weights", "biases")}, layers=table)
+        given["frozen"] = self.frozen_cells
         return routed_mlp(positions, **given, backend=self.backend, **self._where(positions, None))[0]
 
     def explain(self) -> str:
@@ -491,7 +561,8 @@ class VoronoiRouter(nn.Module):
 
     def _route(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         """One call of a method of the module; in a graph one operation where it is fused, else a break of the graph."""
-        if torch.compiler.is_compiling() and self.fuse and self.blend == 0 and not torch.is_autocast_enabled("cpu"):
+        held = self.blend > 0 or self.frozen_cells is not None
+        if torch.compiler.is_compiling() and self.fuse and not held and not torch.is_autocast_enabled("cpu"):
             rule = coords if coords is not None else self.coords
             spec = spec_of(args, kwargs)
             structure = None if spec is None else structure_of(self._known.number, method, spec)
@@ -534,7 +605,7 @@ class VoronoiRouter(nn.Module):
         call = Call(module, method, layout, [*names, *kwargs], args, kwargs)
         mixture, grouping = self._mixture(positions), self._group(method, positions)
         wish = Wish(self.fuse, self.way, bool(self.methods), self.assume)
-        return evaluate(call, grouping, mixture, self._choices, wish)
+        return evaluate(call, grouping, mixture, self._choices, wish, self.frozen_cells)
 
     def _mixture(self, positions: Tensor) -> Mixture | None:
         """The other cells that samples near borders are evaluated in too."""
@@ -579,18 +650,22 @@ class VoronoiRouter(nn.Module):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._known = Known(self)
+        freeze_cells(self.module, self.frozen_cells)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
         detach_results(self, memo)
         copied = memo[id(self)] = type(self).__new__(type(self))
         copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
         copied._known = Known(copied)
+        freeze_cells(copied.module, copied.frozen_cells)
         return copied
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
         self._choices.forget()
         self._assigned = None
-        return super()._apply(fn, recurse)
+        super()._apply(fn, recurse)
+        freeze_cells(self.module, self.frozen_cells)
+        return self
 
     def extra_repr(self) -> str:
         """What ``print(router)`` shows beside the field's modules."""

@@ -141,13 +141,20 @@ def kind_of(call: Call, device: torch.device, fused: bool) -> Any:
 # Carrying out ---------------------------------------------------------------------------------------------------------
 
 
-def evaluate(call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, wish: Wish) -> Any:
-    """What a method returns for the samples of all cells (or two placeholders), some mixed with those of others."""
+def evaluate(
+    call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, wish: Wish, frozen: Tensor | None
+) -> Any:
+    """What a method returns for the samples of all cells (or two placeholders), some mixed with those of others.
+
+    Samples in ``frozen`` cells, bool [k], are evaluated apart, without gradients.
+    """
     if grouping.device.type == "cpu":
         keep_freed_memory()
     kind = find_out(call, grouping, choices, wish)
     way, why = choose(kind, call, grouping, choices, wish)
-    own = carry_out(way, why, kind, call, grouping, choices).restored(call.layout)
+    given = way, why, kind, call, grouping, choices
+    frozen = frozen if torch.is_grad_enabled() and call.layout.n else None
+    own = (carry_out(*given) if frozen is None else carry_out_apart(*given, frozen)).restored(call.layout)
     if mixture is None:
         return own
     entries, tensors = grouping.of_entries(mixture.rows, mixture.cells), tensors_of(own)
@@ -229,6 +236,48 @@ def carry_out(way: Way, why: str, kind: Kind, call: Call, grouping: Grouping, ch
     if why and warns and not alone and layout.n >= _FEWEST:
         choices.say_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
     return results
+
+
+def carry_out_apart(
+    way: Way, why: str, kind: Kind, call: Call, grouping: Grouping, choices: Choices, frozen: Tensor
+) -> Results:
+    """The results of a way for samples in frozen cells, bool [k], without gradients, and for the others."""
+    n, cells = grouping.n, grouping.cells
+    cells = torch.zeros(n, dtype=torch.int32, device=grouping.device) if cells is None else cells
+    still = frozen.index_select(0, cells)
+    found, rows = list[Results](), list[Tensor]()
+    for own, context in ((~still, contextlib.nullcontext()), (still, torch.no_grad())):
+        rows.append(own.nonzero()[:, 0])
+        if len(rows[-1]):
+            part = grouping.of_entries(rows[-1], cells[rows[-1]])
+            with context:
+                found.append(carry_out(way, why, kind, call, part, choices))
+    order = torch.cat(rows)
+    tensors = []
+    for parts in zip(*(results.unsorted for results in found), strict=True):
+        joined = torch.cat(parts)
+        # The backward of index_copy is a gather, where that of an index would add up.
+        joined = torch.zeros_like(joined).index_copy(0, order, joined)
+        if joined.is_floating_point() and not len(rows[0]):  # a batch without samples to learn from is no error
+            joined = _Constant.apply(joined, *(p for p in cell_parameters(call.module) if p.requires_grad))
+        tensors.append(joined)
+    return Results(found[0].value, tensors)
+
+
+class _Constant(torch.autograd.Function):
+    """Values that depend on parameters, with no gradient to them."""
+
+    @staticmethod
+    def forward(values: Tensor, *parameters: Tensor) -> Tensor:
+        return values.view_as(values)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.count = len(inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, ...]:
+        return (None,) * ctx.count
 
 
 def measured(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:

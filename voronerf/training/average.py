@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from voronerf.router.optimizers import trained_parts
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
 
 #: Steps from one update of the averages to the next: weights of steps in between are much the same, and a large table
@@ -35,8 +36,12 @@ def update_averages(optimizer: torch.optim.Optimizer, decay: float, step: int) -
     for parameter in parameters:
         if _KEY not in optimizer.state[parameter]:
             optimizer.state[parameter][_KEY] = parameter.detach().clone()
-    averages = [optimizer.state[parameter][_KEY] for parameter in parameters]
-    get_ema_multi_avg_fn(fading)(averages, [parameter.detach() for parameter in parameters], None)
+    averages, weights = [], []
+    for parameter, parts in zip(parameters, trained_parts(parameters), strict=True):
+        average = optimizer.state[parameter][_KEY]
+        averages += [average[part] for part in parts]
+        weights += [parameter.detach()[part] for part in parts]
+    get_ema_multi_avg_fn(fading)(averages, weights, None)
 
 
 def drop_averages(optimizer: torch.optim.Optimizer) -> None:

@@ -58,13 +58,29 @@ VN_INLINE F32 raised(F32 x, float p, int order) {
   return splat(factor) * (p < 0.0f ? splat(1.0f) / result : result);
 }
 
-// sin(angle + half * pi), large angles by the scalar function.
-VN_INLINE F32 any_sine(F32 angle, bool cosine) {
-  if (!beyond_sine(angle)) return sine(angle, splat(cosine ? 0.5f : 0.0f));
-  float lanes[kLanes];
-  store(lanes, angle);
-  for (int i = 0; i < kLanes; ++i) lanes[i] = cosine ? __builtin_cosf(lanes[i]) : __builtin_sinf(lanes[i]);
+// sin(angle + half * pi) of angles some of which are too large for `sine`, by the scalar function. Lane by lane: what
+// else is in a vector, such as old floats behind the columns of a value, changes no bit.
+__attribute__((noinline)) F32 careful_sine(F32 angle, bool cosine) {
+  float lanes[kLanes], angles[kLanes];
+  store(lanes, sine(angle, splat(cosine ? 0.5f : 0.0f)));
+  store(angles, angle);
+  for (int i = 0; i < kLanes; ++i) {
+    if (__builtin_fabsf(angles[i]) < kLargestAngle) continue;
+    lanes[i] = cosine ? __builtin_cosf(angles[i]) : __builtin_sinf(angles[i]);
+  }
   return load(lanes);
+}
+
+VN_INLINE F32 any_sine(F32 angle, bool cosine) {
+  if (__builtin_expect(beyond_sine(angle), false)) return careful_sine(angle, cosine);
+  return sine(angle, splat(cosine ? 0.5f : 0.0f));
+}
+
+// e^x to 0 and infinity: `exponential` ends at e^-87 and e^88, which times a large x is not 0. What float32 holds with
+// fewer digits is 0, since such numbers take the processor ten times as long.
+VN_INLINE F32 any_exponential(F32 x) {
+  const F32 root = x < splat(-87.0f) ? splat(0.0f) : exponential(splat(0.5f) * x);
+  return root * root;
 }
 
 VN_INLINE F32 hyperbolic_tangent(F32 x) {
@@ -74,13 +90,18 @@ VN_INLINE F32 hyperbolic_tangent(F32 x) {
 
 // Its slope, 1 - tanh^2 without cancellation.
 VN_INLINE F32 tangent_slope(F32 x) {
-  const F32 e = exponential(splat(-2.0f) * abs(x)), sum = splat(1.0f) + e;
+  const F32 e = any_exponential(splat(-2.0f) * abs(x)), sum = splat(1.0f) + e;
   return splat(4.0f) * e / (sum * sum);
+}
+
+// As far as any density is more than 0, so that 0 times a power of x is not 0 times infinity.
+VN_INLINE F32 nearby(F32 x) {
+  return x > splat(30.0f) ? splat(30.0f) : x < splat(-30.0f) ? splat(-30.0f) : x;
 }
 
 // The density of the normal distribution.
 VN_INLINE F32 density(F32 x) {
-  return splat(0.39894228f) * exponential(splat(-0.5f) * x * x);
+  return splat(0.39894228f) * any_exponential(splat(-0.5f) * x * x);
 }
 
 // Its distribution function, erfc(-x / sqrt 2) / 2; erfc by Numerical Recipes' erfcc, relative error 1.2e-7.
@@ -90,14 +111,15 @@ VN_INLINE F32 distribution(F32 x) {
                                -0.18628806f, 0.09678418f,  0.37409196f, 1.00002368f,  -1.26551223f};
   F32 p = splat(kSeries[0]);
   for (int i = 1; i < 10; ++i) p = fma(p, t, splat(kSeries[i]));
-  const F32 tail = splat(0.5f) * t * exponential(p - z * z);
+  const F32 tail = splat(0.5f) * t * any_exponential(p - z * z);
   return x > splat(0.0f) ? splat(1.0f) - tail : tail;
 }
 
 // The logistic function and its derivatives.
 template <int Order>
 VN_INLINE F32 logistic(F32 x) {
-  const F32 s = sigmoid(x), one = splat(1.0f), slope = s * (one - s);
+  const F32 one = splat(1.0f), e = x < splat(-87.0f) ? splat(__builtin_inff()) : any_exponential(splat(0.0f) - x);
+  const F32 s = one / (one + e), slope = s * (one - s);
   if (Order == 0) return s;
   if (Order == 1) return slope;
   return slope * (Order == 2 ? one - s - s : one - splat(6.0f) * slope);
@@ -143,10 +165,10 @@ VN_FUNCTION(affine, fma(splat(a), x, splat(b)), splat(a), zero, zero)
 VN_FUNCTION(relu, x < zero ? zero : x, x <= zero ? zero : one, zero, zero)
 VN_FUNCTION(leaky_relu, positive(x, x, splat(a) * x), positive(x, one, splat(a)), zero, zero)
 VN_FUNCTION(abs, abs(x), positive(x, one, x < zero ? zero - one : zero), zero, zero)
-VN_FUNCTION(clamp, x<splat(a) ? splat(a) : x> splat(b) ? splat(b) : x, x<splat(a) ? zero : x> splat(b) ? zero : one,
-            zero, zero)
-VN_FUNCTION(elu, positive(x, x, splat(a) * exponential_minus_one(x)), positive(x, one, splat(a) * exponential(x)),
-            positive(x, zero, splat(a) * exponential(x)), positive(x, zero, splat(a) * exponential(x)))
+VN_FUNCTION(clamp, x<splat(a) ? splat(a) : x> splat(b) ? splat(b) : x,
+            x >= splat(a) ? (x <= splat(b) ? one : zero) : zero, zero, zero)
+VN_FUNCTION(elu, positive(x, x, splat(a) * exponential_minus_one(x)), positive(x, one, splat(a) * any_exponential(x)),
+            x >= zero ? zero : splat(a) * any_exponential(x), x >= zero ? zero : splat(a) * any_exponential(x))
 VN_FUNCTION(softplus, splat(a) * x > splat(b) ? x : softplus(splat(a) * x) * splat(1.0f / a),
             splat(a) * x > splat(b) ? one : logistic<0>(splat(a) * x),
             splat(a) * x > splat(b) ? zero : splat(a) * logistic<1>(splat(a) * x),
@@ -156,13 +178,14 @@ VN_FUNCTION(tanh, hyperbolic_tangent(x), tangent_slope(x), splat(-2.0f) * hyperb
             tangent_slope(x) * (splat(4.0f) - splat(6.0f) * tangent_slope(x)))
 VN_FUNCTION(silu, x* logistic<0>(x), logistic<0>(x) + x * logistic<1>(x),
             logistic<1>(x) * splat(2.0f) + x * logistic<2>(x), logistic<2>(x) * splat(3.0f) + x * logistic<3>(x))
-VN_FUNCTION(gelu, x* distribution(x), distribution(x) + x * density(x), density(x) * (splat(2.0f) - x * x),
-            density(x) * x * (x * x - splat(4.0f)))
+VN_FUNCTION(gelu, x* distribution(x), distribution(x) + x * density(x),
+            density(x) * (splat(2.0f) - nearby(x) * nearby(x)),
+            density(x) * nearby(x) * (nearby(x) * nearby(x) - splat(4.0f)))
 VN_FUNCTION(gelu_tanh, gelu_by_tanh<0>(x), gelu_by_tanh<1>(x), gelu_by_tanh<2>(x), gelu_by_tanh<3>(x))
 VN_FUNCTION(sine, any_sine(fma(splat(a), x, splat(b)), false), splat(a) * any_sine(fma(splat(a), x, splat(b)), true),
             splat(-a* a) * any_sine(fma(splat(a), x, splat(b)), false),
             splat(-a * a * a) * any_sine(fma(splat(a), x, splat(b)), true))
-VN_FUNCTION(exp, exponential(x), exponential(x), exponential(x), exponential(x))
+VN_FUNCTION(exp, any_exponential(x), any_exponential(x), any_exponential(x), any_exponential(x))
 VN_FUNCTION(log, logarithm(x), one / x, zero - one / (x * x), splat(2.0f) / (x * x * x))
 VN_FUNCTION(power, raised(x, a, 0), raised(x, a - 1.0f, 1), raised(x, a - 2.0f, 2), raised(x, a - 3.0f, 3))
 

@@ -44,6 +44,7 @@ _DEFAULTS: dict[str, Any] = {
     "directions": None,
     "direction_index": None,
     "features": None,
+    "frozen": None,
 }
 
 
@@ -63,6 +64,7 @@ def routed_mlp(
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
+    frozen: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Evaluates every sample by the network of the cell it lies in; results are in the order of the samples.
@@ -92,6 +94,8 @@ def routed_mlp(
         directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
         features: the table of the hash encoding, as in ``grouped_mlp``; None without a grid.
+        frozen: bool [k], the cells whose samples have no gradient to anything, or None. On the CPU they take no part in
+            the backward pass, unless positions or directions have gradients.
         backend: "auto", "reference" or "native". If there is no fused implementation, "auto" calls the separate
             operations, each on the backend it chooses.
 
@@ -135,6 +139,7 @@ def routed_mlp(
         directions=directions,
         direction_index=direction_index,
         features=features,
+        frozen=frozen,
     )
     device, dtype = positions.device, weights[0].dtype
     run: Callable[..., tuple[Tensor, Tensor]]
@@ -142,8 +147,33 @@ def routed_mlp(
         run = functools.partial(compose, operations=_operations(device, dtype, network["coords"]))
     else:
         run = backends.resolve(_OP, backend=backend, device=device, dtype=dtype)
+    frozen = network.pop("frozen")
     out, found = run(**network)
-    return out, found
+    return (out if frozen is None else hold(out, of_samples(frozen, found))), found
+
+
+def of_samples(frozen: Tensor, cells: Tensor) -> Tensor:
+    """bool [n, 1], whether the cell of each sample is frozen."""
+    return frozen.index_select(0, cells)[:, None]
+
+
+def hold(out: Tensor, rows: Tensor) -> Tensor:
+    """The same values, with gradients of zero in rows bool [n, 1]; rows of zeros leave the backward pass of native."""
+    return _Hold.apply(out, rows) if out.requires_grad else out
+
+
+class _Hold(torch.autograd.Function):
+    @staticmethod
+    def forward(out: Tensor, rows: Tensor) -> Tensor:
+        return out.view_as(out)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[1])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return gradient.masked_fill(ctx.saved_tensors[0], 0), None
 
 
 def check_routed(
@@ -154,6 +184,7 @@ def check_routed(
     if network.keys() != _DEFAULTS.keys():
         raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - _DEFAULTS.keys())}")
     tables = {name: network[name] for name in ("centres", "child_offsets", "child", "centre_weights", "cells")}
+    frozen = network["frozen"]
     read = {name: network[name] for name in ("directions", "direction_index", "features")}
     coords, centres = network["coords"], network["centres"]
     sizes: dict[str, int] = {}
@@ -162,6 +193,9 @@ def check_routed(
     check_count(op, "positions", sizes["n"])
     check_network(op, weights, biases, network["layers"], **read, sizes=sizes)
     _check_tables(op, **tables, depth=network["depth"], sizes=sizes)
+    if frozen is not None:
+        check_shape(op, "frozen", frozen, ("k",), sizes)
+        check_dtype(op, "frozen", frozen, (torch.bool,))
     if coords is not None:
         if centres is None:
             raise ValueError(f"{op}: coords must come with centres, got none to compare them with")
@@ -169,11 +203,12 @@ def check_routed(
         check_dtype(op, "coords", coords)
     elif centres is not None and sizes["p"] < 3:
         raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {sizes['p']}")
-    every, device = (positions, coords, *tables.values(), *read.values(), *weights, *biases), positions.device
+    every, device = (positions, coords, frozen, *tables.values(), *read.values(), *weights, *biases), positions.device
     if torch.compiler.is_compiling() or any(t is not None and (t.device != device or t.is_inference()) for t in every):
         tensors = {  # named for an error alone
             "positions": positions,
             "coords": coords,
+            "frozen": frozen,
             **tables,
             **read,
             **{f"weights[{index}]": weight for index, weight in enumerate(weights)},

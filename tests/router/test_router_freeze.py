@@ -1,0 +1,243 @@
+"""Frozen cells: no gradient, no step of any optimiser, no backward time; the same bits."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+
+from voronerf import NeRF, VoronoiRouter
+from voronerf.fields import HashGridField
+from voronerf.ops import learn_outputs
+from voronerf.rendering import Occupancy, OccupancyGrid, Rays, Renderer
+from voronerf.step import Batch, Step
+from voronerf.training.adam import Adam
+from voronerf.training.average import update_averages
+
+FROZEN, LEARNING = [1, 3], [0, 2]
+OPTIMIZERS = {
+    "Adam": lambda p: torch.optim.Adam(p, lr=0.1, weight_decay=0.1),
+    "AdamW": lambda p: torch.optim.AdamW(p, lr=0.1, amsgrad=True),
+    "SGD": lambda p: torch.optim.SGD(p, lr=0.1, momentum=0.9, weight_decay=0.1),
+    "voronerf": lambda p: Adam([{"params": list(p)}], lr=0.1),
+    "voronerf, reference": lambda p: Adam([{"params": list(p)}], lr=0.1, backend="reference"),
+}
+
+
+def make(kind, **options):
+    torch.manual_seed(0)
+    centres = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    if kind == "table":
+        return VoronoiRouter(NeRF(width=16, depth=2), centres, **options)
+    net = torch.nn.Sequential(torch.nn.Linear(3, 16), torch.nn.ReLU(), torch.nn.Linear(16, 2))
+    return VoronoiRouter(net, centres, coords="first3", way=kind, fuse=kind == "fused", **options)
+
+
+def loss_of(router, points):
+    if router.by_table:
+        colour, density = router(points, torch.nn.functional.normalize(points + 0.1, dim=-1))
+        return colour.square().mean() + density.mean()
+    return router(points).square().mean()
+
+
+def gradients(router, points):
+    router.zero_grad()
+    loss_of(router, points).backward()
+    return [p.grad for p in router.parameters()]
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+@pytest.mark.parametrize("kind", ["table", "fused", "grouped", "loop"])
+def test_frozen_cells_have_no_gradient_and_others_the_same(kind, backend):
+    router, points = make(kind, backend=backend if kind == "table" else "auto"), torch.rand(200, 3)
+    expected = [g.clone() for g in gradients(router, points)]
+    values = loss_of(router, points)
+    router.freeze(FROZEN)
+    torch.testing.assert_close(loss_of(router, points), values)
+    found = gradients(router, points)
+    for own, full in zip(found, expected, strict=True):
+        assert not own[FROZEN].any() and own[LEARNING].any()
+        torch.testing.assert_close(own[LEARNING], full[LEARNING])
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+@pytest.mark.parametrize("before", [0, 2])
+def test_steps_leave_frozen_cells_bit_for_bit(name, before):
+    router, points = make("grouped"), torch.rand(200, 3)
+    optimizer = OPTIMIZERS[name](router.parameters())
+    for _ in range(before):
+        gradients(router, points)
+        optimizer.step()
+    router.freeze(FROZEN)
+
+    def bits():
+        state = [v for p in router.parameters() for v in optimizer.state[p].values() if torch.is_tensor(v) and v.dim()]
+        return [t.detach().clone() for t in (*router.parameters(), *state)]
+
+    held = bits()
+    for _ in range(3):
+        gradients(router, points)
+        optimizer.step()
+    now = bits()
+    for own, old in zip(now, held if before else now, strict=True):
+        assert torch.equal(own[FROZEN], old[FROZEN])
+        assert not before or not torch.equal(own[LEARNING], old[LEARNING])
+    if not before:
+        parameters = len(list(router.parameters()))
+        assert all(torch.equal(a[FROZEN], b[FROZEN]) for a, b in zip(now[:parameters], held))
+        assert not any(state[FROZEN].any() for state in now[parameters:])
+
+
+def test_cells_learn_again_with_their_moments():
+    router, points = make("grouped"), torch.rand(200, 3)
+    optimizer = Adam([{"params": list(router.parameters())}], lr=0.1)
+    gradients(router, points)
+    optimizer.step()
+    router.freeze()
+    assert router.frozen.all()
+    router.unfreeze([0])
+    assert router.frozen.tolist() == [False, True, True, True]
+    router.unfreeze()
+    weight = next(router.parameters())
+    old = weight.detach().clone()
+    gradients(router, points)
+    optimizer.step()
+    assert (weight != old).flatten(1).any(1).all()
+
+
+def test_a_batch_in_frozen_cells_alone_is_no_error():
+    for kind in ("table", "fused", "grouped", "loop"):
+        router = make(kind)
+        router.freeze(FROZEN)
+        points = torch.tensor([1.0, 0.5, 0]) + 0.01 * torch.rand(20, 3)
+        loss_of(router, points).backward()
+        assert not any(p.grad is not None and p.grad.any() for p in router.parameters())
+        router(points[:0], points[:0]) if kind == "table" else router(points[:0])
+
+
+def test_inputs_get_no_gradient_from_frozen_cells():
+    router = make("table")
+    router.freeze(FROZEN)
+    points = torch.tensor([[0.0, 0.1, 0], [1.0, 0.1, 0]], requires_grad=True)
+    router(points, torch.ones(2, 3))[1].sum().backward()
+    assert points.grad[0].any() and not points.grad[1].any()
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_tables_learn_from_other_cells_alone(own):
+    torch.manual_seed(0)
+    field, centres = HashGridField(box=((0.0, 0, 0), (1.0, 1, 1))), torch.tensor([[0.0, 0, 0], [1, 1, 1]])
+    router = VoronoiRouter(field, centres, **({} if own else {"share": ["features"]}))
+    points = torch.rand(300, 3)
+    near = router.assign(points) == 0
+    (expected,) = (g.clone() for g in gradients_of_table(router, points[near], len(points)))
+    router.freeze([1])
+    (found,) = gradients_of_table(router, points, len(points))
+    torch.testing.assert_close(found, expected)
+    assert found.any() and (not own or not found[1].any())
+
+
+def gradients_of_table(router, points, count):
+    router.zero_grad()
+    colour, density = router(points, points.new_ones(len(points), 3))
+    ((colour.sum() + density.sum()) / count).backward()
+    return [router.module.features.grad]
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_learn_outputs_leaves_frozen_cells_out(backend):
+    router, points = make("table"), torch.rand(100, 3)
+    router.freeze(FROZEN)
+    network = router.table_arguments(points, torch.ones(100, 3), None)
+    loss = learn_outputs(network, lambda out: (out.square().sum(), 2 * out), backend=backend)
+    loss.backward()
+    for p in router.parameters():
+        assert not p.grad[FROZEN].any() and p.grad[LEARNING].any()
+    with pytest.raises(ValueError, match=r"frozen must have shape \[k\] with k = 4, got \[3\]"):
+        learn_outputs({**network, "frozen": torch.zeros(3, dtype=torch.bool)}, lambda out: (out.sum(), out))
+    with pytest.raises(TypeError, match="frozen must have dtype bool, got float32"):
+        learn_outputs({**network, "frozen": torch.zeros(4)}, lambda out: (out.sum(), out))
+
+
+def test_a_step_leaves_out_rays_that_teach_nothing():
+    router = make("table")
+    grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [2.0, 2, 2]]), 8, threshold=0.01)
+    step = Step(Renderer({"field": router}, Occupancy(grid, 32)))
+    origins = torch.tensor([[x, y, -2.0] for x in (-0.2, 1.2) for y in (-0.2, 1.2)] * 4)
+    rays = Rays(origins, torch.tensor([[0.0, 0, 1]]).expand(16, 3))
+    batch = Batch(rays, torch.zeros(16), torch.full((16,), 4.0), torch.rand(16, 3), torch.rand(16, 3))
+
+    def run():
+        router.zero_grad()
+        found = step.run(batch, torch.Generator().manual_seed(3))
+        found.loss.backward()
+        return found, [p.grad.clone() for p in router.parameters()]
+
+    _, expected = run()
+    router.freeze([1, 2, 3])
+    found, learnt = run()
+    assert len(found.error) == 4 and len(found.importance()) == len(found.weights)
+    for own, full in zip(learnt, expected, strict=True):
+        torch.testing.assert_close(own[0], full[0])
+        assert not own[1:].any()
+    router.freeze()
+    found, learnt = run()
+    assert len(found.error) == 1 and not any(g.any() for g in learnt)
+
+
+def test_averages_of_frozen_cells_stay():
+    router, points = make("grouped"), torch.rand(200, 3)
+    optimizer = Adam([{"params": list(router.parameters())}], lr=0.1)
+    for step in (0, 4):
+        gradients(router, points)
+        optimizer.step()
+        update_averages(optimizer, 0.98, step)
+    router.freeze(FROZEN)
+    old = [optimizer.state[p]["average"].clone() for p in router.parameters()]
+    gradients(router, points)
+    optimizer.step()
+    update_averages(optimizer, 0.98, 8)
+    for p, before in zip(router.parameters(), old, strict=True):
+        now = optimizer.state[p]["average"]
+        assert torch.equal(now[FROZEN], before[FROZEN]) and not torch.equal(now[LEARNING], before[LEARNING])
+
+
+def test_copies_children_and_states():
+    router = make("table")
+    router.freeze(FROZEN)
+    for again in (copy.deepcopy(router), pickle.loads(pickle.dumps(router)), router.double().float()):
+        assert again.frozen.tolist() == [False, True, False, True]
+        optimizer = torch.optim.AdamW(again.parameters())
+        old = [p.detach().clone() for p in again.parameters()]
+        gradients(again, torch.rand(50, 3))
+        optimizer.step()
+        assert all(torch.equal(p[FROZEN], o[FROZEN]) for p, o in zip(again.parameters(), old, strict=True))
+    assert not any("frozen" in name for name in router.state_dict())
+    other = make("table")
+    other.load_state_dict(router.state_dict())
+    assert not other.frozen.any()
+    centres = torch.cat([router.diagram.centres, router.diagram.centres + 0.01])
+    router.subdivide(type(router.diagram)(centres), torch.tensor([0, 1, 2, 3] * 2))
+    assert router.frozen.tolist() == [False, True, False, True] * 2
+    router.load_state_dict(other.state_dict())
+    assert not router.frozen.any() and len(router.frozen) == 4
+
+
+@pytest.mark.parametrize(
+    ("cells", "error", "message"),
+    [
+        ([4], ValueError, "numbers below 4, got 4"),
+        ([-1], ValueError, "numbers below 4, got -1"),
+        (torch.zeros(3, dtype=torch.bool), ValueError, r"cells must be bool \[4\], got \[3\]"),
+        ([0.5], TypeError, r"numbers of cells or bool \[4\], got torch.float32 \[1\]"),
+        ([[0]], TypeError, r"got torch.int64 \[1, 1\]"),
+    ],
+)
+def test_refuses_cells_that_are_none(cells, error, message):
+    router = make("table")
+    for method in (router.freeze, router.unfreeze):
+        with pytest.raises(error, match=message):
+            method(cells)
+    assert not router.frozen.any()
+    router.freeze([])
+    assert not router.frozen.any()
