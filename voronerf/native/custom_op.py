@@ -15,11 +15,12 @@ from voronerf import native
 
 # torch has no public names for these questions; without an answer the custom op is called.
 _LISTENERS = [
-    getattr(torch._C, name, lambda: True)
-    for name in ("_len_torch_function_stack", "_len_torch_dispatch_stack", "_are_functorch_transforms_active")
+    getattr(torch._C, "_len_torch_function_stack", lambda: True),
+    getattr(torch._C, "_len_torch_dispatch_stack", lambda: True),
+    getattr(torch._C, "_are_functorch_transforms_active", lambda: True),
+    getattr(torch.autograd, "_profiler_enabled", lambda: True),
 ]
 _PLAIN = (Tensor, torch.nn.Parameter)
-_PROFILES = getattr(torch.autograd, "_profiler_enabled", lambda: True)
 
 # Results of at least this many bytes are put on huge pages; for smaller ones the allocator usually has warm memory.
 _LARGE = 1 << 22
@@ -102,7 +103,7 @@ class Structs:
 
     def flat(self, packed: Sequence[Any]) -> Sequence[Any]:
         """The arguments of the custom op."""
-        if not self._any:
+        if not self._any:  # most ops
             return packed
         found: list[Any] = []
         for given, kind in zip(packed, self._kinds):
@@ -130,21 +131,27 @@ class Op:
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
         flat = self._structs.flat(arguments)
-        if torch.compiler.is_compiling() or _PROFILES() or any(listens() for listens in _LISTENERS):
+        if torch.compiler.is_compiling():
             return self._op(*flat)
-        tensors = [argument for argument in flat if isinstance(argument, Tensor)]
-        for argument in flat:
-            if isinstance(argument, (list, tuple)):
-                tensors += [entry for entry in argument if isinstance(entry, Tensor)]
-        for tensor in tensors:
-            if type(tensor) not in _PLAIN or tensor.device.type not in self._devices:
+        for listens in _LISTENERS:
+            if listens():
                 return self._op(*flat)
-        if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+        differentiable = False
+        waiting = [flat]
+        for entries in waiting:
+            for entry in entries:
+                if isinstance(entry, Tensor):
+                    if type(entry) not in _PLAIN or entry.device.type not in self._devices:
+                        return self._op(*flat)
+                    differentiable |= entry.requires_grad
+                elif isinstance(entry, (list, tuple)):
+                    waiting.append(entry)
+        if not (differentiable and torch.is_grad_enabled()):
             return self._run(*arguments)
         if self._function is None:
             return self._op(*flat)
-        entries, lengths = _flattened(flat)
-        results = self._function.apply(*entries, lengths)
+        parts, lengths = _flattened(flat)
+        results = self._function.apply(*parts, lengths)
         return list(results) if self._listed else results
 
     def inside(self, *arguments: Any) -> Any:

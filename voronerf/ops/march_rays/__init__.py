@@ -16,6 +16,7 @@ from voronerf.checks import (
     check_same_device,
     check_same_dtype,
     check_shape,
+    detached,
 )
 from voronerf.ops.march_rays.reference import March, Rays
 
@@ -162,16 +163,16 @@ def march_rays(
         raise ValueError(f"{_OP}: samples must be at most 65535, got {samples}")
     run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
     rays = Rays(
-        origins=origins.detach(),
-        directions=directions.detach(),
-        near=near.detach(),
-        far=far.detach(),
+        origins=detached(origins),
+        directions=detached(directions),
+        near=detached(near),
+        far=detached(far),
         occupied=occupied,
-        box=box.detach(),
-        uniforms=None if uniforms is None else uniforms.detach(),
+        box=detached(box),
+        uniforms=detached(uniforms),
         seed=seed,
         start=start,
-        contraction=None if contraction is None else contraction.detach(),
+        contraction=detached(contraction),
         samples=samples,
         disparity=spacing == "disparity",
         most=samples if most is None else most,

@@ -16,6 +16,7 @@ from voronerf.checks import (
     check_same_dtype,
     check_shape,
     check_writable,
+    detached,
 )
 
 _OP = backends.declare(
@@ -87,8 +88,8 @@ def observe_occupancy(
     samples = positions, sigma, deltas, weights
     _check(_OP, density, occupied, box, samples, decay=decay, threshold=threshold, hidden=hidden)
     run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)
-    constant = (tensor.detach() for tensor in (box, *samples))
-    run(density.detach(), occupied, *constant, float(decay), float(threshold), float(hidden))
+    constant = (detached(tensor) for tensor in (box, *samples))
+    run(detached(density), occupied, *constant, float(decay), float(threshold), float(hidden))
 
 
 def observe_told(
@@ -138,7 +139,7 @@ def observe_told(
     check_same_device(_TOLD, density=density, told=told, reached=reached)
     check_range(_TOLD, "told", told[:, 0].contiguous().view(torch.int32), density.numel())
     run = backends.resolve(_TOLD, backend=backend, device=density.device, dtype=density.dtype)
-    run(density.detach(), occupied, box, told, reached, samples, float(decay), float(threshold), float(hidden))
+    run(detached(density), occupied, box, told, reached, samples, float(decay), float(threshold), float(hidden))
 
 
 def tell_observed(

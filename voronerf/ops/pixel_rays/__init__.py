@@ -15,6 +15,7 @@ from voronerf.checks import (
     check_same_dtype,
     check_shape,
     check_tensor,
+    detached,
 )
 from voronerf.ops.camera_rays import check_lenses
 from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
@@ -114,14 +115,14 @@ def pixel_rays(
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
     found: PixelRays = run(
         Pixels(
-            poses=poses.detach(),
-            intrinsics=intrinsics.detach(),
+            poses=detached(poses),
+            intrinsics=detached(intrinsics),
             images=images,
             numbers=index,
-            box=None if box is None else box.detach(),
-            distortion=None if distortion is None else distortion.detach(),
+            box=detached(box),
+            distortion=detached(distortion),
             models=models,
-            background=None if background is None else background.detach(),
+            background=detached(background),
             near=float(near),
             far=float(far),
         )

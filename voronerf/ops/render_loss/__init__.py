@@ -16,6 +16,7 @@ from voronerf.checks import (
     check_same_device,
     check_shape,
     check_tensor,
+    detached,
 )
 from voronerf.ops.render_loss.reference import RenderLoss
 
@@ -86,8 +87,8 @@ def render_loss(
     """
     _check(_OP, raw, deltas, ray_offsets, target, background, density_scale, hidden)
     run = backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)
-    constant = (deltas.detach(), ray_offsets, target.detach())
-    background = None if background is None else background.detach()
+    constant = (detached(deltas), ray_offsets, detached(target))
+    background = detached(background)
     numbers = {"density_scale": float(density_scale), "hidden": float(hidden)}
     return RenderLoss(*run(raw, *constant, background=background, **numbers))
 
@@ -133,8 +134,8 @@ def render_loss_gradient(
     """
     _check(_GRADIENT, raw, deltas, ray_offsets, target, background, density_scale, hidden)
     run = backends.resolve(_GRADIENT, backend=backend, device=raw.device, dtype=raw.dtype)
-    tensors = raw.detach(), deltas.detach(), ray_offsets, target.detach()
-    background = None if background is None else background.detach()
+    tensors = detached(raw), detached(deltas), ray_offsets, detached(target)
+    background = detached(background)
     *parts, gradient = run(*tensors, background, float(density_scale), float(hidden))
     return RenderLoss(*parts), gradient
 
