@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.data.scene import KINDS, Scene, SceneError, Split
+from voronerf.data.errors import SceneError
+from voronerf.data.scene import KINDS, Scene, Split
 from voronerf.files import json_text, read_json, write_text
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.contraction import Contraction, Perspective

@@ -242,6 +242,19 @@ class Call:
         values = [map_tree(value, changed, name) for name, value in given]
         return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
 
+    def shared(self) -> list[Tensor]:
+        """The arguments that are the same for all samples, once it is known which they are."""
+        found: list[Tensor] = []
+
+        def note(name: str, value: Any, nested: bool) -> Any:
+            if self.kinds.get(name) == SHARED:
+                found.append(value)
+            return value
+
+        for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
+            map_tree(value, note, name)
+        return found
+
     def arranged(self, grouping: Grouping | None) -> list[Tensor]:
         """The rows of the arguments as the module sees them, in the order of a grouping, or for None as they came."""
         layout, n = self.layout, self.layout.n if grouping is None else grouping.n
