@@ -21,6 +21,7 @@ LAYERS = (
     {"evaluation", "distributed"},
     {"step"},
     {"training"},
+    {"editing"},
     {"run"},
     {"export"},
     {"cli", "viewer"},
