@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from voronerf import native
+from voronerf.custom_op import custom_op
 from voronerf.derivatives import asked_for
-from voronerf.native.custom_op import custom_op, on_huge_pages
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
 from voronerf.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient, merged
 
@@ -72,7 +72,7 @@ def _run(
     )
     if isinstance(machine, native.compiled.Cpu):
         for result in results:
-            on_huge_pages(result)
+            native.on_huge_pages(result)
         native.compiled.grouped_program(given, results, sums, machine)
         return
     sizes = plan.sizes
