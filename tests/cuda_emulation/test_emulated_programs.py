@@ -13,7 +13,7 @@ from voronerf.ops.grouped_program.case import every_step
 from voronerf.program import Builder, Columns
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "ops"))
-from test_grouped_program import NUMBERS, arguments, check, derivatives, random_program  # noqa: E402
+from test_grouped_program import NUMBERS, arguments, check, derivatives, random_program
 
 plans = importlib.import_module("voronerf.ops.grouped_program.native")
 
