@@ -664,9 +664,9 @@ class Parts(nn.Module):
                 colour, density = colour * weights[:, None], density * weights
             pieces.append((rows, colour, density))
         rows, colour, density = (torch.cat(tensors) for tensors in zip(*pieces, strict=True))
-        if len(claims) == 1 and len(rows) == n:
+        if len(claims) == 1 and len(rows) == n and claims[0][4] is None:
             return None, colour, density
-        if len({id(w) for *_, w in claims}) > 1 or claims[0][4] is not None:  # blended: a row comes more than once
+        if claims[0][4] is not None:  # blended: rows come in any order, and more than once
             both = torch.cat((colour, density[:, None]), 1)
             both = both.new_zeros(n, 4).index_add(0, rows, both)
             return None, both[:, :3], both[:, 3]
