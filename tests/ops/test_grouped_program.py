@@ -224,8 +224,10 @@ def test_order_strays_and_layouts() -> None:
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
         assert not ours[:2].any() and not ours[90:].any()
     turned = [x.t().contiguous().t() for x in rows]
-    for ours, theirs in zip(*(grouped_program(r, parameters, offsets, program=program) for r in (turned, rows))):
-        assert torch.equal(ours, theirs)
+    for order in (None, torch.randperm(101, generator=torch.Generator().manual_seed(0)).int()):
+        given = {"program": program, "order": order, "backend": "native"}
+        for ours, theirs in zip(*(grouped_program(r, parameters, offsets, **given) for r in (turned, rows))):
+            assert torch.equal(ours, theirs)
 
 
 @pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)

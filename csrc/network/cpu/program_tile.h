@@ -2,6 +2,7 @@
 #pragma once
 
 #include "network/cpu/activation_tile.h"
+#include "network/cpu/few_outputs_tile.h"
 #include "network/cpu/functions_tile.h"
 #include "network/cpu/gemm_tile.h"
 #include "network/cpu/grouped_mlp_pack.h"
@@ -102,6 +103,7 @@ struct ProgramTile {
     switch (step.op) {
       case kInput: {
         const float* from = call.inputs[step.number];
+        if (call.turned[step.number]) return turn(from, step);
         if (call.order == nullptr && width == stride) {
           __builtin_memcpy(to, from + begin * width, sizeof(float) * rows * width);
           return;
@@ -156,6 +158,18 @@ struct ProgramTile {
     }
   }
 
+  // Columns [width][n] as rows.
+  void turn(const float* from, const ProgramStep& step) const {
+    float* const to = at(step.slot);
+    int64_t c = 0;
+    for (; call.order == nullptr && c + 4 <= step.width; c += 4) {
+      transpose_four(from + c * call.n + begin, call.n, rows, to + c, step.stride);
+    }
+    for (; c < step.width; ++c) {
+      for (int64_t row = 0; row < rows; ++row) to[row * step.stride + c] = from[c * call.n + place(row)];
+    }
+  }
+
   void linear(const ProgramStep& step, const ProgramOperand* operands) const {
     const Rows x = operand(operands[0]);
     const bool added = step.count > 1 + (step.finish == 2);
@@ -164,6 +178,10 @@ struct ProgramTile {
     const Finish finish = step.finish == 0 ? Finish::none : step.finish == 1 ? Finish::relu : Finish::relu_slope;
     const Source source{x.data, x.stride, step.depth};
     float* const to = at(step.slot);
+    if (step.order > 0) {
+      const auto product = step.order == 1 ? few_outputs<1> : few_outputs<4>;
+      return product(&source, 1, packed + step.number, step.depth, add.data, step.finish == 1, rows, to);
+    }
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       const int64_t columns = smaller(kPanel, step.stride - first);
       const float* start = add.data == kZeros ? kZeros : add.data + first;
