@@ -30,8 +30,8 @@ LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
 #: The same of a cell of contracted space, for the light on its way through the whole cell.
 CONTRACTED_OPACITY = 0.1
 #: How many samples in a row empty a new cell: about thirty steps, until which the field has said nothing about most. In
-#: contracted space cells are many, and few samples meet each.
-OCCUPANCY_PATIENCE, CONTRACTED_PATIENCE = 8, 4
+#: contracted space, cells near the cameras meet several samples in each step.
+OCCUPANCY_PATIENCE, CONTRACTED_PATIENCE = 8, 30
 #: Of a grid made for pictures alone: cells along each axis, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 
