@@ -71,7 +71,7 @@ class TrainConfig:
     """Backend of the operations: auto, native, warp or reference (see `voronerf info`)."""
 
     budget: float | None = None
-    """Training time in seconds, without evaluation; default 480, unless --steps is given."""
+    """Time in seconds for training and evaluation; default 480, unless --steps is given."""
     steps: int | None = None
     """Number of training steps, instead of a time."""
 
@@ -178,7 +178,10 @@ class TrainConfig:
     eval_views: int = 20
     """Test views of an evaluation during training, evenly spread; the final evaluation uses --final-views."""
     final_views: int | None = None
-    """Test views of the final evaluation; default all."""
+    """Test views of the final evaluation; default all, or as many as --evaluation-share allows."""
+    evaluation_share: float = 0.1
+    """Share of --budget for evaluations, half of it for the final one. Where that is too short for all their views,
+    evenly spread ones are scored. 0: evaluations take the time that they need, beside the budget."""
     checkpoint_every: float = 30.0
     """Seconds of training between checkpoints, which are written while it goes on."""
     keep_checkpoints: int = 3
