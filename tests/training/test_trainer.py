@@ -352,7 +352,7 @@ def test_evaluations_are_part_of_the_budget(tmp_path, scene, final_views, views)
     trainer = Trainer(small(tmp_path, **limits), scene, clock=lambda: float(next(seconds)))
     summary = trainer.run()
     assert summary["complete"] and summary["views"] == views
-    assert trainer.scoring <= 4 and 38 <= trainer.seconds + trainer.scoring <= 42
+    assert trainer.scoring <= 2 and 36 <= trainer.seconds + trainer.scoring <= 42
     uncounted = small(tmp_path / "uncounted", **limits, evaluation_share=0.0)
     trainer = Trainer(uncounted, scene, clock=lambda: float(next(seconds)))
     assert 40 <= trainer.run()["seconds"] <= 44

@@ -43,11 +43,11 @@ class Stored:
     rays_done: int
     stages: tuple[dict[str, Any], ...]
     evaluated: int
-    scoring: float
-    view_seconds: float
     skipped: int
     rate_factor: float
     threads: int
+    scoring: float = 0.0
+    view_seconds: float = 0.0
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
@@ -64,7 +64,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
         check_types(source, Stored, values)
         for number, stage in enumerate(values["stages"]):
             check_types(f"{source}: stage {number}", Stage, stage)
-        times = [values[name] for name in ("seconds", "scoring", "view_seconds")]
+        times = [values.get(name, 0.0) for name in ("seconds", "scoring", "view_seconds")]
         if not (values["step"] >= 0 and all(0 <= each < math.inf for each in times) and values["stages"]):
             step, count = values["step"], len(values["stages"])
             raise ValueError(f"{source}: step, times and stages must be counts, got {step}, {times} and {count}")

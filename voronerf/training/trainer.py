@@ -162,7 +162,7 @@ class Trainer:
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
         self.step, self.seconds = 0, 0.0
-        #: Seconds of all evaluations, and of a view in the last one.
+        #: Seconds of all evaluations but the last, and of a view in the latest.
         self.scoring, self.view_seconds = 0.0, 0.0
         self._passed = 0.0  # seconds that ranks have not been told of
         #: Rays of the next step, and of all steps so far.
@@ -516,7 +516,7 @@ class Trainer:
     def _evaluate(self, views: int | None, lpips: Lpips | None = None, *, last: bool = False) -> None:
         """Scores test views; where a stop is asked for meanwhile, not all of them, and without a trace."""
         count = self._affordable(views, lpips, last) if self._counts_evaluation else views
-        scores = [] if count == 0 else self._score(count, lpips)
+        scores = [] if count == 0 else self._score(count, lpips, last)[0]
         if self.stopped:
             return
         self.evaluated = self._due()
@@ -526,23 +526,25 @@ class Trainer:
     def _affordable(self, views: int | None, lpips: Lpips | None, last: bool) -> int:
         """How many of the views the share of the budget allows, from what one takes; 0 to leave out an evaluation."""
         every, share = len(self.scene.test.names), self.config.evaluation_share
-        wanted = every if views is None else min(views, every)
+        wanted, budget = every if views is None else min(views, every), float(self.config.budget or 0.0)
         if last and self.config.final_views is not None:
             return wanted
-        if not self.view_seconds or lpips is not None:
-            self._score(1, lpips)
-        left = share * float(self.config.budget or 0.0) if last else share / 2 * self.seconds
-        return min(wanted, max(int((left - self.scoring) / max(self.view_seconds, 1e-9)), int(last)))
+        one, probed = self.view_seconds, 0.0
+        if one == 0 or lpips is not None:
+            one = probed = self._score(1, lpips, last)[1]
+        left = share * budget - self.scoring - probed if last else share / 2 * self.seconds - self.scoring
+        return min(wanted, max(int(left / max(one, 1e-9)), int(last)))
 
-    def _score(self, views: int | None, lpips: Lpips | None) -> list[ViewScore]:
-        """Scores of test views, whose time is counted."""
+    def _score(self, views: int | None, lpips: Lpips | None, last: bool) -> tuple[list[ViewScore], float]:
+        """Scores of test views, and the seconds that they took, which are counted before the last evaluation."""
         started = self.clock()
         with self.averaged():
             scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, stop=lambda: self.stopped)
         passed = self.clock() - started
-        self.scoring += passed
-        self.view_seconds = passed / max(len(scores), 1)
-        return scores
+        if not last:
+            self.scoring += passed
+            self.view_seconds = passed / max(len(scores), 1)
+        return scores, passed
 
     def _record(self, scores: list[ViewScore]) -> None:
         """Adds an evaluation to ``metrics.jsonl`` and tells it, with what makes it poor."""
