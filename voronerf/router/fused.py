@@ -10,7 +10,6 @@ Letters: n samples, k cells, w columns.
 from __future__ import annotations
 
 import contextlib
-import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
