@@ -14,7 +14,7 @@ from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.distributed.sharing import assign_cells
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.router.grouping import cell_parameters
 from voronerf.step import Cells
 from voronerf.training.checkpoint import (
@@ -27,6 +27,7 @@ from voronerf.training.checkpoint import (
 )
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.networks import check_shapes, router_states
+from voronerf.training.parts import describe_parts
 from voronerf.training.progress import Stage
 from voronerf.training.schema import check_types
 
@@ -57,6 +58,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
     try:
         if isinstance(values.get("stages"), list):
             values["stages"] = tuple(values["stages"])
+        values.pop("parts", None)  # which are compared where they are made
         check_types(source, Stored, values)
         for number, stage in enumerate(values["stages"]):
             check_types(f"{source}: stage {number}", Stage, stage)
@@ -75,7 +77,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
 
 def collect(
     stored: Stored,
-    routers: Mapping[str, VoronoiRouter],
+    routers: Mapping[str, VoronoiRouter | Parts],
     optimizer: torch.optim.Optimizer,
     parts: Mapping[str, Mapping[str, Any]],
 ) -> Checkpoint:
@@ -86,7 +88,10 @@ def collect(
         for prefix, group in every.items()
         for name, value in group.items()
     }
-    return Checkpoint(tensors, {**asdict(stored), "stages": list(stored.stages)})
+    values = {**asdict(stored), "stages": list(stored.stages)}
+    if isinstance(field := routers["field"], Parts):
+        values["parts"] = describe_parts(field)
+    return Checkpoint(tensors, values)
 
 
 def resumed_checkpoint(config: TrainConfig, run: Path) -> Checkpoint:

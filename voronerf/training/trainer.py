@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.data import Scene
-from voronerf.data.record import write_scene
+from voronerf.data.record import within, write_scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.distributed.exchange import Exchange, Told
 from voronerf.distributed.group import Group
@@ -30,7 +30,7 @@ from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
 from voronerf.files import json_text, write_bytes, write_text
 from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.router.grouping import cell_parameters
 from voronerf.step import Cells, Found, Step
 from voronerf.training import state
@@ -43,7 +43,7 @@ from voronerf.training.checkpoint import (
     checkpoint_paths,
     last_checkpoint,
 )
-from voronerf.training.config import TrainConfig
+from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_ranks
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.divergence import (
@@ -60,7 +60,7 @@ from voronerf.training.networks import (
     check_memory,
     computes_natively,
     make_optimizer,
-    make_routers,
+    open_routers,
     resolve_config,
     restore_routers,
 )
@@ -110,6 +110,8 @@ class Trainer:
     ) -> None:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
+        if config.resume:  # the space is that of the run, whatever the views
+            scene = within(scene, config.out)
         self.out, self.scene = config.out, scene
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)
@@ -133,7 +135,9 @@ class Trainer:
             sightings=bool(config.sightings),
             backend=config.backend,
         )
-        self.routers = make_routers(config, self.device)
+        self.routers = open_routers(config, self.device, checkpoint)
+        if self.group.size > 1 and isinstance(self.routers["field"], Parts):
+            raise ConfigError(f"--resume of {self.out} must be one process: it is a run of several parts")
         for router in self.routers.values():
             router.generator = self.draws
         #: Whether native ops compute the networks: then steps are the same bit for bit on any number of threads.
@@ -145,7 +149,7 @@ class Trainer:
         self.sharing = Sharing(self.group)
         self.cells = Cells(
             self.renderer,
-            self.routers,
+            cast(dict[str, VoronoiRouter], self.routers),  # of parts it asks for what they have alone
             self.plan,
             config.split_rule,
             generator=self.generator,
@@ -176,8 +180,8 @@ class Trainer:
         return self.group.rank == 0
 
     @property
-    def router(self) -> VoronoiRouter:
-        """The router whose colours count."""
+    def router(self) -> VoronoiRouter | Parts:
+        """The router whose colours count, or the parts of a run that was joined."""
         return self.routers["field"]
 
     @property
@@ -193,8 +197,10 @@ class Trainer:
     @property
     def parameter_count(self) -> int:
         """Parameters of all networks of all cells."""
-        of_cells = sum(p.numel() for p in cell_parameters(self.router.module))
         everything = sum(p.numel() for router in self.routers.values() for p in router.parameters())
+        if isinstance(self.router, Parts):
+            return everything
+        of_cells = sum(p.numel() for p in cell_parameters(self.router.module))
         return everything + of_cells // self.router.num_cells * (self.diagram.num_cells - self.router.num_cells)
 
     # --- progress ------------------------------------------------------------------------------------------------
@@ -575,14 +581,17 @@ class Trainer:
         try:
             state.load_moments(self.optimizer, checkpoint, stored.step)
             self.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
-            self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
             if self.occupancy is not None:
                 self.occupancy.load_state_dict(checkpoint.group("occupancy"))
-            generators = checkpoint.group("generator")
-            self.generator.set_state(generators["state"])
-            drawn = generators["draws"]
-            if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
-                self.draws.set_state(drawn)  # else the run began on another kind of device
+            if (
+                stored.stages[0]["cells"] == 1 or stored.step
+            ):  # else nothing was trained since it was made of other runs
+                self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
+                generators = checkpoint.group("generator")
+                self.generator.set_state(generators["state"])
+                drawn = generators["draws"]
+                if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
+                    self.draws.set_state(drawn)  # else the run began on another kind of device
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
         threads = torch.get_num_threads()

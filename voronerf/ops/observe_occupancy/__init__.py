@@ -7,16 +7,8 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import (
-    check_count,
-    check_dtype,
-    check_number,
-    check_range,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-    check_writable,
-)
+from voronerf.checks import LIKE_FIRST, Checked, check_count, check_number, check_range, check_writable
+from voronerf.ops.observe_occupancy.reference import Observed
 
 _OP = backends.declare(
     "observe_occupancy",
@@ -31,6 +23,8 @@ _TOLD, _TELL = (
     )
     for op in ("observe_told", "tell_observed")
 )
+#: Density, occupied and box.
+Grid = tuple[Tensor, Tensor, Tensor]
 #: Positions, sigma, deltas and weights.
 Samples = tuple[Tensor, Tensor, Tensor, Tensor]
 
@@ -85,14 +79,12 @@ def observe_occupancy(
         (tensor([2., 9., 4.]), tensor([False,  True,  True]))
     """
     samples = positions, sigma, deltas, weights
-    _check(_OP, density, occupied, box, samples, decay=decay, threshold=threshold, hidden=hidden)
-    run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)
-    constant = (tensor.detach() for tensor in (box, *samples))
-    run(density.detach(), occupied, *constant, float(decay), float(threshold), float(hidden))
+    _, given = _checked(_OP, (density, occupied, box), samples, decay=decay, threshold=threshold, hidden=hidden)
+    backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)(given)
 
 
 def observe_told(
-    grid: tuple[Tensor, Tensor, Tensor],
+    grid: Grid,
     samples: Samples,
     told: Tensor,
     *,
@@ -130,19 +122,17 @@ def observe_told(
         >>> grid[0].flatten(), grid[1].flatten()
         (tensor([4., 2.]), tensor([ True, False]))
     """
-    density, occupied, box = _grid(_TOLD, grid)
-    _check(_TOLD, density, occupied, box, samples, decay=decay, threshold=threshold, hidden=hidden)
-    check_shape(_TOLD, "told", told, ("c", 2))
-    _check_cells(_TOLD, "reached", reached, density)
-    check_same_dtype(_TOLD, density=density, told=told)
-    check_same_device(_TOLD, density=density, told=told, reached=reached)
+    tensors, given = _checked(_TOLD, grid, samples, decay=decay, threshold=threshold, hidden=hidden)
+    density = given.density
+    tensors.tensor("told", told, LIKE_FIRST, "c", 2)
+    tensors.optional("reached", reached, (torch.bool,), density.numel())
     check_range(_TOLD, "told", told[:, 0].contiguous().view(torch.int32), density.numel())
     run = backends.resolve(_TOLD, backend=backend, device=density.device, dtype=density.dtype)
-    run(density.detach(), occupied, box, told, reached, samples, float(decay), float(threshold), float(hidden))
+    run(given, told.detach(), reached)
 
 
 def tell_observed(
-    grid: tuple[Tensor, Tensor, Tensor],
+    grid: Grid,
     samples: Samples,
     *,
     several: Tensor | None = None,
@@ -177,51 +167,38 @@ def tell_observed(
         >>> told[:, 0].view(torch.int32), told[:, 1]
         (tensor([1], dtype=torch.int32), tensor([9.]))
     """
-    density, occupied, box = _grid(_TELL, grid)
-    _check(_TELL, density, occupied, box, samples, decay=1.0, threshold=1.0, hidden=hidden)
-    _check_cells(_TELL, "several", several, density)
+    tensors, given = _checked(_TELL, grid, samples, hidden=hidden)
+    density = given.density
+    tensors.optional("several", several, (torch.bool,), density.numel())
     run = backends.resolve(_TELL, backend=backend, device=density.device, dtype=density.dtype)
-    told: Tensor = run(density, box, several, samples, float(hidden))
+    told: Tensor = run(given, several)
     return told
 
 
-def _grid(op: str, grid: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def _checked(
+    op: str, grid: Grid, samples: Samples, *, hidden: float, decay: float = 1.0, threshold: float = 1.0
+) -> tuple[Checked, Observed]:
+    """The arguments of an implementation, which are no part of a graph."""
     if not isinstance(grid, tuple) or len(grid) != 3:
         raise ValueError(f"{op}: grid must be density, occupied and box, got {grid!r:.60}")
-    return grid
-
-
-def _check_cells(op: str, name: str, chosen: Tensor | None, density: Tensor) -> None:
-    if chosen is not None:
-        check_shape(op, name, chosen, (density.numel(),))
-        check_dtype(op, name, chosen, (torch.bool,))
-        check_same_device(op, density=density, **{name: chosen})
-
-
-def _check(op: str, density: Tensor, occupied: Tensor, box: Tensor, samples: Samples, **numbers: float) -> None:
     if not isinstance(samples, tuple) or len(samples) != 4:
         raise ValueError(f"{op}: samples must be positions, sigma, deltas and weights, got {samples!r:.60}")
-    positions, sigma, deltas, weights = samples
-    sizes: dict[str, int] = {}
-    check_shape(op, "density", density, ("x", "y", "z"), sizes)
-    check_shape(op, "occupied", occupied, ("x", "y", "z"), sizes)
-    check_shape(op, "box", box, (2, 3))
-    check_shape(op, "positions", positions, ("m", 3), sizes)
-    floats = {"density": density, "box": box, "positions": positions}
+    (density, occupied, box), (positions, sigma, deltas, weights) = grid, samples
+    given = Checked(op)
+    given.tensor("density", density, (torch.float32,), "x", "y", "z")
+    given.tensor("occupied", occupied, (torch.bool,), "x", "y", "z")
+    given.tensor("box", box, LIKE_FIRST, 2, 3)
+    given.tensor("positions", positions, LIKE_FIRST, "m", 3)
     for name, value in (("sigma", sigma), ("deltas", deltas), ("weights", weights)):
-        check_shape(op, name, value, ("m",), sizes)
-        floats[name] = value
-    check_dtype(op, "density", density, (torch.float32,))
-    check_dtype(op, "occupied", occupied, (torch.bool,))
-    check_same_dtype(op, **floats)
-    check_same_device(op, **floats, occupied=occupied)
+        given.tensor(name, value, LIKE_FIRST, "m")
     check_count(op, "density", density.numel())
-    check_count(op, "positions", sizes["m"])
-    for name, grid in (("density", density), ("occupied", occupied)):
-        check_writable(op, name, grid)
+    check_writable(op, "density", density)
+    check_writable(op, "occupied", occupied)
     if density.numel() < 1:
         raise ValueError(f"{op}: density must have at least one cell, got {list(density.shape)}")
-    for name, number in numbers.items():
+    for name, number in (("decay", decay), ("threshold", threshold), ("hidden", hidden)):
         check_number(op, name, number)
-    if not 0 <= numbers["decay"] <= 1:
-        raise ValueError(f"{op}: decay must lie in 0 to 1, got {numbers['decay']}")
+    if not 0 <= decay <= 1:
+        raise ValueError(f"{op}: decay must lie in 0 to 1, got {decay}")
+    tensors = (tensor.detach() for tensor in (*grid, *samples))
+    return given, Observed._make([*tensors, float(decay), float(threshold), float(hidden)])

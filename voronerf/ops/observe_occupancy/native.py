@@ -6,75 +6,54 @@ import torch
 from torch import Tensor
 
 from voronerf import native
-
-#: Positions, sigma, deltas and weights.
-Samples = tuple[Tensor, Tensor, Tensor, Tensor]
+from voronerf.ops.observe_occupancy.reference import Observed
 
 
-def observe_occupancy(
-    density: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    positions: Tensor,
-    sigma: Tensor,
-    deltas: Tensor,
-    weights: Tensor,
-    decay: float,
-    threshold: float,
-    hidden: float,
-) -> None:
+def observe_occupancy(given: Observed) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    given = _samples(density, box, (positions, sigma, deltas, weights), decay, threshold, hidden)
-    m = positions.shape[0]
-    machine = native.machine(density)
-    cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
-    native.compiled.observe_occupancy(given, density, occupied.view(torch.uint8), cells, before, machine)
+    native.compiled.observe_occupancy(
+        _samples(given), *_grid(given, len(given.positions)), native.machine(given.density)
+    )
 
 
-def observe_told(
-    density: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    told: Tensor,
-    reached: Tensor | None,
-    samples: Samples,
-    decay: float,
-    threshold: float,
-    hidden: float,
-) -> None:
+def observe_told(given: Observed, told: Tensor, reached: Tensor | None) -> None:
     """The same with samples [c, 2] that other ranks have told, on the CPU; see ``voronerf.ops.observe_told``."""
-    given = _samples(density, box, samples, decay, threshold, hidden)
-    rows = len(samples[0]) + len(told)
-    cells, before = density.new_empty(rows, dtype=torch.int32), density.new_empty(rows)
-    reached = torch.ones_like(occupied) if reached is None else reached
-    grid = density, occupied.view(torch.uint8), cells, before, native.cpu()
-    native.compiled.observe_told(given, told, len(told), reached.view(torch.uint8), *grid)
+    reached = (torch.ones_like(given.occupied) if reached is None else reached).view(torch.uint8)
+    grid = _grid(given, len(given.positions) + len(told))
+    native.compiled.observe_told(_samples(given), told, len(told), reached, *grid, native.cpu())
 
 
-def tell_observed(density: Tensor, box: Tensor, several: Tensor | None, samples: Samples, hidden: float) -> Tensor:
+def tell_observed(given: Observed, several: Tensor | None) -> Tensor:
     """Cell, as bits of float32, and density [c, 2] of samples, on the CPU; see ``voronerf.ops.tell_observed``."""
-    told = density.new_empty(len(samples[0]), 2)
-    given = _samples(density, box, samples, 1.0, 1.0, hidden)
+    told = given.density.new_empty(len(given.positions), 2)
     several = None if several is None else several.view(torch.uint8)
-    return told[: native.compiled.tell_observed(given, several, told, native.cpu())]
+    return told[: native.compiled.tell_observed(_samples(given), several, told, native.cpu())]
 
 
-def _samples(
-    density: Tensor, box: Tensor, samples: Samples, decay: float, threshold: float, hidden: float
-) -> native.compiled.ObservedSamples:
-    positions, sigma, deltas, weights = samples
-    x, y, z = density.shape
+def _grid(given: Observed, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Density, occupied, and memory for the cells of rows and the densities that these had."""
+    density = given.density
+    return (
+        density,
+        given.occupied.view(torch.uint8),
+        density.new_empty(rows, dtype=torch.int32),
+        density.new_empty(rows),
+    )
+
+
+def _samples(given: Observed) -> native.compiled.ObservedSamples:
+    x, y, z = given.density.shape
     return native.compiled.ObservedSamples(
-        positions=positions,
-        sigma=sigma,
-        deltas=deltas,
-        weights=weights,
-        box=box,
+        positions=given.positions,
+        sigma=given.sigma,
+        deltas=given.deltas,
+        weights=given.weights,
+        box=given.box,
         x=x,
         y=y,
         z=z,
-        m=positions.shape[0],
-        decay=decay,
-        threshold=threshold,
-        hidden=hidden,
+        m=len(given.positions),
+        decay=given.decay,
+        threshold=given.threshold,
+        hidden=given.hidden,
     )

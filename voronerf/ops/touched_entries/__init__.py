@@ -9,7 +9,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_shape
+from voronerf.checks import Checked, check_integer
 
 _NATIVE = Implementation(("cpu",), (torch.float32,), file="touched_entries")
 _PACK, _ADD = (
@@ -40,9 +40,7 @@ def pack_entries(gradient: Tensor, *, backend: str = "auto") -> Tensor:
         >>> len(pack_entries(torch.tensor([0.0, 0, 0, 2, 0]))), len(pack_entries(torch.ones(5)))
         (2, 5)
     """
-    check_shape(_PACK, "gradient", gradient, ("n",))
-    check_dtype(_PACK, "gradient", gradient, (torch.float32,))
-    check_count(_PACK, "gradient", len(gradient))
+    Checked(_PACK).tensor("gradient", gradient, (torch.float32,), "n")
     if gradient.is_meta:
         raise ValueError(f"{_PACK}: gradient must have values, got a tensor on meta")
     run = backends.resolve(_PACK, backend=backend, device=gradient.device, dtype=gradient.dtype)
@@ -78,11 +76,10 @@ def add_entries(parts: Sequence[Tensor], n: int, *, backend: str = "auto") -> Te
     check_integer(_ADD, "n", n, 0)
     if not parts:
         raise ValueError(f"{_ADD}: parts must hold at least one message, got none")
-    named = {f"parts[{index}]": part for index, part in enumerate(parts)}
-    for name, part in named.items():
-        check_shape(_ADD, name, part, ("length",))
-        check_dtype(_ADD, name, part, (torch.float32,))
-    check_same_device(_ADD, **named)
+    given = Checked(_ADD)
+    for index, part in enumerate(parts):
+        given.tensor(f"parts[{index}]", part, (torch.float32,), "length")
+        given.sizes.clear()
     run = backends.resolve(_ADD, backend=backend, device=parts[0].device, dtype=parts[0].dtype)
     total = parts[0].new_zeros(n)
     for index, part in enumerate(parts):
