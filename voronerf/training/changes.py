@@ -28,15 +28,15 @@ RAYS = 1 << 15
 #: The least squared error of a ray that is off, whatever is usual in its cell: a tone of 1 in 64.
 LEAST = 3 / 64**2
 #: Voxels along the longest side, and points on a ray that find them.
-VOXELS, STEPS = 48, 96
+VOXELS, STEPS = 40, 96
 #: A voxel has changed if it has so many rays, this share of them is off, and a neighbour has changed, too.
-VOXEL_RAYS, VOXEL_SHARE = 6, 0.6
-#: A cell has changed if it has so many voxels that have, ...
-CELL_VOXELS = 6
+VOXEL_RAYS, VOXEL_SHARE = 10, 0.6
+#: A cell has changed if it has so many voxels that have, and they are this share of those that enough rays pass, ...
+CELL_VOXELS, CELL_SPACE = 6, 0.02
 #: ... or so many rays that meet no such voxel, and this share of them is off, where 1 in 10 is expected.
 CELL_RAYS, CELL_SHARE = 32, 0.3
-#: Pictures show another scene if more of their rays are off than that.
-MOST_OFF = 0.8
+#: Pictures show another scene if more of their rays are off than that, and none if fewer meet a cell.
+MOST_OFF, LEAST_MET = 0.6, 0.002
 
 
 @dataclass(frozen=True)
@@ -87,12 +87,14 @@ class Changes:
         cells: bool [k], those that have changed, or are worse in the new pictures than they were in training.
         voxels: The space that has changed.
         off: The share of the new rays that are off.
+        met: The share of the new rays that meet a cell.
         shares: [k], the share of each cell's rays that are off and meet no changed voxel.
     """
 
     cells: Tensor
     voxels: Voxels
     off: float
+    met: float
     shares: Tensor
 
 
@@ -129,9 +131,10 @@ def find_changes(renderer: Renderer, cells: Cells, batches: RayBatches, usual: T
     rest, bad = (seen.cell[rows].bincount(minlength=k + 1)[:k] for rows in (~explained, ~explained & off))
     shares = bad / rest.clamp(min=1)
     found = (rest >= CELL_RAYS) & (shares > CELL_SHARE)
-    owner = cells.assign(voxels.centres())
-    found |= owner[owner >= 0].long().bincount(minlength=k) >= CELL_VOXELS
-    return Changes(found, voxels, float(off.float().mean()), shares)
+    known = Voxels(space.box, (passed >= VOXEL_RAYS).reshape(voxels.chosen.shape), space.contraction)
+    counts = [own[own >= 0].bincount(minlength=k) for own in (cells.assign(v.centres()).long() for v in (voxels, known))]
+    found |= (counts[0] >= CELL_VOXELS) & (counts[0] >= CELL_SPACE * counts[1])
+    return Changes(found, voxels, float(off.float().mean()), float((seen.cell < k).float().mean()), shares)
 
 
 def near_by(chosen: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from voronerf.step import Batch
 from voronerf.training.batches import RayBatches
 
 #: Rays that errors are taken from, and how many of them are rendered at a time.
-RAYS, CHUNK = 1 << 14, 1 << 12
+RAYS, CHUNK = 1 << 13, 1 << 12
 #: The share of a cell's training rays with a smaller error than the one that is kept.
 QUANTILE = 0.9
 #: Rays that a cell needs for an error of its own; one with fewer has that of all rays.
@@ -94,7 +94,8 @@ def usual_errors(renderer: Renderer, cells: Cells, batches: RayBatches, rays: in
     """
     renderer.train(False)
     generator = torch.Generator(batches.device).manual_seed(0)
-    seen = see_errors(renderer, cells, batches.draw(rays, generator, random_background=False))
+    count = min(rays, len(batches))
+    seen = see_errors(renderer, cells, batches.draw(count, generator, random_background=False))
     usual = seen.error.quantile(QUANTILE).repeat(cells.num_cells + 1)
     order, counts = seen.cell.argsort(), seen.cell.bincount(minlength=cells.num_cells + 1)
     for cell, errors in enumerate(seen.error[order].split(counts.tolist())):

@@ -1,0 +1,376 @@
+"""A run brought up to date with new pictures: cells whose error has grown learn, all others keep their bits.
+
+r rays, k cells.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.data import Scene
+from voronerf.editing import Source
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.sampling import colour_loss
+from voronerf.rendering.volume import render_samples
+from voronerf.router import Part, Parts, VoronoiRouter
+from voronerf.step.cells import DECAY, REVISIT_EVERY, REVISITED
+from voronerf.training.adam import Adam
+from voronerf.training.average import averages_in_place, update_averages
+from voronerf.training.batches import RayBatches
+from voronerf.training.changes import LEAST_MET, MOST_OFF, Changes, Voxels, find_changes, near_by, space_voxels
+from voronerf.training.config import ConfigError
+from voronerf.training.errors import usual_errors
+from voronerf.training.parts import grouped_parameters
+from voronerf.training.rates import learning_rate
+from voronerf.training.renderers import as_field, make_renderer
+
+#: Rays of a step, in multiples of ``--rays``.
+RAYS = 1
+#: Rays that are drawn at a time to find those that meet cells that learn, how many of these there are to be, and the
+#: share of an update that is spent on it at most, and the share that is left for learning at least.
+DRAWN, POOL, FINDING, LEARNING = 1 << 15, 1 << 17, 0.3, 0.25
+#: Rays learn if this share of the light reaches the cells that learn, and no more than that optical depth of others
+#: lies between them.
+LEAST_LIGHT, MOST_BETWEEN = 0.05, 0.05
+
+
+@dataclass(frozen=True)
+class Update:
+    """What an update did.
+
+    Attributes:
+        source: The run that it makes.
+        changes: What the new pictures showed.
+        steps: Steps of training.
+        seconds: Of training, finding the changes included.
+    """
+
+    source: Source
+    changes: Changes
+    steps: int
+    seconds: float
+
+
+def update(
+    source: Source,
+    new: Scene,
+    old: Scene | None,
+    usual: Tensor | None,
+    *,
+    seconds: float,
+    seed: int = 0,
+    clock: Callable[[], float] = time.perf_counter,
+    say: Callable[[str], None] = lambda line: None,
+) -> Update:
+    """Trains the cells that new pictures show to be out of date.
+
+    Args:
+        source: The run, as `join` makes it of one; it is not changed.
+        new: The new pictures, in the space of the run (`placed`).
+        old: The pictures that the run was trained on; None to learn from the new ones alone.
+        usual: [k + 1], the errors of the run, see `usual_errors`; None to find them from the old pictures.
+        seconds: To train for, finding the changes included.
+        seed: Of the rays that are drawn.
+        clock: Counts seconds.
+        say: Told a line for what is found.
+
+    Raises:
+        ConfigError: For pictures that show nothing new, nothing of the scene, another one, or one in another frame.
+    """
+    began = clock()
+    device = source.parts.diagram.centres.device
+    contraction = next((part.contraction for part in source.parts if part.contraction is not None), None)
+    box = contraction.cube if contraction is not None else source.scene.box
+    renderer = make_renderer(source.config, source.scene, {"field": source.parts}, occupancy=source.grid)
+    if usual is None:
+        if old is None:
+            raise ConfigError("the run has no errors to compare with, as its training keeps them; give --old DIR")
+        usual = usual_errors(renderer, source.parts, RayBatches(old, device, backend=source.config.backend))
+    # Rays are drawn from all pixels here; those that miss the box show the background.
+    every = RayBatches(replace(new, box=None), device, backend=source.config.backend)
+    every.box = new.box
+    changes = find_changes(renderer, source.parts, every, usual, space_voxels(box, contraction))
+    if changes.met < LEAST_MET:
+        raise ConfigError(f"--data must show the scene of the run, {changes.met:.2%} of its rays meet it")
+    if changes.off > MOST_OFF:
+        raise ConfigError(
+            f"--data shows another scene, or this one in another frame: {changes.off:.0%} of its rays differ from the run"
+        )
+    count, k = int(changes.cells.sum()), source.parts.num_cells
+    say(f"{changes.off:.1%} of the new rays are off: {count} of {k} cells learn")
+    if not count:
+        raise ConfigError(f"--data shows nothing new: {changes.off:.1%} of its rays are off, as in training")
+    parts, learners = split_off(source.parts, changes.cells)
+    grid = None if source.grid is None else opened(source.grid, source.parts, changes.cells)
+    session = Session(replace(source, parts=parts, grid=grid), learners, changes, seed)
+    given = {"through": bounds(source, changes), "backend": source.config.backend}
+    pictures = [RayBatches(scene, device, **given) for scene in (new, old) if scene is not None]
+    pools: list[list[Pool]] = [[] for _ in pictures]
+    while not pools[0] or (clock() - began < FINDING * seconds and sum(map(len, pools[0])) < POOL):
+        for number, (batches, own) in enumerate(zip(pictures, pools, strict=True)):
+            own.append(session.pool(batches, DRAWN >> number, agree=number > 0))
+    rays = [sum(map(len, own)) for own in pools]
+    say(f"learning from {rays[0]} rays of the new pictures and {sum(rays[1:])} of the old ones")
+    pool, steps, started = Pool.joined([pool for own in pools for pool in own]), 0, clock() - began
+    if not rays[0]:
+        raise ConfigError("--data must show the cells that have changed, got pictures that see them through others")
+    left = max(seconds - started, LEARNING * seconds)
+    while (done := (clock() - began - started) / left) < 1:
+        session.step(pool, steps, done)
+        steps += 1
+    if grid is not None and source.grid is not None:  # voxels across a border have seen samples of cells that learn
+        others = torch.ones_like(grid.occupied).view(-1).index_fill(0, session.own_voxels, False).view_as(grid.occupied)
+        grid.density[others], grid.occupied[others] = source.grid.density[others], source.grid.occupied[others]
+    learnt = [parameter for router in learners for parameter in router.parameters()]
+    with averages_in_place(session.optimizer):
+        averages = [parameter.data for parameter in learnt]
+    for parameter, average in zip(learnt, averages, strict=True):
+        parameter.data = average
+    for router in learners:
+        router.eval()
+    return Update(session.source, changes, steps, clock() - began)
+
+
+def split_off(parts: Parts, cells: Tensor) -> tuple[Parts, list[VoronoiRouter]]:
+    """Gives cells, bool [k], networks of their own, which look the same.
+
+    Returns:
+        The parts, and the routers of these cells; the other routers are as they were, or parts of them.
+    """
+    made, learners = list[Part](), list[VoronoiRouter]()
+    for part, first in zip(parts, parts.starts, strict=False):
+        own = cells[first : first + part.num_cells].nonzero()[:, 0]
+        of = part.owner[part.leaves[own]]
+        for number in of.unique().tolist():
+            mine = own[of == number]
+            before = len(part.routers)
+            part = part.split(mine)
+            if len(part.routers) == before:  # all cells of a router
+                routers = [copy.deepcopy(router) if i == number else router for i, router in enumerate(part)]
+                part = part.changed(routers=routers)
+                learners.append(part[number])
+            else:
+                learners.append(part[len(part.routers) - 1])
+        made.append(part)
+    return Parts(made, backend=parts.backend, blend=parts.blend), learners
+
+
+def opened(grid: OccupancyGrid, parts: Parts, cells: Tensor) -> OccupancyGrid:
+    """A grid in which all voxels of some cells, bool [k], may be occupied; the others are as they were."""
+    again = OccupancyGrid.from_state(grid.state_dict(), contraction=grid.contraction, device=grid.box.device)
+    rows = voxels_of(again, parts, cells)
+    again.density.view(-1)[rows] = again.density.view(-1)[rows].maximum(torch.tensor(again.threshold / DECAY**8))
+    again.occupied.view(-1)[rows] = True
+    return again
+
+
+def voxels_of(grid: OccupancyGrid, parts: Parts, cells: Tensor) -> Tensor:
+    """The voxels of a grid whose middles lie in cells, bool [k]: int64 [q]."""
+    every = torch.arange(grid.occupied.numel(), device=grid.box.device)
+    owner = torch.cat([parts.assign(grid.points(rows)) for rows in every.split(1 << 17)]).long()
+    return every[cells[owner.clamp(min=0)] & (owner >= 0)]
+
+
+def bounds(source: Source, changes: Changes) -> Tensor | None:
+    """A box [2, 3] around what is and what was seen in the cells that learn; None where that is not known."""
+    grid = source.grid
+    if grid is None:
+        return None
+    rows = voxels_of(grid, source.parts, changes.cells)
+    middles = torch.cat((grid.points(rows[grid.occupied.view(-1)[rows]]), changes.voxels.centres()))
+    shapes = (torch.tensor(shape, device=middles.device) for shape in (grid.occupied.shape, changes.voxels.chosen.shape))
+    side = torch.stack([(grid.box[1] - grid.box[0]) / shape for shape in shapes]).amax(0)
+    return torch.stack((middles.amin(0) - side, middles.amax(0) + side)) if len(middles) else None
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Rays that meet cells that learn, with what frozen cells show before and behind them.
+
+    A ray's colour is ``before + light * (colour of the cells that learn, over behind)``, so that a step asks these cells
+    alone.
+
+    Attributes:
+        rays: p rays.
+        near: [p].
+        far: [p].
+        target: [p, 3], the colours to learn.
+        before: [p, 3], the light that comes from before the first sample in the cells.
+        light: [p, 1], the share of the light that passes there.
+        behind: [p, 3], the colour behind the last sample in the cells, background included.
+    """
+
+    rays: Rays
+    near: Tensor
+    far: Tensor
+    target: Tensor
+    before: Tensor
+    light: Tensor
+    behind: Tensor
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    @staticmethod
+    def joined(pools: Sequence[Pool]) -> Pool:
+        """The rays of several pools."""
+        rays = Rays(*(torch.cat([getattr(pool.rays, name) for pool in pools]) for name in ("origins", "directions")))
+        names = ("near", "far", "target", "before", "light", "behind")
+        return Pool(rays, *(torch.cat([getattr(pool, name) for pool in pools]) for name in names))
+
+
+class Session:
+    """The training of some routers of a run of parts, among others that are frozen.
+
+    Attributes:
+        source: What is trained.
+        optimizer: Of the routers that learn.
+
+    Args:
+        source: Parts of which some routers learn, and the grid, which changes in their cells alone.
+        learners: These routers.
+        changes: What is known of the scene.
+        seed: Of random numbers.
+    """
+
+    def __init__(self, source: Source, learners: list[VoronoiRouter], changes: Changes, seed: int) -> None:
+        self.source, self.cells, self.config, self.parts = source, changes.cells, source.config, source.parts
+        self.learners = learners
+        if len(source.parts) == 1:
+            part = source.parts[0]
+            self.leaves = torch.zeros_like(part.owner, dtype=torch.bool)
+            self.leaves[part.leaves] = changes.cells
+        self.renderer = make_renderer(self.config, source.scene, {"field": source.parts}, occupancy=source.grid)
+        self.generator = torch.Generator().manual_seed(seed)
+        for router in learners:
+            router.requires_grad_().train()
+        dense, tables = grouped_parameters(learners)
+        groups = [{"params": dense, "sparse": False}, {"params": tables, "sparse": True}]
+        assert self.config.lr is not None
+        given: dict[str, Any] = {"betas": (0.9, 0.99), "eps": 1e-15, "backend": self.config.backend}
+        self.optimizer = Adam([group for group in groups if group["params"]], lr=self.config.lr, **given)
+        voxels = changes.voxels
+        self.contradicting = Voxels(voxels.box, near_by(voxels.chosen) > 0, voxels.contraction)
+        self.own_voxels = None if source.grid is None else voxels_of(source.grid, source.parts, changes.cells)
+
+    def learns(self, positions: Tensor) -> Tensor:
+        """Which positions [n, 3] lie in cells that learn."""
+        if len(self.parts) == 1:  # whose region is the scene
+            leaf = self.parts[0].diagram.locate(self.own_points(positions), backend=self.parts.backend)
+            return self.leaves.index_select(0, leaf)
+        owner = self.parts.assign(positions).long()
+        return self.cells[owner.clamp(min=0)] & (owner >= 0)
+
+    def field(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        """What the cells that learn say of positions in them: colours [n, 3] and densities [n]."""
+        if len(self.parts) > 1 or len(self.learners) > 1:
+            colour, density = self.parts(positions, directions, ray_index)
+            return colour, density
+        frame, ask = self.parts[0].frame, as_field(self.learners[0])
+        if frame.is_identity:
+            return ask(self.own_points(positions), directions, ray_index)
+        colour, density = ask(self.own_points(positions), frame.inverse.directions(directions), ray_index)
+        return colour, density / frame.scale
+
+    def own_points(self, positions: Tensor) -> Tensor:
+        """Positions [n, 3] as the networks of the only part see them."""
+        part = self.parts[0]
+        return part.contracted(positions if part.frame.is_identity else part.own_points(positions))
+
+    @torch.no_grad()
+    def pool(self, batches: RayBatches, count: int, *, agree: bool = False) -> Pool:
+        """Those of so many rays that meet cells that learn, and through no other surface.
+
+        Args:
+            batches: Of pictures.
+            count: Rays to draw.
+            agree: Leave out rays through space that has changed.
+        """
+        batch = batches.draw(count, self.generator, random_background=self.config.background == "random")
+        samples = self.renderer.sampler.sample(batch.rays, batch.near, batch.far)
+        own = self.learns(samples.positions)
+        index, device = samples.ray_index.long(), own.device
+        meets = torch.zeros(len(batch.rays), dtype=torch.bool, device=device)
+        meets[index[own]] = True
+        rays = meets.nonzero()[:, 0]
+        own, samples = own[meets[index]], samples.of_rays(rays)
+        index, r = samples.ray_index.long(), len(rays)
+        rgb, density = self.parts(samples.inputs, batch.rays.directions[rays], samples.ray_index)
+        thick = density * samples.deltas  # optical depths
+        total = thick.double().cumsum(0)
+        starts = samples.ray_offsets[:-1].long()
+        until = total - thick  # up to each sample, and of the rays before
+        number = torch.arange(len(own), device=device)
+        none = torch.full((r,), len(own), device=device)
+        first = none.scatter_reduce(0, index[own], number[own], "amin")
+        last = torch.zeros_like(none).scatter_reduce(0, index[own], number[own], "amax")
+        taken = (1 - torch.exp(-thick))[:, None] * rgb
+        ahead, past = number < first[index], number > last[index]
+
+        def light(rows: Tensor, since: Tensor) -> Tensor:
+            share = torch.exp(since[index[rows]] - until[rows]).float()[:, None]
+            return rgb.new_zeros(r, 3).index_add(0, index[rows], share * taken[rows])
+
+        before, behind = light(ahead, until[starts]), light(past, total[last])
+        passes = torch.exp(until[starts] - until[first]).float()[:, None]
+        ends = samples.ray_offsets[1:].long() - 1
+        if batch.background is not None:
+            background = batch.background[rays] if batch.background.dim() == 2 else batch.background
+            behind = behind + torch.exp(total[last] - total[ends]).float()[:, None] * background
+        between = thick.new_zeros(r).index_add(0, index[~own & ~ahead & ~past], thick[~own & ~ahead & ~past])
+        good = (passes[:, 0] > LEAST_LIGHT) & (between < MOST_BETWEEN)
+        if agree:
+            # Up to where half of the light has gone.
+            gone = total - until[starts][index] > math.log(2)
+            stop = none.scatter_reduce(0, index[gone], number[gone], "amin")
+            far = torch.where(stop < len(own), samples.depths[stop.clamp(max=len(own) - 1)], batch.far[rays])
+            good &= ~self.contradicting.meet(batch.rays[rays], batch.near[rays], far)
+        rays, before, passes, behind = rays[good], before[good], passes[good], behind[good]
+        kept = batch.rays[rays]
+        return Pool(kept, batch.near[rays], batch.far[rays], batch.target[rays], before, passes, behind)
+
+    def step(self, pool: Pool, number: int, done: float) -> None:
+        """Moves the networks of the cells that learn.
+
+        Args:
+            pool: The rays to draw from.
+            number: Of the step.
+            done: The share of the update before it, 0..1.
+        """
+        config = self.config
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(config, done, number)
+        self.revisit(number)
+        chosen = torch.randint(len(pool), (config.rays * RAYS,), generator=self.generator).to(pool.near.device)
+        rays, near, far = pool.rays[chosen], pool.near[chosen], pool.far[chosen]
+        samples = self.renderer.sampler.sample(rays, near, far, jitter=True, generator=self.generator)
+        samples = samples.part(self.learns(samples.positions))
+        given = {"background": pool.behind[chosen], "backend": config.backend}
+        seen = render_samples(self.field, rays, far, samples, self.renderer.sampler.space, **given)
+        colour = pool.before[chosen] + pool.light[chosen] * seen.colour
+        self.optimizer.zero_grad()
+        colour_loss(colour, pool.target[chosen]).backward()
+        self.optimizer.step()
+        if config.average:
+            update_averages(self.optimizer, config.average, number)
+        if self.source.grid is not None:
+            found = samples.positions, seen.density.detach(), samples.deltas, seen.weights.detach()
+            self.source.grid.observe(*found, decay=DECAY, backend=config.backend)
+
+    def revisit(self, number: int) -> None:
+        """Before some steps, evaluates the field in random voxels of cells that learn."""
+        grid, own = self.source.grid, self.own_voxels
+        if grid is None or own is None or number % REVISIT_EVERY or not len(own):
+            return
+        count = math.ceil(len(own) * REVISITED)
+        chosen = own[torch.randint(len(own), (count,), generator=self.generator).to(own.device)]
+        grid.update(self.parts, chosen, decay=1.0, generator=self.generator, backend=self.config.backend)
