@@ -4,8 +4,8 @@
     python benchmarks/updating.py lego --data LEGO --seconds 90
     python benchmarks/updating.py fox --data FOX --seconds 90
 
-city: `builtin-city:4x4` with a block rebuilt. lego: the loader's bucket recoloured, in pictures edited by where a trained
-run sees their pixels. fox: every other view first, the others later.
+city: `builtin-city:4x4` with a block rebuilt. lego: the loader's bucket recoloured, in pictures edited by where a
+trained run sees their pixels. fox: every other view first, the others later.
 """
 
 from __future__ import annotations
@@ -67,7 +67,9 @@ def scores(run: Run, scene: Scene, before: Scene) -> dict[str, float]:
         error = (image - truth).square().mean(-1)
         for name, rows in (("changed", changed), ("unchanged", ~changed), ("all", changed | ~changed)):
             errors[name].append(error[rows])
-    return {name: round(-10 * math.log10(float(torch.cat(e).mean())), 3) for name, e in errors.items() if sum(map(len, e))}
+    return {
+        name: round(-10 * math.log10(float(torch.cat(e).mean())), 3) for name, e in errors.items() if sum(map(len, e))
+    }
 
 
 def recoloured(scene: Scene, run: Run) -> Scene:
@@ -86,7 +88,9 @@ def recoloured(scene: Scene, run: Run) -> Scene:
     return replace(scene, train=edited(scene.train), test=edited(scene.test))
 
 
-def measure(kind: str, data: str, seconds: float, share: float, seed: int, downscale: int, folder: Path) -> dict[str, Any]:
+def measure(
+    kind: str, data: str, seconds: float, share: float, seed: int, downscale: int, folder: Path
+) -> dict[str, Any]:
     said: list[str] = []
     if kind == "fox":
         scene = load_scene(data, downscale=downscale)
@@ -100,10 +104,14 @@ def measure(kind: str, data: str, seconds: float, share: float, seed: int, downs
     if kind == "lego":
         after = recoloured(before, old)
     began = time.process_time()
-    made = old.update(after, folder / "made", seconds=share * seconds, clock=time.process_time, say=said.append, seed=seed)
+    made = old.update(
+        after, folder / "made", seconds=share * seconds, clock=time.process_time, say=said.append, seed=seed
+    )
     spent = time.process_time() - began
     total = (1 + share) * seconds if kind == "fox" else seconds
-    again = train(whole if kind == "fox" else replace(after, box=before.box), data, total, seed, downscale, folder / "again")
+    again = train(
+        whole if kind == "fox" else replace(after, box=before.box), data, total, seed, downscale, folder / "again"
+    )
     rows = {name: scores(run, after, before) for name, run in (("old", old), ("updated", made), ("again", again))}
     return {"seed": seed, "said": said, "seconds": {"old": seconds, "updated": spent, "again": total}, "psnr": rows}
 

@@ -75,7 +75,9 @@ def error_of(run, scene, before):
 def test_what_has_changed_learns_and_the_rest_keeps_its_bits(tmp_path, runs, city, rebuilt, kind):
     before, said = digest(runs[kind]), []
     run = voronerf.open_run(runs[kind], scene=city)
-    made = run.update(rebuilt, tmp_path / "made", seconds=3.0, clock=ticking(), say=said.append, data="builtin-city:2x2,rebuilt=3")
+    made = run.update(
+        rebuilt, tmp_path / "made", seconds=3.0, clock=ticking(), say=said.append, data="builtin-city:2x2,rebuilt=3"
+    )
     assert digest(runs[kind]) == before
     part = made.router[0]
     assert len(made.router) == 1 and len(part.routers) == 2 and "cells learn" in said[0]
@@ -133,7 +135,14 @@ def test_bad_pictures_are_a_line(tmp_path, runs, city, rebuilt):
     refuses("must show the scene of the run", run.update, turned(rebuilt, away), out, seconds=1.0, error=ConfigError)
     mirrored = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
     mirrored[:3, 3] = torch.tensor([0.3, 0.7, 0.2])
-    refuses("shows another scene, or this one in", run.update, turned(rebuilt, mirrored), out, seconds=1.0, error=ConfigError)
+    refuses(
+        "shows another scene, or this one in",
+        run.update,
+        turned(rebuilt, mirrored),
+        out,
+        seconds=1.0,
+        error=ConfigError,
+    )
     black = replace(rebuilt, background=None)
     refuses("background must be that of", run.update, black, out, seconds=1.0, error=SceneError)
     moved = replace(rebuilt, transform=torch.eye(4, dtype=torch.float64))

@@ -10,19 +10,24 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from voronerf.data import Scene
 from voronerf.editing import Source
+from voronerf.fields.radiance import activate_radiance
+from voronerf.ops.learn_outputs import learn_outputs
+from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
 from voronerf.rendering.cameras import Rays
-from voronerf.rendering.occupancy import OccupancyGrid
+from voronerf.rendering.contraction import Contraction
+from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid
 from voronerf.rendering.sampling import colour_loss
-from voronerf.rendering.volume import render_samples
+from voronerf.rendering.volume import Samples, render_samples
 from voronerf.router import Part, Parts, VoronoiRouter
 from voronerf.step.cells import DECAY, REVISIT_EVERY, REVISITED
+from voronerf.step.ray_loss import density_scale
 from voronerf.training.adam import Adam
 from voronerf.training.average import averages_in_place, update_averages
 from voronerf.training.batches import RayBatches
@@ -31,7 +36,7 @@ from voronerf.training.config import ConfigError
 from voronerf.training.errors import usual_errors
 from voronerf.training.parts import grouped_parameters
 from voronerf.training.rates import learning_rate
-from voronerf.training.renderers import as_field, make_renderer
+from voronerf.training.renderers import as_field, make_contraction, make_renderer
 
 #: Rays of a step, in multiples of ``--rays``.
 RAYS = 1
@@ -86,10 +91,13 @@ def update(
     Raises:
         ConfigError: For pictures that show nothing new, nothing of the scene, another one, or one in another frame.
     """
-    began = clock()
     device = source.parts.diagram.centres.device
+    Adam([torch.zeros(1, requires_grad=True)], lr=1.0)  # torch imports its compiler with the first; not on the clock
+    began = clock()
     contraction = next((part.contraction for part in source.parts if part.contraction is not None), None)
-    box = contraction.cube if contraction is not None else source.scene.box
+    if contraction is None and source.scene.box is None:
+        contraction = cast(Contraction, make_contraction(source.scene))
+    box = cast(Tensor, source.scene.box) if contraction is None else contraction.cube
     renderer = make_renderer(source.config, source.scene, {"field": source.parts}, occupancy=source.grid)
     if usual is None:
         if old is None:
@@ -103,7 +111,7 @@ def update(
         raise ConfigError(f"--data must show the scene of the run, {changes.met:.2%} of its rays meet it")
     if changes.off > MOST_OFF:
         raise ConfigError(
-            f"--data shows another scene, or this one in another frame: {changes.off:.0%} of its rays differ from the run"
+            f"--data shows another scene, or this one in another frame: {changes.off:.0%} of its rays differ"
         )
     count, k = int(changes.cells.sum()), source.parts.num_cells
     say(f"{changes.off:.1%} of the new rays are off: {count} of {k} cells learn")
@@ -112,8 +120,9 @@ def update(
     parts, learners = split_off(source.parts, changes.cells)
     grid = None if source.grid is None else opened(source.grid, source.parts, changes.cells)
     session = Session(replace(source, parts=parts, grid=grid), learners, changes, seed)
-    given = {"through": bounds(source, changes), "backend": source.config.backend}
-    pictures = [RayBatches(scene, device, **given) for scene in (new, old) if scene is not None]
+    through, backend = bounds(source, changes), source.config.backend
+    given = [scene for scene in (new, old) if scene is not None]
+    pictures = [RayBatches(scene, device, through=through, backend=backend) for scene in given]
     pools: list[list[Pool]] = [[] for _ in pictures]
     while not pools[0] or (clock() - began < FINDING * seconds and sum(map(len, pools[0])) < POOL):
         for number, (batches, own) in enumerate(zip(pictures, pools, strict=True)):
@@ -127,7 +136,8 @@ def update(
     while (done := (clock() - began - started) / left) < 1:
         session.step(pool, steps, done)
         steps += 1
-    if grid is not None and source.grid is not None:  # voxels across a border have seen samples of cells that learn
+    if grid is not None and source.grid is not None and session.own_voxels is not None:
+        # Voxels across a border have seen samples of cells that learn.
         others = torch.ones_like(grid.occupied).view(-1).index_fill(0, session.own_voxels, False).view_as(grid.occupied)
         grid.density[others], grid.occupied[others] = source.grid.density[others], source.grid.occupied[others]
     learnt = [parameter for router in learners for parameter in router.parameters()]
@@ -187,8 +197,8 @@ def bounds(source: Source, changes: Changes) -> Tensor | None:
         return None
     rows = voxels_of(grid, source.parts, changes.cells)
     middles = torch.cat((grid.points(rows[grid.occupied.view(-1)[rows]]), changes.voxels.centres()))
-    shapes = (torch.tensor(shape, device=middles.device) for shape in (grid.occupied.shape, changes.voxels.chosen.shape))
-    side = torch.stack([(grid.box[1] - grid.box[0]) / shape for shape in shapes]).amax(0)
+    fewest = [min(pair) for pair in zip(grid.occupied.shape, changes.voxels.chosen.shape, strict=True)]
+    side = (grid.box[1] - grid.box[0]) / torch.tensor(fewest, device=middles.device)
     return torch.stack((middles.amin(0) - side, middles.amax(0) + side)) if len(middles) else None
 
 
@@ -196,8 +206,7 @@ def bounds(source: Source, changes: Changes) -> Tensor | None:
 class Pool:
     """Rays that meet cells that learn, with what frozen cells show before and behind them.
 
-    A ray's colour is ``before + light * (colour of the cells that learn, over behind)``, so that a step asks these cells
-    alone.
+    A ray's colour is ``before + light * (colour of the cells that learn, over behind)``: a step asks these cells alone.
 
     Attributes:
         rays: p rays.
@@ -354,17 +363,58 @@ class Session:
         rays, near, far = pool.rays[chosen], pool.near[chosen], pool.far[chosen]
         samples = self.renderer.sampler.sample(rays, near, far, jitter=True, generator=self.generator)
         samples = samples.part(self.learns(samples.positions))
-        given = {"background": pool.behind[chosen], "backend": config.backend}
-        seen = render_samples(self.field, rays, far, samples, self.renderer.sampler.space, **given)
-        colour = pool.before[chosen] + pool.light[chosen] * seen.colour
         self.optimizer.zero_grad()
-        colour_loss(colour, pool.target[chosen]).backward()
+        shown = pool.target[chosen], pool.before[chosen], pool.light[chosen], pool.behind[chosen]
+        density, weights = (self.learn_fused if self.is_fused else self.learn)(rays, far, samples, *shown)
         self.optimizer.step()
         if config.average:
             update_averages(self.optimizer, config.average, number)
         if self.source.grid is not None:
-            found = samples.positions, seen.density.detach(), samples.deltas, seen.weights.detach()
+            found = samples.positions, density, samples.deltas, weights
             self.source.grid.observe(*found, decay=DECAY, backend=config.backend)
+
+    def learn(
+        self, rays: Rays, far: Tensor, samples: Samples, target: Tensor, before: Tensor, light: Tensor, behind: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Gradients of the colours' error; density [m] and weights [m] of the samples. Arguments as of `Pool`."""
+        space, backend = self.renderer.sampler.space, self.config.backend
+        seen = render_samples(self.field, rays, far, samples, space, background=behind, backend=backend)
+        colour_loss(before + light * seen.colour, target).backward()
+        return seen.density.detach(), seen.weights.detach()
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether networks, colours, loss and gradients are one operation, as in `voronerf.step.ray_loss.Fused`."""
+        router = self.learners[0]
+        known = getattr(type(router.module), "activate", None) is activate_radiance and router.by_table
+        return known and len(self.parts) == len(self.learners) == 1
+
+    def learn_fused(
+        self, rays: Rays, far: Tensor, samples: Samples, target: Tensor, before: Tensor, light: Tensor, behind: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """As :meth:`learn`, for one router with a layer table."""
+        router, frame, found = self.learners[0], self.parts[0].frame, list[RenderLoss]()
+        wanted, factor = (target - before) / light, light.square().index_select(0, samples.ray_index)
+
+        def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
+            result, gradient = render_loss_gradient(
+                raw,
+                samples.deltas / frame.scale,
+                samples.ray_offsets,
+                wanted,
+                background=behind,
+                density_scale=density_scale(router),
+                hidden=HIDDEN,
+                backend=self.config.backend,
+            )
+            found.append(result)
+            return result.loss, gradient * factor
+
+        directions = rays.directions if frame.is_identity else frame.inverse.directions(rays.directions)
+        network = router.table_arguments(self.own_points(samples.positions), directions, samples.ray_index)
+        assert network is not None
+        learn_outputs(network, loss, backend=self.config.backend).backward()
+        return found[0].density / frame.scale, found[0].weights
 
     def revisit(self, number: int) -> None:
         """Before some steps, evaluates the field in random voxels of cells that learn."""

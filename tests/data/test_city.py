@@ -78,7 +78,9 @@ def test_names(scene):
 
 def test_a_rebuilt_block_changes_nothing_else(scene):
     before, after = city(2), city(2, rebuilt=2)
-    changed = [index for index, (a, b) in enumerate(zip(before, after)) if [s.centre for s in a] != [s.centre for s in b]]
+    changed = [
+        index for index, (a, b) in enumerate(zip(before, after)) if [s.centre for s in a] != [s.centre for s in b]
+    ]
     assert changed == [3], "the ground comes first"
     other = city_scene(20, blocks=2, train_views=2, test_views=1, rebuilt=2)
     assert other.name == "builtin-city-2x2-rebuilt-2"

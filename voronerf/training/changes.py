@@ -132,7 +132,9 @@ def find_changes(renderer: Renderer, cells: Cells, batches: RayBatches, usual: T
     shares = bad / rest.clamp(min=1)
     found = (rest >= CELL_RAYS) & (shares > CELL_SHARE)
     known = Voxels(space.box, (passed >= VOXEL_RAYS).reshape(voxels.chosen.shape), space.contraction)
-    counts = [own[own >= 0].bincount(minlength=k) for own in (cells.assign(v.centres()).long() for v in (voxels, known))]
+    counts = [
+        own[own >= 0].bincount(minlength=k) for own in (cells.assign(v.centres()).long() for v in (voxels, known))
+    ]
     found |= (counts[0] >= CELL_VOXELS) & (counts[0] >= CELL_SPACE * counts[1])
     return Changes(found, voxels, float(off.float().mean()), float((seen.cell < k).float().mean()), shares)
 

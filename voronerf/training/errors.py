@@ -25,7 +25,10 @@ FEWEST = 32
 class Cells(Protocol):
     """What says which cell holds a position: a router, or the parts of a run."""
 
-    num_cells: int
+    @property
+    def num_cells(self) -> int:
+        """k."""
+        ...
 
     def assign(self, positions: Tensor) -> Tensor:
         """[n, 3] -> int32 [n]; -1 for none."""
