@@ -29,7 +29,8 @@ class AdamGuard(NamedTuple):
     scale: Tensor | None  # const float32*
 
 class AdamRule(NamedTuple):
-    rate: Tensor | None  # const float32*
+    rate: float  # float64
+    rate_at: Tensor | None  # const float32*
     step: Tensor | None  # float32*
     decay: float  # float64
     decay_sq: float  # float64
@@ -297,6 +298,7 @@ class ProgramInputs(NamedTuple):
     code: Tensor | None  # const int32*
     constants: Tensor | None  # const float32*
     inputs: Sequence[Tensor | None] | None  # const float32**
+    turned: Tensor | None  # const int32*
     parameters: Sequence[Tensor | None] | None  # const float32**
     strides: Tensor | None  # const int64*
     widths: Tensor | None  # const int64*
@@ -305,6 +307,14 @@ class ProgramInputs(NamedTuple):
     order: Tensor | None  # const int32*
     n: int  # int64
     k: int  # int64
+
+class ProgramSizes(NamedTuple):
+    columns: int  # int64
+    partial: int  # int64
+    inputs: int  # int64
+    parameters: int  # int64
+    outputs: int  # int64
+    sums: int  # int64
 
 class RenderLossInputs(NamedTuple):
     raw: Tensor | None  # const float32*
@@ -345,11 +355,12 @@ class SparseAdam(NamedTuple):
 
 TableType: tuple[str, ...]  # float32 bfloat16 float16
 
-# SparseAdam[], const float32**, float32**, float32**, float32**, int64[], Cpu
-def adam(_0: Sequence[SparseAdam], _1: Sequence[Tensor | None] | None, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[int], _6: Cpu) -> None: ...
-
+# AdamRule[], AdamGuard, const float32**, float32**, float32**, float32**, int64[], Cpu
+@overload
+def adam(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Cpu) -> None: ...
 # AdamRule[], AdamGuard, const float32**, float32**, float32**, float32**, int64[], float32*, Cuda
-def adam_on_device(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Tensor | None, _8: Cuda) -> None: ...
+@overload
+def adam(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Tensor | None, _8: Cuda) -> None: ...
 
 # const float32*, int64, int64, float32*, Cpu
 def add_touched(_0: Tensor | None, _1: int, _2: int, _3: Tensor | None, _4: Cpu) -> None: ...
@@ -460,7 +471,14 @@ def grouped_mlp_hashes(_0: MlpTable, _1: str, _2: str, _3: Cuda) -> bool: ...
 def grouped_mlp_workspace(_0: MlpTable, _1: int, _2: int, _3: bool, _4: bool, _5: str, _6: str, _7: Cuda) -> int: ...
 
 # ProgramInputs, float32**, float32**, Cpu
+@overload
 def grouped_program(_0: ProgramInputs, _1: Sequence[Tensor | None] | None, _2: Sequence[Tensor | None] | None, _3: Cpu) -> None: ...
+# ProgramInputs, ProgramSizes, float32**, float32**, uint8*, Cuda
+@overload
+def grouped_program(_0: ProgramInputs, _1: ProgramSizes, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Tensor | None, _5: Cuda) -> None: ...
+
+# ProgramSizes, int64, int64, Cuda
+def grouped_program_workspace(_0: ProgramSizes, _1: int, _2: int, _3: Cuda) -> int: ...
 
 # HashInputs, HashGrid, float32*, Cpu
 @overload

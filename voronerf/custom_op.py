@@ -14,11 +14,12 @@ from torch.library import CustomOpDef
 
 # torch has no public names for these questions; without an answer the custom op is called.
 _LISTENERS = [
-    getattr(torch._C, name, lambda: True)
-    for name in ("_len_torch_function_stack", "_len_torch_dispatch_stack", "_are_functorch_transforms_active")
+    getattr(torch._C, "_len_torch_function_stack", lambda: True),
+    getattr(torch._C, "_len_torch_dispatch_stack", lambda: True),
+    getattr(torch._C, "_are_functorch_transforms_active", lambda: True),
+    getattr(torch.autograd, "_profiler_enabled", lambda: True),
 ]
 _PLAIN = (Tensor, torch.nn.Parameter)
-_PROFILES = getattr(torch.autograd, "_profiler_enabled", lambda: True)
 
 
 def custom_op(
@@ -143,8 +144,11 @@ class Op:
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
         flat = self.structs.flat(arguments)
-        if torch.compiler.is_compiling() or _PROFILES() or any(listens() for listens in _LISTENERS):
+        if torch.compiler.is_compiling():
             return self._op(*flat)
+        for listens in _LISTENERS:
+            if listens():
+                return self._op(*flat)
         tensors = [flat[place] for place in self.structs.tensors if flat[place] is not None]
         for place in self.structs.lists:
             tensors += [entry for entry in flat[place] if entry is not None]

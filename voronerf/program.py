@@ -39,7 +39,7 @@ class Function(NamedTuple):
 
     Attributes:
         formula: (x, a, b) -> f(x), in PyTorch. The compiled module has f and its derivatives, in a line of its own
-            (csrc/network/cpu/functions_tile.h).
+            (csrc/network/functions.h).
         orders: the highest derivative that is not 0.
     """
 
@@ -69,6 +69,8 @@ FUNCTIONS = {
     "exp": Function(lambda x, a, b: x.exp()),
     "log": Function(lambda x, a, b: x.log()),
     "power": Function(lambda x, a, b: x**a),
+    "erf": Function(lambda x, a, b: x.erf()),
+    "atan": Function(lambda x, a, b: x.atan()),
 }
 """By their names in the compiled module."""
 
@@ -179,7 +181,8 @@ class Builder:
         self.inputs, self.parameters = list(program.inputs), list(program.parameters)
         self.steps = list(program.steps)
         self.sums = list(program.sums)
-        self._values = max((step.out + 1 for step in self.steps if not _sums(step)), default=0)
+        self._makers = {step.out: step for step in self.steps if not _sums(step)}
+        self._values = max(self._makers, default=-1) + 1
         self._made: dict[Step, Columns] = {}
 
     def program(self, outputs: Iterable[Columns]) -> Program:
@@ -199,6 +202,7 @@ class Builder:
         if key not in self._made:
             self._made[key] = Columns(VALUE, self._values, 0, width)
             self.steps.append(key._replace(out=self._values))
+            self._makers[self._values] = self.steps[-1]
             self._values += 1
         return self._made[key]
 
@@ -222,13 +226,15 @@ class Builder:
     def function(
         self, name: str, x: Columns, a: float = 0.0, b: float = 0.0, order: int = 0, times: Columns | None = None
     ) -> Columns | None:
-        """A derivative of a function, times a value; None where it is 0. Powers are whole or half ones."""
-        if name == "power" and not (abs(a) <= 64 and 2 * a == int(2 * a)):
-            raise ValueError(f"a power must be a multiple of 0.5 from -64 to 64, got {a}")
+        """A derivative of a function, times a value; None where it is 0."""
         if order > FUNCTIONS[name].orders or (name == "power" and a == int(a) and 0 <= a < order):
             return None
         if order == 1 and times is not None and name in ("copy", "affine"):
             return times if name == "copy" or a == 1 else self.function("affine", times, a)
+        before = self._makers[x.index] if x.of == VALUE and order == 0 and name in ("affine", "sine") else None
+        if before is not None and before.name == "affine" and before.numbers[0] == 0 and len(before.operands) == 1:
+            x = before.operands[0].part(x.start, x.width)._replace(spread=x.spread or before.operands[0].spread)
+            a, b = a * before.numbers[1], a * before.numbers[2] + b
         operands = (x,) if times is None else (x, times)
         return self.emit("function", x.width, operands, (order, float(a), float(b)), name)
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.diagram.subdivision import Split, split_diagram
+from voronerf.distributed.group import Group
 from voronerf.distributed.pictures import LookOverRanks
 from voronerf.distributed.sharing import Sharing, assign_cells
 from voronerf.ops.select_heaviest import select_heaviest
@@ -45,6 +46,11 @@ class SplitRule:
         inherit: Whether new cells start as copies of their parent, else from random parameters.
         reservoir: Samples that are kept.
         batches: The latest batches that they come from.
+
+    Examples:
+        >>> from voronerf.step import SplitRule
+        >>> SplitRule(reservoir=2_000, batches=100).inherit
+        True
     """
 
     centres: str = "centroidal"
@@ -70,7 +76,31 @@ class Cells:
         plan: The splits to make.
         rule: How they are made.
         generator: Of random choices, in the same state on all ranks.
-        sharing: That of the step.
+        sharing: That of the step; None for this process alone.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF, VoronoiRouter
+        >>> from voronerf.rendering import Rays, Renderer, Stratified
+        >>> from voronerf.step import Batch, Cells, PlannedSplit, SplitRule, Step
+        >>> router = VoronoiRouter(NeRF(width=16, depth=2), torch.zeros(1, 3))
+        >>> optimizer = torch.optim.Adam(router.parameters(), lr=0.01)
+        >>> step = Step(Renderer({"field": router}, Stratified(8)))
+        >>> plan, generator = [PlannedSplit(at=3, children=4, cells="all")], torch.Generator().manual_seed(0)
+        >>> cells = Cells(step.renderer, {"field": router}, plan, SplitRule(), generator=generator)
+        >>> rays = Rays(torch.zeros(9, 3), torch.nn.functional.normalize(torch.randn(9, 3)))
+        >>> batch = Batch(rays, torch.ones(9), torch.full((9,), 3.0), torch.rand(9, 3))
+        >>> for number in range(4):
+        ...     if cells.is_due(number, number) and (split := cells.find_split()):
+        ...         cells.divide(split, optimizer)
+        ...     cells.revisit(number)  # some of empty space
+        ...     optimizer.zero_grad()
+        ...     found = step.run(batch, generator, backward=True)
+        ...     optimizer.step()
+        ...     cells.observe(found)
+        ...     cells.reservoir.add(found.samples.positions, found.importance())
+        >>> router.num_cells
+        4
     """
 
     def __init__(
@@ -81,15 +111,15 @@ class Cells:
         rule: SplitRule,
         *,
         generator: torch.Generator,
-        sharing: Sharing,
+        sharing: Sharing | None = None,
     ) -> None:
         self.renderer, self.routers, self.plan, self.rule = renderer, routers, plan, rule
-        self.generator, self.sharing = generator, sharing
+        self.generator, self.sharing = generator, sharing or Sharing(Group(next(routers["field"].parameters()).device))
         self.splits = 0
         self.weights = torch.ones(1)  # what the networks of each cell cost, by which ranks share them
         self.empty_reservoir()
-        if sharing.group.size > 1:
-            renderer.look = LookOverRanks(renderer, sharing)
+        if self.sharing.group.size > 1:
+            renderer.look = LookOverRanks(renderer, self.sharing)
 
     def empty_reservoir(self) -> None:
         """Forgets the kept samples."""

@@ -48,8 +48,15 @@ class OverRanks:
     def __init__(self, renderer: Renderer, sharing: Sharing, sightings: float) -> None:
         self.renderer, self.sharing, self.sightings = renderer, sharing, sightings
 
-    def __call__(self, batch: Batch, generator: torch.Generator | None) -> Found:
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
         """As of `RayLoss`; the generator is in the same state on all ranks."""
+        found = self._found(batch, generator)
+        if backward:
+            found.loss.backward()
+            found = found._replace(loss=found.loss.detach())
+        return found
+
+    def _found(self, batch: Batch, generator: torch.Generator | None) -> Found:
         if batch.background is not None:
             batch = replace(batch, background=batch.background.expand_as(batch.target))
         if why_not_fused(self.renderer) is not None:

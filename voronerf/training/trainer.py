@@ -29,6 +29,8 @@ from voronerf.distributed.sharing import Sharing
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
 from voronerf.files import json_text, write_bytes, write_text
+from voronerf.ops import Guard
+from voronerf.ops.sparse_adam.reference import judge
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.router import Parts, VoronoiRouter
 from voronerf.router.grouping import cell_parameters
@@ -49,7 +51,6 @@ from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.divergence import (
     PATIENCE,
     SETTLED,
-    GradientGuard,
     all_finite,
     one_colour_psnr,
     sum_of_gradients,
@@ -157,7 +158,7 @@ class Trainer:
             sharing=self.sharing,
         )
         self.learner = Step(self.renderer, sightings=config.sightings or 0.0, sharing=self.sharing)
-        self.guard = GradientGuard(self.device)
+        self.guard = Guard.on(self.device)  # of steps whose loss or gradients are not finite
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
         self.step, self.seconds = 0, 0.0
@@ -180,6 +181,11 @@ class Trainer:
     def writes(self) -> bool:
         """Whether this process writes the files of the run."""
         return self.group.rank == 0
+
+    @property
+    def skipped(self) -> int:
+        """Steps that were left out, since a loss or gradients were not finite; waits for the device."""
+        return int(self.guard.skipped)
 
     @property
     def router(self) -> VoronoiRouter | Parts:
@@ -336,9 +342,9 @@ class Trainer:
         if self.rate_factor < 1 or not there:
             kept = "with half the rate again; the checkpoint is as it was" if there else "there is no checkpoint"
             raise TrainingError(f"{self.out}: {reason} at step {at}, try a smaller --lr; {kept}")
-        skipped = int(self.guard.skipped)
+        skipped = self.skipped
         self._resume(last_checkpoint(self.out))
-        self.guard.skipped.fill_(skipped)
+        self.guard = Guard.on(self.device, skipped)
         self.rate_factor = 0.5
         self.saved_at = self.seconds
         self._begin_stage()
@@ -370,19 +376,29 @@ class Trainer:
         config = self.config
         batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
         half = HALVES.get(config.precision)
-        with nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False):
-            found = self.learner.run(batch, self.draws)
         self.optimizer.zero_grad(set_to_none=True)
-        # Nothing is read on the host: the fused optimiser skips a step whose gradients have overflowed by itself.
-        self.scaler.scale(found.loss).backward()
-        told = self._agree(found)
-        self.cells.observe(found, told.seen if self.group.size > 1 else None)
+        with nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False):
+            found = self.learner.run(batch, self.draws, backward=half is None)
+        if half is not None:
+            self.scaler.scale(found.loss).backward()
+        if self.group.size > 1:
+            told = self._agree(found)
+            loss, kept, samples, seen = told.loss, told.kept, told.samples, told.seen
+            judge(self.guard, told.total, [])
+        else:
+            loss, kept, samples, seen = found.loss.detach(), self.cells.heaviest(found), len(found.weights), None
+        self.cells.observe(found, seen)
         if self.occupancy is not None:
-            self.rays = next_rays(config, self.rays, told.samples)
-        self.guard.judge(told.total, self.optimizer, scaled=self.scaler.is_enabled())
-        self.scaler.step(self.optimizer)
-        self.scaler.update()
-        return told.loss, told.kept
+            self.rays = next_rays(config, self.rays, samples)
+        # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
+        if self.scaler.is_enabled():
+            if self.group.size == 1:
+                judge(self.guard, loss, [])
+            self.scaler.step(self.optimizer)
+            self.scaler.update()
+        else:
+            self.optimizer.update(self.guard, loss if self.group.size == 1 else None)
+        return loss, kept
 
     def _agree(self, found: Found) -> Told:
         """Adds up gradients over all ranks, and lets them agree on time, stops, checkpoints and what was found."""
@@ -524,7 +540,7 @@ class Trainer:
             "parameters": self.parameter_count,
             "cells": self.diagram.num_cells,
             "splits_left": len(self.plan) - self.level,
-            "skipped_steps": int(self.guard.skipped),
+            "skipped_steps": self.skipped,
             "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
         }
@@ -563,7 +579,7 @@ class Trainer:
             rays_done=self.rays_done,
             stages=tuple(asdict(stage) for stage in self.stages),
             evaluated=self.evaluated,
-            skipped=int(self.guard.skipped),
+            skipped=self.skipped,
             rate_factor=self.rate_factor,
             threads=torch.get_num_threads(),
         )
@@ -615,7 +631,7 @@ class Trainer:
         self.rays, self.rays_done = stored.rays, stored.rays_done
         self.stages = [Stage(**stage) for stage in stored.stages]
         self.cells.splits = len(self.stages) - 1
-        self.guard = GradientGuard(self.device, stored.skipped)
+        self.guard = Guard.on(self.device, stored.skipped)
         self.rate_factor = stored.rate_factor
         self.evaluated = min(stored.evaluated, self._due())  # fewer where the run was made longer
         # Evaluations made after the checkpoint will be made again.
