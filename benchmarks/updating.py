@@ -32,7 +32,7 @@ from voronerf.training.config import TrainConfig
 from voronerf.training.trainer import Trainer
 
 #: Where the bucket of Lego's loader is, and the most views of which pictures are compared.
-BUCKET, VIEWS = torch.tensor([[-0.75, -1.25, -0.6], [0.75, -0.5, 0.35]]), 48
+BUCKET, VIEWS = torch.tensor([[-0.75, -1.25, 0.4], [0.75, -0.5, 1.2]]), 48
 
 
 def train(scene: Scene, data: str, seconds: float, seed: int, downscale: int, out: Path) -> Run:

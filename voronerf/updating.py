@@ -41,8 +41,10 @@ from voronerf.training.renderers import as_field, make_contraction, make_rendere
 #: Rays of a step, in multiples of ``--rays``.
 RAYS = 1
 #: Rays that are drawn at a time to find those that meet cells that learn, how many of these there are to be, and the
-#: share of an update that is spent on it at most, and the share that is left for learning at least.
-DRAWN, POOL, FINDING, LEARNING = 1 << 15, 1 << 17, 0.3, 0.25
+#: share of an update that is spent on it before the first step at most, and the share that is left for steps at least.
+DRAWN, POOL, FINDING, LEARNING = 1 << 15, 1 << 17, 0.15, 0.25
+#: How often a ray is learnt from before others are found.
+AGAIN = 4
 #: Rays learn if this share of the light reaches the cells that learn, and no more than that optical depth of others
 #: lies between them.
 LEAST_LIGHT, MOST_BETWEEN = 0.05, 0.05
@@ -123,18 +125,30 @@ def update(
     through, backend = bounds(source, changes), source.config.backend
     given = [scene for scene in (new, old) if scene is not None]
     pictures = [RayBatches(scene, device, through=through, backend=backend) for scene in given]
-    pools: list[list[Pool]] = [[] for _ in pictures]
-    while not pools[0] or (clock() - began < FINDING * seconds and sum(map(len, pools[0])) < POOL):
-        for number, (batches, own) in enumerate(zip(pictures, pools, strict=True)):
-            own.append(session.pool(batches, DRAWN >> number, agree=number > 0))
-    rays = [sum(map(len, own)) for own in pools]
+    count = DRAWN if grid is not None else DRAWN // 4  # of rays that skip nothing
+    pools: list[list[Pool]] = []
+
+    def draw() -> Pool:
+        """More rays to learn from, with those before; the oldest go."""
+        found = [session.pool(batches, count, agree=number > 0) for number, batches in enumerate(pictures)]
+        pools.append(found)
+        while sum(len(pool) for pair in pools[1:] for pool in pair) >= POOL:
+            pools.pop(0)
+        return Pool.joined([pool for pair in pools for pool in pair])
+
+    pool = draw()
+    while clock() - began < FINDING * seconds and len(pool) < POOL:
+        pool = draw()
+    rays = [sum(len(pair[number]) for pair in pools) for number in range(len(pictures))]
     say(f"learning from {rays[0]} rays of the new pictures and {sum(rays[1:])} of the old ones")
-    pool, steps, started = Pool.joined([pool for own in pools for pool in own]), 0, clock() - began
     if not rays[0]:
         raise ConfigError("--data must show the cells that have changed, got pictures that see them through others")
+    steps, drawn, started = 0, 0, clock() - began
     left = max(seconds - started, LEARNING * seconds)
     while (done := (clock() - began - started) / left) < 1:
-        session.step(pool, steps, done)
+        if drawn > AGAIN * len(pool):
+            pool, drawn = draw(), 0
+        drawn += session.step(pool, steps, done)
         steps += 1
     if grid is not None and source.grid is not None and session.own_voxels is not None:
         # Voxels across a border have seen samples of cells that learn.
@@ -347,8 +361,8 @@ class Session:
         kept = batch.rays[rays]
         return Pool(kept, batch.near[rays], batch.far[rays], batch.target[rays], before, passes, behind)
 
-    def step(self, pool: Pool, number: int, done: float) -> None:
-        """Moves the networks of the cells that learn.
+    def step(self, pool: Pool, number: int, done: float) -> int:
+        """Moves the networks of the cells that learn; returns the rays that they have learnt from.
 
         Args:
             pool: The rays to draw from.
@@ -372,6 +386,7 @@ class Session:
         if self.source.grid is not None:
             found = samples.positions, density, samples.deltas, weights
             self.source.grid.observe(*found, decay=DECAY, backend=config.backend)
+        return len(chosen)
 
     def learn(
         self, rays: Rays, far: Tensor, samples: Samples, target: Tensor, before: Tensor, light: Tensor, behind: Tensor
