@@ -39,9 +39,9 @@ def rebuilt():
 def runs(tmp_path_factory, city):
     """A run of the default field, and one of small networks without a table that cells share."""
     folder = tmp_path_factory.mktemp("runs")
-    common = {"evaluations": 1, "final_views": 1, "panels": 0, "steps": 700, "cells": (8,), "rays": 256}
+    common = {"evaluations": 1, "final_views": 1, "panels": 0, "steps": 500, "cells": (8,), "rays": 256}
     made = {}
-    for name, options in {"hashgrid": {}, "nerf": {"field": "nerf", "width": 16, "depth": 2, "steps": 500}}.items():
+    for name, options in {"hashgrid": {}, "nerf": {"field": "nerf", "width": 16, "depth": 1, "steps": 300}}.items():
         config = TrainConfig(out=folder / name, data="builtin-city:2x2", **{**common, **options})
         Trainer(config, city).run()
         made[name] = folder / name
