@@ -30,6 +30,7 @@ class Samples(NamedTuple):
         depths: [m], their distances.
         deltas: [m], the lengths of the parts of the ray that they stand for.
         edges: [r, s + 1], the ends of these parts, where all rays have s samples; else None.
+        rows: int32 [1], how many of the samples belong to rays, where no host has read it; None for all.
 
     Examples:
         >>> import torch
@@ -46,6 +47,7 @@ class Samples(NamedTuple):
     depths: Tensor
     deltas: Tensor
     edges: Tensor | None = None
+    rows: Tensor | None = None
 
     @property
     def positions(self) -> Tensor:

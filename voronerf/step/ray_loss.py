@@ -181,6 +181,7 @@ class Fused:
 
         network = field.table_arguments(samples.inputs, directions, samples.ray_index)
         assert network is not None
+        network["rows"] = samples.rows
         total = learn_outputs(network, loss, backward=backward, backend=renderer.backend)
         return Found(total, found[0].error, found[0].weights, found[0].density, samples)
 
