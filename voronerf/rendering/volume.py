@@ -54,6 +54,15 @@ class Samples(NamedTuple):
         """[m, 3], the points or the means of the Gaussians."""
         return self.inputs if self.inputs.shape[1] == 3 else self.inputs[:, :3]
 
+    def counted(self) -> Samples:
+        """Without the rows that belong to no ray; the host waits for their number."""
+        if self.rows is None:
+            return self
+        known = int(self.rows)
+        parts = (values[:known] for values in (self.inputs, self.ray_index, self.depths, self.deltas))
+        inputs, index, depths, deltas = parts
+        return Samples(inputs, index, self.ray_offsets, depths, deltas)
+
     def of_rays(self, rays: Tensor) -> Samples:
         """The samples of some rays, int64 [q] in ascending order, which become rays 0 to q - 1."""
         counts = self.ray_offsets.diff()
