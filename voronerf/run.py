@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from voronerf import editing
+from voronerf import editing, updating
 from voronerf.data import Scene, load_scene
-from voronerf.data.record import read_scene, within
+from voronerf.data.record import placed, read_scene, within
 from voronerf.diagram import VoronoiDiagram
+from voronerf.editing import check_out
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import score_views
 from voronerf.rendering.cameras import Cameras
@@ -21,13 +23,17 @@ from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
 from voronerf.router import Parts, Similarity, Solid, VoronoiRouter
 from voronerf.training.average import load_averages
-from voronerf.training.checkpoint import last_checkpoint
+from voronerf.training.checkpoint import NETWORKS, checkpoint_path, last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
 from voronerf.training.networks import check_shapes, open_routers, parameter_groups, restore_routers
 from voronerf.training.renderers import make_picture_grid, make_renderer, through_grid
 from voronerf.training.run_directory import check_folders, check_stored_paths
 from voronerf.training.state import stored_values
+from voronerf.training.streaming import Pages, bytes_of
+
+#: Rays of a picture of a run of parts that are rendered at a time.
+PARTS_RAYS = 16_384
 
 
 @dataclass(frozen=True)
@@ -174,6 +180,55 @@ class Run:
         frames = [Similarity(), editing.standing(source, at, degrees, scale)]
         return self._made(self, out, editing.join([self.source, source], frames, on_top=[False, True]))
 
+    def update(
+        self,
+        scene: Scene,
+        out: Path | str,
+        *,
+        seconds: float | None = None,
+        data: str | None = None,
+        old: bool = True,
+        seed: int = 0,
+        clock: Callable[[], float] = time.perf_counter,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> Run:
+        """This run brought up to date with new pictures, in new files.
+
+        Cells whose error has grown learn; the networks of all others, and the tables that these share, are the same
+        bits afterwards.
+
+        Args:
+            scene: The new pictures. Photographs that were moved as they were read are moved to where the run has them.
+            out: A new directory.
+            seconds: To train for; None for a tenth of the time that the run was trained for, and 10 at least.
+            data: Where the new pictures were loaded from, for the settings of the new run.
+            old: Also learn from the pictures of this run's scene, where they agree with the new ones.
+            seed: Of the rays that are drawn.
+            clock: Counts seconds.
+            say: Told a line for what is found.
+
+        Raises:
+            ConfigError: For pictures that show nothing new, nothing of the scene, or another scene.
+            SceneError: For pictures with another background, or in another frame.
+            OSError: When it cannot be written; nothing is left then.
+        """
+        check_out(Path(out))
+        source = editing.join([self.source], [Similarity()])
+        checkpoint = last_checkpoint(self.path, keep=lambda name: name.startswith("errors."))
+        usual = checkpoint.group("errors").get("usual")
+        if self.renderer.sampler.passes > 1 or (usual is not None and len(usual) != source.parts.num_cells + 1):
+            usual = None  # of other samples, or cells
+        if seconds is None:
+            seconds = max(10.0, float(checkpoint.values["seconds"]) / 10)
+        if not 0 < seconds < math.inf:
+            raise ConfigError(f"--budget must be positive, got {seconds}")
+        new = placed(scene, self.scene)
+        before = self.scene if old and len(self.scene.train.images) else None
+        found = updating.update(source, new, before, usual, seconds=seconds, seed=seed, clock=clock, say=say)
+        config = replace(found.source.config, data=data or self.config.data)
+        editing.write(replace(found.source, config=config, scene=new), Path(out))
+        return open_run(out, scene=new, backend=self.renderer.backend)
+
     @classmethod
     def _made(cls, first: Run, out: Path | str, source: editing.Source, blend: float | None = None) -> Run:
         """Writes what was made and opens it."""
@@ -216,6 +271,10 @@ def _shows(name: str) -> bool:
     return not name.startswith("optimizer.") or name.endswith(".average")
 
 
+def _shows_without_networks(name: str) -> bool:
+    return name != NETWORKS and _shows(name)
+
+
 def open_run(
     path: Path | str,
     *,
@@ -229,6 +288,7 @@ def open_run(
     blend: float | None = None,
     device: str = "cpu",
     backend: str = "auto",
+    memory: str | int | None = None,
 ) -> Run:
     """Opens a run that ``voronerf train`` or :class:`voronerf.training.trainer.Trainer` has written.
 
@@ -250,6 +310,9 @@ def open_run(
         blend: Margin in scene units within which neighbouring cells are blended; None for that of the training.
         device: Torch device.
         backend: Backend of the operations.
+        memory: Bound on the memory of this process and on what the files of networks take of the system's, such as
+            "512M", for a run of several parts on the CPU. Networks are read as rays meet them, those that were not used
+            for longest are dropped, and their checksums are not compared. Pictures are the same bit for bit.
 
     Raises:
         CheckpointError: If there is no usable checkpoint.
@@ -282,12 +345,17 @@ def open_run(
     if blend is not None and not 0 <= blend < math.inf:
         raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
     check_folders(path)
-    checkpoint = last_checkpoint(path, keep=_shows)
+    pages = None if memory is None else Pages(checkpoint_path(path).parent, bytes_of(memory))
+    checkpoint = last_checkpoint(path, keep=_shows if pages is None else _shows_without_networks)
+    if pages is not None and ("parts" not in checkpoint.values or torch.device(device).type != "cpu"):
+        raise ConfigError(
+            f"--memory needs --device cpu and a run of parts, as join, cut and place make; {path} is none"
+        )
     config, _ = stored_values(checkpoint)
     if scene is None and data is None:
         check_stored_paths(path, data=config.data)
     check_shapes(config, checkpoint)
-    routers = open_routers(config, device, checkpoint)
+    routers = open_routers(config, device, checkpoint, pages)
     if isinstance(routers["field"], VoronoiRouter):
         restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
     load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
@@ -304,6 +372,8 @@ def open_run(
     several = "parts" in checkpoint.values
     scene = within(scene, path) if several else scene
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
+    if several:  # the networks of as few parts as possible at a time
+        renderer.most_rays = PARTS_RAYS
     state = checkpoint.group("occupancy")
     grid = None
     if state:

@@ -114,7 +114,7 @@ def test_a_table_that_does_not_fit_into_memory(monkeypatch):
 
 @pytest.mark.parametrize(
     ("side", "contraction", "samples", "entries"),
-    [(100, "none", 64, 15), (20, "none", 48, 14), (20, "sphere", 64, None)],
+    [(100, "none", 64, 15), (20, "none", 48, 14), (20, "sphere", 128, None)],
 )
 def test_larger_images_get_more_samples_and_larger_tables(side, contraction, samples, entries):
     scene = builtin_scene(side, train_views=2, test_views=1)
