@@ -61,7 +61,10 @@ class OverRanks:
             batch = replace(batch, background=batch.background.expand_as(batch.target))
         if why_not_fused(self.renderer) is not None:
             return self._composed(batch, generator)
-        return self._whole_rays(batch, generator) if self.sharing.diagram is None else self._fused(batch, generator)
+        if self.sharing.diagram is None:
+            return self._whole_rays(batch, generator)
+        seen = self.sightings and batch.seen is not None
+        return self._composed(batch, generator) if seen else self._fused(batch, generator)
 
     def explain(self) -> str:
         """As of `RayLoss`."""
@@ -71,7 +74,7 @@ class OverRanks:
     def _whole_rays(self, batch: Batch, generator: torch.Generator | None) -> Found:
         """Where all ranks have the same network no ray is split."""
         kept = self.sharing.slice(len(batch.rays))
-        found = Fused(self.renderer)(batch, generator, kept=kept)
+        found = Fused(self.renderer, self.sightings)(batch, generator, kept=kept)
         return found._replace(loss=found.loss * (len(found.error) / len(batch.rays)))
 
     def _fused(self, batch: Batch, generator: torch.Generator | None) -> Found:
@@ -173,7 +176,7 @@ class OverRanks:
             ends = len(target) - max(own.start, rays - len(batch.seen)) + own.start  # of these rays, the last
             if ends > 0:
                 light = colour[len(target) - ends :, 3]
-                loss = loss + self.sightings * sighting_loss(light) * (ends / len(batch.seen))
+                loss = loss + self.sightings * sighting_loss(light).sum() / len(batch.seen)
         (slopes,) = torch.autograd.grad(loss, colour)
         error = (colour[:, :3].detach() - target).square().sum(-1)
         blocked = whole.behind(part, ray, slopes, behind)

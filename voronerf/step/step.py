@@ -44,7 +44,7 @@ class Step:
         if self.sharing is not None and self.sharing.group.size > 1:
             return OverRanks(self.renderer, self.sharing, self.sightings)
         if why_not_fused(self.renderer) is None:
-            return Fused(self.renderer)
+            return Fused(self.renderer, self.sightings)
         return Composed(self.renderer, self.sightings)
 
     def run(self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False) -> Found:

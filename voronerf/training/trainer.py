@@ -1,6 +1,7 @@
 """The training loop: coarse stage, splits, local stages; evaluations and checkpoints on the way.
 
-Time means training time: steps and splits count, evaluations and checkpoints do not. Over several ranks every one of
+Time means training time: steps and splits. Evaluations take a share of the budget, checkpoints are written
+meanwhile. Over several ranks every one of
 them runs this loop: they take the same steps, and each holds the networks of its own cells. A group of one rank is an
 ordinary training.
 """
@@ -56,6 +57,7 @@ from voronerf.training.divergence import (
     sum_of_gradients,
     why_scores_are_poor,
 )
+from voronerf.training.errors import usual_errors
 from voronerf.training.networks import (
     check_backend,
     check_memory,
@@ -161,6 +163,9 @@ class Trainer:
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
         self.step, self.seconds = 0, 0.0
+        self._rows: Tensor | None = None  # how many samples the last step had, where no host has read it
+        #: Seconds of all evaluations but the last, and of a view in the latest.
+        self.scoring, self.view_seconds = 0.0, 0.0
         self._passed = 0.0  # seconds that ranks have not been told of
         #: Rays of the next step, and of all steps so far.
         self.rays, self.rays_done = config.rays, 0
@@ -169,6 +174,7 @@ class Trainer:
         self.metrics: list[dict[str, Any]] = []
         self.stopped = self._asked_to_stop = self.described = False
         self.loss = math.nan
+        self.errors: Tensor | None = None  # of each cell, see `usual_errors`
         self.writer = CheckpointWriter(self.out, config.keep_checkpoints, self.group)
         if checkpoint is not None:
             self._resume(checkpoint)
@@ -216,7 +222,24 @@ class Trainer:
         """How much of the run is done, 0..1."""
         if self.config.steps is not None:
             return min(1.0, self.step / self.config.steps)
-        return min(1.0, self.seconds / float(self.config.budget or 1.0))
+        return min(1.0, self.seconds / self._training_time)
+
+    @property
+    def _training_time(self) -> float:
+        """Seconds of the budget for training: what evaluations have taken, and the last one will take, is less."""
+        budget = float(self.config.budget or 1.0)
+        if not self._counts_evaluation:
+            return budget
+        views = len(self.scene.test.names)
+        last = self.view_seconds * min(views, self.config.final_views or views)
+        if self.config.final_views is None:
+            last = min(last, self.config.evaluation_share * budget / 2)
+        return max(budget - self.scoring - last, 1e-9)
+
+    @property
+    def _counts_evaluation(self) -> bool:
+        """Whether evaluations are part of the budget; over ranks they are not, whose clocks differ."""
+        return self.config.budget is not None and self.config.evaluation_share > 0 and self.group.size == 1
 
     @property
     def level(self) -> int:
@@ -257,6 +280,7 @@ class Trainer:
         self.advance()
         while not self._check_moments():
             self.advance()
+        self._find_errors()
         self.save()
         if self.fraction >= 1:
             self.stopped = False  # a stop that came in the last step has nothing to end
@@ -265,7 +289,7 @@ class Trainer:
                 self.say(f"Run ended before {left} of {len(self.plan)} planned splits.")
             for router in self.routers.values():
                 router.blend = self.config.blend
-            self._evaluate(self.config.final_views, self.lpips)
+            self._evaluate(self.config.final_views, self.lpips, last=True)
         return self._summarise()
 
     def advance(self, until: float = math.inf) -> None:
@@ -314,7 +338,17 @@ class Trainer:
             TrainingError: When steps are skipped again and again, see :meth:`_go_back`.
         """
         started = self.clock()
-        self.loss, in_a_row = torch.stack((loss.float(), self.guard.in_a_row)).tolist()
+        figures = [loss.float(), self.guard.in_a_row]
+        if self._rows is not None:
+            figures.append(self._rows[0].float())
+        self.loss, in_a_row, *samples = torch.stack(figures).tolist()
+        if samples and self.occupancy is not None:
+            rays = next_rays(self.config, self.rays, int(samples[0]))
+            if self.config.cuda_graph:  # which is captured anew for other numbers of rays
+                rays -= rays % self.config.rays
+            if rays != self.rays:
+                self.rays = rays
+                self._begin_stage()
         if self.group.size == 1:
             self._count(started)
         if in_a_row >= PATIENCE:
@@ -384,8 +418,9 @@ class Trainer:
             judge(self.guard, told.total, [])
         else:
             loss, kept, samples, seen = found.loss.detach(), self.cells.heaviest(found), len(found.weights), None
+            self._rows = found.samples.rows
         self.cells.observe(found, seen)
-        if self.occupancy is not None:
+        if self.occupancy is not None and self._rows is None:
             self.rays = next_rays(config, self.rays, samples)
         # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
         if self.scaler.is_enabled():
@@ -493,14 +528,38 @@ class Trainer:
         """Number of evaluations that are due by now."""
         return int(self.fraction * self.config.evaluations + 1e-9)
 
-    def _evaluate(self, views: int | None, lpips: Lpips | None = None) -> None:
+    def _evaluate(self, views: int | None, lpips: Lpips | None = None, *, last: bool = False) -> None:
         """Scores test views; where a stop is asked for meanwhile, not all of them, and without a trace."""
-        with self.averaged():
-            scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, stop=lambda: self.stopped)
+        count = self._affordable(views, lpips, last) if self._counts_evaluation else views
+        scores = [] if count == 0 else self._score(count, lpips, last)[0]
         if self.stopped:
             return
         self.evaluated = self._due()
-        self._record(scores)
+        if scores:
+            self._record(scores)
+
+    def _affordable(self, views: int | None, lpips: Lpips | None, last: bool) -> int:
+        """How many of the views the share of the budget allows, from what one takes; 0 to leave out an evaluation."""
+        every, share = len(self.scene.test.names), self.config.evaluation_share
+        wanted, budget = every if views is None else min(views, every), float(self.config.budget or 0.0)
+        if last and self.config.final_views is not None:
+            return wanted
+        one, probed = self.view_seconds, 0.0
+        if one == 0 or lpips is not None:
+            one = probed = self._score(1, lpips, last)[1]
+        left = share * budget - self.scoring - probed if last else share / 2 * self.seconds - self.scoring
+        return min(wanted, max(int(left / max(one, 1e-9)), int(last)))
+
+    def _score(self, views: int | None, lpips: Lpips | None, last: bool) -> tuple[list[ViewScore], float]:
+        """Scores of test views, and the seconds that they took, which are counted before the last evaluation."""
+        started = self.clock()
+        with self.averaged():
+            scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, stop=lambda: self.stopped)
+        passed = self.clock() - started
+        if not last:
+            self.scoring += passed
+            self.view_seconds = passed / max(len(scores), 1)
+        return scores, passed
 
     def _record(self, scores: list[ViewScore]) -> None:
         """Adds an evaluation to ``metrics.jsonl`` and tells it, with what makes it poor."""
@@ -560,6 +619,12 @@ class Trainer:
         if wait:
             self.writer.wait()
 
+    def _find_errors(self) -> None:
+        """Finds the errors that an update compares new pictures with; over ranks it finds them itself."""
+        if self.group.size == 1 and self.step:
+            with self.averaged():
+                self.errors = usual_errors(self.renderer, self.router, self.batches)
+
     def _state(self) -> Checkpoint:
         """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
         stored = state.Stored(
@@ -570,6 +635,8 @@ class Trainer:
             rays_done=self.rays_done,
             stages=tuple(asdict(stage) for stage in self.stages),
             evaluated=self.evaluated,
+            scoring=self.scoring,
+            view_seconds=self.view_seconds,
             skipped=self.skipped,
             rate_factor=self.rate_factor,
             threads=torch.get_num_threads(),
@@ -578,6 +645,8 @@ class Trainer:
             "reservoir": self.cells.reservoir.state_dict(),
             "generator": {"state": self.generator.get_state(), "draws": self.draws.get_state()},
         }
+        if self.errors is not None:
+            parts["errors"] = {"usual": self.errors}
         if self.occupancy is not None:
             parts["occupancy"] = self.occupancy.state_dict()
         if self.scaler.is_enabled():
@@ -617,6 +686,7 @@ class Trainer:
                 ", and torch computes these networks"
             )
         self.step, self.seconds = stored.step, stored.seconds
+        self.scoring, self.view_seconds = stored.scoring, stored.view_seconds
         self.rays, self.rays_done = stored.rays, stored.rays_done
         self.stages = [Stage(**stage) for stage in stored.stages]
         self.cells.splits = len(self.stages) - 1
