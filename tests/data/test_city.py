@@ -74,3 +74,20 @@ def test_names(scene):
         refuses("builtin-city: blocks must be 1x1, 2x2, ... or 32x32, got", load_scene, name, error=SceneError)
     refuses("city_scene: blocks must be 1 to 32, got 0", city_scene, blocks=0)
     refuses("city_scene: size must be >= 1, got 0", city_scene, 0)
+
+
+def test_a_rebuilt_block_changes_nothing_else(scene):
+    before, after = city(2), city(2, rebuilt=2)
+    changed = [
+        index for index, (a, b) in enumerate(zip(before, after)) if [s.centre for s in a] != [s.centre for s in b]
+    ]
+    assert changed == [3], "the ground comes first"
+    other = city_scene(20, blocks=2, train_views=2, test_views=1, rebuilt=2)
+    assert other.name == "builtin-city-2x2-rebuilt-2"
+    assert torch.equal(other.train.cameras.poses, scene.train.cameras.poses)
+    assert 0.02 < float((other.train.images != scene.train.images).any(-1).float().mean()) < 0.9
+    assert load_scene("builtin-city:1x1,rebuilt=0", downscale=50).name == "builtin-city-1x1-rebuilt-0"
+    for name in ("rebuilt=4", "rebuilt=", "rebuilt=-1", "other=1", ""):
+        line = "builtin-city: after the blocks must come rebuilt=0 to rebuilt=3, got"
+        refuses(line, load_scene, f"builtin-city:2x2,{name}", error=SceneError)
+    refuses("city_scene: rebuilt must be a block of 0 to 3, got 4", city_scene, blocks=2, rebuilt=4)

@@ -64,6 +64,13 @@ class Samples(NamedTuple):
         edges = None if self.edges is None else self.edges[rays]
         return Samples(inputs, number.index_select(0, index), offsets, depths, deltas, edges)
 
+    def part(self, rows: Tensor) -> Samples:
+        """Some of the samples, bool [m]; all rays stay."""
+        counts = torch.zeros_like(self.ray_offsets).index_add(0, self.ray_index[rows].long() + 1, rows[rows].int())
+        packed = (values[rows] for values in (self.inputs, self.ray_index, self.depths, self.deltas))
+        inputs, index, depths, deltas = packed
+        return Samples(inputs, index, counts.cumsum(0, dtype=torch.int32), depths, deltas)
+
     def by_ray(self, values: Tensor) -> Tensor:
         """Values [m, ...] as [r, s, ...], where all rays have as many samples; else as they are."""
         if self.edges is None:

@@ -6,6 +6,7 @@ Letters: r rays of a batch. Colours are in 0..1.
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from voronerf.data import Scene
 from voronerf.data.scene import Sightings
@@ -32,6 +33,7 @@ class RayBatches:
         device: Where batches live, and images that are in memory.
         cones: Whether the rays have radii.
         sightings: Whether a share of the rays, `SEEN`, are through sightings of points.
+        through: [2, 3], a box in that of the scene that rays must meet; None for all of it.
         backend: Of the ops.
     """
 
@@ -42,6 +44,7 @@ class RayBatches:
         *,
         cones: bool = False,
         sightings: bool = False,
+        through: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
         self.scene, self.backend = scene, backend
@@ -53,15 +56,15 @@ class RayBatches:
         self.pages = Pages(self.images) if scene.train.on_disk else None
         self.background = scene.background_colour(self.place)
         self.box = None if scene.box is None else scene.box.to(self.place)
-        self.useful = self._useful_pixels()
+        self.useful = self._useful_pixels(self.box if through is None else through.to(self.place))
         self.sightings = None
         if sightings and scene.train.sightings is not None:
             self.sightings = Sightings(*(tensor.to(self.place) for tensor in scene.train.sightings))
 
-    def _useful_pixels(self) -> Runs | None:
+    def _useful_pixels(self, box: Tensor | None) -> Runs | None:
         """The pixels to draw from; None when that is all of them."""
         cameras, masks = self.cameras, self.scene.train.masks
-        if self.box is None and masks is None and cameras.sizes is None:
+        if box is None and masks is None and cameras.sizes is None:
             return None
         found = []
         for image in range(len(cameras)):
@@ -69,9 +72,9 @@ class RayBatches:
             chosen = torch.ones(height, width, dtype=torch.bool, device=self.place)
             if masks is not None:
                 chosen &= masks[image, :height, :width].to(self.place)
-            if self.box is not None:
+            if box is not None:
                 rays = cameras.image_rays(image)
-                _, _, hit = intersect_box(rays.origins, rays.directions, self.box, self.scene.near, self.scene.far)
+                _, _, hit = intersect_box(rays.origins, rays.directions, box, self.scene.near, self.scene.far)
                 chosen &= hit.reshape(height, width)
             edges = torch.nn.functional.pad(chosen.to(torch.int8), (1, 1)).diff(dim=1)
             row, column = (edges == 1).nonzero(as_tuple=True)

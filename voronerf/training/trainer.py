@@ -57,6 +57,7 @@ from voronerf.training.divergence import (
     sum_of_gradients,
     why_scores_are_poor,
 )
+from voronerf.training.errors import usual_errors
 from voronerf.training.networks import (
     check_backend,
     check_memory,
@@ -172,6 +173,7 @@ class Trainer:
         self.metrics: list[dict[str, Any]] = []
         self.stopped = self._asked_to_stop = self.described = False
         self.loss = math.nan
+        self.errors: Tensor | None = None  # of each cell, see `usual_errors`
         self.writer = CheckpointWriter(self.out, config.keep_checkpoints, self.group)
         if checkpoint is not None:
             self._resume(checkpoint)
@@ -277,6 +279,7 @@ class Trainer:
         self.advance()
         while not self._check_moments():
             self.advance()
+        self._find_errors()
         self.save()
         if self.fraction >= 1:
             self.stopped = False  # a stop that came in the last step has nothing to end
@@ -604,6 +607,12 @@ class Trainer:
         if wait:
             self.writer.wait()
 
+    def _find_errors(self) -> None:
+        """Finds the errors that an update compares new pictures with; over ranks it finds them itself."""
+        if self.group.size == 1 and self.step:
+            with self.averaged():
+                self.errors = usual_errors(self.renderer, self.router, self.batches)
+
     def _state(self) -> Checkpoint:
         """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
         stored = state.Stored(
@@ -624,6 +633,8 @@ class Trainer:
             "reservoir": self.cells.reservoir.state_dict(),
             "generator": {"state": self.generator.get_state(), "draws": self.draws.get_state()},
         }
+        if self.errors is not None:
+            parts["errors"] = {"usual": self.errors}
         if self.occupancy is not None:
             parts["occupancy"] = self.occupancy.state_dict()
         if self.scaler.is_enabled():
