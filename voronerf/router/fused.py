@@ -368,8 +368,8 @@ def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None
     except Ungroupable:
         says = f"{name_of(node.target)}{node.meta['line']} meets parameters and has no rule for all cells at once"
         raise Unfusable(says) from None
-    made = map_tensors(result, lambda own: own.stacked if isinstance(own, PerCell) else own)
-    values[node] = args[0] if node.meta.get("inplace") else made
+    made = args[0] if node.meta.get("inplace") else result
+    values[node] = map_tensors(made, lambda own: own.stacked if isinstance(own, PerCell) else own)
 
 
 def _flat(value: Tensor, n: int) -> Tensor:
