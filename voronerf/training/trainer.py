@@ -163,6 +163,7 @@ class Trainer:
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
         self.step, self.seconds = 0, 0.0
+        self._rows: Tensor | None = None  # how many samples the last step had, where no host has read it
         #: Seconds of all evaluations but the last, and of a view in the latest.
         self.scoring, self.view_seconds = 0.0, 0.0
         self._passed = 0.0  # seconds that ranks have not been told of
@@ -337,7 +338,17 @@ class Trainer:
             TrainingError: When steps are skipped again and again, see :meth:`_go_back`.
         """
         started = self.clock()
-        self.loss, in_a_row = torch.stack((loss.float(), self.guard.in_a_row)).tolist()
+        figures = [loss.float(), self.guard.in_a_row]
+        if self._rows is not None:
+            figures.append(self._rows[0].float())
+        self.loss, in_a_row, *samples = torch.stack(figures).tolist()
+        if samples and self.occupancy is not None:
+            rays = next_rays(self.config, self.rays, int(samples[0]))
+            if self.config.cuda_graph:  # which is captured anew for other numbers of rays
+                rays -= rays % self.config.rays
+            if rays != self.rays:
+                self.rays = rays
+                self._begin_stage()
         if self.group.size == 1:
             self._count(started)
         if in_a_row >= PATIENCE:
@@ -407,8 +418,9 @@ class Trainer:
             judge(self.guard, told.total, [])
         else:
             loss, kept, samples, seen = found.loss.detach(), self.cells.heaviest(found), len(found.weights), None
+            self._rows = found.samples.rows
         self.cells.observe(found, seen)
-        if self.occupancy is not None:
+        if self.occupancy is not None and self._rows is None:
             self.rays = next_rays(config, self.rays, samples)
         # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
         if self.scaler.is_enabled():

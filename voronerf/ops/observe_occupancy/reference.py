@@ -27,11 +27,15 @@ class Observed(NamedTuple):
 def observe_occupancy(given: Observed) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
     rows, found = _found(given)
-    flat = given.density.view(-1)
+    count = given.density.numel()
+    rows = torch.where(given.deltas != 0, rows, count)  # one cell more, for samples that say nothing
+    density, occupied = (torch.nn.functional.pad(table.view(-1), (0, 1)) for table in (given.density, given.occupied))
     # A cell decays once, however often it occurs.
-    faded = flat.scatter(0, rows, flat[rows] * given.decay)
-    flat.copy_(faded.scatter_reduce(0, rows, found, "amax"))
-    given.occupied.view(-1)[rows] = flat[rows] >= given.threshold
+    faded = density.scatter(0, rows, density[rows] * given.decay)
+    raised = faded.scatter_reduce(0, rows, found, "amax")
+    occupied[rows] = raised[rows] >= given.threshold
+    given.density.view(-1).copy_(raised[:count])
+    given.occupied.view(-1).copy_(occupied[:count])
 
 
 def observe_told(given: Observed, told: Tensor, reached: Tensor | None) -> None:
@@ -58,7 +62,8 @@ def tell_observed(given: Observed, several: Tensor | None) -> Tensor:
     """Cell, as bits of float32, and density [c, 2] of samples; see ``voronerf.ops.tell_observed``."""
     rows, found = _found(given)
     told = torch.stack((rows.int().view(torch.float32), found), 1)
-    return told if several is None else told[several.view(-1)[rows]]
+    kept = given.deltas != 0
+    return told[kept if several is None else kept & several.view(-1)[rows]]
 
 
 def _found(given: Observed) -> tuple[Tensor, Tensor]:
