@@ -68,9 +68,9 @@ FUNCTIONS = {
     "sine": Function(lambda x, a, b: torch.sin(a * x + b)),
     "exp": Function(lambda x, a, b: x.exp()),
     "log": Function(lambda x, a, b: x.log()),
+    "power": Function(lambda x, a, b: x**a),
     "erf": Function(lambda x, a, b: x.erf()),
     "atan": Function(lambda x, a, b: x.atan()),
-    "power": Function(lambda x, a, b: x**a),
 }
 """By their names in the compiled module."""
 

@@ -152,12 +152,12 @@ VN_INLINE F32 gelu_by_tanh(F32 x) {
      splat(-a * a * a) * any_sine(fma(splat(a), x, splat(b)), true))                                                  \
   DO(exp, any_exponential(x), any_exponential(x), any_exponential(x), any_exponential(x))                             \
   DO(log, logarithm(x), one / x, zero - one / (x * x), splat(2.0f) / (x * x * x))                                     \
+  DO(power, raised(x, a, 0), raised(x, a - 1.0f, 1), raised(x, a - 2.0f, 2), raised(x, a - 3.0f, 3))                  \
   DO(erf, error_function(x), splat(2.82842712f) * density(splat(1.41421356f) * x),                                    \
      splat(-5.65685425f) * nearby(x) * density(splat(1.41421356f) * x),                                               \
      splat(5.65685425f) * fma(splat(2.0f) * nearby(x), nearby(x), splat(-1.0f)) * density(splat(1.41421356f) * x))    \
   DO(atan, arctangent(x), arctangent_slope(x), splat(-2.0f) * x * arctangent_slope(x) * arctangent_slope(x),          \
-     arctangent_slope(x) * arctangent_slope(x) * fma(splat(-8.0f), arctangent_slope(x), splat(6.0f)))                 \
-  DO(power, raised(x, a, 0), raised(x, a - 1.0f, 1), raised(x, a - 2.0f, 2), raised(x, a - 3.0f, 3))
+     arctangent_slope(x) * arctangent_slope(x) * fma(splat(-8.0f), arctangent_slope(x), splat(6.0f)))
 
 #define VN_FUNCTION(NAME, F0, F1, F2, F3)                                                          \
   struct NAME##_function {                                                                         \

@@ -74,7 +74,7 @@ def train(
         import_viewer().check_address(host, port)
     scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
     if explain:
-        unused = replace(config, out=config.out or Path("runs"), resume=False)
+        unused = replace(config, out=config.out or Path("runs"), resume=config.resume and config.out is not None)
         for line in Trainer(unused, scene).learner.explain().splitlines():
             say(line)
         return 0
