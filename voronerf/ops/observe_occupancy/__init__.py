@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import LIKE_FIRST, Checked, check_count, check_number, check_range, check_writable
+from voronerf.checks import LIKE_FIRST, Checked, check_count, check_number, check_range, check_writable, detached
 from voronerf.ops.observe_occupancy.reference import Observed
 
 _OP = backends.declare(
@@ -200,5 +200,5 @@ def _checked(
         check_number(op, name, number)
     if not 0 <= decay <= 1:
         raise ValueError(f"{op}: decay must lie in 0 to 1, got {decay}")
-    tensors = (tensor.detach() for tensor in (*grid, *samples))
+    tensors = [detached(tensor) for tensor in (*grid, *samples)]
     return given, Observed._make([*tensors, float(decay), float(threshold), float(hidden)])
