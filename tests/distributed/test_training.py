@@ -1,4 +1,4 @@
-"""Training over two ranks: as one process, memory, bytes, checkpoints, resumed runs."""
+"""Joint training: the same bits on any number of ranks, gradients, memory, bytes, checkpoints, resumed and moved runs."""
 
 import functools
 import json
@@ -10,35 +10,36 @@ import torch
 from helpers import refuses, same
 from ranks import on_ranks
 
-from voronerf import open_run
-from voronerf.data import builtin_scene
+from voronerf.data import builtin_scene, city_scene
 from voronerf.data.scene import Sightings
 from voronerf.distributed.group import joined
-from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
+from voronerf.training.checkpoint import CheckpointError, checkpoint_path, load_checkpoint, part_files
 from voronerf.training.config import TrainConfig
-from voronerf.training.trainer import Trainer
+from voronerf.training.joint import JointTrainer
 
 CONFIGS = {
     "nerf": {"field": "nerf", "samples": 24, "depth": 2, "cells": (3, 3), "min_cell_samples": 4},
     "dense": {"field": "nerf", "samples": 24, "depth": 2, "cells": (4,), "occupancy": False, "sightings": 0.1},
     "hashgrid": {"cells": (4,)},
-    "contracted": {"cells": (4,), "contraction": "sphere", "occupancy_resolution": 32},
+    "contracted": {"cells": (4,), "contraction": "sphere", "occupancy_resolution": 32, "assignment": "stochastic"},
+    "cones": {"field": "mipnerf", "samples": 24, "depth": 2, "cells": (2,), "init": "random"},
 }
 
 
-def settings(out, name):
-    config = CONFIGS[name]
-    return TrainConfig(
-        out=out,
-        steps=20,
-        split_at_steps=(8, 14)[: len(config["cells"])],
-        width=16,
-        rays=128,
-        evaluations=1,
-        final_views=1,
-        reservoir_batches=10,
-        **config,
-    )
+def settings(out, name, **more):
+    given = {
+        "steps": 20,
+        "split_at_steps": (8, 14)[: len(CONFIGS[name]["cells"])],
+        "width": 16,
+        "rays": 64,
+        "territories": 4,
+        "evaluations": 1,
+        "final_views": 2,
+        "reservoir_batches": 10,
+        **CONFIGS[name],
+        **more,
+    }
+    return TrainConfig(out=out, **given)
 
 
 def scene():
@@ -53,85 +54,57 @@ def stop_at(trainer, step, progress):
         trainer.request_stop()
 
 
-def train(folder, configs, stop=None):
+def train(folder, configs, stop=None, balance=None):
     """Trains configurations one after the other; writes what each rank held and sent."""
-    with joined(torch.device("cpu")) as group:
+    with joined(torch.device("cpu")) as group, pytest.MonkeyPatch.context() as patch:
+        if balance is not None:
+            patch.setattr("voronerf.training.joint.BALANCE_EVERY", balance)
+            patch.setattr("voronerf.training.joint.HEAVIEST", 1.0)
         for name, config in configs.items():
             group.sent.clear()
-            trainer = Trainer(config, scene(), group=group)
+            trainer = JointTrainer(config, scene(), group=group)
             trainer.on_step = functools.partial(stop_at, trainer, stop)
             trainer.run()
-            held = list(trainer.router.parameters())
-            held += [v for state in trainer.optimizer.state.values() for v in state.values()]
-            found = {"cells": trainer.router.num_cells, "held": sum(v.numel() for v in held), "sent": group.sent}
+            held = [p for each in trainer.trainers.values() for p in each.router.parameters()]
+            found = {"own": list(trainer.trainers), "held": sum(v.numel() for v in held), "sent": group.sent}
             (folder / f"{name}-{group.rank}.json").write_text(json.dumps(found))
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Runs of one process and of two ranks."""
+    """Runs of one process, and of two and four ranks."""
     folder = tmp_path_factory.mktemp("ranks")
-    codes, _ = on_ranks(train, folder, {n: settings(folder / f"two-{n}", n) for n in CONFIGS}, folder=folder)
-    assert codes == [0, 0]
     for name in CONFIGS:
-        Trainer(settings(folder / f"one-{name}", name), scene()).run()
+        JointTrainer(settings(folder / f"1-{name}", name), scene()).run()
+    for size in (2, 4):
+        each = {name: settings(folder / f"{size}-{name}", name) for name in CONFIGS}
+        codes, _ = on_ranks(train, folder, each, folder=folder, size=size)
+        assert codes == [0] * size
     return folder
 
 
-def tensors(run):
-    return load_checkpoint(checkpoint_path(run)).tensors
+def parts(run):
+    """The tensors of all territories."""
+    path = checkpoint_path(run)
+    files = part_files(load_checkpoint(path, keep=lambda name: not name.startswith("part-")).values)
+    found = [load_checkpoint(path.with_name(file)).tensors for file in files]
+    return {f"{number}.{name}": tensor for number, part in enumerate(found) for name, tensor in part.items()}
+
+
+def assert_same(first, second):
+    assert first.keys() == second.keys()
+    different = [name for name in first if not torch.equal(first[name].nan_to_num(), second[name].nan_to_num())]
+    assert not different
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_two_ranks_are_one_process(runs, name):
-    one, two = tensors(runs / f"one-{name}"), tensors(runs / f"two-{name}")
-    assert two.keys() - one.keys() == {"sharing.owner", "sharing.weights"}
-    for key, expected in one.items():
-        if not expected.is_floating_point():
-            assert torch.equal(two[key], expected), key
-        else:
-            assert (two[key] - expected).norm() <= 1e-5 * expected.norm(), key
-    first, second = (open_run(runs / f"{count}-{name}", scene=scene()) for count in ("one", "two"))
-    assert torch.allclose(first.render(0).colour, second.render(0).colour, atol=1e-4)
-    files = [{str(p.relative_to(run.path)) for p in run.path.rglob("*.*")} for run in (first, second)]
-    assert all(name.startswith("checkpoints/cells-") for name in files[0] ^ files[1])
-    scores = [json.loads((run.path / "summary.json").read_text()) for run in (first, second)]
-    # Pictures of one process end rays at opaque surfaces.
-    assert scores[0]["psnr"] == pytest.approx(scores[1]["psnr"], abs=0.02)
-    assert scores[0]["parameters"] == scores[1]["parameters"] and scores[0]["cells"] == scores[1]["cells"]
-
-
-def test_what_a_rank_holds_and_sends(runs):
-    """Its own cells, and 28 bytes a run there and back with some room, where points are learnt from too."""
-    one = tensors(runs / "one-dense")
-    whole = sum(v.numel() for k, v in one.items() if k.startswith(("router.module.", "optimizer.")))
-    for rank in (0, 1):
-        found = json.loads((runs / f"dense-{rank}.json").read_text())
-        assert found["cells"] == 2 and found["held"] < 0.6 * whole
-        assert 0 < found["sent"]["sums"] <= 20 * 128 * 64
-
-
-def test_resumed_on_other_numbers_of_ranks(runs, tmp_path):
-    """The same number goes on bit for bit; another one, also a single process, as it would have but for rounding."""
-    half = settings(tmp_path / "half", "nerf")
-    codes, _ = on_ranks(train, tmp_path, {"half": half}, 11, folder=tmp_path)
-    assert codes == [0, 0] and load_checkpoint(checkpoint_path(half.out)).values["step"] == 12
-    files = sorted(path.name.split("-")[0] for path in (half.out / "checkpoints").iterdir())
-    assert files == ["cells", "cells", "last.safetensors"]
-    expected = tensors(runs / "two-nerf")
-    for ranks in (2, 3, 1):
-        config = replace(half, out=tmp_path / f"to-{ranks}", resume=True)
-        shutil.copytree(half.out, config.out)
-        if ranks == 1:
-            Trainer(config, scene()).run()
-        else:
-            assert on_ranks(train, tmp_path, {"rest": config}, folder=tmp_path, size=ranks)[0] == [0] * ranks
-        found = tensors(config.out)
-        if ranks == 2:
-            assert same(found, expected)
-        for key, value in expected.items():
-            if value.is_floating_point() and not key.startswith("sharing"):
-                assert (found[key] - value).norm() <= 1e-5 * value.norm(), (ranks, key)
-    shard = next(path for path in half.out.rglob("cells-*"))
-    shard.rename(shard.with_name("elsewhere"))
-    refuses(f"{shard}: there is no checkpoint", load_checkpoint, checkpoint_path(half.out))
+def test_ranks_are_one_process_to_the_bit(runs, name):
+    one = parts(runs / f"1-{name}")
+    assert any(key.endswith("router.diagram.centres") and len(value) > 1 for key, value in one.items())
+    for size in (2, 4):
+        assert_same(one, parts(runs / f"{size}-{name}"))
+    files = [{p.name.split("-")[0] for p in (runs / f"{size}-{name}").rglob("*.*")} for size in (1, 2, 4)]
+    assert files[0] == files[1] == files[2]
+    scores = [json.loads((runs / f"{size}-{name}" / "summary.json").read_text()) for size in (1, 2, 4)]
+    for key in ("psnr", "ssim", "parameters", "cells", "splits_left"):
+        assert scores[0][key] == scores[1][key] == scores[2][key], key

@@ -93,6 +93,10 @@ class TrainConfig:
     """Each cell has all parameters of its network for itself: with hashgrid a table of features too, which the cells
     share otherwise."""
 
+    territories: int | None = None
+    """Parts of space that are trained as scenes of their own, with cells, table, views and rays of their own; rays that
+    cross their borders are put together. All other settings are those of one of them. They are what processes share
+    out: default 1, with several processes the least power of two that gives each one."""
     cells: tuple[int, ...] = (16,)
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, no number is one network."""
     split_at: tuple[float, ...] | None = None

@@ -37,7 +37,7 @@ STREET_ANGLE, ABOVE_ANGLE = 1.2, 0.75  # fields of view, radians
 def city_scene(
     size: int = 100,
     *,
-    blocks: int = 1,
+    blocks: int | tuple[int, int] = 1,
     train_views: int = TRAIN_VIEWS,
     test_views: int = TEST_VIEWS,
     images: str = "memory",
@@ -46,7 +46,7 @@ def city_scene(
 
     Args:
         size: of the square images, pixels.
-        blocks: on each side, 1 to 32.
+        blocks: on each side, or along x and along y, 1 to 32.
         train_views: of each block, every other one from its streets and the rest from above.
         test_views: of each block, at other places than the training views.
         images: "memory"; "cached", which also keeps them in a store of the cache, where a next call finds them; or
@@ -65,20 +65,22 @@ def city_scene(
     for name, value in (("size", size), ("train_views", train_views), ("test_views", test_views)):
         if value < 1:
             raise ValueError(f"city_scene: {name} must be >= 1, got {value}")
-    if not 1 <= blocks <= MOST:
+    sides = (blocks, blocks) if isinstance(blocks, int) else tuple(blocks)
+    if len(sides) != 2 or not 1 <= min(sides) <= max(sides) <= MOST:
         raise ValueError(f"city_scene: blocks must be 1 to {MOST}, got {blocks}")
     if images not in ("memory", "cached", "disk"):
         raise ValueError(f"city_scene: images must be memory, cached or disk, got {images!r:.60}")
-    groups, name = city(blocks), f"builtin-city-{blocks}x{blocks}"
+    groups, name = city(sides), f"builtin-city-{sides[0]}x{sides[1]}"
+    made_of = sides[0] if sides[0] == sides[1] else list(sides)
     solids = [solid for group in groups for solid in group]
     box = bounds(solids)
     look = functools.partial(see, solids=solids, hits=block_caster(groups))
 
     def views(part: str, seed: int, count: int) -> Split:
-        cameras = city_cameras(size, blocks, count, seed)
+        cameras = city_cameras(size, sides, count, seed)
 
         def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
-            found = stored(f"{name}-{part}", [blocks, size, count, seed], FORMULA, shape, make, os.cpu_count() or 1)
+            found = stored(f"{name}-{part}", [made_of, size, count, seed], FORMULA, shape, make, os.cpu_count() or 1)
             return found if images == "disk" else found.clone()
 
         kept = None if images == "memory" else keep
@@ -86,30 +88,30 @@ def city_scene(
         return replace(found, on_disk=images == "disk")
 
     train, test = views("train", 0, train_views), views("test", 1, test_views)
-    far = math.hypot(blocks, blocks) + 3
+    far = math.hypot(*sides) + 3
     return Scene(name, train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
 
 
 def city_of(size: int, blocks: str, images: str) -> Scene:
-    """The city of blocks such as "4x4"; in the cache if it is larger than one block.
+    """The city of blocks such as "4x4" or "4x8"; in the cache if it is larger than one block.
 
     Raises:
         SceneError: other blocks than these.
     """
-    found = re.fullmatch(r"([1-9]\d?)x\1", blocks)
-    if found is None or int(found[1]) > MOST:
-        raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, ... or {MOST}x{MOST}, got {blocks!r:.60}")
+    found = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", blocks)
+    if found is None or max(int(found[1]), int(found[2])) > MOST:
+        raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {blocks!r:.60}")
     where = "disk" if images == "disk" else "memory" if blocks == "1x1" else "cached"
-    return city_scene(size, blocks=int(found[1]), images=where)
+    return city_scene(size, blocks=(int(found[1]), int(found[2])), images=where)
 
 
-def city_cameras(size: int, blocks: int, views: int, seed: int) -> Cameras:
+def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> Cameras:
     """The cameras of each block in turn: from the middle of a street beside it, and from above its roofs."""
     random = np.random.default_rng((seed, 2))
     eyes, aims, angles = [], [], []
-    for row in range(blocks):
-        for column in range(blocks):
-            middle = np.array((column + 0.5 - blocks / 2, row + 0.5 - blocks / 2, 0))
+    for row in range(blocks[1]):
+        for column in range(blocks[0]):
+            middle = np.array((column + 0.5 - blocks[0] / 2, row + 0.5 - blocks[1] / 2, 0))
             for view in range(views):
                 eye, aim = (_in_the_street if view % 2 == 0 else _above)(random)
                 eyes.append(middle + eye)
