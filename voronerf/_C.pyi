@@ -29,7 +29,8 @@ class AdamGuard(NamedTuple):
     scale: Tensor | None  # const float32*
 
 class AdamRule(NamedTuple):
-    rate: Tensor | None  # const float32*
+    rate: float  # float64
+    rate_at: Tensor | None  # const float32*
     step: Tensor | None  # float32*
     decay: float  # float64
     decay_sq: float  # float64
@@ -345,11 +346,12 @@ class SparseAdam(NamedTuple):
 
 TableType: tuple[str, ...]  # float32 bfloat16 float16
 
-# SparseAdam[], const float32**, float32**, float32**, float32**, int64[], Cpu
-def adam(_0: Sequence[SparseAdam], _1: Sequence[Tensor | None] | None, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[int], _6: Cpu) -> None: ...
-
+# AdamRule[], AdamGuard, const float32**, float32**, float32**, float32**, int64[], Cpu
+@overload
+def adam(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Cpu) -> None: ...
 # AdamRule[], AdamGuard, const float32**, float32**, float32**, float32**, int64[], float32*, Cuda
-def adam_on_device(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Tensor | None, _8: Cuda) -> None: ...
+@overload
+def adam(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Tensor | None, _8: Cuda) -> None: ...
 
 # any*, int64
 def advise_huge_pages(_0: Tensor | None, _1: int) -> None: ...

@@ -179,7 +179,8 @@ class Builder:
         self.inputs, self.parameters = list(program.inputs), list(program.parameters)
         self.steps = list(program.steps)
         self.sums = list(program.sums)
-        self._values = max((step.out + 1 for step in self.steps if not _sums(step)), default=0)
+        self._makers = {step.out: step for step in self.steps if not _sums(step)}
+        self._values = max(self._makers, default=-1) + 1
         self._made: dict[Step, Columns] = {}
 
     def program(self, outputs: Iterable[Columns]) -> Program:
@@ -199,6 +200,7 @@ class Builder:
         if key not in self._made:
             self._made[key] = Columns(VALUE, self._values, 0, width)
             self.steps.append(key._replace(out=self._values))
+            self._makers[self._values] = self.steps[-1]
             self._values += 1
         return self._made[key]
 
@@ -229,6 +231,10 @@ class Builder:
             return None
         if order == 1 and times is not None and name in ("copy", "affine"):
             return times if name == "copy" or a == 1 else self.function("affine", times, a)
+        before = self._makers[x.index] if x.of == VALUE and order == 0 and name in ("affine", "sine") else None
+        if before is not None and before.name == "affine" and before.numbers[0] == 0 and len(before.operands) == 1:
+            x = before.operands[0].part(x.start, x.width)._replace(spread=x.spread or before.operands[0].spread)
+            a, b = a * before.numbers[1], a * before.numbers[2] + b
         operands = (x,) if times is None else (x, times)
         return self.emit("function", x.width, operands, (order, float(a), float(b)), name)
 

@@ -8,14 +8,11 @@
 
 namespace voronerf {
 
-// sparse_adam_cpu of each parameter, by its own rule.
-void adam_cpu(const std::vector<SparseAdam>& rules, const float* const* gradients, float* const* parameters,
-              float* const* means, float* const* squares, const std::vector<int64_t>& sizes, Isa isa, int threads);
-
-// The rule of a parameter whose numbers are on the device, where no host reads them.
+// The rule of a parameter. Its step is on the device, and its rate may be: on CUDA no host reads them.
 struct AdamRule {
-  const float* rate;  // [1], the learning rate
-  float* step;        // [1], steps done; goes up by one unless the step is left out
+  double rate;           // the learning rate, where rate_at is null
+  const float* rate_at;  // [1], or null
+  float* step;           // [1], steps done; goes up by one unless the step is left out
   double decay, decay_sq, epsilon;
   bool every;  // as of SparseAdam
 };
@@ -27,8 +24,12 @@ struct AdamGuard {
   float limit;
   float* found;               // [1], or null for never
   float *skipped, *in_a_row;  // [1], how many steps were left out, and of the last ones; null without a loss
-  const float* scale;         // [1], of which the gradients are multiples, or null
+  const float* scale;         // [1], of which the gradients are multiples, or null; on CUDA
 };
+
+void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
+              float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
+              Isa isa, int threads);
 
 // The same on CUDA in two launches. corrected: [2, number of parameters], working memory.
 void adam_cuda(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,

@@ -1,5 +1,6 @@
 // Blocks of entries over threads. An entry depends on itself alone, so results do not depend on the threads.
 #include <algorithm>
+#include <cmath>
 
 #include "common/parallel.h"
 #include "encoding/adam.h"
@@ -16,6 +17,34 @@ void run_block(Isa isa, const SparseAdam& rule, const float* gradient, float* pa
   VN_FOR_ISA(isa, sparse_adam_block(rule, gradient, parameter, mean, square, begin, end))
 }
 
+bool all_below(Isa isa, float limit, const float* gradient, int64_t n) {
+  VN_FOR_ISA(isa, sparse_adam_all_below(limit, gradient, n))
+}
+
+// Whether a step is left out, which is counted.
+bool left_out(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
+              const std::vector<int64_t>& sizes, Isa isa) {
+  if (guard.loss != nullptr) {
+    bool fine = std::fabs(*guard.loss) < guard.limit;
+    for (size_t i = 0; i < sizes.size() && fine; ++i) {
+      fine = !rules[i].every || all_below(isa, guard.limit, gradients[i], sizes[i]);
+    }
+    *guard.found = fine ? 0.0f : 1.0f;
+    *guard.skipped += *guard.found;
+    *guard.in_a_row = (*guard.in_a_row + 1.0f) * *guard.found;
+  }
+  return guard.found != nullptr && *guard.found != 0.0f;
+}
+
+// What a step of a rule is, which is counted.
+SparseAdam corrected(const AdamRule& rule) {
+  const double step = static_cast<double>(*rule.step += 1.0f);
+  const double root = std::pow(1.0 - std::pow(rule.decay_sq, step), 0.5);
+  const double rate = rule.rate_at == nullptr ? rule.rate : *rule.rate_at;
+  return {static_cast<float>(rate * root / (1.0 - std::pow(rule.decay, step))), static_cast<float>(rule.decay),
+          static_cast<float>(rule.decay_sq), static_cast<float>(rule.epsilon * root), rule.every};
+}
+
 }  // namespace
 
 void sparse_adam_cpu(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
@@ -25,8 +54,12 @@ void sparse_adam_cpu(const SparseAdam& rule, const float* gradient, float* param
   });
 }
 
-void adam_cpu(const std::vector<SparseAdam>& rules, const float* const* gradients, float* const* parameters,
-              float* const* means, float* const* squares, const std::vector<int64_t>& sizes, Isa isa, int threads) {
+void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
+              float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
+              Isa isa, int threads) {
+  if (left_out(rules, guard, gradients, sizes, isa)) return;
+  std::vector<SparseAdam> steps;
+  for (const AdamRule& rule : rules) steps.push_back(corrected(rule));
   struct Block {
     size_t tensor;
     int64_t begin;
@@ -37,7 +70,7 @@ void adam_cpu(const std::vector<SparseAdam>& rules, const float* const* gradient
   }
   parallel_for(static_cast<int64_t>(blocks.size()), 1, threads, [&](int64_t number) {
     const auto [i, begin] = blocks[number];
-    run_block(isa, rules[i], gradients[i], parameters[i], means[i], squares[i], begin,
+    run_block(isa, steps[i], gradients[i], parameters[i], means[i], squares[i], begin,
               std::min(sizes[i], begin + kBlock));
   });
 }

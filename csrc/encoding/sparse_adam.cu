@@ -16,7 +16,7 @@ namespace {
 constexpr int kThreads = 256;
 constexpr int kPrepareThreads = 1024;
 constexpr int kRun = 4 * kThreads;  // entries of a block
-constexpr int kMost = 40;           // parameters of a launch: their pointers are its arguments, of which 4 KB fit
+constexpr int kMost = 36;           // parameters of a launch: their pointers are its arguments, of which 4 KB fit
 
 __device__ __forceinline__ void update_entry(const SparseAdam& rule, float g, float* parameter, float* mean,
                                              float* square, int64_t i) {
@@ -54,7 +54,8 @@ __global__ void __launch_bounds__(kPrepareThreads)
   if (static_cast<int>(threadIdx.x) < tensors.count) {
     const AdamRule& rule = tensors.of[threadIdx.x].rule;
     const double step = static_cast<double>(*rule.step) + 1.0, root = sqrt(1.0 - pow(rule.decay_sq, step));
-    corrected[2 * threadIdx.x] = static_cast<float>(*rule.rate * root / (1.0 - pow(rule.decay, step)));
+    const double rate = rule.rate_at == nullptr ? rule.rate : *rule.rate_at;
+    corrected[2 * threadIdx.x] = static_cast<float>(rate * root / (1.0 - pow(rule.decay, step)));
     corrected[2 * threadIdx.x + 1] = static_cast<float>(rule.epsilon * root);
   }
   if (guard.loss == nullptr) return;

@@ -82,5 +82,11 @@ void sparse_adam_block(const SparseAdam& rule, const float* gradient, float* par
   __builtin_memcpy(square + line, rest[3], bytes);
 }
 
+bool sparse_adam_all_below(float limit, const float* gradient, int64_t n) {
+  int beyond = 0;
+  for (int64_t i = 0; i < n; ++i) beyond |= !(__builtin_fabsf(gradient[i]) < limit);  // true for NaN
+  return beyond == 0;
+}
+
 }  // namespace VN_ISA_NAMESPACE
 }  // namespace voronerf

@@ -139,10 +139,10 @@ def step(module):
     gradient[::3] = 0
     module.sparse_adam(rule, *every((gradient, floats(700), floats(700), floats(700))), 700, gpu)
     sizes = [1100, 33, 1100]  # ThreadSanitizer knows some thousand threads of a launch
-    rules = [module.AdamRule(at(floats(1)), at(floats(1)), 0.9, 0.99, 1e-8, n > 33) for n in sizes]
+    rules = [module.AdamRule(0.0, at(floats(1)), at(floats(1)), 0.9, 0.99, 1e-8, n > 33) for n in sizes]
     tensors = [[floats(n) for n in sizes] for _ in range(4)]
     guard = module.AdamGuard(at(floats(1)), 9.0, *every([floats(1) for _ in range(4)]))
-    module.adam_on_device(rules, guard, *map(every, tensors), sizes, at(unwritten(2 * len(sizes))), gpu)
+    module.adam(rules, guard, *map(every, tensors), sizes, at(unwritten(2 * len(sizes))), gpu)
     marched(module, 7, 70)
     ends, first = np.cumsum(RANDOM.integers(1, 9, 40)), RANDOM.integers(0, 1, 99).astype(np.int32)
     drawn, uniforms = np.full(300, -7777), unwritten(300, 3)

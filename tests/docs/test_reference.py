@@ -14,7 +14,7 @@ import torch
 
 PAGES = Path(__file__).resolve().parents[2] / "docs" / "reference"
 PACKAGES = ("voronerf", *(f"voronerf.{name}" for name in ("ops", "diagram", "router", "fields", "rendering", "data")))
-PACKAGES += ("voronerf.evaluation", "voronerf.training", "voronerf.export")
+PACKAGES += ("voronerf.evaluation", "voronerf.step", "voronerf.training", "voronerf.export")
 
 
 def resolve(path: str) -> Any:

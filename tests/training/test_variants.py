@@ -112,7 +112,8 @@ def test_coarse_and_fine_inherit_alike(tmp_path, scene):
 def test_importance_is_that_of_the_last_pass(tmp_path, scene, monkeypatch):
     trainer = stopping(small(tmp_path, **HIERARCHICAL, reservoir=50, reservoir_batches=1, split_at=(0.9,)), scene, 1)
     results, run = [], trainer.learner.run
-    monkeypatch.setattr(trainer.learner, "run", lambda *a: results.append((a[0], run(*a))) or results[-1][1])
+    keep = lambda *a, **options: results.append((a[0], run(*a, **options))) or results[-1][1]  # noqa: E731
+    monkeypatch.setattr(trainer.learner, "run", keep)
     render = trainer.renderer.render
     passes = []
     monkeypatch.setattr(trainer.renderer, "render", lambda *a, **k: passes.append(render(*a, **k)) or passes[-1])

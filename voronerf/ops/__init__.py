@@ -34,7 +34,7 @@ from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradie
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.select_heaviest import select_heaviest
-from voronerf.ops.sparse_adam import Rule, adam, sparse_adam
+from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 from voronerf.ops.update_occupancy import update_occupancy
 
@@ -42,6 +42,7 @@ __all__ = [
     "MLP",
     "CentreGrid",
     "Composite",
+    "Guard",
     "HashGrid",
     "Layer",
     "March",

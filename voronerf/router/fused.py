@@ -9,6 +9,7 @@ Letters: n samples, k cells, w columns.
 
 from __future__ import annotations
 
+import contextlib
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,12 +25,39 @@ from voronerf.router.grouped import GroupedRun, PerCell, for_all_cells, name_of
 from voronerf.router.grouping import Grouping, owned_parameters
 from voronerf.router.layout import Call, Results, map_tensors, map_tree, tensors_of
 from voronerf.router.lower import Entries, Lowering, NotAStep
-from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable
+from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
 
 
 def fuse(call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> Fused:
     """The fused way of a call, traced for the first cell on some rows of its arguments, or raises Unfusable."""
     return Fused(call, given, assume)
+
+
+class Taken:
+    """A parameter of a program: entries of a parameter of the module.
+
+    Args:
+        of: A node of the trace whose value it is, or a tensor.
+        codes: [o, i] or [w], the number of each entry among those of one cell.
+    """
+
+    def __init__(self, of: Any, codes: Tensor) -> None:
+        self._of, self._shape, numbers = of, codes.shape, codes.flatten()
+        self._of_cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
+        every = torch.arange((of.meta["value"] if isinstance(of, fx.Node) else of).numel())
+        self._whole = torch.equal(numbers, every)
+        self._turned = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
+        self._numbers = numbers
+
+    def of_values(self, values: Mapping[Any, Any]) -> Tensor:
+        """Its entries, [k, ...], or [1, ...] where cells share it."""
+        value = values.get(self._of, self._of)
+        flat = value.flatten(1) if self._of_cells else value.reshape(1, -1)
+        if self._whole:
+            return flat.reshape(-1, *self._shape)
+        if self._turned:
+            return flat.reshape(-1, *self._shape[::-1]).transpose(1, 2)
+        return flat.index_select(1, self._numbers.to(flat.device)).reshape(-1, *self._shape)
 
 
 @dataclass
@@ -38,7 +66,7 @@ class Run:
 
     program: Program
     inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
-    parameters: list[tuple[Any, Tensor]] = field(default_factory=list)  # nodes or tensors, and numbers of entries
+    parameters: list[Taken] = field(default_factory=list)
     outputs: list[Any] = field(default_factory=list)
 
 
@@ -57,11 +85,12 @@ class Fused:
     def __init__(self, call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> None:
         self._module = call.module
         trace = Trace(call, given, assume)
-        self._n, self._inputs, self._parameters = trace.n, trace.inputs, trace.parameters
+        self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
         self._result, self._outputs = trace.result, trace.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
+        self._recorded = any(node.meta.get("grad") for node in trace.graph.nodes)
         self._lowering = Lowering(trace.rows)
         self._entries: dict[fx.Node, Entries] = {}  # of values that steps make or move
         self._ready: dict[fx.Node, int] = {}  # of what PyTorch makes: the first run that can read it
@@ -80,7 +109,7 @@ class Fused:
         self._sorted = any(self._meets_cells(node) for node in self._between)
         lines: dict[str, dict[str, None]] = {}  # of the module, with the functions that are no steps
         for node in self._between:
-            if node in self._why:
+            if node in self._why and node.target is not differentiable:
                 lines.setdefault(node.meta["line"], {})[name_of(node.target)] = None
         said = [f"{', '.join(functions)}{line}" for line, functions in lines.items()]
         self.name = "fused in runs" if len(self._runs) > 1 or said else "fused"
@@ -101,9 +130,8 @@ class Fused:
             return
         try:
             self._lower(node)
-        except (NotAStep, RuntimeError, TypeError, IndexError, ValueError) as error:
-            why = str(error) if isinstance(error, NotAStep) else type(error).__name__
-            self._why[node] = f"{name_of(node.target)}{node.meta['line']}, which is no step: {why}"
+        except NotAStep as error:
+            self._why[node] = f"{name_of(node.target)}{node.meta['line']}, which is no step: {error}"
             self._ready[node] = max((self._at(source) for source in node.all_input_nodes), default=0)
             for value in node.meta["results"]:
                 self._ready[value] = self._ready[node]
@@ -142,6 +170,8 @@ class Fused:
 
         if getattr(node.target, "__name__", "") == "apply":
             raise NotAStep("a custom function")
+        if node.target in (torch.autograd.grad, differentiable):
+            raise NotAStep("a gradient")
         if any(source.meta.get("value") is None for source in node.all_input_nodes):
             raise NotAStep("a part of a result")
         args, kwargs = map_arg((node.args, node.kwargs), own)
@@ -150,14 +180,15 @@ class Fused:
             return self._known(values[id(value)]) if id(value) in values else None
 
         function: Any = node.target
+        written: Any = node.args[0] if node.meta["inplace"] else None
+        before = written and Entries(self._known(written).codes.clone(), self._known(written).of)
         # As an ordinary dict, of which a changed copy can be made.
         result, args, entries = self._lowering.run(function, args, dict(kwargs), known)
-        found = [args[0]] if node.meta["inplace"] else tensors_of(result)
-        made = [entries(tensor) for tensor in found]
+        made = [entries(tensor) for tensor in ([args[0]] if written else tensors_of(result))]
+        if written:  # what shares memory with the tensor has the codes of after, too
+            self._entries[written] = before
         for value, known_as in zip(node.meta["results"], made, strict=True):
-            if known_as is None or known_as.of is not None:
-                raise NotAStep("a result without samples")
-            if torch.is_grad_enabled() and not node.meta["grad"]:
+            if self._recorded and not node.meta["grad"]:
                 places, numbers = self._lowering.order(known_as.codes)
                 b = self._lowering.builder
                 stopped = b.apply("stop", self._lowering.operand(numbers))
@@ -246,11 +277,16 @@ class Fused:
         owned = self._owned
         if call.module is not self._module:  # a copy of the module, with parameters of its own
             owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
-        values: dict[Any, Any] = {self._n: rows[0].shape[0]}
+        values: dict[Any, Any] = {self._n: rows[0].shape[0], **dict(zip(self._shared, call.shared(), strict=True))}
         values.update(zip(self._inputs, [x.clone() for x in rows] if self._writes else rows))
         for node, place in self._parameters.items():
             owner, name = owned[place]
             values[node] = owner._parameters[name]
+        with torch.set_grad_enabled(self._recorded):
+            self._compute(values, grouping, sort)
+        return Results(self._result, [values[node] for node in self._outputs], grouping if sort else None)
+
+    def _compute(self, values: dict[Any, Any], grouping: Grouping, sort: bool) -> None:
         self._compute_weights(values)
         grouped = GroupedRun(grouping, {}) if self._sorted else None
         last = max(self._runs, default=-1)
@@ -260,14 +296,12 @@ class Fused:
                     _compute(node, values, grouped)
             if number in self._runs:
                 self._compute_run(self._runs[number], values, grouping, None if sort else grouping.source)
-        found = [values[node] for node in self._outputs]
-        return Results(self._result, found, grouping if sort else None)
 
     def _compute_run(self, run: Run, values: dict[Any, Any], grouping: Grouping, order: Tensor | None) -> None:
         n = values[self._n]
         rows = [_flat(values[source], n) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
-        parameters = [_taken(values.get(of, of), of, codes).to(dtype) for of, codes in run.parameters]
+        parameters = [taken.of_values(values).to(dtype) for taken in run.parameters]
         found = grouped_program(
             [x.to(dtype) for x in rows],
             parameters,
@@ -312,7 +346,7 @@ def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outp
     def parameter(index: int) -> int:
         if index not in parameters:
             parameters[index] = b.parameter(*lowering.builder.parameters[index])
-            run.parameters.append(lowering.parameters[index])
+            run.parameters.append(Taken(*lowering.parameters[index]))
         return parameters[index]
 
     def columns(c: Columns) -> Columns:
@@ -345,11 +379,9 @@ def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun | None) 
         return value
 
     args, kwargs = map_arg((node.args, node.kwargs), given)
-    if grouped is None:
+    recorded = torch.is_grad_enabled() and node.meta.get("grad", True)
+    with grouped or contextlib.nullcontext(), torch.set_grad_enabled(recorded):
         result = node.target(*args, **kwargs)  # type: ignore[operator]
-    else:
-        with grouped, torch.set_grad_enabled(torch.is_grad_enabled() and node.meta.get("grad", True)):
-            result = node.target(*args, **kwargs)  # type: ignore[operator]
     values[node] = args[0] if node.meta.get("inplace") else result
 
 
@@ -359,20 +391,6 @@ def _flat(value: Tensor, n: int) -> Tensor:
         at = next(d for d, size in enumerate(value.shape) if size == n)
         value = value.movedim(at, 0)
     return value.reshape(n, -1) if n else value.reshape(0, max(value.shape[1:].numel(), 1))
-
-
-def _taken(value: Tensor, of: Any, codes: Tensor) -> Tensor:
-    """Entries of a parameter, [k, ...], or [1, ...] of one that cells share."""
-    cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
-    flat = value.flatten(1) if cells else value.reshape(1, -1)
-    numbers = codes.flatten()
-    if len(numbers) == flat.shape[1] and torch.equal(numbers, torch.arange(len(numbers))):
-        return flat.reshape(-1, *codes.shape)
-    if codes.dim() == 2 and len(numbers) == flat.shape[1]:
-        o, i = codes.shape
-        if torch.equal(codes.t().flatten(), torch.arange(len(numbers))):
-            return flat.reshape(-1, i, o).transpose(1, 2)
-    return flat.index_select(1, numbers.to(flat.device)).reshape(-1, *codes.shape)
 
 
 def _sample_dimension(shape: torch.Size, rows: int) -> int:

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import inspect
 import math
+import types
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -241,6 +242,19 @@ class Call:
         values = [map_tree(value, changed, name) for name, value in given]
         return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
 
+    def shared(self) -> list[Tensor]:
+        """The arguments that are the same for all samples, once it is known which they are."""
+        found: list[Tensor] = []
+
+        def note(name: str, value: Any, nested: bool) -> Any:
+            if self.kinds.get(name) == SHARED:
+                found.append(value)
+            return value
+
+        for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
+            map_tree(value, note, name)
+        return found
+
     def arranged(self, grouping: Grouping | None) -> list[Tensor]:
         """The rows of the arguments as the module sees them, in the order of a grouping, or for None as they came."""
         layout, n = self.layout, self.layout.n if grouping is None else grouping.n
@@ -337,7 +351,14 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Te
 
 
 def argument_names(function: Callable[..., Any]) -> list[str]:
-    """Names of the positional arguments of a function."""
+    """Names of the positional arguments of a function, of a class's methods found out once."""
+    return list(
+        _names(function.__func__)[1:] if isinstance(function, types.MethodType) else _names.__wrapped__(function)
+    )
+
+
+@functools.lru_cache(maxsize=256)
+def _names(function: Callable[..., Any]) -> list[str]:
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return [parameter.name for parameter in inspect.signature(function).parameters.values() if parameter.kind in kinds]
 

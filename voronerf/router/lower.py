@@ -13,14 +13,17 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from voronerf.program import PARAMETER, VALUE, Builder, Columns
+from voronerf.router.grouped import find
 from voronerf.router.layout import map_tensors, tensors_of
 
 _LOW = (1 << 32) - 1
 _FEW, _PRODUCTS = 3, 16  # parts of an input that a layer reads one by one; layers that one function makes
+_SMALL = 64  # products of a small matrix with another
 
 _MOVERS = frozenset(
     """
@@ -67,7 +70,119 @@ _BINARY = {
     **dict.fromkeys(("bitwise_and", "logical_and"), "mul"),
     **{name: name for name in ("gt", "ge", "lt", "le", "rsub")},
 }
-_CONSTANT = {"zeros_like": 0.0, "ones_like": 1.0, "new_zeros": 0.0, "new_ones": 1.0}
+_BY_SHAPE = frozenset(
+    "zeros_like ones_like full_like empty_like new_zeros new_ones new_full new_empty".split()  # noqa: SIM905
+)
+_EMPTY = find("empty empty_like new_empty", torch, torch.Tensor)
+
+
+def _folded(join: Callable[[Tensor, Tensor], Tensor], x: Tensor, dims: Any = None, keep: bool = False) -> Tensor:
+    """All entries along dimensions joined, half of them with the other half as long as there are two."""
+    dims = [dims] if isinstance(dims, int) else list(dims or ())
+    if not dims:
+        raise NotAStep("it mixes samples")
+    for dim in dims:
+        while (size := x.shape[dim]) > 1:
+            half = size // 2
+            joined = join(x.narrow(dim, 0, half), x.narrow(dim, half, half))
+            x = torch.cat([joined, x.narrow(dim, size - 1, 1)], dim) if size % 2 else joined
+    return x if keep else x.squeeze(dims)
+
+
+def _maximum(x: Tensor, y: Tensor) -> Tensor:
+    # Where they are equal each has half of the gradient.
+    return torch.where(x > y, x, torch.where(x < y, y, (x + y) / 2))
+
+
+def _below_largest(x: Tensor, dim: int) -> Tensor:
+    return x - _folded(_maximum, x.detach(), dim, True)
+
+
+def _softmax(x: Tensor, dim: int, _: bool) -> Tensor:
+    y = _below_largest(x, dim).exp()
+    return y / y.sum(dim, keepdim=True)
+
+
+def _log_softmax(x: Tensor, dim: int, _: bool) -> Tensor:
+    y = _below_largest(x, dim)
+    return y - y.exp().sum(dim, keepdim=True).log()
+
+
+def _mean(x: Tensor, dim: Any = None, keepdim: bool = False, **_: Any) -> Tensor:
+    total = x.sum(dim, keepdim=keepdim)
+    return total / (x.numel() // total.numel())
+
+
+def _norm(x: Tensor, order: float = 2, dim: Any = None, keepdim: bool = False, **_: Any) -> Tensor:
+    if order == 1:
+        return x.abs().sum(dim, keepdim=keepdim)
+    if order != 2:
+        raise NotAStep(f"a norm of order {order}")
+    total = x.square().sum(dim, keepdim=keepdim)  # where it is 0, the gradient is 0 too, and not that of the root
+    return torch.where(total > 0, torch.where(total > 0, total, 1.0).sqrt(), 0.0)
+
+
+def _variance(x: Tensor, dim: Any = None, correction: float | None = None, keepdim: bool = False) -> Tensor:
+    total = (x - _mean(x, dim, True)).square().sum(dim, keepdim=keepdim)
+    return total / (x.numel() // total.numel() - (1 if correction is None else correction))
+
+
+def _layer_norm(x: Tensor, shape: Sequence[int], weight: Any, bias: Any, eps: float) -> tuple[Tensor, ...]:
+    dims = list(range(x.dim() - len(shape), x.dim()))
+    mean = _mean(x, dims, True)
+    scale = (_variance(x, dims, 0, True) + eps).rsqrt()
+    y = (x - mean) * scale
+    y = y if weight is None else y * weight
+    return y if bias is None else y + bias, mean, scale
+
+
+def _products(x: Tensor, y: Tensor) -> Tensor:
+    """Small matrices of samples with each other, [n, i, j] and [n, j, k]."""
+    if math.prod(x.shape[1:]) * y.shape[2] > _SMALL:
+        raise NotAStep("a product of two tensors of samples")
+    return (x.unsqueeze(2) * y.transpose(1, 2).unsqueeze(1)).sum(3)
+
+
+_WRITTEN_OUT: dict[str, Callable[..., Any]] = {
+    "maximum": _maximum,
+    "minimum": lambda x, y: -_maximum(-x, -y),
+    "amax": lambda x, dim=None, keepdim=False: _folded(_maximum, x, dim, keepdim),
+    "amin": lambda x, dim=None, keepdim=False: -_folded(_maximum, -x, dim, keepdim),
+    "prod": lambda x, dim=None, keepdim=False, **_: _folded(torch.mul, x, dim, keepdim),
+    "all": lambda x, dim=None, keepdim=False: _folded(torch.bitwise_and, x, dim, keepdim),
+    "any": lambda x, dim=None, keepdim=False: ~_folded(torch.bitwise_and, ~x, dim, keepdim),
+    "mean": _mean,
+    "var": _variance,
+    "std": lambda *args, **kwargs: _variance(*args, **kwargs).sqrt(),
+    "linalg_vector_norm": _norm,
+    "native_layer_norm": _layer_norm,
+    "_softmax": _softmax,
+    "_log_softmax": _log_softmax,
+    "hardswish": lambda x: x * F.hardtanh(x + 3, 0, 6) / 6,
+    "hardsigmoid": lambda x: F.hardtanh(x + 3, 0, 6) / 6,
+    "celu": lambda x, a=1.0: F.elu(x / a) * a,
+    "mish": lambda x: x * F.softplus(x).tanh(),
+    "log_sigmoid_forward": lambda x: (-F.softplus(-x), x.new_zeros(0)),
+    "glu": lambda x, dim=-1: x.chunk(2, dim)[0] * x.chunk(2, dim)[1].sigmoid(),
+    "threshold": lambda x, least, value: torch.where(x > least, x, value),
+    "softshrink": lambda x, a=0.5: x - x.clamp(-a, a),
+    "hardshrink": lambda x, a=0.5: torch.where(x.abs() > a, x, 0.0),
+    "sign": lambda x: (x > 0).to(x.dtype) - (x < 0).to(x.dtype),
+    "ceil": lambda x: -(-x).floor(),
+    "frac": lambda x: x - torch.where(x > 0, x.floor(), x.ceil()),
+    "remainder": lambda x, y: x - (x / y).floor() * y,
+    "lerp": lambda x, y, weight: x + weight * (y - x),
+    "addcmul": lambda x, y, z, value=1: x + value * (y * z),
+    "addcdiv": lambda x, y, z, value=1: x + value * (y / z),
+    "masked_fill": lambda x, mask, value: torch.where(mask, value, x),
+    "eq": lambda x, y: (x >= y) & (x <= y),
+    "ne": lambda x, y: ~((x >= y) & (x <= y)),
+    "bitwise_or": lambda x, y: ~(~x & ~y),
+    "logical_or": lambda x, y: ~(~x & ~y),
+    "linalg_cross": lambda x, y, dim=-1: x.roll(-1, dim) * y.roll(1, dim) - x.roll(1, dim) * y.roll(-1, dim),
+    "mv": lambda x, y: torch.mm(x, y.unsqueeze(1)).squeeze(1),
+}
+"""Functions of ATen as others."""
 
 
 class NotAStep(Exception):
@@ -195,7 +310,7 @@ class Lowering:
     # Functions --------------------------------------------------------------------------------------------------------
 
     def run(self, function: Callable[..., Any], args: Any, kwargs: Any, known: Callable[[Any], Entries | None]) -> Any:
-        """Runs a function and gives its result, and a look-up of where the entries of a tensor come from.
+        """Runs a function and gives its result, its arguments, and a look-up of what a tensor is made of.
 
         ``known`` gives the entries of a tensor among the arguments. Raises :class:`NotAStep`.
         """
@@ -205,16 +320,17 @@ class Lowering:
 
             def own(value: Tensor) -> Tensor:
                 copied = value.detach().clone()
-                copied = copied.float() if copied.is_floating_point() else copied
-                entries = known(value)
-                mode.keep(copied, entries)
+                copied = copied.float() if copied.dtype in (torch.float16, torch.bfloat16) else copied
+                mode.keep(copied, known(value))
                 mode.originals[id(copied)] = value
                 return copied
 
             args, kwargs = map_tensors((args, kwargs), own)
             with mode:
                 result = function(*args, **kwargs)
-        return result, args, mode.entries
+            if function in _EMPTY:
+                result.zero_()
+        return result, args, mode.of_result
 
 
 class _Recording(TorchDispatchMode):
@@ -239,6 +355,11 @@ class _Recording(TorchDispatchMode):
         """Where the entries of a tensor come from; None for a constant."""
         return self._kept.get(id(tensor), (None, None))[1]
 
+    def of_result(self, tensor: Tensor) -> Entries:
+        """Entries of a tensor as one of samples."""
+        entries = self.entries(tensor)
+        return entries if entries is not None and entries.of is None else self.of_samples(tensor, entries)
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         name = func.overloadpacket.__name__
@@ -249,28 +370,40 @@ class _Recording(TorchDispatchMode):
         if name not in ("linear", "rsub") and name not in _MOVERS and func._can_decompose():
             with self:
                 return func.decompose(*args, **kwargs)
-        result = func(*args, **kwargs)
         inplace = name.endswith("_") and not name.startswith("_")
         base = name.rstrip("_") if inplace else name
-        made = self._made(base, func, args, kwargs, result, rows)
+        both = base == "bmm" and all(e is not None and e.of is None for e in found)
+        written = _products if both else _WRITTEN_OUT.get(base)
+        if written is not None:
+            with self:
+                made = [self.entries(tensor) for tensor in tensors_of(written(*args, **kwargs))]
+            result = func(*args, **kwargs)
+        else:
+            result = func(*args, **kwargs)
+            made = self._made(base, func, args, kwargs, result, rows)
         for tensor, entries in zip(tensors_of(result), made, strict=True):
-            self.keep(tensor, entries)
+            before = self.entries(tensor)
+            if inplace and before is not None and entries is not None:
+                before.codes.copy_(entries.codes)  # of the tensor that this one is a part of, too
+            else:
+                self.keep(tensor, entries)
         return result
 
-    def _made(self, name: str, func: Any, args: Any, kwargs: Any, result: Any, rows: bool) -> list[Entries]:
+    def _made(self, name: str, func: Any, args: Any, kwargs: Any, result: Any, rows: bool) -> list[Entries | None]:
         """Where the entries of a function's results come from."""
         if name in _MOVERS and func.overloadpacket.__name__ == name:
             return self._moved(func, args, kwargs, rows, name)
         if not rows:
             raise NotAStep(f"{name} of parameters")
         if name == "_to_copy":
-            kinds = (args[0].dtype, result.dtype)
-            if any(k not in (torch.float32, torch.bool) for k in kinds) or kinds[1] == torch.bool:
-                raise NotAStep(f"a conversion to {kinds[1]}")
+            if not result.is_floating_point() or args[0].dtype not in (result.dtype, torch.bool):
+                raise NotAStep(f"a conversion from {args[0].dtype} to {result.dtype}")
             return [self._known(args[0])]
-        if name in _CONSTANT or name == "full_like":
-            return [self._constant(result, _CONSTANT.get(name, args[1] if name == "full_like" else 0.0))]
-        if not isinstance(result, Tensor) and name != "native_layer_norm":
+        if name in _BY_SHAPE:
+            return [None]
+        if name in ("copy", "fill") and result is args[0]:
+            return [self._copied(args[0], args[1])]
+        if not isinstance(result, Tensor):
             raise NotAStep(f"{name} is no step")
         if name in ("mm", "linear", "addmm", "bmm", "baddbmm"):
             return [self._product(name, args, kwargs, result)]
@@ -282,10 +415,8 @@ class _Recording(TorchDispatchMode):
             return [self._binary(name, args, kwargs, result)]
         if name == "where":
             return [self._where(args, result)]
-        if name in ("sum", "mean", "linalg_vector_norm"):
-            return [self._reduced(name, args, kwargs, result)]
-        if name == "native_layer_norm":
-            return self._layer_norm(args, result)
+        if name == "sum":
+            return [self._summed(args[0], args[1] if len(args) > 1 else kwargs.get("dim"), result)]
         raise NotAStep(f"{name} is no step")
 
     def _known(self, tensor: Tensor) -> Entries:
@@ -301,51 +432,57 @@ class _Recording(TorchDispatchMode):
             of = self.originals[id(tensor)] if id(tensor) in self.originals else tensor.clone()
         return Entries(torch.arange(tensor.numel()).reshape(tensor.shape), of)
 
-    def _moved(self, func: Any, args: Any, kwargs: Any, rows: bool, name: str) -> list[Entries]:
+    def _moved(self, func: Any, args: Any, kwargs: Any, rows: bool, name: str) -> list[Entries | None]:
         given = tensors_of((args, kwargs))
-        sources = {id(e.of) for t in given if (e := self.entries(t)) is not None}
-        if len(sources) > 1:
-            raise NotAStep("parameters beside samples in one tensor")
-        of = next(e.of for t in given if (e := self.entries(t)) is not None)
+        sources = {id(e.of): e.of for t in given if (e := self.entries(t)) is not None}
         indexed = args[1] if name in ("index",) else [args[2]] if name == "index_select" else []
         indices = {id(t) for t in indexed if isinstance(t, Tensor)}
+        of = None if rows or len(sources) > 1 else next(iter(sources.values()))
 
         def codes(tensor: Tensor) -> Tensor:
             entries = self.entries(tensor)
-            if entries is not None:
-                if id(tensor) in indices:
-                    raise NotAStep("a look-up at places that depend on samples")
-                return entries.codes
             if id(tensor) in indices:
+                if entries is not None:
+                    raise NotAStep("a look-up at places that depend on samples")
                 return tensor
-            return self._constants(tensor, rows)
+            return entries.codes if entries is not None and entries.of is of else self.of_samples(tensor, entries).codes
 
-        args, kwargs = map_tensors((args, {k: v for k, v in kwargs.items() if k != "memory_format"}), codes)
-        moved = [Entries(t.clone(), of) for t in tensors_of(func(*args, **kwargs))]
         if name == "detach" and of is None:
-            places, numbers = self.lowering.order(moved[0].codes)
-            stopped = self.b.apply("stop", self.lowering.operand(numbers))
-            return [self._placed(stopped, places, moved[0].codes.shape)]
-        return moved
+            places, numbers = self.lowering.order(codes(args[0]))
+            return [self._placed(self.b.apply("stop", self.lowering.operand(numbers)), places, args[0].shape)]
+        args, kwargs = map_tensors((args, {k: v for k, v in kwargs.items() if k != "memory_format"}), codes)
+        return [Entries(t, of) for t in tensors_of(func(*args, **kwargs))]
 
-    def _constants(self, tensor: Tensor, rows: bool) -> Tensor:
-        """Codes of a constant that stands beside samples: the same number in every sample."""
-        values = tensor.unique()
-        if not rows or len(values) != 1 or not tensor.is_floating_point():
-            raise NotAStep("constants beside samples in one tensor")
-        return self._constant(tensor, float(values)).codes
-
-    def _constant(self, like: Tensor, value: float) -> Entries:
-        """A number as a tensor of samples, in the first of its dimensions that they can be."""
-        at = next((d for d, size in enumerate(like.shape) if size and size % self.lowering.rows == 0), None)
-        if at is None:
+    def of_samples(self, tensor: Tensor, entries: Entries | None) -> Entries:
+        """A parameter or a constant, which is the same for each sample, as a tensor of samples."""
+        shape, rows = tensor.shape, self.lowering.rows
+        at = next((d for d, size in enumerate(shape) if size and size % rows == 0), None)
+        if at is None or not tensor.numel() or not (tensor.is_floating_point() or tensor.dtype == torch.bool):
             raise NotAStep("a constant without samples")
-        column = self.b.apply("affine", self.b.move(1, []), 0.0, value)
-        rows = torch.arange(self.lowering.rows).repeat_interleave(like.shape[at] // self.lowering.rows)
-        shape = [1] * like.dim()
-        shape[at] = like.shape[at]
-        number = int(self.lowering._codes(column)[0, 0])
-        return Entries(((rows << 32) + number).reshape(shape).expand(like.shape).clone())
+        by_sample = (tensor if entries is None else entries.codes).movedim(at, 0).reshape(rows, -1)
+        if not (by_sample == by_sample[:1]).all():
+            raise NotAStep("a constant with other numbers for each sample")
+        if entries is None and bool((by_sample == by_sample[0, 0]).all()):
+            column = self.b.apply("affine", self.b.move(1, []), 0.0, float(by_sample[0, 0]))
+        else:
+            of, codes = (entries, by_sample[0]) if entries else ((e := self._of_constant(by_sample[0])), e.codes)
+            column = self.lowering.vector(of, codes)
+            column = self.b.rows(column.part(0, 1) if column.spread else column)
+        moved = [shape[at], *shape[:at], *shape[at + 1 :]]
+        numbers = self.lowering._codes(column).expand(rows, tensor.numel() // rows)
+        return Entries(numbers.reshape(moved).movedim(0, at).contiguous())
+
+    def _copied(self, target: Tensor, source: Any) -> Entries:
+        """What a tensor becomes that another is written into."""
+        before = self.entries(target)
+        if before is None or before.of is not None:
+            raise NotAStep("a write into a parameter or a constant")
+        value = source if isinstance(source, Tensor) else torch.full_like(target, source)
+        entries = self.entries(value)
+        entries = Entries(entries.codes.expand(target.shape), entries.of) if entries is not None else None
+        if entries is not None and entries.of is None:
+            return entries
+        return self.of_samples(value.expand(target.shape), entries)
 
     def _placed(self, value: Columns, places: Tensor, shape: Sequence[int]) -> Entries:
         """A value's entries at their places in a tensor."""
@@ -426,14 +563,13 @@ class _Recording(TorchDispatchMode):
         made = self.b.binary("add", self.b.binary("gate", yes, condition), self.b.binary("gate", no, other))
         return self._placed(made, places, result.shape)
 
-    def _groups(self, tensor: Tensor, dims: Any) -> tuple[Tensor, Columns, int]:
-        """A tensor with the entries that are summed next to each other: places of sums, operand, how many."""
+    def _summed(self, tensor: Tensor, dims: Any, result: Tensor) -> Entries:
+        """Sums over entries of a sample, for which those of one sum are put next to each other."""
         dims = [dims] if isinstance(dims, int) else dims or range(tensor.dim())
         dims = [d % tensor.dim() for d in dims]
         kept = [d for d in range(tensor.dim()) if d not in dims]
-        codes = self._known(tensor).codes.permute([*kept, *dims])
         group = math.prod(tensor.shape[d] for d in dims)
-        codes = codes.reshape(-1, group)
+        codes = self._known(tensor).codes.permute([*kept, *dims]).reshape(-1, group)
         rows = codes[:, :1] >> 32
         if not torch.equal(codes >> 32, rows.expand_as(codes)):
             raise NotAStep("it sums over samples")
@@ -441,43 +577,7 @@ class _Recording(TorchDispatchMode):
         numbers = codes[places] & _LOW  # [rows, m, group]
         if not (numbers == numbers[:1]).all():
             raise NotAStep("the samples of a tensor differ in more than their values")
-        return places, self.lowering.operand(numbers[0].flatten()), group
-
-    def _reduced(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
-        if name == "linalg_vector_norm":
-            p, dims = (args[1] if len(args) > 1 else 2), (args[2] if len(args) > 2 else kwargs.get("dim"))
-            if p != 2:
-                raise NotAStep(f"a norm of order {p}")
-        else:
-            p, dims = 0, (args[1] if len(args) > 1 else kwargs.get("dim"))
-        places, x, group = self._groups(args[0], dims)
-        x = self.b.apply("power", x, 2.0) if p else x
-        made = self.b.total(x, group)
-        if p:
-            made = self.b.apply("power", made, 0.5)
-        elif name == "mean":
-            made = self.b.apply("affine", made, 1 / group)
-        return self._placed(made, places, result.shape)
-
-    def _layer_norm(self, args: Any, result: Any) -> list[Entries]:
-        tensor, shape, weight, bias, eps = args
-        dims = list(range(tensor.dim() - len(shape), tensor.dim()))
-        places, x, group = self._groups(tensor, dims)
-        if x.width != group:
-            raise NotAStep("a norm of several parts of a sample")
-        scale = 1 / group
-        mean = self.b.apply("affine", self.b.total(x, group), scale)
-        centred = self.b.binary("sub", x, mean._replace(width=group, spread=True))
-        variance = self.b.apply("affine", self.b.total(self.b.apply("power", centred, 2.0), group), scale, eps)
-        inverse = self.b.apply("power", variance, -0.5)
-        made = self.b.binary("mul", centred, inverse._replace(width=group, spread=True))
-        for name, given in (("mul", weight), ("add", bias)):
-            if given is not None:
-                entries = self.entries(given) or self._of_constant(given)
-                made = self.b.binary(name, made, self.lowering.vector(entries, entries.codes.flatten()))
-        whole, _ = self.lowering.order(self._known(tensor).codes)
-        small = [self._placed(value, places, part.shape) for value, part in zip((mean, inverse), result[1:])]
-        return [self._placed(made, whole, result[0].shape), *small]
+        return self._placed(self.b.total(self.lowering.operand(numbers[0].flatten()), group), places, result.shape)
 
     def _product(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
         """Rows times a matrix of the cell, in any of the ways to write it."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import operator
 import threading
-import types
 from collections.abc import Iterator, Mapping
 from typing import Any
 from unittest import mock
@@ -17,7 +16,7 @@ from unittest import mock
 import torch
 import torch.nn.functional as F
 from torch import Tensor, fx, nn
-from torch.fx.node import map_aggregate
+from torch.fx.node import map_aggregate, map_arg
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.double import Double
@@ -30,6 +29,12 @@ _PATCHES = threading.RLock()  # one thread at a time changes what torch calls fo
 _PRIMES = (37, 31, 29, 23)  # numbers of samples of a trace, see `rows_for`
 _LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
 _VERDICTS = find("any all", torch, torch.Tensor)
+_TOTALS = find("sum", torch, torch.Tensor)
+
+
+def differentiable(value: Tensor) -> Tensor:
+    """A tensor of which gradients are asked for, which what comes after it is computed from."""
+    return value.view_as(value)
 
 
 class Unfusable(Exception):
@@ -72,11 +77,16 @@ class Trace(TorchFunctionMode):
         self.rows = rows_for(module, given)
         self.n = self._new(self.rows)
         self.inputs = [self._new(tensor) for tensor in given]
+        self.shared = [self._new(tensor, on=CONSTANTS) for tensor in call.shared()]
         double = Double(module)
         with _custom_functions(self), self:
             result = double.run(call, given, single)
+        self._part_from_gradients()
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self._argument(tensor) for tensor in tensors_of(result)]
+        for node in self.outputs:
+            if isinstance(node, fx.Node) and "mixes" in node.meta:
+                raise Unfusable(node.meta["mixes"])
 
     def _new(self, value: Any, node: fx.Node | None = None, on: int = SAMPLES) -> fx.Node:
         """The node of a value; without one it is an input of the graph."""
@@ -85,14 +95,14 @@ class Trace(TorchFunctionMode):
         if isinstance(value, Tensor):
             self._nodes[id(value)] = node
             if on == SAMPLES and not any(size and size % self.rows == 0 for size in value.shape):
-                name = name_of(node.target)
-                if node.target in _VERDICTS and value.dim() == 0:
-                    return node  # which may be promised
-                raise Unfusable(
-                    f"{name}{node.meta.get('line', '')} gives a tensor of shape {list(value.shape)}, which has no row "
-                    f"for each of {self.rows} samples: it mixes or selects them; keep a row for each, as torch.where "
-                    "does"
+                node.meta["mixes"] = (
+                    f"{name_of(node.target)}{node.meta.get('line', '')} gives a tensor of shape {list(value.shape)}, "
+                    f"which has no row for each of {self.rows} samples: it mixes or selects them; keep a row for each, "
+                    "as torch.where does"
                 )
+                # These may be promised, or what a gradient is taken of.
+                if value.dim() or node.target not in _VERDICTS | _TOTALS:
+                    raise Unfusable(node.meta["mixes"])
         return node
 
     def _argument(self, value: Any) -> Any:
@@ -119,6 +129,8 @@ class Trace(TorchFunctionMode):
         line, operands = user_line(), tensors_of((args, kwargs))
         if func is torch.Tensor.type_as:
             func, args = torch.Tensor.to, (args[0], args[1].device, args[1].dtype)
+        if func is torch.autograd.grad:  # again of one run, where a loop over cells has a graph for each call
+            kwargs = {**kwargs, "retain_graph": True}
         node = self.graph.call_function(func, *map_aggregate((args, kwargs), self._argument))
         node.meta["inplace"] = inplace = writes_in_place(func) or bool(kwargs.get("inplace"))
         node.meta["line"], node.meta["grad"] = line, torch.is_grad_enabled()
@@ -134,6 +146,9 @@ class Trace(TorchFunctionMode):
             raise Unfusable(f"{name_of(func)} draws random numbers{line}; pass them as an argument")
         if used and not found and result is not None:
             return self._read(node, result, line)
+        for source in used:
+            if "mixes" in source.meta and func is not torch.autograd.grad:
+                raise Unfusable(source.meta["mixes"])
         alone = func in _LIKE and not any(size and size % self.rows == 0 for size in found[0].shape)
         if not used or alone or not found or (not inplace and any(result is tensor for tensor in operands)):
             self.graph.erase_node(node)
@@ -146,6 +161,21 @@ class Trace(TorchFunctionMode):
             self._new(tensor, value, on)
         node.meta["on"] = on
         return result
+
+    def _part_from_gradients(self) -> None:
+        """Has what a gradient is taken by be a tensor between runs, and what follows be computed from it."""
+        for node in list(self.graph.nodes):
+            if node.target is not torch.autograd.grad:
+                continue
+            by: list[fx.Node] = []
+            map_arg(node.args[1] if len(node.args) > 1 else node.kwargs["inputs"], by.append)
+            for source in by:
+                if source.target is not differentiable and source.meta["on"] == SAMPLES:
+                    with self.graph.inserting_after(source):
+                        new = self.graph.call_function(differentiable, (source,))
+                    for user in [user for user in source.users if user is not new]:
+                        user.replace_input_with(source, new)
+                    new.meta.update(source.meta, results=[new], inplace=False, grad=True, line=node.meta["line"])
 
     def _read(self, node: fx.Node, result: Any, line: str) -> Any:
         """A value that is read: one that a promise gives, or what depends on parameters alone."""
@@ -167,11 +197,12 @@ def _custom_functions(trace: Trace) -> Iterator[None]:
     """Shows a trace the custom functions of this thread, which no mode sees."""
     here = threading.get_ident()
     with _PATCHES:
-        own = torch.autograd.Function.apply.__func__  # type: ignore[attr-defined]
+        # Below ``Function``, whose own ``apply`` a module may have bound when it was imported.
+        base = torch.autograd.function._SingleLevelFunction
 
         def apply(cls: Any, *args: Any, **kwargs: Any) -> Any:
-            function = types.MethodType(own, cls)
+            function = super(base, cls).apply
             return function(*args, **kwargs) if threading.get_ident() != here else trace.follow(function, args, kwargs)
 
-        with mock.patch.object(torch.autograd.Function, "apply", classmethod(apply)):
+        with mock.patch.object(base, "apply", classmethod(apply)):
             yield

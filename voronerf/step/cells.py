@@ -42,6 +42,11 @@ class SplitRule:
         inherit: Whether new cells start as copies of their parent, else from random parameters.
         reservoir: Samples that are kept.
         batches: The latest batches that they come from.
+
+    Examples:
+        >>> from voronerf.step import SplitRule
+        >>> SplitRule(reservoir=2_000, batches=100).inherit
+        True
     """
 
     centres: str = "centroidal"
@@ -67,6 +72,30 @@ class Cells:
         plan: The splits to make.
         rule: How they are made.
         generator: Of random choices.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF, VoronoiRouter
+        >>> from voronerf.rendering import Rays, Renderer, Stratified
+        >>> from voronerf.step import Batch, Cells, PlannedSplit, SplitRule, Step
+        >>> router = VoronoiRouter(NeRF(width=16, depth=2), torch.zeros(1, 3))
+        >>> optimizer = torch.optim.Adam(router.parameters(), lr=0.01)
+        >>> step = Step(Renderer({"field": router}, Stratified(8)))
+        >>> plan, generator = [PlannedSplit(at=3, children=4, cells="all")], torch.Generator().manual_seed(0)
+        >>> cells = Cells(step.renderer, {"field": router}, plan, SplitRule(), generator=generator)
+        >>> rays = Rays(torch.zeros(9, 3), torch.nn.functional.normalize(torch.randn(9, 3)))
+        >>> batch = Batch(rays, torch.ones(9), torch.full((9,), 3.0), torch.rand(9, 3))
+        >>> for number in range(4):
+        ...     if cells.is_due(number, number) and (split := cells.find_split()):
+        ...         cells.divide(split, optimizer)
+        ...     cells.revisit(number)  # some of empty space
+        ...     optimizer.zero_grad()
+        ...     found = step.run(batch, generator, backward=True)
+        ...     optimizer.step()
+        ...     cells.observe(found)
+        ...     cells.reservoir.add(found.samples.positions, found.importance())
+        >>> router.num_cells
+        4
     """
 
     def __init__(

@@ -36,6 +36,13 @@ class Batch:
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] where it was drawn; None for black.
         seen: [s], the distances of the points that the last s rays end at, or None.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.rendering import Rays
+        >>> from voronerf.step import Batch
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> batch = Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3), background=torch.ones(3))
     """
 
     rays: Rays
@@ -83,14 +90,23 @@ class Found(NamedTuple):
 
 
 class RayLoss(Protocol):
-    """A way to the loss of a batch."""
+    """A way to the loss of a batch.
 
-    def __call__(self, batch: Batch, generator: torch.Generator | None) -> Found:
+    Examples:
+        >>> from voronerf import NeRF
+        >>> from voronerf.rendering import Renderer, Stratified
+        >>> from voronerf.step import Step
+        >>> Step(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8))).way.explain()
+        'networks, colours and loss are separate operations'
+    """
+
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
         """The loss of rays at random samples; ``loss.backward()`` gives the gradients of all parameters.
 
         Args:
             batch: The rays.
             generator: Of the samples.
+            backward: Whether that is done at once, which can be faster.
         """
         ...
 
@@ -123,7 +139,7 @@ class Fused:
     def __init__(self, renderer: Renderer) -> None:
         self.renderer = renderer
 
-    def __call__(self, batch: Batch, generator: torch.Generator | None) -> Found:
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
         """As of :class:`RayLoss`."""
         renderer, directions, target, background = self.renderer, batch.rays.directions, batch.target, batch.background
         field = cast(VoronoiRouter, renderer.field)
@@ -149,13 +165,16 @@ class Fused:
                 backend=renderer.backend,
             )
             found.append(result)
-            return result.loss, gradient if shares is None else gradient * shares[:, None]
+            total = result.loss
+            if shares is not None:
+                gradient = gradient * shares[:, None]
+            if len(target) < all_rays:  # the others count, but learn nothing
+                total, gradient = (values * (len(target) / all_rays) for values in (total, gradient))
+            return total, gradient
 
         network = field.table_arguments(samples.inputs, directions, samples.ray_index)
         assert network is not None
-        total = learn_outputs(network, loss, backend=renderer.backend)
-        if len(target) < all_rays:
-            total = total * (len(target) / all_rays)
+        total = learn_outputs(network, loss, backward=backward, backend=renderer.backend)
         return Found(total, found[0].error, found[0].weights, found[0].density, samples)
 
     def explain(self) -> str:
@@ -185,7 +204,7 @@ class Composed:
     def __init__(self, renderer: Renderer, sightings: float) -> None:
         self.renderer, self.sightings = renderer, sightings
 
-    def __call__(self, batch: Batch, generator: torch.Generator | None) -> Found:
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
         """As of :class:`RayLoss`."""
         given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
         *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
@@ -199,6 +218,9 @@ class Composed:
         for first in before:
             loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
         error = (last.colour.detach() - batch.target).square().sum(-1)
+        if backward:
+            loss.backward()
+            loss = loss.detach()
         return Found(loss, error, last.weights.detach(), last.density.detach(), samples)
 
     def explain(self) -> str:

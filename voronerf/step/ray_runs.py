@@ -318,7 +318,7 @@ class _Pass:
             return
         network = field.table_arguments(own.positions, self.rays.directions, own.ray_index)
         assert network is not None
-        self.total = learn_outputs(network, loss, backend=backend)
+        self.total = learn_outputs(network, loss, backward=True, backend=backend)
 
     def _composed(self, own: OwnSamples, then: Callable[[], None]) -> None:
         """From colours and densities, which torch differentiates."""

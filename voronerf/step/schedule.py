@@ -22,6 +22,11 @@ class PlannedSplit:
         children: number of new cells for each cell that is split.
         cells: "all" cells are split, or only the "worst", which has the largest accumulated error.
         most: largest number of cells after the split, or None for no limit.
+
+    Examples:
+        >>> from voronerf.step import PlannedSplit
+        >>> PlannedSplit(at=0.2, children=16, cells="all").most is None
+        True
     """
 
     at: float

@@ -14,17 +14,18 @@ from voronerf.step.ray_loss import Batch, Composed, Found, Fused, RayLoss, why_n
 class Step:
     """What a training does with a batch: samples its rays, asks the networks, compares colours.
 
-    Whoever calls it differentiates the loss, moves the parameters, and tells `Cells` what was found.
+    Whoever calls it moves the parameters, and tells `Cells` what was found.
 
     Args:
         renderer: Networks and sampler.
         sightings: Factor of the `sighting_loss`; 0 is off.
 
     Examples:
+        >>> import torch
         >>> from voronerf import NeRF, VoronoiRouter
         >>> from voronerf.rendering import Renderer, Stratified
         >>> from voronerf.step import Step
-        >>> router = VoronoiRouter(NeRF(width=16, depth=2), [[0.0, 0, 0]])
+        >>> router = VoronoiRouter(NeRF(width=16, depth=2), torch.zeros(1, 3))
         >>> print(Step(Renderer({"field": router}, Stratified(8))).explain())
         samples: Stratified, 8 a ray
         loss: networks, colours and loss are separate operations
@@ -41,14 +42,16 @@ class Step:
             return Fused(self.renderer)
         return Composed(self.renderer, self.sightings)
 
-    def run(self, batch: Batch, generator: torch.Generator | None = None) -> Found:
+    def run(self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False) -> Found:
         """The loss of a batch, with gradients, and what its samples have found.
 
         Args:
             batch: The rays.
             generator: Of random samples.
+            backward: Whether gradients are added to those of the parameters at once, as ``loss.backward()`` does it,
+                in less time; the loss has none then.
         """
-        return self.way(batch, generator)
+        return self.way(batch, generator, backward=backward)
 
     def explain(self) -> str:
         """How a step is computed, and what keeps it from a faster way: some lines."""

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.ops.sparse_adam import Rule, adam, sparse_adam
+from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
+from voronerf.ops.sparse_adam.reference import judge
 from voronerf.router.optimizers import trained_parts
 
 
@@ -17,8 +18,8 @@ class Adam(torch.optim.Adam):
     """``torch.optim.Adam``, with groups of parameters whose entries without a gradient stay as they are.
 
     A group says ``sparse=True``; see :func:`voronerf.ops.sparse_adam`. Its state has the same names as that of the
-    other groups, which are torch's. On the CPU all float32 parameters are updated by one operation, since torch's own
-    step takes longer to prepare than to compute for networks of this size.
+    other groups, which are torch's. All float32 parameters are updated by one operation, since torch's own step takes
+    longer to prepare than to compute for networks of this size.
 
     Args:
         params: Parameters or groups of them, as ``torch.optim.Adam`` takes them.
@@ -53,117 +54,92 @@ class Adam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Updates the parameters."""
+        """Updates the parameters, as of ``torch.optim.Adam``."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        if self._is_on_device():
-            self._step_on_device()
-            return loss
-        entries = [(p, p.grad, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        together = self.leaves_frozen()
-        own = [entry for entry in entries if together or entry[2].get("sparse", False)]
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
-        if own and (overflow is None or not overflow.item()):
-            if scale is not None:
-                own = [(parameter, gradient / scale, group) for parameter, gradient, group in own]
-            if together:
-                self._step_together(own)
-            else:
-                for parameter, gradient, group in own:
-                    self._step_table(parameter, gradient, group)
-        if not together:
-            for parameter, _, _ in own:
-                parameter.grad = None  # torch's step passes them over
-            super().step()
-            for parameter, gradient, _ in own:
-                parameter.grad = gradient
+        if self.leaves_frozen():
+            # Without a loss nothing is counted.
+            self._together(None if overflow is None else Guard(overflow, overflow, overflow, scale), None)
+            return loss
+        tables = self._step_tables(scale, overflow)
+        super().step()
+        for parameter, gradient in tables:
+            parameter.grad = gradient
         return loss
+
+    @torch.no_grad()
+    def update(self, guard: Guard, loss: Tensor | None = None) -> None:
+        """:meth:`step` without its hooks, which take as long as a layer of a small network.
+
+        Args:
+            guard: Leaves out the step, see :func:`voronerf.ops.adam`.
+            loss: [], of the step; with it the guard judges first.
+        """
+        if self.leaves_frozen():
+            self._together(guard, loss)
+            return
+        dense = (p.grad for group in self.param_groups if not group.get("sparse") for p in group["params"])
+        judge(guard, loss, [gradient for gradient in dense if gradient is not None])
+        self.found_inf = guard.found
+        self.step()
+        del self.found_inf
 
     def leaves_frozen(self) -> bool:
         """Whether one operation takes all parameters, and passes over frozen cells (`VoronoiRouter.freeze`)."""
-        held = (p for group in self.param_groups for p in group["params"] if p.grad is not None)
-        return self._in_one() and all(_is_plain(parameter) for parameter in held)
-
-    def _in_one(self) -> bool:
-        """Whether one operation takes all parameters on the CPU; torch's own step is faster than the reference."""
-        chosen = backends.chosen("adam", torch.device("cpu"), torch.float32, backend=self.backend)
-        return chosen == "native" or self.backend == "reference"
-
-    def _step_together(self, entries: list[tuple[Tensor, Tensor, dict[str, Any]]]) -> None:
-        rules, tensors = [], []
-        for (parameter, gradient, group), parts in zip(entries, trained_parts([entry[0] for entry in entries])):
-            state, step = self._next(parameter)
-            rule = Rule(step, float(group["lr"]), group["betas"], group["eps"], not group.get("sparse", False))
-            own = parameter, gradient, state["exp_avg"], state["exp_avg_sq"]
-            rules += [rule] * len(parts)
-            tensors += [[tensor[part] for tensor in own] for part in parts]
-        adam(rules, *(list(column) for column in zip(*tensors)), backend=self.backend)
-
-    def _step_table(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
-        state, step = self._next(parameter)
-        sparse_adam(
-            parameter,
-            gradient,
-            state["exp_avg"],
-            state["exp_avg_sq"],
-            step=step,
-            learning_rate=group["lr"],
-            betas=group["betas"],
-            epsilon=group["eps"],
-            backend=self.backend,
-        )
-
-    def _next(self, parameter: Tensor) -> tuple[dict[str, Tensor], int]:
-        """The state of a parameter, and the number of the step that comes, which is counted."""
-        state = self.state[parameter]
-        if not state:
-            state["step"] = torch.tensor(0.0)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        step = state["step"] = state["step"].cpu()  # a fused optimiser loads it to the parameter's device
-        step += 1
-        return state, int(step)
-
-    def _is_on_device(self) -> bool:
-        """Whether the compiled module's CUDA step takes all parameters, for which the host does not wait."""
-        parameters = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
-        if not parameters or backends.why_not("sparse_adam", "native", parameters[0].device) is not None:
+        held = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
+        if not held or not all(p.dtype is torch.float32 and p.is_contiguous() for p in held):
             return False
-        from voronerf import native
+        chosen = backends.chosen("adam", held[0].device, torch.float32, backend=self.backend)
+        return chosen == "native" or self.backend == "reference"  # torch's own step is faster than the reference
 
-        return all(native.on_cuda(p) and p.dtype == torch.float32 and p.is_contiguous() for p in parameters)
-
-    def _step_on_device(self) -> None:
-        from voronerf.ops.sparse_adam.native import Judged, Rule, adam_on_device
-
-        rates: dict[float, Tensor] = {}
+    def _together(self, guard: Guard | None, loss: Tensor | None) -> None:
         rules, tensors = [], []
-        for group in self.param_groups:
-            for parameter in group["params"]:
+        held = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        for (parameter, group), parts in zip(held, trained_parts([entry[0] for entry in held]), strict=True):
+            state = self._state(parameter)
+            step, every = state["step"], not group.get("sparse", False)
+            own = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
+            for number, part in enumerate(parts):
+                counted = step.clone() if number else step  # once for a parameter
+                rules.append(Rule(counted, group["lr"], group["betas"], group["eps"], every))
+                tensors.append(own if part is ... else tuple(tensor[part] for tensor in own))
+        if rules:
+            adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)
+
+    def _step_tables(self, scale: Tensor | None, overflow: Tensor | None) -> list[tuple[Tensor, Tensor]]:
+        """Updates tables by entries, and takes their gradients, so that torch's step passes them over."""
+        taken = []
+        for group in self.param_groups if overflow is None or not overflow.item() else ():
+            for parameter in group["params"] if group.get("sparse", False) else ():
                 if parameter.grad is None:
                     continue
-                rate, device, state = group["lr"], parameter.device, self.state[parameter]
-                if not isinstance(rate, Tensor):
-                    if rate not in rates:
-                        rates[rate] = torch.full((), rate, device=device)
-                    rate = rates[rate]
-                if not state:
-                    state["step"] = torch.zeros((), device=device)
-                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-                state["step"] = state["step"].to(device)  # a checkpoint of a CPU has it there
-                first, second = group["betas"]
-                every = not group.get("sparse", False)
-                rules.append(Rule(rate.to(device), state["step"], first, second, group["eps"], every))
-                tensors.append((parameter.grad, parameter, state["exp_avg"], state["exp_avg_sq"]))
-        found = getattr(self, "found_inf", None)
-        judged = None if found is None else Judged(found)
-        gradients, parameters, means, squares = zip(*tensors, strict=True)
-        adam_on_device(
-            rules, gradients, parameters, means, squares, judged=judged, scale=getattr(self, "grad_scale", None)
-        )
+                state, gradient = self._state(parameter), parameter.grad
+                state["step"].add_(1)
+                sparse_adam(
+                    parameter,
+                    gradient if scale is None else gradient / scale,
+                    state["exp_avg"],
+                    state["exp_avg_sq"],
+                    step=int(state["step"]),
+                    learning_rate=float(group["lr"]),
+                    betas=group["betas"],
+                    epsilon=group["eps"],
+                    backend=self.backend,
+                )
+                taken.append((parameter, gradient))
+                parameter.grad = None
+        return taken
 
-
-def _is_plain(parameter: Tensor) -> bool:
-    return parameter.is_cpu and parameter.dtype == torch.float32 and parameter.is_contiguous()
+    def _state(self, parameter: Tensor) -> dict[str, Tensor]:
+        """The state of a parameter, on its device: a checkpoint has the steps done on the CPU."""
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), device=parameter.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        if state["step"].device != parameter.device:
+            state["step"] = state["step"].to(parameter.device)
+        return state

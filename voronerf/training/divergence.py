@@ -14,42 +14,12 @@ from voronerf.data import Scene
 from voronerf.evaluation.scores import view_numbers
 from voronerf.training.config import TrainConfig
 
-#: Gradients from here on have squares beyond float32, which make Adam's second moment infinite for good.
-LARGEST = 1e18
 #: Skipped steps in a row after which waiting is of no use.
 PATIENCE = 10
 #: Decibels below the best evaluation so far that are a collapse.
 COLLAPSE = 5.0
 #: A run is compared with pictures of one colour from its middle on, and from this step.
 SETTLED = 100
-
-
-class GradientGuard:
-    """Keeps an optimiser from steps whose loss or gradients are not finite, and counts them on the device.
-
-    Attributes:
-        skipped: How many there were, a scalar tensor.
-        in_a_row: How many the last steps were.
-    """
-
-    def __init__(self, device: torch.device, skipped: int = 0) -> None:
-        self.skipped = torch.tensor(float(skipped), device=device)
-        self.in_a_row = torch.zeros((), device=device)
-        self._found = torch.zeros((), device=device)
-
-    def judge(self, total: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool = False) -> None:
-        """Tells the optimiser whether to skip the step that comes; the host waits for nothing.
-
-        Args:
-            total: [], see :func:`sum_of_gradients`; over ranks the sum of all.
-            optimizer: Of the step.
-            scaled: Whether gradients are scaled, which is the scaler's own matter.
-        """
-        self._found.copy_(total.abs().lt(LARGEST).logical_not_())  # true for NaN
-        self.skipped.add_(self._found)
-        self.in_a_row.add_(1).mul_(self._found)
-        if not scaled:
-            optimizer.found_inf = self._found  # type: ignore[attr-defined]  # what torch's scaler sets too
 
 
 def sum_of_gradients(loss: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool) -> Tensor:

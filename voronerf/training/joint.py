@@ -252,6 +252,7 @@ class JointTrainer:
         with backends.torch_on_one_thread() if natively else nullcontext():
             batches = {}
             for number, trainer in self.trainers.items():
+                trainer.optimizer.zero_grad(set_to_none=True)
                 trainer.step, trainer.seconds, trainer.rate_factor = self.step, self.seconds, self.rate_factor
                 trainer.draws.manual_seed((trainer.config.seed * 6364136223846793005 + self.step) % 2**63)
                 trainer.prepare()

@@ -24,6 +24,8 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
 from voronerf.files import json_text, write_bytes, write_text
+from voronerf.ops import Guard
+from voronerf.ops.sparse_adam.reference import judge
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.router import VoronoiRouter
 from voronerf.step import Batch, Cells, Found, Step
@@ -42,10 +44,8 @@ from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.divergence import (
     PATIENCE,
     SETTLED,
-    GradientGuard,
     all_finite,
     one_colour_psnr,
-    sum_of_gradients,
     why_scores_are_poor,
 )
 from voronerf.training.networks import (
@@ -138,7 +138,7 @@ class Trainer:
             generator=self.generator,
         )
         self.learner = Step(self.renderer, sightings=config.sightings or 0.0)
-        self.guard = GradientGuard(self.device)
+        self.guard = Guard.on(self.device)  # of steps whose loss or gradients are not finite
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
         self.step, self.seconds = 0, 0.0
@@ -157,6 +157,11 @@ class Trainer:
 
     #: Whether this process writes the files of the run.
     writes = True
+
+    @property
+    def skipped(self) -> int:
+        """Steps that were left out, since a loss or gradients were not finite; waits for the device."""
+        return int(self.guard.skipped)
 
     @property
     def router(self) -> VoronoiRouter:
@@ -301,9 +306,9 @@ class Trainer:
         if self.rate_factor < 1 or not there:
             kept = "with half the rate again; the checkpoint is as it was" if there else "there is no checkpoint"
             raise TrainingError(f"{self.out}: {reason} at step {at}, try a smaller --lr; {kept}")
-        skipped = int(self.guard.skipped)
+        skipped = self.skipped
         self._resume(last_checkpoint(self.out))
-        self.guard.skipped.fill_(skipped)
+        self.guard = Guard.on(self.device, skipped)
         self.rate_factor = 0.5
         self.saved_at = self.seconds
         self._begin_stage()
@@ -330,10 +335,11 @@ class Trainer:
             self.renderer.train()
 
     def _forward_backward(self) -> tuple[Tensor, Tensor]:
-        """Draws a batch and learns from it, see :meth:`learn`."""
+        """Draws a batch and learns from it; returns what :meth:`learn` does."""
         batch = self.draw()
+        self.optimizer.zero_grad(set_to_none=True)
         with self.precision():
-            found = self.learner.run(batch, self.draws)
+            found = self.learner.run(batch, self.draws, backward=self.config.precision == "fp32")
         return self.learn(found)
 
     def draw(self) -> Batch:
@@ -346,18 +352,24 @@ class Trainer:
         return nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False)
 
     def learn(self, found: Found) -> tuple[Tensor, Tensor]:
-        """Updates the parameters; returns the loss, and the heaviest samples [n, 4], until the last split."""
-        self.optimizer.zero_grad(set_to_none=True)
-        loss, scaled = found.loss.detach(), self.scaler.is_enabled()
-        # Nothing is read on the host: the fused optimiser skips a step whose gradients have overflowed by itself.
+        """Updates the parameters after gradients were dropped and a step has found these, or a loss that has them.
+
+        Returns:
+            The loss, and the heaviest samples [n, 4], until the last split.
+        """
         if found.loss.requires_grad:
             self.scaler.scale(found.loss).backward()
+        loss = found.loss.detach()
         self.cells.observe(found)
         if self.occupancy is not None:
             self.rays = next_rays(self.config, self.rays, len(found.weights))
-        self.guard.judge(sum_of_gradients(loss, self.optimizer, scaled=scaled), self.optimizer, scaled=scaled)
-        self.scaler.step(self.optimizer)
-        self.scaler.update()
+        # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
+        if self.scaler.is_enabled():
+            judge(self.guard, loss, [])
+            self.scaler.step(self.optimizer)
+            self.scaler.update()
+        else:
+            self.optimizer.update(self.guard, loss)
         return loss, self.cells.heaviest(found)
 
     def finish(self, kept: Tensor) -> None:
@@ -472,7 +484,7 @@ class Trainer:
             "parameters": self.parameter_count,
             "cells": self.diagram.num_cells,
             "splits_left": len(self.plan) - self.level,
-            "skipped_steps": int(self.guard.skipped),
+            "skipped_steps": self.skipped,
             "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
         }
@@ -501,7 +513,7 @@ class Trainer:
             rays_done=self.rays_done,
             stages=tuple(asdict(stage) for stage in self.stages),
             evaluated=self.evaluated,
-            skipped=int(self.guard.skipped),
+            skipped=self.skipped,
             rate_factor=self.rate_factor,
             threads=torch.get_num_threads(),
         )
@@ -547,7 +559,7 @@ class Trainer:
         self.rays, self.rays_done = stored.rays, stored.rays_done
         self.stages = [Stage(**stage) for stage in stored.stages]
         self.cells.splits = len(self.stages) - 1
-        self.guard = GradientGuard(self.device, stored.skipped)
+        self.guard = Guard.on(self.device, stored.skipped)
         self.rate_factor = stored.rate_factor
         self.evaluated = min(stored.evaluated, self._due())  # fewer where the run was made longer
         # Evaluations made after the checkpoint will be made again.

@@ -72,8 +72,9 @@ constexpr int block_rows() {
   return kLanes < 16 ? 6 : V == 4 ? 6 : V == 3 ? 8 : 12;
 }
 
+// Not inlined: among the caller's variables its pointers go to the stack, and the inner loop reloads them.
 template <int R, int V, bool Transposed>
-void block(const Product& p, int64_t row, int64_t column) {
+__attribute__((noinline)) void block(const Product& p, int64_t row, int64_t column) {
   F32 sum[R][V];
   for (int r = 0; r < R; ++r) {
     for (int v = 0; v < V; ++v) sum[r][v] = load(p.start + (row + r) * p.start_stride + column + v * kLanes);

@@ -25,6 +25,19 @@ void reduce(Isa isa, const ProgramCall& call, int64_t cell, float* partials, int
   VN_FOR_ISA(isa, program_reduce(call, cell, partials, count))
 }
 
+// Parameters of a cell on their way to the cache, as of grouped_mlp.
+void fetch(const ProgramCall& call, int64_t cell) {
+  constexpr int64_t kLine = 16, kMostFetched = 1 << 15;  // floats
+  const auto& header = *reinterpret_cast<const ProgramHeader*>(call.code);
+  if (header.packed > kMostFetched) return;
+  const auto* packs = reinterpret_cast<const ProgramPack*>(call.code + sizeof(ProgramHeader) / 4);
+  for (int32_t p = 0; p < header.packs; ++p) {
+    const int64_t stride = call.strides[packs[p].parameter];
+    const float* from = call.parameters[packs[p].parameter] + cell * stride;
+    for (int64_t i = 0; i < stride; i += kLine) __builtin_prefetch(from + i, 0, 2);
+  }
+}
+
 }  // namespace
 
 void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads) {
@@ -49,7 +62,7 @@ void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* 
   float* partial = workspace.data() + stride * threads;
   for_each_task(
       tasks, workspace.data(), stride, threads, [&](int64_t cell, float* own, bool) { pack(isa, call, cell, own); },
-      [](int64_t) {},
+      [&](int64_t cell) { fetch(call, cell); },
       [&](const RowTask& task, float* own) {
         const bool alone = task.partial < 0;
         float* to = alone ? own + own_partial : partial + task.partial * header.partial;

@@ -15,7 +15,9 @@ struct ProgramHeader {
 };
 
 struct ProgramPack {
-  int32_t kind;  // 0: a matrix [o][i] as panels [width][o]; 1: as panels [o][width]; 2: a vector
+  // 0: a matrix [o][i] as panels [width][o]; 1: as panels [o][width]; 2: a vector; 4, 5: as 0 and 1, but of up to four
+  // outputs, [1 or 4][inputs] for few_outputs_tile.h
+  int32_t kind;
   int32_t parameter, o, i, start, width, at;
 };
 
@@ -25,7 +27,9 @@ struct ProgramOperand {
 };
 
 struct ProgramStep {
-  int32_t op, name, order, width, slot, stride;
+  int32_t op, name;
+  int32_t order;  // function: of the derivative; linear: 1 or 4 outputs by few_outputs_tile.h, else 0; move: 1 if whole
+  int32_t width, slot, stride;
   int32_t number;            // input, output: which; linear: its panels; total: columns of a group; sums: their partial
   int32_t depth;             // linear: of the product; sums: 1 where the inputs are next to each other
   int32_t finish;            // linear: 0, 1 ReLU, 2 where ReLU is 0

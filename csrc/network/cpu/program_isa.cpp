@@ -21,13 +21,24 @@ void program_pack(const ProgramCall& call, int64_t cell, float* packed) {
       for (int64_t c = 0; c < padded; ++c) to[c] = c < pack.width ? from[pack.start + c] : 0.0f;
       continue;
     }
-    const int64_t outputs = pack.kind == 0 ? pack.o : pack.width, depth = pack.kind == 0 ? pack.width : pack.o;
+    const bool turned = pack.kind % 2 == 1;
+    const int64_t outputs = turned ? pack.width : pack.o, depth = turned ? pack.o : pack.width;
     const int64_t padded = (outputs + kGranule - 1) / kGranule * kGranule;
     from += pack.start;
+    if (pack.kind > 2) {
+      for (int64_t o = 0; o < (outputs == 1 ? 1 : 4); ++o, to += depth) {
+        if (o < outputs && !turned) {
+          copy_row(from + o * pack.i, depth, to);
+        } else {
+          for (int64_t i = 0; i < depth; ++i) to[i] = o < outputs ? from[i * pack.i + o] : 0.0f;
+        }
+      }
+      continue;
+    }
     for (int64_t first = 0; first < padded; first += kPanel) {
       const int64_t columns = smaller(kPanel, padded - first);
       float* panel = to + first * depth;
-      if (pack.kind == 1) {
+      if (turned) {
         const int64_t count = smaller(columns, outputs - first);
         for (int64_t o = 0; o < depth; ++o) {
           const float* row = from + o * pack.i + first;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "network/cpu/activation_tile.h"
+#include "network/cpu/few_outputs_tile.h"
 #include "network/cpu/functions_tile.h"
 #include "network/cpu/gemm_tile.h"
 #include "network/cpu/grouped_mlp_pack.h"
@@ -164,6 +165,10 @@ struct ProgramTile {
     const Finish finish = step.finish == 0 ? Finish::none : step.finish == 1 ? Finish::relu : Finish::relu_slope;
     const Source source{x.data, x.stride, step.depth};
     float* const to = at(step.slot);
+    if (step.order > 0) {
+      const auto product = step.order == 1 ? few_outputs<1> : few_outputs<4>;
+      return product(&source, 1, packed + step.number, step.depth, add.data, step.finish == 1, rows, to);
+    }
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       const int64_t columns = smaller(kPanel, step.stride - first);
       const float* start = add.data == kZeros ? kZeros : add.data + first;

@@ -25,6 +25,7 @@ _ORDERS = 3  # of derivatives that the compiled module has
 _FLOATS = 96 << 10  # of the values of a tile: they share the second cache level with the weights
 _ROWS = (24, 96)  # of a tile, whole blocks of the products (gemm_tile.h)
 _GRANULE = 16
+_FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h)
 
 
 def grouped_program(
@@ -202,9 +203,12 @@ class _Writing:
             o, _ = self.program.parameters[matrix]
             x = step.operands[0]
             depth, finish = x.width, ("", "relu", "relu_slope").index(step.name)
-            width = step.width if transposed else depth
-            floats = o * padded if transposed else padded * depth
-            number = self.pack(transposed, matrix, start, width, floats)
+            added = step.operands[1 : len(step.operands) - (finish == 2)]
+            if step.width <= _FEW and depth % _GRANULE == 0 and finish < 2 and all(c.of == PARAMETER for c in added):
+                order = 1 if step.width == 1 else _FEW
+            columns = order or padded
+            kind, width = transposed + 4 * (order > 0), step.width if transposed else depth
+            number = self.pack(kind, matrix, start, width, (o if transposed else depth) * columns)
         elif step.op == "function":
             order, name, constants = int(step.numbers[0]), list(FUNCTIONS).index(step.name), len(self.constants)
             self.constants += step.numbers[1:]

@@ -10,28 +10,30 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.checks import check_flag
 from voronerf.ops.learn_outputs.reference import Loss
 from voronerf.ops.routed_mlp import check_routed, routed_mlp
 
 _OP = backends.declare("learn_outputs", native=Implementation(EVERYWHERE, FLOATS))
 
 
-def learn_outputs(network: Mapping[str, Any], loss: Loss, *, backend: str = "auto") -> Tensor:
+def learn_outputs(network: Mapping[str, Any], loss: Loss, *, backward: bool = False, backend: str = "auto") -> Tensor:
     """Evaluates networks, and computes a loss of their outputs together with the gradients of their parameters.
 
     Equivalent to ``loss(routed_mlp(**network)[0])`` and its backward pass, for a loss that knows its own gradient. The
-    native CPU implementation is one node of autograd, which has all gradients before ``backward`` is called. A whole
-    training step is this operation. Only once differentiable.
+    native CPU implementation is one node of autograd, which has all gradients before ``backward`` is called; or none,
+    if these go to the parameters at once. A whole training step is this operation. Only once differentiable.
 
     Args:
         network: The arguments of `routed_mlp` by name, but for ``backend``, as ``VoronoiRouter.table_arguments`` gives
             them. Gradients go to weights, biases and features.
         loss: Called once with the outputs, float32 [n, out], without gradients; returns the loss [] and its gradient to
             the outputs, [n, out].
+        backward: Whether the gradients are added to ``.grad`` of the parameters at once, as ``loss.backward()`` does.
         backend: "auto", "reference" or "native".
 
     Returns:
-        The loss [].
+        The loss []; with ``backward`` without gradients.
 
     Raises:
         ValueError: As `routed_mlp`; a loss or gradient of another shape.
@@ -56,6 +58,7 @@ def learn_outputs(network: Mapping[str, Any], loss: Loss, *, backend: str = "aut
         raise ValueError(f"{_OP}: network must hold positions, weights, biases and layers, got {network!r:.60}")
     if not callable(loss):
         raise TypeError(f"{_OP}: loss must be a function, got {type(loss).__name__}")
+    check_flag(_OP, "backward", backward)
     network = check_routed(_OP, **network)
     positions, weights = network["positions"], network["weights"]
 
@@ -70,5 +73,5 @@ def learn_outputs(network: Mapping[str, Any], loss: Loss, *, backend: str = "aut
     run = backends.resolve(_OP, backend=backend, device=device, dtype=dtype)
     if backend == "auto" and backends.chosen(_OP, device, dtype) == "reference":
         run = functools.partial(run, evaluate=routed_mlp)  # whose operations have backends of their own
-    total: Tensor = run(network, checked)
+    total: Tensor = run(network, checked, backward)
     return total

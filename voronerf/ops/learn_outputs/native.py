@@ -1,12 +1,13 @@
 """``learn_outputs`` of the compiled module: one node of autograd on the CPU in float32.
 
 Checks and nodes of ``routed_mlp``, a loss and their backward passes take a tenth of a step of a few thousand samples.
-Here the gradients of the parameters are computed with the loss, and the backward pass hands them over.
+Here the gradients of the parameters are computed with the loss, and the backward pass hands them over; or they are
+given to the parameters themselves, where autograd would do no more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -19,20 +20,58 @@ from voronerf.ops.routed_mlp import native as routed_mlp
 from voronerf.ops.routed_mlp import of_samples
 
 
-def learn_outputs(network: Mapping[str, Any], loss: Loss) -> Tensor:
+def learn_outputs(network: Mapping[str, Any], loss: Loss, backward: bool) -> Tensor:
     """The loss, with gradients, once differentiable; see ``voronerf.ops.learn_outputs``."""
     floats = (network["positions"], *network["weights"], *network["biases"], network.get("features"))
     plain = all(tensor is None or (tensor.is_cpu and tensor.dtype == torch.float32) for tensor in floats)
     if not plain or torch.is_autocast_enabled("cpu") or not torch.is_grad_enabled():
-        return reference.learn_outputs(network, loss, routed_mlp.routed_mlp)
+        return reference.learn_outputs(network, loss, backward, routed_mlp.routed_mlp)
     frozen = network.get("frozen")
     names = routed_mlp.Where._fields
     where = routed_mlp.Where(**{name: network[name] for name in names if name in network})
     rest = {name: value for name, value in network.items() if name not in (*names, "frozen")}
     call, _ = routed_mlp.prepared(**rest, where=where)
     taken = call.network
-    total: Tensor = _Learn.apply(call, loss, frozen, *taken.weights, *taken.biases, taken.features)
-    return total
+    parameters = [*taken.weights, *taken.biases, taken.features]
+    if backward and all(map(_takes_gradients, parameters)):
+        needs = [parameter is not None and parameter.requires_grad for parameter in parameters]
+        with torch.no_grad():
+            total, gradients = _learn(call, loss, frozen, needs)
+            for parameter, gradient, need in zip(parameters, gradients, needs, strict=bool(gradients)):
+                if need and parameter is not None:
+                    parameter.grad = gradient if parameter.grad is None else parameter.grad.add_(gradient)
+        return total
+    learnt: Tensor = _Learn.apply(call, loss, frozen, *parameters)
+    if not backward:
+        return learnt
+    learnt.backward()
+    return learnt.detach()
+
+
+def _takes_gradients(parameter: Tensor | None) -> bool:
+    """Whether autograd would only add to the gradient: of a leaf without hooks, and of what has no gradient."""
+    if parameter is None or not parameter.requires_grad:
+        return True
+    return parameter.is_leaf and not parameter._backward_hooks and not parameter._post_accumulate_grad_hooks
+
+
+def _learn(
+    call: routed_mlp.Call, loss: Loss, frozen: Tensor | None, needs: Sequence[bool]
+) -> tuple[Tensor, list[Tensor]]:
+    """The loss, and gradients of weights, biases and features where any is needed."""
+    out, cells, order, offsets, encoded = routed_mlp.forward.inside(*call)
+    total, gradient = loss(out)
+    if frozen is not None:  # rows of zeros leave the backward pass
+        cells = cells if call.where.cells is None else call.where.cells
+        gradient = gradient.masked_fill(of_samples(frozen, cells), 0)
+    *of_layers, of_features = needs
+    if not any(needs):
+        return total, []
+    wanted = [any(of_layers), False, False, of_features]
+    sorted_by = order if order.numel() else None
+    found = grouped_mlp.backward.inside(gradient, call.network, offsets, sorted_by, encoded, wanted)
+    *of_parameters, _, _, features = found
+    return total, [*of_parameters, features]
 
 
 class _Learn(torch.autograd.Function):
@@ -40,18 +79,7 @@ class _Learn(torch.autograd.Function):
     def forward(
         ctx: Any, call: routed_mlp.Call, loss: Loss, frozen: Tensor | None, *parameters: Tensor | None
     ) -> Tensor:
-        out, cells, order, offsets, encoded = routed_mlp.forward.inside(*call)
-        total, gradient = loss(out)
-        if frozen is not None:  # rows of zeros leave the backward pass
-            cells = cells if call.where.cells is None else call.where.cells
-            gradient = gradient.masked_fill(of_samples(frozen, cells), 0)
-        *needs, to_features = ctx.needs_input_grad[3:]
-        if any(needs) or to_features:
-            wanted = [any(needs), False, False, to_features]
-            sorted_by = order if order.numel() else None
-            results = grouped_mlp.backward.inside(gradient, call.network, offsets, sorted_by, encoded, wanted)
-            *of_parameters, _, _, of_features = results
-            ctx.gradients = [*of_parameters, of_features]
+        total, ctx.gradients = _learn(call, loss, frozen, ctx.needs_input_grad[3:])
         return total
 
     @staticmethod

@@ -16,7 +16,10 @@ Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def learn_outputs(
-    network: Mapping[str, Any], loss: Loss, evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp
+    network: Mapping[str, Any],
+    loss: Loss,
+    backward: bool,
+    evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp,
 ) -> Tensor:
     """The loss, with gradients; see ``voronerf.ops.learn_outputs``."""
     network = dict(network)
@@ -26,7 +29,11 @@ def learn_outputs(
         total, gradient = loss(out.detach().float())
         if frozen is not None:
             gradient = gradient.masked_fill(of_samples(frozen, cells), 0)
-    return with_gradients(total, [out], [gradient])
+    total = with_gradients(total, [out], [gradient])
+    if not backward:
+        return total
+    total.backward()
+    return total.detach()
 
 
 def with_gradients(loss: Tensor, tensors: list[Tensor], gradients: list[Tensor]) -> Tensor:
@@ -43,5 +50,7 @@ class _Known(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # what the gradients follow from is not known here
+            raise RuntimeError("learn_outputs: gradients are differentiable no further, got create_graph=True")
         found = zip(ctx.gradients, ctx.dtypes, strict=True)  # narrowed last: a scaled loss keeps small ones
         return (None, None, *((gradient * of_loss).to(dtype) for gradient, dtype in found))

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import check_dtype, check_integer, check_number, check_same_device, check_tensor, check_writable
+from voronerf.checks import (
+    check_dtype,
+    check_integer,
+    check_number,
+    check_same_device,
+    check_shape,
+    check_tensor,
+    check_writable,
+)
+from voronerf.ops.sparse_adam.reference import Guard, Rule
 
 _OP = backends.declare(
     "sparse_adam",
@@ -19,32 +28,9 @@ _OP = backends.declare(
 )
 _ALL = backends.declare(
     "adam",
-    native=Implementation(("cpu",), (torch.float32,), file="sparse_adam"),
+    native=Implementation(EVERYWHERE, (torch.float32,), file="sparse_adam"),
     reference=Implementation(file="sparse_adam"),
 )
-
-
-class Rule(NamedTuple):
-    """How a parameter moves.
-
-    Attributes:
-        step: the number of this step, from 1.
-        learning_rate: the rate.
-        betas: decay of the two moments, in [0, 1).
-        epsilon: > 0, added outside of the root.
-        every: whether entries without a gradient move too, as in ``torch.optim.Adam``.
-
-    Examples:
-        >>> from voronerf.ops import Rule
-        >>> Rule(step=1, learning_rate=0.02, every=False).betas
-        (0.9, 0.999)
-    """
-
-    step: int
-    learning_rate: float
-    betas: tuple[float, float] = (0.9, 0.999)
-    epsilon: float = 1e-8
-    every: bool = True
 
 
 @torch.no_grad()
@@ -55,9 +41,11 @@ def adam(
     means: Sequence[Tensor],
     squares: Sequence[Tensor],
     *,
+    guard: Guard | None = None,
+    loss: Tensor | None = None,
     backend: str = "auto",
 ) -> None:
-    """A step of Adam (Kingma and Ba 2015, algorithm 1) of several parameters, in place.
+    """A step of Adam (Kingma and Ba 2015, algorithm 1) of several parameters, in place; no device value is read.
 
     Args:
         rules: One for each parameter.
@@ -65,45 +53,61 @@ def adam(
         gradients: float32, of the same shapes. Not differentiable.
         means: float32, of the same shapes, contiguous: the first moments.
         squares: float32, of the same shapes, contiguous, >= 0: the second moments.
+        guard: Leaves the step out where it has ``found`` something; None for never.
+        loss: float32 [], of the step. With it the guard judges first: the step is left out, and counted as such, unless
+            the magnitudes of the loss, and of the gradients whose rule has ``every``, are all below the limit.
         backend: "auto", "reference" or "native".
 
     Raises:
-        ValueError: shapes, devices, a tensor that is not contiguous, lists of other lengths, numbers out of range.
+        ValueError: shapes, devices, a tensor that is not contiguous, lists of other lengths, numbers out of range, a
+            loss without a guard.
         TypeError: dtypes.
         BackendUnavailable: the named backend cannot run here.
 
     Examples:
         >>> import torch
         >>> from voronerf.ops import Rule, adam
-        >>> weight, mean, square = torch.zeros(2), torch.zeros(2), torch.zeros(2)
-        >>> adam([Rule(1, 0.25)], [weight], [torch.tensor([0.5, -2.0])], [mean], [square])
-        >>> weight
-        tensor([-0.2500,  0.2500])
+        >>> steps, weight, mean, square = torch.zeros(()), torch.zeros(2), torch.zeros(2), torch.zeros(2)
+        >>> adam([Rule(steps, 0.25)], [weight], [torch.tensor([0.5, -2.0])], [mean], [square])
+        >>> weight, steps
+        (tensor([-0.2500,  0.2500]), tensor(1.))
     """
     lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
-    for name, given_list in {"rules": rules, **lists}.items():
-        if not isinstance(given_list, Sequence):
-            raise TypeError(f"{_ALL}: {name} must be a list, got {type(given_list).__name__}")
-    for name, tensors in lists.items():
-        if len(tensors) != len(rules):
-            raise ValueError(f"{_ALL}: {name} must be as many as the {len(rules)} rules, got {len(tensors)}")
+    for name, given in {"rules": rules, **lists}.items():
+        if not isinstance(given, Sequence):
+            raise TypeError(f"{_ALL}: {name} must be a list, got {type(given).__name__}")
+        if len(given) != len(rules):
+            raise ValueError(f"{_ALL}: {name} must be as many as the {len(rules)} rules, got {len(given)}")
     if not rules:
         return
-    for index, rule in enumerate(rules):
+    before: Any = None
+    for rule in rules:
         if not isinstance(rule, Rule):
             raise TypeError(f"{_ALL}: rules must hold a Rule for each parameter, got {type(rule).__name__}")
-        if index == 0 or rule != rules[index - 1]:  # a training has the same rule many times
+        if before is None or rule[1:] != before[1:]:  # a training has the same rule many times
             _check_rule(_ALL, rule)
-    if not _are_plain(parameters, gradients, means, squares):
+        before = rule
+    steps = [rule.step for rule in rules]
+    if not _are_plain(parameters, gradients, means, squares) or not _are_scalars(steps, parameters[0].device):
         for own in zip(*lists.values(), strict=True):
             _check(_ALL, dict(zip(lists, own, strict=True)))
         check_same_device(_ALL, **{f"parameters[{index}]": tensor for index, tensor in enumerate(parameters)})
+        for step in steps:
+            _check_scalar("step", step, parameters[0])
+    if guard is not None:
+        if not isinstance(guard, Guard):
+            raise TypeError(f"{_ALL}: guard must be a Guard, got {type(guard).__name__}")
+        check_number(_ALL, "limit", guard.limit)
+        for name, scalar in zip(guard._fields, guard[:4]):
+            if scalar is not None:
+                _check_scalar(name, scalar, parameters[0])
+    if loss is not None:
+        if guard is None:
+            raise ValueError(f"{_ALL}: loss must come with a guard, got none")
+        _check_scalar("loss", loss, parameters[0])
+        loss = loss.detach()
     run = backends.resolve(_ALL, backend=backend, device=parameters[0].device, dtype=torch.float32)
-    given = []
-    for rule in rules:
-        rate, epsilon = corrected(*rule[:4])
-        given.append((rate, *rule.betas, epsilon, rule.every))
-    run(given, [gradient.contiguous() for gradient in gradients], parameters, means, squares)
+    run(rules, [gradient.contiguous() for gradient in gradients], parameters, means, squares, guard, loss)
 
 
 @torch.no_grad()
@@ -161,7 +165,9 @@ def sparse_adam(
     """
     tensors = {"parameters": parameter, "gradients": gradient, "means": mean, "squares": square}
     _check(_OP, tensors)
-    _check_rule(_OP, Rule(step, learning_rate, betas, epsilon))
+    check_integer(_OP, "step", step, 1)
+    check_number(_OP, "learning_rate", learning_rate)
+    _check_decay(_OP, betas, epsilon)
     run = backends.resolve(_OP, backend=backend, device=parameter.device, dtype=torch.float32)
     first, second = betas
     rate, epsilon = corrected(step, learning_rate, betas, epsilon)
@@ -201,18 +207,36 @@ def _check(op: str, tensors: dict[str, Tensor]) -> None:
     check_same_device(op, **{name[:-1]: tensor for name, tensor in tensors.items()})
 
 
+def _are_scalars(steps: Sequence[Any], device: torch.device) -> bool:
+    """Whether the steps keep all rules."""
+    return all(
+        isinstance(step, Tensor) and step.dtype is torch.float32 and not step.shape and step.device == device
+        for step in steps
+    )
+
+
+def _check_scalar(name: str, tensor: Tensor, parameter: Tensor) -> None:
+    check_shape(_ALL, name, tensor, ())
+    check_dtype(_ALL, name, tensor, (torch.float32,))
+    check_same_device(_ALL, **{"parameters[0]": parameter, name: tensor})
+
+
 def _check_rule(op: str, rule: Rule) -> None:
-    check_integer(op, "step", rule.step, 1)
-    check_number(op, "learning_rate", rule.learning_rate)
-    check_number(op, "epsilon", rule.epsilon)
-    if not isinstance(rule.betas, (tuple, list)) or len(rule.betas) != 2:
-        raise TypeError(f"{op}: betas must be a pair of numbers, got {rule.betas!r:.60}")
-    for beta in rule.betas:
+    if not isinstance(rule.learning_rate, Tensor):
+        check_number(op, "learning_rate", rule.learning_rate)
+    _check_decay(op, rule.betas, rule.epsilon)
+
+
+def _check_decay(op: str, betas: tuple[float, float], epsilon: float) -> None:
+    check_number(op, "epsilon", epsilon)
+    if not isinstance(betas, (tuple, list)) or len(betas) != 2:
+        raise TypeError(f"{op}: betas must be a pair of numbers, got {betas!r:.60}")
+    for beta in betas:
         check_number(op, "betas", beta)
         if not 0 <= beta < 1:
-            raise ValueError(f"{op}: betas must lie in [0, 1), got {rule.betas}")
-    if not rule.epsilon > 0:
-        raise ValueError(f"{op}: epsilon must be positive, got {rule.epsilon}")
+            raise ValueError(f"{op}: betas must lie in [0, 1), got {betas}")
+    if not epsilon > 0:
+        raise ValueError(f"{op}: epsilon must be positive, got {epsilon}")
 
 
 def corrected(step: int, learning_rate: float, betas: tuple[float, float], epsilon: float) -> tuple[float, float]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import torch
+
 from voronerf.ops.cases import Arguments, Case, Draw
-from voronerf.ops.sparse_adam import Rule
+from voronerf.ops.sparse_adam import Guard, Rule
 
 
 def _make(draw: Draw, n: int) -> Arguments:
@@ -24,7 +26,10 @@ def _make(draw: Draw, n: int) -> Arguments:
 def _make_lists(draw: Draw, n: int) -> Arguments:
     one, other = _make(draw, n), _make(draw, 3)
     lists = {f"{name}s": [one[name], other[name]] for name in ("parameter", "gradient", "mean", "square")}
-    return {"rules": [Rule(3, 0.01), Rule(1, 0.02, every=False)], **lists}
+    steps = torch.tensor(2.0), torch.tensor(0.0)
+    guard = draw.among("guard", Guard.on("cpu"), None)
+    loss = None if guard is None else torch.tensor(draw.among("loss", 0.5, torch.nan))
+    return {"rules": [Rule(steps[0], 0.01), Rule(steps[1], 0.02, every=False)], **lists, "guard": guard, "loss": loss}
 
 
 CASE = Case(_make, refused={"learning_rate must be a number, got str": {"learning_rate": "x"}}, in_place=True)

@@ -3,9 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+
+class Rule(NamedTuple):
+    """How a parameter moves.
+
+    Attributes:
+        step: float32 [], the steps done, on the device of the parameter; `adam` counts it on.
+        learning_rate: the rate; or float32 [] on the device of the parameter, which a CUDA graph can read.
+        betas: decay of the two moments, in [0, 1).
+        epsilon: > 0, added outside of the root.
+        every: whether entries without a gradient move too, as in ``torch.optim.Adam``.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import Rule
+        >>> Rule(torch.tensor(0.0), learning_rate=0.02, every=False).betas
+        (0.9, 0.999)
+    """
+
+    step: Tensor
+    learning_rate: float | Tensor
+    betas: tuple[float, float] = (0.9, 0.999)
+    epsilon: float = 1e-8
+    every: bool = True
+
+
+class Guard(NamedTuple):
+    """Which steps are left out. All tensors are float32 [] on the device of the parameters, so that no host reads them.
+
+    Attributes:
+        found: not 0 if the step is left out; with a loss `adam` writes it.
+        skipped: how many steps were left out; with a loss `adam` counts it on.
+        in_a_row: how many of the last ones; counted like ``skipped``.
+        scale: of which the gradients are multiples; None for 1.
+        limit: of the magnitudes of the loss, and of gradients of rules with ``every``.
+
+    Examples:
+        >>> from voronerf.ops import Guard
+        >>> Guard.on("cpu").skipped
+        tensor(0.)
+    """
+
+    found: Tensor
+    skipped: Tensor
+    in_a_row: Tensor
+    scale: Tensor | None = None
+    limit: float = 1e18  # from here on squares are beyond float32, and make the second moment infinite for good
+
+    @staticmethod
+    def on(device: torch.device | str, skipped: int = 0) -> Guard:
+        """A guard that has left out so many steps."""
+        found, in_a_row = torch.zeros((), device=device), torch.zeros((), device=device)
+        return Guard(found, torch.full((), float(skipped), device=device), in_a_row)
 
 
 def sparse_adam(
@@ -27,28 +81,41 @@ def sparse_adam(
 
 
 def adam(
-    rules: Sequence[tuple[float, float, float, float, bool]],
+    rules: Sequence[Rule],
     gradients: Sequence[Tensor],
     parameters: Sequence[Tensor],
     means: Sequence[Tensor],
     squares: Sequence[Tensor],
+    guard: Guard | None,
+    loss: Tensor | None,
 ) -> None:
-    """``sparse_adam`` of several parameters; see ``voronerf.ops.adam``.
+    """A step of several parameters; see ``voronerf.ops.adam``."""
+    left_out = torch.zeros((), dtype=torch.bool, device=parameters[0].device)
+    if guard is not None:
+        judge(guard, loss, [gradient for rule, gradient in zip(rules, gradients) if rule.every])
+        left_out = guard.found != 0
+        if guard.scale is not None:
+            gradients = [gradient / guard.scale for gradient in gradients]
+    for rule, gradient, *tensors in zip(rules, gradients, parameters, means, squares, strict=True):
+        first, second = rule.betas
+        step = rule.step.double() + 1
+        root = (1 - second**step).sqrt()
+        rate, epsilon = (rule.learning_rate * root / (1 - first**step)).float(), (rule.epsilon * root).float()
+        parameter, mean, square = tensors
+        new_mean = first * mean + (1 - first) * gradient
+        new_square = second * square + (1 - second) * gradient.square()
+        moved = parameter - rate * (new_mean / (new_square.sqrt() + epsilon))
+        moves = ~left_out if rule.every else (gradient != 0) & ~left_out
+        for tensor, new in zip(tensors, (moved, new_mean, new_square), strict=True):
+            tensor.copy_(torch.where(moves, new, tensor))
+        rule.step.add_(~left_out)
 
-    Args:
-        rules: rate, first, second and epsilon for each parameter, and whether all of its entries move.
-        gradients: of the parameters.
-        parameters: any shapes.
-        means: of gradients.
-        squares: of squared gradients.
-    """
-    for (*rule, every), gradient, parameter, mean, square in zip(
-        rules, gradients, parameters, means, squares, strict=True
-    ):
-        if not every:
-            sparse_adam(parameter, gradient, mean, square, *rule)
-            continue
-        rate, first, second, epsilon = rule
-        mean.mul_(first).add_(gradient, alpha=1 - first)
-        square.mul_(second).add_(gradient.square(), alpha=1 - second)
-        parameter.sub_(rate * mean / (square.sqrt() + epsilon))
+
+def judge(guard: Guard, loss: Tensor | None, gradients: Sequence[Tensor]) -> None:
+    """Whether a step is left out, where there is a loss: unless it and all gradients are below the limit."""
+    if loss is None:
+        return
+    beyond = ~torch.stack([(tensor.abs() < guard.limit).all() for tensor in (loss, *gradients)])  # true for NaN
+    guard.found.copy_(beyond.any())
+    guard.skipped.add_(guard.found)
+    guard.in_a_row.add_(1).mul_(guard.found)

@@ -1,0 +1,161 @@
+"""Networks, a loss of their outputs and the gradients, in one operation."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from op_cases import refused
+
+from voronerf import MLP, HashGrid, Layer
+from voronerf.ops import learn_outputs, routed_mlp
+
+pytestmark = pytest.mark.op("learn_outputs")
+
+GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
+TABLE = MLP(
+    (Layer(("positions",), 8, "relu"), Layer((0, "directions"), 3)),
+    outputs=(1,),
+    position_encoding="hash",
+    grid=GRID,
+)
+
+
+def network(device, n=40, k=3):
+    """Of k cells, with a table that they share and directions for each of seven rays."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape):
+        return torch.randn(shape, generator=generator).to(device)
+
+    weights = [draw(k, o, i).requires_grad_() for o, i in TABLE.weight_shapes(3, 2)]
+    biases = [draw(k, 8).requires_grad_(), None]
+    return {
+        "positions": draw(n, 3),
+        "weights": weights,
+        "biases": biases,
+        "layers": TABLE,
+        "centres": draw(k, 3) if k > 1 else None,
+        "directions": draw(7, 2),
+        "direction_index": torch.arange(n, device=device, dtype=torch.int32) % 7,
+        "features": draw(*GRID.table_shape).requires_grad_(),
+    }
+
+
+def parameters_of(given):
+    return [*given["weights"], given["biases"][0], given["features"]]
+
+
+def squares(out):
+    """With gradients that differ from row to row."""
+    factor = torch.linspace(0.5, 2, max(len(out), 1), device=out.device)[: len(out), None]
+    return (factor * out.square()).sum(), 2 * factor * out
+
+
+def composed(given):
+    """The same loss, differentiated by torch."""
+    out, _ = routed_mlp(**given, backend="reference")
+    return squares(out)[0]
+
+
+@pytest.mark.parametrize(("n", "k"), [(0, 3), (1, 1), (40, 1), (40, 3)])
+@pytest.mark.parametrize("backward", [False, True])
+def test_equals_its_parts(device, backend, n, k, backward):
+    given, expected = network(device, n, k), network(device, n, k)
+    loss = learn_outputs(given, squares, backward=backward, backend=backend)
+    wanted = composed(expected)
+    assert loss.requires_grad != backward
+    if not backward:
+        (3 * loss).backward()
+    wanted.backward()
+    torch.testing.assert_close(loss.detach(), wanted.detach(), rtol=1e-4, atol=1e-5)
+    for found, other in zip(parameters_of(given), parameters_of(expected), strict=True):
+        factor = 1 if backward else 3
+        torch.testing.assert_close(found.grad, factor * other.grad, rtol=1e-4, atol=1e-4)
+    assert given["positions"].grad is None and given["directions"].grad is None
+
+
+def test_gradients_at_once_are_those_of_backward_bit_for_bit(device, backend):
+    """They are added to those that are there, as autograd does it."""
+    given, expected = network(device), network(device)
+    for _ in range(2):
+        learn_outputs(given, squares, backward=True, backend=backend)
+        learn_outputs(expected, squares, backend=backend).backward()
+    for found, other in zip(parameters_of(given), parameters_of(expected), strict=True):
+        assert torch.equal(found.grad, other.grad)
+
+
+def test_only_what_needs_gradients_gets_them(device, backend):
+    for frozen in ((0,), (0, 1, 2), (3,), (0, 1, 2, 3)):
+        given = network(device)
+        parameters = parameters_of(given)
+        for number in frozen:
+            parameters[number].requires_grad_(False)
+        if len(frozen) < 4:
+            learn_outputs(given, squares, backward=True, backend=backend)
+        assert [p.grad is None for p in parameters] == [number in frozen or len(frozen) == 4 for number in range(4)]
+
+
+def test_gradients_reach_what_parameters_are_made_of(device, backend):
+    """A shared layer is one parameter that all cells have, expanded: autograd adds up what the cells give it."""
+    results = []
+    for backward in (True, False):
+        given = network(device)
+        shared = given["weights"][0].detach()[0].clone().requires_grad_()
+        given["weights"][0] = shared.expand(3, -1, -1)
+        loss = learn_outputs(given, squares, backward=backward, backend=backend)
+        if not backward:
+            loss.backward()
+        results.append([shared.grad, *(p.grad for p in parameters_of(given)[1:])])
+    assert all(torch.equal(*pair) for pair in zip(*results, strict=True))
+
+
+def test_hooks_of_parameters_are_called(device, backend):
+    given, called = network(device), []
+    first, second = given["weights"]
+    first.register_hook(lambda gradient: called.append(gradient.shape))
+    second.register_post_accumulate_grad_hook(lambda parameter: called.append(parameter.shape))
+    learn_outputs(given, squares, backward=True, backend=backend)
+    assert sorted(called) == sorted((first.shape, second.shape))
+
+
+def test_a_loss_without_gradients_to_anything(device, backend):
+    with torch.no_grad():
+        loss = learn_outputs(network(device), squares, backend=backend)
+    assert not loss.requires_grad and float(loss) > 0
+
+
+def test_under_autocast(device, backend):
+    given = network(device)
+    with torch.autocast(torch.device(device).type, torch.bfloat16):
+        loss = learn_outputs(given, squares, backend=backend)
+    loss.backward()
+    torch.testing.assert_close(loss.detach(), composed(network(device)).detach(), rtol=0.05, atol=0.0)
+    assert all(parameter.grad.dtype == torch.float32 for parameter in parameters_of(given))
+
+
+def test_is_once_differentiable(device, backend):
+    given = network(device)
+    loss = learn_outputs(given, squares, backend=backend)
+    with pytest.raises(RuntimeError):
+        gradients = torch.autograd.grad(loss, parameters_of(given), create_graph=True)
+        torch.autograd.grad(sum(gradient.square().sum() for gradient in gradients), given["weights"][0])
+
+
+def test_refuses_what_makes_no_sense(device, backend):
+    given = network(device)
+    with refused(ValueError, "learn_outputs: network must hold positions, weights, biases and layers, got ..."):
+        learn_outputs({"positions": given["positions"]}, squares)
+    with refused(TypeError, "learn_outputs: loss must be a function, got int"):
+        learn_outputs(given, 1)
+    with refused(TypeError, "learn_outputs: backward must be True or False, got int"):
+        learn_outputs(given, squares, backward=1)
+    with refused(TypeError, "learn_outputs: unknown arguments other"):
+        learn_outputs({**given, "other": 1}, squares)
+    wrong = (lambda out: (out, out), "[40, 3] and [40, 3]"), (lambda out: (out.sum(), out[0]), "[] and [3]")
+    for result, came in wrong:
+        message = f"learn_outputs: loss must return a loss [] and a gradient [40, 3], got {came}"
+        with refused(ValueError, message):
+            learn_outputs(given, result, backend=backend)
+    with refused(ValueError, "learn_outputs: weights[1] must have shape ..."):
+        learn_outputs({**given, "weights": [given["weights"][0], given["weights"][1][:, :2]]}, squares)
+    assert all(parameter.grad is None for parameter in parameters_of(given))

@@ -1,0 +1,221 @@
+"""What becomes a step of a fused network, and what runs between its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from convention_harness import randomised
+from convention_listed import uniform
+from torch import Tensor, nn
+
+from voronerf import VoronoiRouter
+
+K = 4
+
+
+def written(make: Callable[[Any], Tensor]) -> Callable[[Any, Tensor], Tensor]:
+    """A step that writes into a tensor that it makes."""
+
+    def step(net: Any, h: Tensor) -> Tensor:
+        made = make(h)
+        made[..., 0] = 1.5 * h[..., 1]
+        made[..., 2:5] = h[..., 3:6]
+        made[:, 5:].copy_(h[:, :3])
+        made[:, 6] *= 2
+        return made
+
+    return step
+
+
+STEPS: dict[str, Callable[[Any, Tensor], Tensor]] = {
+    "maximum": lambda net, h: torch.maximum(h, h.roll(1, -1)),
+    "minimum": lambda net, h: torch.min(h, h.roll(1, -1)),
+    "maximum of equals": lambda net, h: torch.maximum(h.clamp(0, 0.1), h.roll(1, -1).clamp(0, 0.1)),
+    "amax": lambda net, h: h - h.amax(-1, keepdim=True),
+    "amin": lambda net, h: h - h[:, :5].amin(-1)[:, None],
+    "product": lambda net, h: h * h[:, 1:6].prod(-1, keepdim=True),
+    "softmax": lambda net, h: F.softmax(30 * h, -1),
+    "log_softmax": lambda net, h: F.log_softmax(h, -1),
+    "variance": lambda net, h: h / h.var(-1, keepdim=True),
+    "deviation": lambda net, h: h / h.std(-1, unbiased=False, keepdim=True),
+    "hardswish": lambda net, h: F.hardswish(8 * h),
+    "hardsigmoid": lambda net, h: F.hardsigmoid(8 * h),
+    "celu": lambda net, h: F.celu(h, 0.7),
+    "selu": lambda net, h: F.selu(h),
+    "mish": lambda net, h: F.mish(h),
+    "logsigmoid": lambda net, h: F.logsigmoid(h),
+    "glu": lambda net, h: torch.cat([F.glu(h), F.glu(-h)], -1),
+    "threshold": lambda net, h: F.threshold(h, 0.1, 0.3),
+    "softshrink": lambda net, h: F.softshrink(h, 0.2),
+    "hardshrink": lambda net, h: F.hardshrink(h, 0.2),
+    "softsign": lambda net, h: F.softsign(h),
+    "tanhshrink": lambda net, h: F.tanhshrink(3 * h),
+    "sign": lambda net, h: h * torch.sign(h),
+    "ceil, frac, remainder": lambda net, h: h * (3 * h).ceil() + (3 * h).frac() + torch.remainder(h, 0.4),
+    "lerp": lambda net, h: torch.lerp(h, h.roll(1, -1), 0.3) + torch.lerp(h, h.square(), h),
+    "addcmul, addcdiv": lambda net, h: torch.addcmul(h, h, h, value=0.5) + torch.addcdiv(h, h, h.exp()),
+    "masks": lambda net, h: h.masked_fill((h > 0.2) | (h == 0.1), 0.0) * ((h != 0) & ~(h < -1)),
+    "all, any": lambda net, h: h * ((h > -1).all(-1, keepdim=True) | (h > 0.3).any(-1, keepdim=True)),
+    "cross": lambda net, h: torch.cat([torch.linalg.cross(h[:, :3], h[:, 3:6]), h[:, :5]], -1),
+    "a norm": lambda net, h: F.normalize(h, dim=-1) + h.norm(p=1, dim=-1, keepdim=True),
+    "a norm of zeros": lambda net, h: F.normalize(h.clamp(min=9) - 9, dim=-1) + (0 * h).norm(dim=-1, keepdim=True) + h,
+    "small matrices": lambda net, h: torch.bmm(h.view(-1, 2, 4), h.view(-1, 4, 2)).flatten(1).repeat(1, 2),
+    "a matrix and a vector": lambda net, h: h * (h @ net.gain)[:, None],
+    "a parameter beside samples": lambda net, h: torch.cat([h[:, 2:], net.gain[None, :2].expand(len(h), 2)], 1),
+    "constants beside samples": lambda net, h: torch.cat([h[:, 2:], torch.arange(2.0).repeat(len(h), 1)], 1),
+    "writing into zeros": written(torch.zeros_like),
+    "writing into new memory": written(lambda h: torch.empty(len(h), 8).fill_(0.5)),
+    "writing into a mask": written(lambda h: torch.ones(h.shape, dtype=h.dtype)),
+}
+
+
+class Around(nn.Module):
+    """Linear layers around a step."""
+
+    def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.a, self.b, self.step = nn.Linear(3, 8), nn.Linear(8, 2), [step]
+        self.gain = nn.Parameter(torch.ones(8))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.b(self.step[0](self, torch.tanh(self.a(x))))
+
+
+def both(make: Callable[[], nn.Module], x: Tensor, *args: Any, **options: Any) -> tuple[Any, Any, VoronoiRouter]:
+    """(result, that of a loop over masks with the router's parameters, router) for a module of its own in each cell."""
+    modules = [randomised(make()) for _ in range(K)]
+    centres = torch.rand(K, 3, generator=torch.Generator().manual_seed(3)) * 2 - 1
+    options = {"coords": "first3", "fuse": True, "way": "fused", **options}
+    router = VoronoiRouter.from_modules(modules, centres, **options)
+    cells = router.assign(x)
+    expected = torch.empty(0)
+    for cell in range(K):
+        own = {name: p[cell] for name, p in router.module.named_parameters()}
+        part = torch.func.functional_call(modules[cell], own, (x[cells == cell], *args))
+        expected = part.new_empty(len(x), *part.shape[1:]) if not expected.numel() else expected
+        expected = expected.index_put(((cells == cell).nonzero()[:, 0],), part)
+    return router(x, *args), expected, router
+
+
+ONCE = ("hardsigmoid", "a norm of zeros")  # PyTorch has no second derivative of the one, and NaN of the other
+
+
+def derivatives(y: Tensor, x: Tensor, router: VoronoiRouter, twice: bool = True) -> list[Tensor]:
+    """The first derivatives by x and by parameters, and those of a penalty of the first ones."""
+    weights = torch.linspace(0.5, 1.5, y.numel()).view_as(y)
+    wanted = [x, *router.parameters()]
+    first = torch.autograd.grad((y * weights).sum(), wanted, create_graph=twice, retain_graph=True, allow_unused=True)
+    penalty = (first[0].norm(dim=-1) - 1).square().mean()
+    second = torch.autograd.grad(penalty, wanted, allow_unused=True) if twice else ()
+    return [torch.zeros(1) if g is None else g for g in (*first, *second)]
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_a_step_of_the_program(name: str) -> None:
+    """Values, first and second derivatives are those of the loop, and nothing runs between."""
+    torch.manual_seed(0)
+    x = uniform((90,)).requires_grad_()
+    found, expected, router = both(lambda: Around(STEPS[name]), x)
+    assert router.explain() == "forward: fused"
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    ours, theirs = (derivatives(y, x, router, name not in ONCE) for y in (found, expected))
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
+
+
+class Exponential(torch.autograd.Function):
+    """torch-ngp's ``trunc_exp``."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return torch.exp(x)
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> Tensor:
+        return g * torch.exp(ctx.saved_tensors[0].clamp(-0.2, 0.2))
+
+
+bound_early = Exponential.apply  # as modules do when they are imported
+
+
+def by_sum(net: Any, h: Tensor) -> Tensor:
+    (gradient,) = torch.autograd.grad(net.a(h[:, :3]).square().sum(), h, create_graph=True)
+    return gradient
+
+
+class Slope(Around):
+    """NeuS: the gradient of the first output, by ``torch.autograd.grad`` inside of ``forward``."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.enable_grad():
+            x.requires_grad_(True)
+            y = super().forward(x)[:, :1]
+            ones = torch.ones_like(y, requires_grad=False)
+            (slope,) = torch.autograd.grad(y, x, ones, create_graph=True, retain_graph=True, only_inputs=True)
+        return torch.cat([y, F.normalize(slope, dim=-1), self.b(self.a(slope))], -1)
+
+
+BETWEEN: dict[str, tuple[Callable[[], nn.Module], str]] = {
+    "a custom function bound early": (lambda: Around(lambda net, h: bound_early(h)), "Exponential.apply"),
+    "a gradient": (lambda: Slope(lambda net, h: h.square()), "grad"),
+    "a gradient of a sum, by what was computed": (lambda: Around(by_sum), "sum, grad"),
+    "no gradient": (lambda: Around(lambda net, h: h * torch.no_grad()(torch.erf)(h)), "torch.erf"),
+}
+
+
+@pytest.mark.parametrize("name", BETWEEN)
+def test_what_runs_between_the_runs(name: str) -> None:
+    """Values and derivatives are those of the loop, where PyTorch computes a part; also where none are asked for."""
+    torch.manual_seed(0)
+    make, says = BETWEEN[name]
+    x = uniform((90,)).requires_grad_()
+    found, expected, router = both(make, x)
+    assert router.explain().startswith("forward: fused in runs") and says in router.explain()
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    for a, b in zip(derivatives(found, x, router), derivatives(expected, x, router), strict=True):
+        torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
+    if "by what was computed" not in name:
+        with torch.no_grad():
+            torch.testing.assert_close(router(x.detach()), expected.detach(), rtol=1e-4, atol=1e-5)
+        assert "fused in runs" in router.explain()
+
+
+class Timed(nn.Module):
+    """torch-ngp's D-NeRF: a time that all samples share goes through a layer of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time, self.a, self.b = nn.Linear(1, 4), nn.Linear(7, 8), nn.Linear(8, 2)
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        h = torch.cat([x, self.time(t).repeat(len(x), 1)], -1)
+        return self.b(F.relu(self.a(h))) * t
+
+
+def test_arguments_that_all_samples_share_are_those_of_each_call() -> None:
+    x, t = uniform((90,)), torch.tensor([[0.2]], requires_grad=True)
+    found, expected, router = both(Timed, x, t)
+    torch.testing.assert_close(found, expected)
+    modules = [router.cell(cell) for cell in range(K)]
+    for value in (0.7, -2.0):
+        t = torch.tensor([[value]], requires_grad=True)
+        result, cells = router(x, t), router.assign(x)
+        own = torch.stack([modules[cell](x[i : i + 1], t)[0] for i, cell in enumerate(cells.tolist())])
+        torch.testing.assert_close(result, own)
+        torch.testing.assert_close(torch.autograd.grad(result.sum(), t), torch.autograd.grad(own.sum(), t))
+    assert router.explain() == "forward: fused"
+
+
+def test_a_path_that_an_argument_chooses_is_refused() -> None:
+    class Chooses(Timed):
+        def forward(self, x: Tensor, t: Tensor) -> Tensor:
+            return super().forward(x, t) if t > 0 else x[:, :2]
+
+    router = VoronoiRouter(Chooses(), torch.randn(4, 3), coords="first3", fuse=True)
+    with pytest.raises(ValueError, match=r"the truth of a tensor is read \(.* if t > 0 .*depends on values"):
+        router(uniform((90,)), torch.tensor([[0.2]]))
