@@ -1,4 +1,4 @@
-"""Joint training: the same bits on any number of ranks, gradients, memory, bytes, checkpoints, resumed and moved runs."""
+"""Joint training: the same bits on any number of ranks, what these hold and send, moved and resumed runs."""
 
 import functools
 import json
@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import refuses, same
-from ranks import on_ranks
+from helpers import refuses
+from ranks import joint_tensors, on_ranks
 
-from voronerf.data import builtin_scene, city_scene
+from voronerf.data import builtin_scene
 from voronerf.data.scene import Sightings
 from voronerf.distributed.group import joined
-from voronerf.training.checkpoint import CheckpointError, checkpoint_path, load_checkpoint, part_files
+from voronerf.training.checkpoint import CheckpointError, checkpoint_path, load_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.joint import JointTrainer
 
@@ -83,14 +83,6 @@ def runs(tmp_path_factory):
     return folder
 
 
-def parts(run):
-    """The tensors of all territories."""
-    path = checkpoint_path(run)
-    files = part_files(load_checkpoint(path, keep=lambda name: not name.startswith("part-")).values)
-    found = [load_checkpoint(path.with_name(file)).tensors for file in files]
-    return {f"{number}.{name}": tensor for number, part in enumerate(found) for name, tensor in part.items()}
-
-
 def assert_same(first, second):
     assert first.keys() == second.keys()
     different = [name for name in first if not torch.equal(first[name].nan_to_num(), second[name].nan_to_num())]
@@ -99,12 +91,50 @@ def assert_same(first, second):
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_ranks_are_one_process_to_the_bit(runs, name):
-    one = parts(runs / f"1-{name}")
+    one = joint_tensors(runs / f"1-{name}")
     assert any(key.endswith("router.diagram.centres") and len(value) > 1 for key, value in one.items())
     for size in (2, 4):
-        assert_same(one, parts(runs / f"{size}-{name}"))
+        assert_same(one, joint_tensors(runs / f"{size}-{name}"))
     files = [{p.name.split("-")[0] for p in (runs / f"{size}-{name}").rglob("*.*")} for size in (1, 2, 4)]
     assert files[0] == files[1] == files[2]
     scores = [json.loads((runs / f"{size}-{name}" / "summary.json").read_text()) for size in (1, 2, 4)]
     for key in ("psnr", "ssim", "parameters", "cells", "splits_left"):
         assert scores[0][key] == scores[1][key] == scores[2][key], key
+
+
+def test_what_a_rank_holds_and_sends(runs):
+    """The networks of its own territories; of the rays of others 32 bytes each."""
+    tensors = joint_tensors(runs / "1-hashgrid")
+    found = [json.loads((runs / f"hashgrid-{rank}.json").read_text()) for rank in range(4)]
+    assert [each["own"] for each in found] == [[0], [1], [2], [3]]
+    for rank, each in enumerate(found):
+        own = sum(t.numel() for key, t in tensors.items() if key.startswith(f"{rank}.router.module."))
+        assert each["held"] == own
+        assert each["sent"]["sums"] > 0 and each["sent"]["answers"] > 0
+        steps, rays = 20, 64
+        assert each["sent"]["rays"] < steps * 3 * (32 * (rays + 8) * 9 / 8 + 64)
+
+
+def test_territories_move_and_ranks_change(runs, tmp_path):
+    """Moved territories, other numbers of ranks, and a restart in one process go on to the bit."""
+    expected = joint_tensors(runs / "1-nerf")
+    moving = settings(tmp_path / "moving", "nerf")
+    codes, _ = on_ranks(train, tmp_path, {"moving": moving}, None, 3, folder=tmp_path)
+    assert codes == [0, 0]
+    assert_same(expected, joint_tensors(moving.out))
+    own = [json.loads((tmp_path / f"moving-{rank}.json").read_text())["own"] for rank in range(2)]
+    assert sorted(own[0] + own[1]) == [0, 1, 2, 3] and own != [[0, 1], [2, 3]]
+
+    half = settings(tmp_path / "half", "nerf")
+    assert on_ranks(train, tmp_path, {"half": half}, 11, folder=tmp_path)[0] == [0, 0]
+    assert load_checkpoint(checkpoint_path(half.out)).values["step"] == 16
+    for ranks in (2, 3, 1):
+        config = replace(half, out=tmp_path / f"to-{ranks}", resume=True)
+        shutil.copytree(half.out, config.out)
+        if ranks == 1:
+            JointTrainer(config, scene()).run()
+        else:
+            assert on_ranks(train, tmp_path, {"rest": config}, folder=tmp_path, size=ranks)[0] == [0] * ranks
+        assert_same(expected, joint_tensors(config.out))
+    other = replace(half, resume=True, territories=2)
+    refuses("--territories 4 -> 2", JointTrainer, other, scene(), error=CheckpointError)
