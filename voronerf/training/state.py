@@ -51,6 +51,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
     try:
         if isinstance(values.get("stages"), list):
             values["stages"] = tuple(values["stages"])
+        values.pop("parts", None)  # which are compared where they are made
         check_types(source, Stored, values)
         for number, stage in enumerate(values["stages"]):
             check_types(f"{source}: stage {number}", Stage, stage)
