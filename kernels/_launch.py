@@ -23,6 +23,13 @@ def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float3
     return wp.from_torch(tensor.detach().resolve_neg())  # which torch leaves to ops that take lists
 
 
+def of_both_dtypes(kernel: Any) -> None:
+    """Has a kernel of points, centres and weights compiled for float32 and float64 when its file is."""
+    for scalar in (wp.float32, wp.float64):
+        rows = wp.array2d(dtype=scalar)
+        wp.overload(kernel, {"points": rows, "centres": rows, "weights": wp.array(dtype=scalar)})
+
+
 def on_stream(tensor: Tensor) -> AbstractContextManager[Any]:
     """Makes torch's current stream Warp's, for calls without a stream argument."""
     if not tensor.is_cuda:

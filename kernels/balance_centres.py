@@ -7,10 +7,13 @@ sum, so that the order in which threads come does not matter: the result is the 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -100,27 +103,22 @@ def _move_kernel(
     cleared[i] = wp.int64(0)
 
 
+@custom_op("balance_centres_warp")
 def balance_centres(
-    samples: Tensor, masses: Tensor, centres: Tensor, *, steps: int, alpha: float, neighbours: int, global_norm: bool
-) -> tuple[Tensor, Tensor]:
-    """The published update, repeated; see ``voronerf.ops.balance_centres``."""
-    moved, weights = _balance(samples, masses, centres, steps, alpha, neighbours, global_norm)
-    return moved, weights
-
-
-@torch.library.custom_op("voronerf::balance_centres_warp", mutates_args=())
-def _balance(
     samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int, global_norm: bool
-) -> tuple[Tensor, Tensor]:
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The published update, repeated; see ``voronerf.ops.balance_centres``."""
     m, k = samples.shape[0], centres.shape[0]
+    moved, weights = centres.new_empty(centres.shape), masses.new_empty(k)
+    yield moved, weights
     # A power of two, in which masses that are short numbers are whole.
     unit = torch.ldexp(masses.new_ones(()), torch.frexp(masses.sum()).exponent - _BITS)
     units = (masses / unit).round().to(torch.int64)
     now, then = centres.clone(memory_format=torch.contiguous_format), torch.empty_like(centres)
-    weights, cleared = units.new_zeros(k), units.new_zeros(k)
+    found, cleared = units.new_zeros(2, k)
     given = [array(samples, samples), array(units, samples)]
     places = [array(now, samples), array(then, samples)]
-    sums = [array(weights, samples), array(cleared, samples)]
+    sums = [array(found, samples), array(cleared, samples)]
     steps = steps if k > 1 else 0
     for step in range(steps):
         here, there = step % 2, 1 - step % 2
@@ -129,11 +127,5 @@ def _balance(
         launch(_move_kernel, k, [places[here], sums[here], *rest], samples)
     last = steps % 2
     launch(_weigh_kernel, m, [*given, places[last], sums[last]], samples)
-    return (now, then)[last], (weights, cleared)[last] * unit
-
-
-@_balance.register_fake
-def _(
-    samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int, global_norm: bool
-) -> tuple[Tensor, Tensor]:
-    return centres.new_empty(centres.shape), masses.new_empty(centres.shape[0])
+    moved.copy_((now, then)[last])
+    weights.copy_((found, cleared)[last] * unit)

@@ -5,10 +5,13 @@ A thread takes a pixel. The distortion of the lens is undone in float64 by the r
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch
 from voronerf.ops.camera_rays.reference import FISHEYE, FOV, NEWTON_STEPS, PERSPECTIVE, TINY
 
@@ -119,53 +122,22 @@ def _camera_rays_kernel(
         directions[i, axis] = direction[axis]
 
 
+@custom_op("camera_rays_warp")
 def camera_rays(
     poses: Tensor,
     intrinsics: Tensor,
     x: Tensor,
     y: Tensor,
-    *,
     camera: Tensor | None,
     distortion: Tensor | None,
     models: Tensor | None,
-) -> tuple[Tensor, Tensor]:
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Origins and unit directions; see ``voronerf.ops.camera_rays``."""
-    origins, directions = _camera_rays(poses, intrinsics, x, y, camera, distortion, models)
-    return origins, directions
-
-
-@torch.library.custom_op("voronerf::camera_rays_warp", mutates_args=())
-def _camera_rays(
-    poses: Tensor,
-    intrinsics: Tensor,
-    x: Tensor,
-    y: Tensor,
-    camera: Tensor | None,
-    distortion: Tensor | None,
-    models: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    results = _allocate(poses, x)
+    origins, directions = poses.new_empty(x.shape[0], 3), poses.new_empty(x.shape[0], 3)
+    yield origins, directions
     given = [array(tensor, poses) for tensor in (poses, intrinsics, x, y)]
     lens = array(intrinsics.new_empty(0, 8) if distortion is None else distortion, poses)
     kinds = array(models, poses, torch.int32)
     choice = [array(camera, poses, torch.int32), camera is not None, lens, distortion is not None, kinds]
-    inputs = [*given, *choice, *(array(tensor, poses) for tensor in results)]
+    inputs = [*given, *choice, array(origins, poses), array(directions, poses)]
     launch(_camera_rays_kernel, x.shape[0], inputs, poses)
-    return results
-
-
-@_camera_rays.register_fake
-def _(
-    poses: Tensor,
-    intrinsics: Tensor,
-    x: Tensor,
-    y: Tensor,
-    camera: Tensor | None,
-    distortion: Tensor | None,
-    models: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    return _allocate(poses, x)
-
-
-def _allocate(poses: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    return poses.new_empty(x.shape[0], 3), poses.new_empty(x.shape[0], 3)

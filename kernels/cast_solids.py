@@ -6,12 +6,14 @@ reference's formulas. Building the tree of some hundred solids costs less than a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch, on_stream
 from voronerf.ops.cast_solids.reference import BOX, CYLINDER, SPHERE, SURFACE, TINY, TRACE_STEPS, bounds
 
@@ -139,21 +141,17 @@ def _cast_solids_kernel(
     solids[i] = which
 
 
+@custom_op("cast_solids_warp")
 def cast_solids(
     kinds: Tensor, frames: Tensor, sizes: Tensor, origins: Tensor, directions: Tensor
-) -> tuple[Tensor, Tensor]:
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Depths and solids; see ``voronerf.ops.cast_solids``."""
-    depths, solids = _cast_solids(kinds, frames, sizes, origins, directions)
-    return depths, solids
-
-
-@torch.library.custom_op("voronerf::cast_solids_warp", mutates_args=())
-def _cast_solids(
-    kinds: Tensor, frames: Tensor, sizes: Tensor, origins: Tensor, directions: Tensor
-) -> tuple[Tensor, Tensor]:
-    depths, solids = _allocate(origins)
+    depths, solids = origins.new_empty(origins.shape[0]), origins.new_empty(origins.shape[0], dtype=torch.int32)
+    yield depths, solids
     if kinds.shape[0] == 0:
-        return depths.fill_(float("inf")), solids.fill_(-1)
+        depths.fill_(float("inf"))
+        solids.fill_(-1)
+        return
     low, high = (corner.contiguous() for corner in bounds(kinds, frames, sizes))
     low, high = low - MARGIN, high + MARGIN
     with on_stream(origins):
@@ -161,13 +159,3 @@ def _cast_solids(
         tree = wp.Bvh(*corners)
         tables = [array(tensor, origins) for tensor in (kinds, frames, sizes, origins, directions, depths, solids)]
         launch(_cast_solids_kernel, origins.shape[0], [tree.id, *tables], origins)
-    return depths, solids
-
-
-@_cast_solids.register_fake
-def _(kinds: Tensor, frames: Tensor, sizes: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    return _allocate(origins)
-
-
-def _allocate(origins: Tensor) -> tuple[Tensor, Tensor]:
-    return origins.new_empty(origins.shape[0]), origins.new_empty(origins.shape[0], dtype=torch.int32)

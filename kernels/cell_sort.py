@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Iterator
+
 import warp as wp
 from torch import Tensor
 
+from voronerf.checks import check_range
+from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch, on_stream
 
 wp.set_module_options({"enable_backward": False})
@@ -39,29 +42,17 @@ def _offsets_kernel(keys: wp.array(dtype=wp.int32), n: wp.int32, offsets: wp.arr
     offsets[cell] = low
 
 
-def cell_sort(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:
+@custom_op("cell_sort_warp")
+def cell_sort(cells: Tensor, k: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Stable order and cell offsets; see ``voronerf.ops.cell_sort``."""
-    order, offsets = _cell_sort(cells, k)
-    return order, offsets
-
-
-@torch.library.custom_op("voronerf::cell_sort_warp", mutates_args=())
-def _cell_sort(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:
     n = cells.shape[0]
-    if not cells.is_cuda and n > 0:
-        low, high = (int(bound) for bound in cells.aminmax())
-        if low < 0 or high >= k:
-            raise ValueError(f"cell_sort: cells must lie in 0 to {k - 1}, got values from {low} to {high}")
+    order, offsets = cells.new_empty(n), cells.new_empty(k + 1)
+    yield order, offsets
+    check_range("cell_sort", "cells", cells, k)
     # The sort needs room for twice the pairs, and leaves them in the first half.
-    keys, order = cells.new_empty(2 * n), cells.new_empty(2 * n)
-    offsets = cells.new_empty(k + 1)
-    launch(_keys_kernel, n, [array(cells, cells), k, array(keys, cells), array(order, cells)], cells)
+    keys, rows = cells.new_empty(2, 2 * n)
+    launch(_keys_kernel, n, [array(cells, cells), k, array(keys, cells), array(rows, cells)], cells)
     with on_stream(cells):
-        wp.utils.radix_sort_pairs(array(keys, cells), array(order, cells), n, end_bit=max((k + 1).bit_length(), 1))
+        wp.utils.radix_sort_pairs(array(keys, cells), array(rows, cells), n, end_bit=max((k + 1).bit_length(), 1))
     launch(_offsets_kernel, k + 1, [array(keys, cells), n, array(offsets, cells)], cells)
-    return order[:n].clone(), offsets
-
-
-@_cell_sort.register_fake
-def _(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(cells), cells.new_empty(k + 1)
+    order.copy_(rows[:n])

@@ -11,21 +11,16 @@ whole ray. Second derivatives come from the reference formula.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op, in_float32
 from voronerf.kernels._launch import array, launch
-from voronerf.ops.composite.autograd import (
-    composite_backward_backward,
-    composite_backward_setup,
-    composite_forward_backward,
-    composite_forward_setup,
-)
-from voronerf.ops.composite.reference import Composite
+from voronerf.ops.composite.autograd import Arriving, RaySamples, register
 
 wp.set_module_options({"enable_backward": False})
 
@@ -157,124 +152,54 @@ def _composite_backward_kernel(
             grad_sigma[i] = to_optical * deltas[i]
 
 
-def composite(
-    sigma: Tensor,
-    rgb: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
-    *,
-    ray_offsets: Tensor | None = None,
-    background: Tensor | None = None,
-) -> Composite:
+def composite(*given: Tensor | None) -> Any:
     """Absorption and emission along rays; see ``voronerf.ops.composite``."""
-    if background is not None:
-        background = background.float()
-    parts = _forward(sigma.float(), rgb.float(), depths.float(), deltas.float(), ray_offsets, background)
-    return Composite(*(part.to(rgb.dtype) for part in parts))
+    return in_float32(_forward, RaySamples._make(given))
 
 
-@torch.library.custom_op("voronerf::composite_warp", mutates_args=())
-def _forward(
-    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    colour, opacity, depth, weights = results = _allocate(sigma, rgb, ray_offsets)
+@custom_op("composite_warp")
+def _forward(given: RaySamples) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    colour, opacity, depth, weights = results = given.results()
+    yield results
     # Samples that belong to no ray.
     weights.zero_()
-    outputs = [array(tensor, sigma) for tensor in (colour, opacity, depth, weights.view(-1))]
-    inputs = _inputs(sigma, rgb, depths, deltas, ray_offsets, background)
-    launch(_composite_kernel, opacity.shape[0], [*inputs, *outputs], sigma)
-    return results
+    outputs = [array(tensor, colour) for tensor in (colour, opacity, depth, weights.view(-1))]
+    launch(_composite_kernel, given.rays, [*_inputs(given), *outputs], colour)
 
 
-@torch.library.custom_op("voronerf::composite_warp_backward", mutates_args=())
-def _backward(
-    colour: Tensor | None,
-    opacity: Tensor | None,
-    depth: Tensor | None,
-    weights: Tensor | None,
-    sigma: Tensor,
-    rgb: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor | None,
-    background: Tensor | None,
-    wanted: Sequence[bool],
-) -> list[Tensor]:
-    """Gradients to sigma, rgb, depths, deltas and background; the last is empty without one.
-
-    The first four arguments are the gradients of the outputs, None for zero.
-    """
-    shapes = _allocate(sigma, rgb, ray_offsets)
-    given = [
-        torch.zeros_like(part) if gradient is None else gradient
-        for gradient, part in zip((colour, opacity, depth, weights), shapes)
-    ]
-    results = [
-        torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in (sigma, rgb, depths, deltas)
-    ]
-    left = sigma.new_empty(_rays(sigma, ray_offsets))
-    gradients = [array(tensor, sigma) for tensor in (*given[:3], given[3].reshape(-1))]
-    inputs = _inputs(sigma, rgb, depths, deltas, ray_offsets, background)
-    flat = [results[0].view(-1), results[1].view(-1, rgb.shape[-1]), results[2].view(-1), results[3].view(-1), left]
+@custom_op("composite_warp_backward")
+def _backward(arriving: Arriving, given: RaySamples, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
+    sigma, rgb = given.sigma, given.rgb
+    results = given.gradients([*[True] * 4, wanted[4]])
+    yield results
+    *to_samples, to_background = results
+    colour, opacity, depth, weights = (
+        torch.zeros_like(part) if gradient is None else gradient for gradient, part in zip(arriving, given.results())
+    )
+    left = sigma.new_empty(given.rays)
+    for result in to_samples:
+        result.zero_()
+    to_sigma, to_rgb, to_depths, to_deltas = to_samples
+    flat = to_sigma.view(-1), to_rgb.view(-1, rgb.shape[-1]), to_depths.view(-1), to_deltas.view(-1), left
+    gradients = [array(tensor, sigma) for tensor in (colour, opacity, depth, weights.reshape(-1))]
     outputs = [array(tensor, sigma) for tensor in flat]
-    launch(_composite_backward_kernel, left.shape[0], [*gradients, *inputs, *outputs], sigma)
-    seen = sigma.new_empty(0)
-    if background is not None:
-        seen = given[0] * left[:, None]
-        if background.dim() == 1:
-            seen = seen.sum(dim=0, dtype=torch.float64).float()
-    return [*results, seen]
+    launch(_composite_backward_kernel, given.rays, [*gradients, *_inputs(given), *outputs], sigma)
+    if to_background.numel():
+        seen = colour * left[:, None]
+        to_background.copy_(seen if to_background.dim() == 2 else seen.sum(dim=0, dtype=torch.float64))
 
 
-def _inputs(
-    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
-) -> list[Any]:
+def _inputs(given: RaySamples) -> list[Any]:
     """The inputs of both kernels, in their order. Samples are numbered through all rays."""
-    rays, c = _rays(sigma, ray_offsets), rgb.shape[-1]
-    flat = [sigma.reshape(-1), rgb.reshape(sigma.numel(), c), depths.reshape(-1), deltas.reshape(-1)]
-    behind = rgb.new_empty(0, c) if background is None else background.expand(rays, c)
+    sigma, rgb, ray_offsets, rays = given.sigma, given.rgb, given.ray_offsets, given.rays
+    flat = [sigma.reshape(-1), rgb.reshape(sigma.numel(), rgb.shape[-1])]
+    flat += [given.depths.reshape(-1), given.deltas.reshape(-1)]
+    behind = rgb.new_empty(0, rgb.shape[-1])
+    if given.background is not None:
+        behind = given.background.expand(rays, rgb.shape[-1])
+    views, offsets = [array(tensor, sigma) for tensor in flat], array(ray_offsets, sigma, torch.int32)
     s = 0 if ray_offsets is not None else sigma.shape[1]
-    views = [array(tensor, sigma) for tensor in flat]
-    offsets = array(ray_offsets, sigma, torch.int32)
     return [*views, offsets, ray_offsets is not None, s, array(behind, sigma)]
 
 
-def _rays(sigma: Tensor, ray_offsets: Tensor | None) -> int:
-    return sigma.shape[0] if ray_offsets is None else ray_offsets.shape[0] - 1
-
-
-def _allocate(sigma: Tensor, rgb: Tensor, ray_offsets: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r = _rays(sigma, ray_offsets)
-    return rgb.new_empty(r, rgb.shape[-1]), sigma.new_empty(r), sigma.new_empty(r), sigma.new_empty(sigma.shape)
-
-
-@_forward.register_fake
-def _(
-    sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor | None, background: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return _allocate(sigma, rgb, ray_offsets)
-
-
-@_backward.register_fake
-def _(
-    colour: Tensor | None,
-    opacity: Tensor | None,
-    depth: Tensor | None,
-    weights: Tensor | None,
-    sigma: Tensor,
-    rgb: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor | None,
-    background: Tensor | None,
-    wanted: Sequence[bool],
-) -> list[Tensor]:
-    given = (sigma, rgb, depths, deltas)
-    return [
-        *(tensor.new_empty(tensor.shape) for tensor in given),
-        sigma.new_empty(0 if background is None else background.shape),
-    ]
-
-
-_forward.register_autograd(composite_forward_backward(_backward), setup_context=composite_forward_setup)
-_backward.register_autograd(composite_backward_backward, setup_context=composite_backward_setup)
+register(_forward, _backward)

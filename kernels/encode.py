@@ -7,17 +7,15 @@ is float32; second derivatives come from the reference formulas.
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Iterator, Sequence
+
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op, in_float32
+from voronerf.derivatives import OfOne
 from voronerf.kernels._launch import array, launch
-from voronerf.ops.frequency_encode.autograd import (
-    encode_backward_backward,
-    encode_backward_setup,
-    encode_gradients,
-    encode_setup,
-)
+from voronerf.ops.frequency_encode.autograd import Encoding, register
 
 wp.set_module_options({"enable_backward": False})
 
@@ -85,58 +83,38 @@ def _encode_backward_kernel(
         grad_variances[i, j] = to_variance
 
 
-def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True) -> Tensor:
+def frequency_encode(x: Tensor, octaves: int, include_input: bool = True) -> Tensor:
     """``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``; see ``voronerf.ops.frequency_encode``."""
-    encoded: Tensor = _encode(x.float(), None, octaves, include_input)
-    return encoded.to(x.dtype)
+    encoded: Tensor = in_float32(_encode, Encoding(x, None, octaves, include_input))
+    return encoded
 
 
 def integrated_encode(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
     """Expected encoding of a Gaussian; see ``voronerf.ops.integrated_encode``."""
-    encoded: Tensor = _encode(means.float(), variances.float(), octaves, False)
-    return encoded.to(means.dtype)
+    encoded: Tensor = in_float32(_encode, Encoding(means, variances, octaves, False))
+    return encoded
 
 
-@torch.library.custom_op("voronerf::encode_warp", mutates_args=())
-def _encode(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Tensor:
-    """The frequency encoding or, with variances, the integrated one."""
-    out = _allocate(x, octaves, include_input)
-    spread = x[:0] if variances is None else variances
-    inputs = [array(x, x), array(spread, x), variances is not None, octaves, include_input, array(out, x)]
-    launch(_encode_kernel, x.shape, inputs, x)
-    return out
+@custom_op("encode_warp")
+def _encode(given: Encoding) -> Iterator[Tensor]:
+    out = given.result()
+    yield out
+    launch(_encode_kernel, given.x.shape, [*_inputs(given), array(out, out)], out)
 
 
-@torch.library.custom_op("voronerf::encode_warp_backward", mutates_args=())
-def _encode_backward(
-    gradient: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool
-) -> list[Tensor]:
-    """Gradients to x and to the variances, the second empty without them."""
-    grad_x, grad_variances = results = _allocate_gradients(x, variances)
-    spread = x[:0] if variances is None else variances
-    to_spread = grad_x[:0] if variances is None else grad_variances
-    given = [array(gradient, x), array(x, x), array(spread, x), variances is not None, octaves, include_input]
-    launch(_encode_backward_kernel, x.shape, [*given, array(grad_x, x), array(to_spread, x)], x)
-    return results
+@custom_op("encode_warp_backward")
+def _backward(arriving: OfOne, given: Encoding, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
+    of_x, of_variances = results = given.gradients()
+    yield results
+    to_spread = of_x[:0] if given.variances is None else of_variances
+    inputs = [array(arriving.result, of_x), *_inputs(given), array(of_x, of_x), array(to_spread, of_x)]
+    launch(_encode_backward_kernel, given.x.shape, inputs, of_x)
 
 
-def _allocate(x: Tensor, octaves: int, include_input: bool) -> Tensor:
-    return x.new_empty(x.shape[0], x.shape[1] * (include_input + 2 * octaves))
+def _inputs(given: Encoding) -> list[object]:
+    x, variances = given.x, given.variances
+    spread = array(x[:0] if variances is None else variances, x)
+    return [array(x, x), spread, variances is not None, given.octaves, given.include_input]
 
 
-def _allocate_gradients(x: Tensor, variances: Tensor | None) -> list[Tensor]:
-    return [x.new_empty(x.shape), x.new_empty(0 if variances is None else variances.shape)]
-
-
-@_encode.register_fake
-def _(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Tensor:
-    return _allocate(x, octaves, include_input)
-
-
-@_encode_backward.register_fake
-def _(gradient: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> list[Tensor]:
-    return _allocate_gradients(x, variances)
-
-
-_encode.register_autograd(encode_gradients(_encode_backward), setup_context=encode_setup)
-_encode_backward.register_autograd(encode_backward_backward, setup_context=encode_backward_setup)
+register(_encode, _backward)

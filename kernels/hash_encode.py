@@ -8,14 +8,16 @@ directions, the weights of the corners are replaced by their derivatives along t
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op
 from voronerf.grids import HashGrid
 from voronerf.kernels._launch import array, launch
-from voronerf.ops.hash_encode.autograd import HashDerivatives
+from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed
 
 wp.set_module_options({"enable_backward": False})
 
@@ -211,62 +213,48 @@ def _positions_kernel(
         of_positions[i, axis] = total[axis]
 
 
-def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, *, cells: Tensor | None = None) -> Tensor:
+def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None = None) -> Tensor:
     """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
-    encoded: Tensor = _encode(positions.float(), table.float(), None, cells, grid.text)
+    encoded: Tensor = _encode(Hashed(positions.float(), table.float(), None, cells, grid.text))
     return encoded
 
 
-@torch.library.custom_op("voronerf::hash_encode_warp", mutates_args=())
-def _encode(positions: Tensor, table: Tensor, direction: Tensor | None, cells: Tensor | None, grid: str) -> Tensor:
-    """The features or, with directions [n, 3], their derivatives along them."""
-    out = _new_features(positions, grid)
-    levels = HashGrid.parse(grid)
-    rows = array(table.reshape(-1, levels.features), table)
-    given = [array(positions, table), _direction(direction, positions), rows, array(cells, table, torch.int32)]
-    inputs = [*given, _grid(grid, table, direction, cells), array(out, table)]
-    launch(_encode_kernel, (len(positions), levels.levels), inputs, table)
-    return out
+@custom_op("hash_encode_warp")
+def _encode(given: Hashed) -> Iterator[Tensor]:
+    out = given.result()
+    yield out
+    points, tables, rows = _inputs(given, given.table)
+    levels = HashGrid.parse(given.grid).levels
+    launch(_encode_kernel, (len(out), levels), [*points, rows, *tables, array(out, out)], out)
 
 
-@torch.library.custom_op("voronerf::hash_encode_warp_backward", mutates_args=())
-def _backward(
-    gradient: Tensor,
-    positions: Tensor,
-    table: Tensor,
-    direction: Tensor | None,
-    cells: Tensor | None,
-    grid: str,
-    to_positions: bool,
-    to_table: bool,
-) -> list[Tensor]:
-    """Gradients to positions and table, empty where not wanted."""
-    results = of_positions, of_table = _new_gradients(positions, table, to_positions, to_table)
-    levels = HashGrid.parse(grid)
-    given = [array(gradient, table), array(positions, table), _direction(direction, positions)]
-    more = [array(cells, table, torch.int32), _grid(grid, table, direction, cells)]
+@custom_op("hash_encode_warp_backward")
+def _backward(gradient: Tensor, given: Hashed, to_positions: bool, to_table: bool) -> Iterator[list[Tensor]]:
+    of_positions, of_table = results = given.gradients(to_positions, to_table)
+    yield results
+    n, levels, arriving = len(gradient), HashGrid.parse(given.grid).levels, array(gradient, gradient)
     if to_table:
-        rows = array(of_table.zero_().reshape(-1, levels.features), table)
-        launch(_table_kernel, (len(positions), levels.levels), [*given, *more, rows], table)
+        points, tables, rows = _inputs(given, of_table.zero_())
+        launch(_table_kernel, (n, levels), [arriving, *points, *tables, rows], gradient)
     if to_positions:
-        rows = array(table.reshape(-1, levels.features), table)
-        launch(_positions_kernel, len(positions), [*given, rows, *more, array(of_positions, table)], table)
-    return list(results)
+        points, tables, rows = _inputs(given, given.table)
+        inputs = [arriving, *points, rows, *tables, array(of_positions, gradient)]
+        launch(_positions_kernel, n, inputs, gradient)
 
 
-def _direction(direction: Tensor | None, positions: Tensor) -> object:
-    return array(positions[:0] if direction is None else direction, positions)
-
-
-def _grid(text: str, table: Tensor, direction: Tensor | None, cells: Tensor | None) -> Grid:
-    levels, found = HashGrid.parse(text), Grid()
+def _inputs(given: Hashed, table: Tensor) -> tuple[list[object], list[object], object]:
+    """What all kernels take: points and directions; cells and the grid; the rows of a table."""
+    positions, cells, direction = given.positions, given.cells, given.direction
+    along = positions[:0] if direction is None else direction
+    levels, grid = HashGrid.parse(given.grid), Grid()
     low, high = levels.box
-    found.low, found.inverse = wp.vec3(*low), wp.vec3(*(1 / (b - a) for a, b in zip(low, high)))
-    found.smooth, found.along = levels.interpolation == "smoothstep", direction is not None
-    found.features, found.entries, found.several = levels.features, table.shape[-2], cells is not None
-    numbers, sizes = _levels(text, table.device)
-    found.numbers, found.sizes = array(numbers, table), array(sizes, table)
-    return found
+    grid.low, grid.inverse = wp.vec3(*low), wp.vec3(*(1 / (b - a) for a, b in zip(low, high)))
+    grid.smooth, grid.along = levels.interpolation == "smoothstep", direction is not None
+    grid.features, grid.entries, grid.several = levels.features, given.table.shape[-2], cells is not None
+    numbers, sizes = _levels(given.grid, positions.device)
+    grid.numbers, grid.sizes = array(numbers, positions), array(sizes, positions)
+    points: list[object] = [array(positions, positions), array(along, positions)]
+    return points, [array(cells, positions, torch.int32), grid], array(table.reshape(-1, levels.features), positions)
 
 
 @functools.lru_cache(maxsize=64)
@@ -277,34 +265,4 @@ def _levels(text: str, device: torch.device) -> tuple[Tensor, Tensor]:
     return numbers, torch.tensor(sizes, dtype=torch.int32, device=device)
 
 
-def _new_features(positions: Tensor, grid: str) -> Tensor:
-    return positions.new_empty(positions.shape[0], HashGrid.parse(grid).out_features)
-
-
-def _new_gradients(positions: Tensor, table: Tensor, to_positions: bool, to_table: bool) -> tuple[Tensor, Tensor]:
-    of_positions = positions.new_empty(positions.shape if to_positions else 0)
-    return of_positions, positions.new_empty(table.shape if to_table else 0)
-
-
-@_encode.register_fake
-def _(positions: Tensor, table: Tensor, direction: Tensor | None, cells: Tensor | None, grid: str) -> Tensor:
-    return _new_features(positions, grid)
-
-
-@_backward.register_fake
-def _(
-    gradient: Tensor,
-    positions: Tensor,
-    table: Tensor,
-    direction: Tensor | None,
-    cells: Tensor | None,
-    grid: str,
-    to_positions: bool,
-    to_table: bool,
-) -> list[Tensor]:
-    return list(_new_gradients(positions, table, to_positions, to_table))
-
-
-_derivatives = HashDerivatives(_encode, _backward)
-_encode.register_autograd(_derivatives.encode, setup_context=_derivatives.encode_setup)
-_backward.register_autograd(_derivatives.backward, setup_context=_derivatives.backward_setup)
+HashDerivatives(_encode, _backward)

@@ -6,13 +6,15 @@ Nothing outside the tables is read; a walk that leads out of them or ends at no 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.kernels._launch import array, launch
+from voronerf.custom_op import custom_op
+from voronerf.kernels._launch import array, launch, of_both_dtypes
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -58,47 +60,17 @@ def _locate_cell_kernel(
     leaves[i] = -state - 1
 
 
-for _scalar in (wp.float32, wp.float64):
-    wp.overload(
-        _locate_cell_kernel,
-        [
-            wp.array2d(dtype=_scalar),
-            wp.array2d(dtype=_scalar),
-            wp.array(dtype=_scalar),
-            wp.bool,
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=wp.int32),
-            wp.int32,
-            wp.array(dtype=wp.int32),
-        ],
-    )
+of_both_dtypes(_locate_cell_kernel)
 
 
+@custom_op("locate_cell_warp")
 def locate_cell(
-    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, *, depth: int, weights: Tensor | None = None
-) -> Tensor:
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
+) -> Iterator[Tensor]:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
-    leaves: Tensor = _locate_cell(points, centres, child_offsets, child, depth, weights)
-    return leaves
-
-
-@torch.library.custom_op("voronerf::locate_cell_warp", mutates_args=())
-def _locate_cell(
-    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
-) -> Tensor:
-    given = (points, centres) if weights is None else (points, centres, weights)
-    dtype = torch.float64 if any(tensor.dtype == torch.float64 for tensor in given) else torch.float32
-    kept = [None if tensor is None else tensor.to(dtype) for tensor in (points, centres, weights)]
     leaves = points.new_empty(points.shape[0], dtype=torch.int32)
-    arrays = [array(tensor, points, dtype) for tensor in kept]
+    yield leaves
+    given = [array(tensor, points, points.dtype) for tensor in (points, centres, weights)]
     tables = [array(tensor, points) for tensor in (child_offsets, child)]
-    inputs = [*arrays, weights is not None, *tables, depth, array(leaves, points)]
+    inputs = [*given, weights is not None, *tables, depth, array(leaves, points)]
     launch(_locate_cell_kernel, points.shape[0], inputs, points)
-    return leaves
-
-
-@_locate_cell.register_fake
-def _(
-    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
-) -> Tensor:
-    return points.new_empty(points.shape[0], dtype=torch.int32)

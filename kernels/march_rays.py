@@ -7,13 +7,14 @@ on its own (``fuse_fp`` off): a sample falls in the same cell.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from voronerf.checks import MAX_COUNT
+from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch
 from voronerf.ops.march_rays.reference import March, Rays
 
@@ -200,54 +201,33 @@ def _march_kernel(
 
 def march_rays(rays: Rays, capacity: int | None) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    *tensors, samples, disparity, most = rays
-    rest = samples, disparity, most
-    offsets = _count(tensors, *rest, MAX_COUNT if capacity is None else capacity)
+    offsets = _count(rays, MAX_COUNT if capacity is None else capacity)
     rows = int(offsets[-1]) if capacity is None else capacity
-    return March(offsets, *_fill(tensors, offsets, *rest, rows))
+    return March(offsets, *_fill(rays, offsets, rows))
 
 
-# The tensors of the custom ops are those of `Rays`, in its order.
-@torch.library.custom_op("voronerf::march_rays_warp_count", mutates_args=())
-def _count(tensors: Sequence[Tensor | None], samples: int, disparity: bool, most: int, capacity: int) -> Tensor:
-    rays = Rays._make([*tensors, samples, disparity, most])
-    near = rays.near
-    offsets = near.new_zeros(near.shape[0] + 1, dtype=torch.int32)
-    none, no_index = array(near[:0], near), array(offsets[:0], near)
-    results = [array(offsets[1:], near), no_index, none, none, array(rays.origins[:0], near), no_index]
-    launch(_march_kernel, near.shape[0], [*_inputs(rays), True, no_index, *results], near)
+@custom_op("march_rays_warp_count")
+def _count(rays: Rays, capacity: int) -> Iterator[Tensor]:
+    near, r = rays.near, rays.near.shape[0]
+    offsets = near.new_empty(r + 1, dtype=torch.int32)
+    yield offsets
+    counts = torch.zeros_like(offsets)
+    none, no_index = array(near[:0], near), array(counts[:0], near)
+    results = [array(counts[1:], near), no_index, none, none, array(rays.origins[:0], near), no_index]
+    launch(_march_kernel, r, [*_inputs(rays), True, no_index, *results], near)
     # In int64: the number of samples of all rays may not fit int32; the capacity does.
-    return offsets.cumsum(dim=0).clamp(max=capacity).to(torch.int32)
+    offsets.copy_(counts.cumsum(dim=0).clamp(max=capacity))
 
 
-@_count.register_fake
-def _(tensors: Sequence[Tensor | None], samples: int, disparity: bool, most: int, capacity: int) -> Tensor:
-    near = Rays._make([*tensors, samples, disparity, most]).near
-    return near.new_empty(near.shape[0] + 1, dtype=torch.int32)
-
-
-@torch.library.custom_op("voronerf::march_rays_warp_fill", mutates_args=())
-def _fill(
-    tensors: Sequence[Tensor | None], offsets: Tensor, samples: int, disparity: bool, most: int, rows: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    rays = Rays._make([*tensors, samples, disparity, most])
-    near, results = rays.near, _new_samples(rays.near, rows)
+@custom_op("march_rays_warp_fill")
+def _fill(rays: Rays, offsets: Tensor, rows: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    near, r = rays.near, rays.near.shape[0]
+    # Rays, depths, deltas and positions, 0 in rows that belong to no ray; and where the rays stop.
+    index, stop = near.new_zeros(rows, dtype=torch.int32), near.new_empty(r, dtype=torch.int32)
+    results = index, near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3), stop
+    yield results
     arrays = [array(tensor, near) for tensor in (offsets[:0], *results)]
-    launch(_march_kernel, near.shape[0], [*_inputs(rays), False, array(offsets, near), *arrays], near)
-    return results
-
-
-@_fill.register_fake
-def _(
-    tensors: Sequence[Tensor | None], offsets: Tensor, samples: int, disparity: bool, most: int, rows: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    return _new_samples(Rays._make([*tensors, samples, disparity, most]).near, rows)
-
-
-def _new_samples(near: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Rays, depths, deltas and positions, 0 in rows that belong to no ray; and where the rays stop."""
-    index, stop = near.new_zeros(rows, dtype=torch.int32), near.new_empty(near.shape[0], dtype=torch.int32)
-    return index, near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3), stop
+    launch(_march_kernel, r, [*_inputs(rays), False, array(offsets, near), *arrays], near)
 
 
 def _inputs(rays: Rays) -> list[object]:

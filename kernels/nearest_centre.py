@@ -6,11 +6,15 @@ that the answer is that of the reference and of csrc/ to the last index.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
+
+from voronerf.custom_op import custom_op
+from voronerf.kernels._launch import array, launch, of_both_dtypes
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -43,41 +47,13 @@ def _nearest_centre_kernel(
     cells[i] = cell
 
 
-for _scalar in (wp.float32, wp.float64):
-    wp.overload(
-        _nearest_centre_kernel,
-        [
-            wp.array2d(dtype=_scalar),
-            wp.array2d(dtype=_scalar),
-            wp.array(dtype=_scalar),
-            wp.bool,
-            wp.array(dtype=wp.int32),
-        ],
-    )
+of_both_dtypes(_nearest_centre_kernel)
 
 
-def nearest_centre(points: Tensor, centres: Tensor, *, weights: Tensor | None = None) -> Tensor:
+@custom_op("nearest_centre_warp")
+def nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None) -> Iterator[Tensor]:
     """Index of the centre with the smallest ``|x - c|^2 - w`` for every point; see ``voronerf.ops.nearest_centre``."""
-    cells: Tensor = _nearest_centre(points.detach(), centres.detach(), None if weights is None else weights.detach())
-    return cells
-
-
-@torch.library.custom_op("voronerf::nearest_centre_warp", mutates_args=())
-def _nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None) -> Tensor:
-    given = (points, centres) if weights is None else (points, centres, weights)
-    dtype = torch.float64 if any(tensor.dtype == torch.float64 for tensor in given) else torch.float32
     cells = points.new_empty(points.shape[0], dtype=torch.int32)
-    if points.shape[0] == 0:
-        return cells
-    # Strides are passed on: only tensors of another dtype are copied.
-    arrays = [wp.from_torch(tensor.to(dtype)) for tensor in given]
-    arrays += [wp.empty(0, dtype=arrays[0].dtype, device=arrays[0].device)] if weights is None else []
-    stream = wp.stream_from_torch(points.device) if points.is_cuda else None
-    inputs = [*arrays, weights is not None, wp.from_torch(cells)]
-    wp.launch(_nearest_centre_kernel, dim=points.shape[0], inputs=inputs, device=arrays[0].device, stream=stream)
-    return cells
-
-
-@_nearest_centre.register_fake
-def _(points: Tensor, centres: Tensor, weights: Tensor | None) -> Tensor:
-    return points.new_empty(points.shape[0], dtype=torch.int32)
+    yield cells
+    given = [array(tensor, points, points.dtype) for tensor in (points, centres, weights)]
+    launch(_nearest_centre_kernel, points.shape[0], [*given, weights is not None, array(cells, points)], points)

@@ -7,13 +7,15 @@ that cell by their float64 distances, each operation rounded on its own. Tables 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.kernels._launch import array, launch
+from voronerf.custom_op import custom_op
+from voronerf.kernels._launch import array, launch, of_both_dtypes
 from voronerf.ops.centre_grid.reference import BRICK_BITS, CELL_BITS, REACH, GridTables
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -88,46 +90,15 @@ def _nearest_centre_grid_kernel(
     cells[i] = cell
 
 
-for _scalar in (wp.float32, wp.float64):
-    wp.overload(
-        _nearest_centre_grid_kernel,
-        [
-            wp.array2d(dtype=_scalar),
-            wp.array2d(dtype=_scalar),
-            wp.array(dtype=_scalar),
-            wp.bool,
-            wp.array2d(dtype=wp.float32),
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=wp.int32),
-            wp.int32,
-            wp.array(dtype=wp.int32),
-        ],
-    )
+of_both_dtypes(_nearest_centre_grid_kernel)
 
 
-def nearest_centre_grid(points: Tensor, centres: Tensor, grid: GridTables, *, weights: Tensor | None = None) -> Tensor:
+@custom_op("nearest_centre_grid_warp")
+def nearest_centre_grid(points: Tensor, centres: Tensor, weights: Tensor | None, grid: GridTables) -> Iterator[Tensor]:
     """Index of the nearest centre of every point by the candidates of its cell; see ``voronerf.ops.nearest_centre``."""
-    cells: Tensor = _nearest(points, centres, weights, grid.frame, grid.entries, grid.lists, grid.bits)
-    return cells
-
-
-@torch.library.custom_op("voronerf::nearest_centre_grid_warp", mutates_args=())
-def _nearest(
-    points: Tensor, centres: Tensor, weights: Tensor | None, frame: Tensor, entries: Tensor, lists: Tensor, bits: int
-) -> Tensor:
-    given = (points, centres) if weights is None else (points, centres, weights)
-    dtype = torch.float64 if any(tensor.dtype == torch.float64 for tensor in given) else torch.float32
-    kept = [None if tensor is None else tensor.to(dtype) for tensor in (points, centres, weights)]
     cells = points.new_empty(points.shape[0], dtype=torch.int32)
-    arrays = [array(tensor, points, dtype) for tensor in kept]
-    tables = [array(tensor, points) for tensor in (frame, entries, lists)]
-    inputs = [*arrays, weights is not None, *tables, bits, array(cells, points)]
+    yield cells
+    given = [array(tensor, points, points.dtype) for tensor in (points, centres, weights)]
+    tables = [array(tensor, points) for tensor in (grid.frame, grid.entries, grid.lists)]
+    inputs = [*given, weights is not None, *tables, grid.bits, array(cells, points)]
     launch(_nearest_centre_grid_kernel, points.shape[0], inputs, points)
-    return cells
-
-
-@_nearest.register_fake
-def _(
-    points: Tensor, centres: Tensor, weights: Tensor | None, frame: Tensor, entries: Tensor, lists: Tensor, bits: int
-) -> Tensor:
-    return points.new_empty(points.shape[0], dtype=torch.int32)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 import warp as wp
-from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
+from voronerf.ops.observe_occupancy.reference import Observed
 
 wp.set_module_options({"enable_backward": False})
 
@@ -86,25 +86,14 @@ def _compare_kernel(
     occupied[cells[i]] = wp.where(density[cells[i]] >= threshold, wp.uint8(1), wp.uint8(0))
 
 
-def observe_occupancy(
-    density: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    positions: Tensor,
-    sigma: Tensor,
-    deltas: Tensor,
-    weights: Tensor,
-    decay: float,
-    threshold: float,
-    hidden: float,
-) -> None:
+def observe_occupancy(given: Observed) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    m = positions.shape[0]
+    density, m = given.density, given.positions.shape[0]
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
     flat, rows, faded = (array(tensor, density) for tensor in (density.view(-1), cells, before))
-    samples = [array(tensor, density) for tensor in (sigma, deltas, weights)]
-    places = [array(positions, density), array(box, density), *density.shape]
+    samples = [array(tensor, density) for tensor in (given.sigma, given.deltas, given.weights)]
+    places = [array(given.positions, density), array(given.box, density), *density.shape]
     launch(_find_kernel, m, [*places, flat, rows, faded], density)
-    launch(_fade_kernel, m, [rows, faded, decay, flat], density)
-    launch(_raise_kernel, m, [rows, *samples, hidden, flat], density)
-    launch(_compare_kernel, m, [rows, flat, threshold, array(occupied.view(-1), density)], density)
+    launch(_fade_kernel, m, [rows, faded, given.decay, flat], density)
+    launch(_raise_kernel, m, [rows, *samples, given.hidden, flat], density)
+    launch(_compare_kernel, m, [rows, flat, given.threshold, array(given.occupied.view(-1), density)], density)

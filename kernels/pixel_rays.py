@@ -5,13 +5,17 @@ c images of h x w pixels, b rays, a thread each.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import warp as wp
 from torch import Tensor
 
+from voronerf.checks import check_range
+from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch
 from voronerf.kernels.camera_rays import camera_rays
-from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
+from voronerf.ops.pixel_rays.reference import Pixels
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,59 +73,24 @@ def _colour_kernel(
         colour[i, channel] = value
 
 
-def pixel_rays(pixels: Pixels) -> PixelRays:
+@custom_op("pixel_rays_warp")
+def pixel_rays(pixels: Pixels) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    poses, intrinsics, images, index, box, distortion, models, background, near, far = pixels
-    _, h, w, _ = images.shape
+    poses, index, b = pixels.poses, pixels.numbers, pixels.numbers.shape[0]
+    origins, directions, colour = (poses.new_empty(b, 3) for _ in range(3))
+    first, last = poses.new_empty(b), poses.new_empty(b)
+    yield origins, directions, first, last, colour
+    c, h, w, channels = pixels.images.shape
+    check_range("pixel_rays", "index", index, c * h * w)
     pixel = index % (h * w)
     x, y = ((place + 0.5).to(poses.dtype) for place in (pixel % w, pixel // w))
     camera = (index // (h * w)).to(torch.int32)
-    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion, models=models)
-    behind = None if background is None else background.expand(index.shape[0], 3)
-    first, last, colour = _cut_and_colour(origins, directions, images, index, box, behind, near, far)
-    return PixelRays(origins, directions, first, last, colour)
-
-
-@torch.library.custom_op("voronerf::pixel_rays_warp", mutates_args=())
-def _cut_and_colour(
-    origins: Tensor,
-    directions: Tensor,
-    images: Tensor,
-    index: Tensor,
-    box: Tensor | None,
-    background: Tensor | None,
-    near: float,
-    far: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    flat = images.reshape(-1, images.shape[-1])
-    if not index.is_cuda and index.shape[0] > 0:
-        low, high = (int(bound) for bound in index.aminmax())
-        if low < 0 or high >= flat.shape[0]:
-            raise ValueError(f"pixel_rays: index must lie in 0 to {flat.shape[0] - 1}, got values from {low} to {high}")
-    first, last, colour = results = _allocate(origins)
-    corners = array(origins.new_empty(0, 3) if box is None else box, origins)
-    rays = [array(tensor, origins) for tensor in (origins, directions)]
-    cut = [array(tensor, origins) for tensor in (first, last)]
-    launch(_meet_box_kernel, index.shape[0], [*rays, corners, near, far, *cut], origins)
-    behind = origins.new_empty(0, 3) if background is None else background
-    launch(_colour_kernel, index.shape[0], [array(t, origins) for t in (flat, index, behind, colour)], origins)
-    return results
-
-
-@_cut_and_colour.register_fake
-def _(
-    origins: Tensor,
-    directions: Tensor,
-    images: Tensor,
-    index: Tensor,
-    box: Tensor | None,
-    background: Tensor | None,
-    near: float,
-    far: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    return _allocate(origins)
-
-
-def _allocate(origins: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    b = origins.shape[0]
-    return origins.new_empty(b), origins.new_empty(b), origins.new_empty(b, 3)
+    rays = camera_rays(poses, pixels.intrinsics, x, y, camera, pixels.distortion, pixels.models)
+    origins.copy_(rays[0])
+    directions.copy_(rays[1])
+    box = origins.new_empty(0, 3) if pixels.box is None else pixels.box
+    behind = origins.new_empty(0, 3) if pixels.background is None else pixels.background.expand(b, 3)
+    given = [array(tensor, origins) for tensor in (origins, directions, box)]
+    launch(_meet_box_kernel, b, [*given, pixels.near, pixels.far, array(first, poses), array(last, poses)], poses)
+    images = pixels.images.reshape(-1, channels)
+    launch(_colour_kernel, b, [array(tensor, origins) for tensor in (images, index, behind, colour)], poses)

@@ -7,15 +7,18 @@ sample where the gradient of its density is to be, a second one comes back with 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch
 from voronerf.kernels.composite import _OPAQUE, _absorbed, _density
 from voronerf.ops.composite.reference import check_ray_offsets
-from voronerf.ops.render_loss.autograd import render_loss_backward, render_loss_setup
-from voronerf.ops.render_loss.reference import RenderLoss
+from voronerf.ops.render_loss.autograd import Results, register, results
+from voronerf.ops.render_loss.reference import Rendered
 
 wp.set_module_options({"enable_backward": False})
 
@@ -101,61 +104,26 @@ def _density_kernel(raw: wp.array2d(dtype=wp.float32), scale: wp.float32, densit
     density[i] = _softplus(raw[i, 3]) * scale
 
 
-def render_loss(
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
-    *,
-    background: Tensor | None = None,
-    density_scale: float,
-    hidden: float = 0.0,
-) -> RenderLoss:
+def render_loss(given: Rendered) -> list[Tensor]:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
-    *parts, _ = _render_loss(raw.float(), deltas, ray_offsets, target, background, density_scale, hidden)
-    return RenderLoss(*parts)
+    *parts, _ = _render_loss(given._replace(raw=given.raw.float()))
+    return parts
 
 
-@torch.library.custom_op("voronerf::render_loss_warp", mutates_args=())
-def _render_loss(
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
-    background: Tensor | None,
-    density_scale: float,
-    hidden: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
-    _, colour, weights, density, error, gradient = _allocate(raw, target)
+@custom_op("render_loss_warp")
+def _render_loss(given: Rendered) -> Iterator[Results]:
+    loss, colour, weights, density, error, gradient = found = results(given)
+    yield found
+    raw, target, m, r = given.raw, given.target, given.raw.shape[0], given.target.shape[0]
+    check_ray_offsets("render_loss", given.ray_offsets, m)
     for of_strays in (weights, gradient):  # samples that belong to no ray
         of_strays.zero_()
-    behind = target.new_empty(0, 3) if background is None else background.expand_as(target)
-    given = [array(tensor, raw) for tensor in (raw, deltas, ray_offsets, target, behind)]
-    results = [array(tensor, raw) for tensor in (colour, weights, error, gradient)]
-    launch(_render_loss_kernel, target.shape[0], [*given, density_scale, hidden, *results], raw)
-    launch(_density_kernel, raw.shape[0], [given[0], density_scale, array(density, raw)], raw)
-    loss = (error.mean(dtype=torch.float64) / 3).float()
-    return loss, colour, weights, density, error, gradient
+    behind = target.new_empty(0, 3) if given.background is None else given.background.expand_as(target)
+    inputs = [array(tensor, raw) for tensor in (raw, given.deltas, given.ray_offsets, target, behind)]
+    outputs = [array(tensor, raw) for tensor in (colour, weights, error, gradient)]
+    launch(_render_loss_kernel, r, [*inputs, given.density_scale, given.hidden, *outputs], raw)
+    launch(_density_kernel, m, [inputs[0], given.density_scale, array(density, raw)], raw)
+    loss.copy_(error.mean(dtype=torch.float64) / 3)
 
 
-@_render_loss.register_fake
-def _(
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
-    background: Tensor | None,
-    density_scale: float,
-    hidden: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    return _allocate(raw, target)
-
-
-def _allocate(raw: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    r, m = target.shape[0], raw.shape[0]
-    loss, colour, error = raw.new_empty(()), raw.new_empty(r, 3), raw.new_empty(r)
-    return loss, colour, raw.new_empty(m), raw.new_empty(m), error, raw.new_empty(m, 4)
-
-
-_render_loss.register_autograd(render_loss_backward, setup_context=render_loss_setup)
+register(_render_loss)

@@ -6,10 +6,12 @@ float64. Targets are sorted by torch.
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Iterator
+
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op, in_float32
 from voronerf.kernels._launch import array, launch
 
 wp.set_module_options({"enable_backward": False})
@@ -79,24 +81,16 @@ def _resample_kernel(
         depths[ray, j] = wp.float32(depth)
 
 
-def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None) -> Tensor:
+def resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
     """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
-    if uniforms is not None:
-        uniforms = uniforms.detach().float()
-    depths: Tensor = _resample(weights.detach().float(), edges.detach().float(), count, uniforms)
-    return depths.to(edges.dtype)
-
-
-@torch.library.custom_op("voronerf::resample_warp", mutates_args=())
-def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
-    depths = edges.new_empty(edges.shape[0], count)
-    targets = uniforms if uniforms is None else uniforms.sort(dim=1).values
-    places = array(depths[:0] if targets is None else targets, weights)
-    inputs = [array(weights, weights), array(edges, weights), places, targets is not None, array(depths, weights)]
-    launch(_resample_kernel, weights.shape[0], inputs, weights)
+    depths: Tensor = in_float32(_resample, (weights, edges, count, uniforms))
     return depths
 
 
-@_resample.register_fake
-def _(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
-    return edges.new_empty(edges.shape[0], count)
+@custom_op("resample_warp")
+def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Iterator[Tensor]:
+    depths = edges.new_empty(edges.shape[0], count)
+    yield depths
+    targets = depths[:0] if uniforms is None else uniforms.sort(dim=1).values
+    given = [array(tensor, depths) for tensor in (weights, edges, targets)]
+    launch(_resample_kernel, depths.shape[0], [*given, uniforms is not None, array(depths, depths)], depths)

@@ -5,17 +5,15 @@ The arithmetic is float32; second derivatives come from the reference formula.
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Iterator, Sequence
+
 import warp as wp
 from torch import Tensor
 
+from voronerf.custom_op import custom_op, in_float32
+from voronerf.derivatives import OfOne
 from voronerf.kernels._launch import array, launch
-from voronerf.ops.spherical_harmonics.autograd import (
-    harmonics_backward_backward,
-    harmonics_backward_setup,
-    harmonics_gradient,
-    harmonics_setup,
-)
+from voronerf.ops.spherical_harmonics.autograd import Harmonics, register
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,34 +88,25 @@ def _harmonics_backward_kernel(
 
 def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     """Bands 0 to degree - 1; see ``voronerf.ops.spherical_harmonics``."""
-    encoded: Tensor = _forward(directions.float(), degree)
-    return encoded.to(directions.dtype)
+    encoded: Tensor = in_float32(_forward, Harmonics(directions, degree))
+    return encoded
 
 
-@torch.library.custom_op("voronerf::spherical_harmonics_warp", mutates_args=())
-def _forward(directions: Tensor, degree: int) -> Tensor:
+@custom_op("spherical_harmonics_warp")
+def _forward(given: Harmonics) -> Iterator[Tensor]:
+    directions, degree = given
     out = directions.new_empty(directions.shape[0], degree**2)
-    launch(_harmonics_kernel, out.shape[0], [array(directions, directions), degree, array(out, out)], directions)
-    return out
+    yield out
+    launch(_harmonics_kernel, out.shape[0], [array(directions, out), degree, array(out, out)], out)
 
 
-@torch.library.custom_op("voronerf::spherical_harmonics_warp_backward", mutates_args=())
-def _backward(gradient: Tensor, directions: Tensor, degree: int) -> Tensor:
+@custom_op("spherical_harmonics_warp_backward")
+def _backward(arriving: OfOne, given: Harmonics, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
+    directions, degree = given
     found = directions.new_empty(directions.shape)
-    given = [array(gradient, directions), array(directions, directions), degree, array(found, directions)]
-    launch(_harmonics_backward_kernel, found.shape[0], given, directions)
-    return found
+    yield [found]
+    inputs = [array(arriving.result, found), array(directions, found), degree, array(found, found)]
+    launch(_harmonics_backward_kernel, found.shape[0], inputs, found)
 
 
-@_forward.register_fake
-def _(directions: Tensor, degree: int) -> Tensor:
-    return directions.new_empty(directions.shape[0], degree**2)
-
-
-@_backward.register_fake
-def _(gradient: Tensor, directions: Tensor, degree: int) -> Tensor:
-    return directions.new_empty(directions.shape)
-
-
-_forward.register_autograd(harmonics_gradient(_backward), setup_context=harmonics_setup)
-_backward.register_autograd(harmonics_backward_backward, setup_context=harmonics_backward_setup)
+register(_forward, _backward)

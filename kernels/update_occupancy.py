@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import warp as wp
 from torch import Tensor
 
+from voronerf.checks import check_range
+from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch
 
 wp.set_module_options({"enable_backward": False})
@@ -39,32 +43,16 @@ def _compare_kernel(
     occupied[i] = wp.where(result[i] >= threshold, wp.uint8(1), wp.uint8(0))
 
 
+@custom_op("update_occupancy_warp")
 def update_occupancy(
-    density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
-) -> tuple[Tensor, Tensor]:
+    density: Tensor, cells: Tensor, values: Tensor, decay: float, threshold: float
+) -> Iterator[tuple[Tensor, Tensor]]:
     """The larger of the density found and the decayed old one; see ``voronerf.ops.update_occupancy``."""
-    remembered, occupied = _update(density, cells, values, decay, threshold)
-    return remembered, occupied
-
-
-@torch.library.custom_op("voronerf::update_occupancy_warp", mutates_args=())
-def _update(density: Tensor, cells: Tensor, values: Tensor, decay: float, threshold: float) -> tuple[Tensor, Tensor]:
-    if not cells.is_cuda and cells.shape[0] > 0:
-        low, high = (int(bound) for bound in cells.aminmax())
-        if low < 0 or high >= density.numel():
-            raise ValueError(
-                f"update_occupancy: cells must lie in 0 to {density.numel() - 1}, got values from {low} to {high}"
-            )
-    flat = density.reshape(-1)
-    result = flat.clone()
-    occupied = torch.empty_like(result, dtype=torch.bool)
-    before, after, rows = (array(tensor, density) for tensor in (flat, result, cells))
+    remembered, occupied = density.new_empty(density.shape), density.new_empty(density.shape, dtype=torch.bool)
+    yield remembered, occupied
+    check_range("update_occupancy", "cells", cells, density.numel())
+    tensors = density.reshape(-1), remembered.copy_(density).view(-1), occupied.view(-1), cells
+    before, after, over, rows = (array(tensor, density) for tensor in tensors)
     launch(_fade_kernel, cells.shape[0], [before, rows, decay, after], density)
     launch(_raise_kernel, cells.shape[0], [rows, array(values, density), after], density)
-    launch(_compare_kernel, flat.shape[0], [after, threshold, array(occupied, density)], density)
-    return result.reshape(density.shape), occupied.reshape(density.shape)
-
-
-@_update.register_fake
-def _(density: Tensor, cells: Tensor, values: Tensor, decay: float, threshold: float) -> tuple[Tensor, Tensor]:
-    return density.new_empty(density.shape), density.new_empty(density.shape, dtype=torch.bool)
+    launch(_compare_kernel, density.numel(), [after, threshold, over], density)

@@ -298,6 +298,7 @@ class ProgramInputs(NamedTuple):
     code: Tensor | None  # const int32*
     constants: Tensor | None  # const float32*
     inputs: Sequence[Tensor | None] | None  # const float32**
+    turned: Tensor | None  # const int32*
     parameters: Sequence[Tensor | None] | None  # const float32**
     strides: Tensor | None  # const int64*
     widths: Tensor | None  # const int64*

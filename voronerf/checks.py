@@ -21,8 +21,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INDEX = (torch.int32,)
+LIKE_FIRST: tuple[torch.dtype, ...] = ()
+"""For `Checked`: the dtype of the first floating-point tensor."""
 MAX_COUNT = 2**31 - 1
 """Rows of one call: index tensors are int32."""
 
@@ -79,7 +81,7 @@ def check_shape(
     known.update(found)
 
 
-def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATS) -> None:
+def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATING) -> None:
     """Raises TypeError unless the tensor's dtype is one of ``dtypes``."""
     if not isinstance(tensor, Tensor) or tensor.dtype not in dtypes:
         check_tensor(op, name, tensor)
@@ -112,6 +114,69 @@ def check_same_device(op: str, **tensors: Tensor | None) -> None:
             first = (name, tensor.device)
         elif tensor.device != first[1]:
             raise ValueError(f"{op}: {name} must be on the device of {first[0]}, {first[1]}, got {tensor.device}")
+
+
+class Checked:
+    """The tensors of one call, checked one after another.
+
+    Args:
+        op: operation named in errors.
+
+    Attributes:
+        sizes: what the letters of the shapes stand for.
+        tensors: those that are there, by name.
+    """
+
+    def __init__(self, op: str) -> None:
+        self.op = op
+        self.sizes: dict[str, int] = {}
+        self.tensors: dict[str, Tensor] = {}
+        self._first: tuple[str, Tensor] | None = None
+        self._float: tuple[str, Tensor] | None = None
+
+    def tensor(self, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype], *shape: int | str) -> None:
+        """Checks shape, dtype, that it is on the device of the first tensor, and that an int32 can number its rows.
+
+        Args:
+            name: of the argument.
+            tensor: its value; anything but a tensor is a TypeError.
+            dtypes: what it may have; `LIKE_FIRST` for that of the first floating-point tensor.
+            shape: as in `check_shape`.
+
+        Raises:
+            TypeError: not a tensor, another dtype.
+            ValueError: another shape or device, too many rows.
+        """
+        check_shape(self.op, name, tensor, shape, self.sizes)
+        if not dtypes and self._float is not None:
+            if tensor.dtype != self._float[1].dtype:
+                check_same_dtype(self.op, **{self._float[0]: self._float[1], name: tensor})
+        else:
+            check_dtype(self.op, name, tensor, dtypes)
+        if self._float is None and tensor.dtype in FLOATING:
+            self._float = name, tensor
+        if self._first is None:
+            self._first = name, tensor
+        elif tensor.device != self._first[1].device:
+            check_same_device(self.op, **{self._first[0]: self._first[1], name: tensor})
+        if shape and tensor.shape[0] > MAX_COUNT:
+            check_count(self.op, name, tensor.shape[0])
+        self.tensors[name] = tensor
+
+    def optional(self, name: str, tensor: Tensor | None, dtypes: Sequence[torch.dtype], *shape: int | str) -> None:
+        """`tensor`, where None is passed over."""
+        if tensor is not None:
+            self.tensor(name, tensor, dtypes, *shape)
+
+    def each_or_all(self, name: str, tensor: Tensor | None, dtypes: Sequence[torch.dtype], *shape: int | str) -> None:
+        """`optional`, of which the first dimension may be missing: the same row for all."""
+        if tensor is not None:
+            check_tensor(self.op, name, tensor)
+            self.tensor(name, tensor, dtypes, *shape[tensor.dim() == len(shape) - 1 :])
+
+    def no_inference(self) -> None:
+        """`check_no_inference` of all tensors."""
+        check_no_inference(self.op, **self.tensors)
 
 
 def check_writable(op: str, name: str, tensor: Tensor) -> None:

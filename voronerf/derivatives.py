@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from voronerf.custom_op import Op
 
 
 def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
@@ -76,6 +78,88 @@ def second_derivatives(
     total = parts[0].new_zeros(())
     for gradient, cotangent in zip(gradients, cotangents, strict=True):
         total = total + (gradient * cotangent).sum()
+    if not total.requires_grad:
+        return [None] * len(tensors)
     present = [tensor for tensor in tensors if tensor is not None]
     seconds = iter(torch.autograd.grad(total, present, create_graph=graph, allow_unused=True))
     return [None if tensor is None else next(seconds) for tensor in tensors]
+
+
+class OfOne(NamedTuple):
+    """The gradient that arrives at an op with one result."""
+
+    result: Tensor | None
+
+
+def register_derivatives(
+    forward: Op, backward: Op, formula: Callable[..., Tensor | Sequence[Tensor]], smooth: Sequence[str]
+) -> None:
+    """Registers the derivatives of an op whose gradients are another op, and whose further ones are those of a formula.
+
+    Args:
+        forward: ``forward(given)``, of a named tuple.
+        backward: ``backward(arriving, given, wanted)`` gives the gradients to the smooth parts of ``given``, in a list:
+            of what has arrived at the results, a named tuple with None for zero, and a bool for each smooth part. What
+            is not wanted or not there may be anything.
+        formula: takes the parts of ``given``, and gives what ``forward`` does.
+        smooth: the fields of ``given`` that have gradients.
+    """
+    kind: Any = forward.structs.kinds[0]
+    arrived: Any = backward.structs.kinds[0]
+    count, places = len(arrived._fields), [kind._fields.index(name) for name in smooth]
+
+    def placed(values: Sequence[Tensor | None]) -> Any:
+        """The values in the places of the smooth parts."""
+        found: list[Tensor | None] = [None] * len(kind._fields)
+        for place, value in zip(places, values):
+            found[place] = value
+        return kind._make(found)
+
+    def first(ctx: Any, *arriving: Tensor | None) -> tuple[Any, ...]:
+        given = kind._make(_kept(ctx, forward))
+        wanted = [ctx.needs_input_grad[place] for place in places]
+        found: list[Tensor | None] = []
+        if any(gradient is not None for gradient in arriving):
+            parts = backward(arrived._make(arriving), given, wanted)
+            found = [part if want else None for part, want in zip(parts, wanted)]
+        return (placed(found),)
+
+    def second(ctx: Any, cotangents: Sequence[Tensor | None]) -> tuple[Any, ...]:
+        arriving, given, wanted = backward.structs.packed(_kept(ctx, backward))
+        leaves, graph = aliases([*arriving, *(given[place] for place in places)])
+        inputs = leaves[count:]
+        with torch.enable_grad():
+            results = formula(*given._replace(**dict(zip(smooth, inputs))))
+            outputs = zip((results,) if isinstance(results, Tensor) else results, leaves)
+            pairs = [
+                (leaf, cotangent)
+                for leaf, cotangent, want in zip(inputs, cotangents, wanted)
+                if want and leaf is not None and cotangent is not None
+            ]
+            used = [(part, gradient) for part, gradient in outputs if gradient is not None]
+            found = second_derivatives(used, pairs, leaves, graph)
+        return arrived._make(found[:count]), placed(found[count:]), None
+
+    forward.register_autograd(first, setup_context=_keeping(forward))
+    backward.register_autograd(second, setup_context=_keeping(backward))
+
+
+def _keeping(op: Op) -> Callable[..., None]:
+    """Saves the arguments of an op, of its custom op one by one."""
+
+    def keep(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        flat = list(op.structs.flat(inputs))
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*[flat[place] for place in op.structs.tensors])
+        for place in op.structs.tensors:
+            flat[place] = None
+        ctx.rest = flat
+
+    return keep
+
+
+def _kept(ctx: Any, op: Op) -> list[Any]:
+    flat = list(ctx.rest)
+    for place, tensor in zip(op.structs.tensors, ctx.saved_tensors):
+        flat[place] = tensor
+    return flat

@@ -39,7 +39,7 @@ class Function(NamedTuple):
 
     Attributes:
         formula: (x, a, b) -> f(x), in PyTorch. The compiled module has f and its derivatives, in a line of its own
-            (csrc/network/cpu/functions_tile.h).
+            (csrc/network/functions.h).
         orders: the highest derivative that is not 0.
     """
 
@@ -69,6 +69,8 @@ FUNCTIONS = {
     "exp": Function(lambda x, a, b: x.exp()),
     "log": Function(lambda x, a, b: x.log()),
     "power": Function(lambda x, a, b: x**a),
+    "erf": Function(lambda x, a, b: x.erf()),
+    "atan": Function(lambda x, a, b: x.atan()),
 }
 """By their names in the compiled module."""
 
@@ -224,9 +226,7 @@ class Builder:
     def function(
         self, name: str, x: Columns, a: float = 0.0, b: float = 0.0, order: int = 0, times: Columns | None = None
     ) -> Columns | None:
-        """A derivative of a function, times a value; None where it is 0. Powers are whole or half ones."""
-        if name == "power" and not (abs(a) <= 64 and 2 * a == int(2 * a)):
-            raise ValueError(f"a power must be a multiple of 0.5 from -64 to 64, got {a}")
+        """A derivative of a function, times a value; None where it is 0."""
         if order > FUNCTIONS[name].orders or (name == "power" and a == int(a) and 0 <= a < order):
             return None
         if order == 1 and times is not None and name in ("copy", "affine"):

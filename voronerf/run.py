@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from voronerf import editing
 from voronerf.data import Scene, load_scene
+from voronerf.data.record import read_scene, within
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import score_views
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, Similarity, Solid, VoronoiRouter
 from voronerf.training.average import load_averages
 from voronerf.training.checkpoint import last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
-from voronerf.training.networks import check_shapes, make_routers, parameter_groups, restore_routers
+from voronerf.training.joint import joint_config
+from voronerf.training.networks import check_shapes, open_routers, parameter_groups, restore_routers
 from voronerf.training.renderers import make_picture_grid, make_renderer, through_grid
 from voronerf.training.run_directory import check_folders, check_stored_paths
 from voronerf.training.state import stored_values
@@ -49,12 +53,12 @@ class Run:
     path: Path
     config: TrainConfig
     scene: Scene
-    routers: dict[str, VoronoiRouter]
+    routers: dict[str, VoronoiRouter | Parts]
     renderer: Renderer
 
     @property
-    def router(self) -> VoronoiRouter:
-        """The router of the field."""
+    def router(self) -> VoronoiRouter | Parts:
+        """The router of the field, or the parts of a run that was joined or cut."""
         return self.routers["field"]
 
     @property
@@ -81,6 +85,105 @@ class Run:
         if not 0 <= index < len(cameras):
             raise IndexError(f"render: there are {len(cameras)} cameras, got number {index}")
         return render_camera(self.renderer, self.scene, cameras, index, heaviest=heaviest)
+
+    # --- runs made of runs -------------------------------------------------------------------------------------------
+
+    @property
+    def source(self) -> editing.Source:
+        """What other runs can be made of.
+
+        Raises:
+            ConfigError: For a field of cones, or one in normalised device coordinates.
+        """
+        return editing.Source.of(self.path.name, self.config, self.scene, self.router, self.renderer)
+
+    @classmethod
+    def join(
+        cls,
+        runs: Sequence[Run],
+        out: Path | str,
+        *,
+        frames: Sequence[Similarity] | None = None,
+        blend: float | None = None,
+    ) -> Run:
+        """One run of several: where they overlap the nearest centre decides.
+
+        Args:
+            runs: At least two; the first gives data, background and settings.
+            out: A new directory; the runs stay as they are.
+            frames: From the scene of each run into that of the new one; None for where they are.
+            blend: Margin in scene units within which neighbours are blended; None for that of the first.
+
+        Raises:
+            ConfigError: For runs that cannot be joined; see the guide.
+            OSError: When it cannot be written; nothing is left then.
+        """
+        if len(runs) < 2 or (frames is not None and len(frames) != len(runs)):
+            count = "none" if frames is None else f"{len(frames)}"
+            raise ConfigError(
+                f"join needs two runs or more, and a frame for each: got {len(runs)} runs, {count} frames"
+            )
+        return cls._made(
+            runs[0], out, editing.join([run.source for run in runs], frames or [Similarity()] * len(runs)), blend
+        )
+
+    def cut(self, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Run:
+        """A run of what lies in a solid or in some cells, in new files; networks that show nothing of it are dropped.
+
+        Args:
+            kept: A solid of the scene, such as ``Solid.box(low, high)``, or numbers of cells.
+            out: A new directory.
+            outside: What does not lie there, in its place.
+
+        Raises:
+            ConfigError: When nothing is left, or there is no such cell.
+            OSError: When it cannot be written; nothing is left then.
+        """
+        source = self.source
+        if isinstance(kept, Solid):
+            return self._made(self, out, editing.cut(source, replace(kept, outside=kept.outside != outside)))
+        k = source.parts.num_cells
+        if not kept or not 0 <= min(kept) <= max(kept) < k:
+            raise ConfigError(f"--cells must be numbers of 0..{k - 1}, at least one, got {[*kept][:20]}")
+        chosen = torch.full((k,), outside)
+        chosen[list(kept)] = not outside
+        return self._made(self, out, editing.cut(source, chosen))
+
+    def place(
+        self,
+        thing: Run,
+        at: Sequence[float],
+        out: Path | str,
+        *,
+        degrees: Sequence[float] = (0, 0, 0),
+        scale: float = 1.0,
+    ) -> Run:
+        """This run with an object in it, in new files; its density comes on top of the scene's.
+
+        Args:
+            thing: The object, cut out or trained on white.
+            at: Where the middle of the bottom of its box shall be.
+            out: A new directory.
+            degrees: Turned about the axes x, y, z, in this order.
+            scale: Of its size.
+
+        Raises:
+            ConfigError: For an object without bounds.
+            OSError: When it cannot be written; nothing is left then.
+        """
+        source = thing.source
+        frames = [Similarity(), editing.standing(source, at, degrees, scale)]
+        return self._made(self, out, editing.join([self.source, source], frames, on_top=[False, True]))
+
+    @classmethod
+    def _made(cls, first: Run, out: Path | str, source: editing.Source, blend: float | None = None) -> Run:
+        """Writes what was made and opens it."""
+        if blend is not None:
+            source = replace(source, config=replace(source.config, blend=blend))
+        editing.write(source, Path(out))
+        images = len(first.scene.test.images) > 0
+        scene = first.scene if images else read_scene(Path(out) / "scene.json")
+        return open_run(out, scene=scene, backend=first.renderer.backend)
 
     def find_lpips(self, weights: Path | str | None = None) -> tuple[Lpips | None, str]:
         """The LPIPS network for the images of this run, or None; and where it was found, or why it was not.
@@ -185,8 +288,9 @@ def open_run(
     if scene is None and data is None:
         check_stored_paths(path, data=config.data)
     check_shapes(config, checkpoint)
-    routers = make_routers(config, device)
-    restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
+    routers = open_routers(config, device, checkpoint)
+    if isinstance(routers["field"], VoronoiRouter):
+        restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
     load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
     for router in routers.values():
         router.backend = backend
@@ -198,12 +302,16 @@ def open_run(
         downscale=config.downscale if downscale is None else downscale,
     )
     scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
+    several = "parts" in checkpoint.values
+    scene = within(scene, path) if several else scene
+    if several and (config.territories or 1) > 1:  # as it was trained: its parts know their own settings
+        config = joint_config(config, scene)
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     state = checkpoint.group("occupancy")
     grid = None
     if state:
         grid = OccupancyGrid.from_state(state, contraction=renderer.contraction, device=renderer.device)
-    elif occupancy:
+    elif occupancy and not several:
         grid = make_picture_grid(config, scene, renderer)
     if grid is not None:
         renderer.sampler = through_grid(renderer.sampler, grid, picture_samples=samples)

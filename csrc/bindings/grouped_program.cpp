@@ -3,7 +3,7 @@
 
 namespace voronerf {
 
-VN_STRUCT(ProgramInputs, code, constants, inputs, parameters, strides, widths, outputs, offsets, order, n, k);
+VN_STRUCT(ProgramInputs, code, constants, inputs, turned, parameters, strides, widths, outputs, offsets, order, n, k);
 
 VN_BINDINGS(module) {
   module.cpu("grouped_program", VN_CPU(grouped_program_cpu));

@@ -17,6 +17,7 @@ struct ProgramInputs {
   const int32_t* code;     // as voronerf/ops/grouped_program/native.py writes it and program_code.h reads it
   const float* constants;  // the numbers of functions
   const float* const* inputs;
+  const int32_t* turned;  // for each input: 1 where it is [w, n], as PyTorch's look-ups in planes give it
   const float* const* parameters;
   const int64_t* strides;  // floats from one cell's parameter to the next: 0 where all cells share it
   const int64_t* widths;   // columns of each output

@@ -9,7 +9,7 @@ import pytest
 from ranks import joint_tensors, new_store, on_ranks
 
 from voronerf.cli import main
-from voronerf.training.checkpoint import checkpoint_path, load_checkpoint, part_files
+from voronerf.training.checkpoint import checkpoint_path, load_checkpoint, network_files
 from voronerf.training.joint import JointTrainer
 
 ARGUMENTS = """
@@ -108,7 +108,7 @@ def test_a_damaged_part(tmp_path, harm):
     assert on_ranks(main, out, folder=tmp_path)[0] == [0, 0]
     assert on_ranks(main, [*out, "--resume", "--steps", "20"], folder=tmp_path)[0] == [0, 0]
     last = checkpoint_path(tmp_path / "run")
-    part = last.with_name(part_files(load_checkpoint(last).values)[1])
+    part = last.with_name(network_files(load_checkpoint(last).values)[1])
     data = bytearray(part.read_bytes())
     if harm == "missing":
         part.unlink()

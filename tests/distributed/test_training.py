@@ -22,7 +22,7 @@ CONFIGS = {
     "dense": {"field": "nerf", "samples": 24, "depth": 2, "cells": (4,), "occupancy": False, "sightings": 0.1},
     "hashgrid": {"cells": (4,)},
     "contracted": {"cells": (4,), "contraction": "sphere", "occupancy_resolution": 32, "assignment": "stochastic"},
-    "cones": {"field": "mipnerf", "samples": 24, "depth": 2, "cells": (2,), "init": "random"},
+    "random": {"field": "nerf", "samples": 24, "depth": 2, "cells": (2,), "init": "random", "precision": "fp16"},
 }
 
 

@@ -150,7 +150,7 @@ def test_large_results_ask_for_huge_pages() -> None:
         pytest.skip("huge pages are switched off here")
     program = """
 import resource, torch
-from voronerf.native.custom_op import on_huge_pages
+from voronerf.native import on_huge_pages
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 before = faults()
 out = torch.empty(1 << 24)

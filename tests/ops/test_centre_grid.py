@@ -263,22 +263,10 @@ def test_compiled_graphs_refuse_grids_of_another_size():
 
 
 @native
-@pytest.mark.warp
-def test_ops_pass_opcheck_and_compile_whole():
-    ops = torch.ops.voronerf
-    for backend in ("native", "warp"):  # which registers them
-        backends.resolve("nearest_centre_grid", backend=backend, device=torch.device("cpu"), dtype=torch.float32)
-
-    points, centres, weights = torch.rand(50, 3), torch.rand(70, 3), torch.rand(70)
-    grid = centre_grid(centres, weights=weights)
-    torch.library.opcheck(ops.nearest_centre_grid.default, (points, centres, weights, *grid.tables))
-    tables = [grid.tables.frame, grid.tables.entries, grid.tables.lists, grid.tables.bits]
-    torch.library.opcheck(ops.nearest_centre_grid_warp.default, (points, centres, weights, *tables))
-    torch.library.opcheck(ops.centre_grid.default, (centres.double(), weights.double()))
-    compiled = torch.compile(
-        lambda p: nearest_centre(p * 2, centres, weights=weights, grid=grid) + 1, fullgraph=True, backend="aot_eager"
-    )
-    assert torch.equal(compiled(points), nearest_centre(points * 2, centres, weights=weights) + 1)
+def test_the_custom_op_passes_opcheck():
+    weights = torch.rand(70)
+    centre_grid(torch.rand(70, 3), weights=weights)  # which registers it
+    torch.library.opcheck(torch.ops.voronerf.centre_grid.default, (torch.rand(70, 3).double(), weights.double()))
 
 
 @native

@@ -123,7 +123,7 @@ def test_any_size_gives_what_the_reference_gives(device, backend, name):
     for n in (0, 1, 2, 15, 16, 17, 33, 257):
         given = tensors(n)
         expected = results(functools.partial(run, backend="reference"), given)
-        assert_close(results(run, given)[: len(expected)], expected)
+        assert_close(results(run, given), expected)
 
 
 class Calls(TorchFunctionMode):

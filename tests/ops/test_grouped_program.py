@@ -123,7 +123,9 @@ FAR = [*(sign * 10.0**size for size in (-30, -3, 0, 1, 1.5, 2, 3, 10, 19, 30, 38
 
 
 @pytest.mark.parametrize("order", range(4))
-@pytest.mark.parametrize("name", ["exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu", "clamp", "relu", "abs"])
+@pytest.mark.parametrize(
+    "name", ["exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu", "clamp", "relu", "abs", "erf", "atan"]
+)
 def test_derivatives_far_away_and_at_borders(name: str, order: int) -> None:
     """Of arguments as large as they come, at 0, and where a function has its kinks."""
     b = Builder()
@@ -167,12 +169,20 @@ def test_sums_spread_over_a_layer_and_products_with_relu() -> None:
     check(b.program([h, gated]), [97, 0, 30])
 
 
-@pytest.mark.parametrize("power", [0.3, -1.25, 64.5, float("nan")])
-def test_refuses_powers_that_are_not_whole_or_half(power: float) -> None:
-    """Which the compiled module would round."""
+@pytest.mark.parametrize("order", range(4))
+@pytest.mark.parametrize("power", [0.3, -1.25, 2.4, 1 / 3, 5.0, -3.5, 70.0])
+def test_powers(power: float, order: int) -> None:
+    """Whole, half and any other ones, of positive numbers, 0 and negative ones."""
     b = Builder()
-    with pytest.raises(ValueError, match=r"a power must be a multiple of 0\.5 from -64 to 64, got"):
-        b.apply("power", b.input(1), power)
+    found = b.function("power", b.input(1), power, order=order)
+    assert found is not None
+    rows = torch.tensor([0.001, 0.3, 1.0, 1.5, 2.7, 0.0, -1.5])[:, None]
+    given = [], offsets_of([len(rows)])
+    (exact,) = grouped_program([rows.double()], *given, program=b.program([found]), backend="reference")
+    for isa in native.SUPPORTED_ISAS:
+        with native.using_isa(isa):
+            (ours,) = grouped_program([rows], *given, program=b.program([found]), backend="native")
+        torch.testing.assert_close(ours, exact.float(), rtol=2e-5, atol=3e-7, equal_nan=True)
 
 
 @pytest.mark.parametrize("sizes", SIZES)
@@ -224,8 +234,10 @@ def test_order_strays_and_layouts() -> None:
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
         assert not ours[:2].any() and not ours[90:].any()
     turned = [x.t().contiguous().t() for x in rows]
-    for ours, theirs in zip(*(grouped_program(r, parameters, offsets, program=program) for r in (turned, rows))):
-        assert torch.equal(ours, theirs)
+    for order in (None, torch.randperm(101, generator=torch.Generator().manual_seed(0)).int()):
+        given = {"program": program, "order": order, "backend": "native"}
+        for ours, theirs in zip(*(grouped_program(r, parameters, offsets, **given) for r in (turned, rows))):
+            assert torch.equal(ours, theirs)
 
 
 @pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)

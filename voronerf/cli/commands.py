@@ -32,7 +32,7 @@ from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.paths import CameraPath, read_camera_path, spiral_cameras
-from voronerf.run import Run
+from voronerf.run import Run, open_run
 from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device, check_joint, why_no_occupancy
@@ -124,7 +124,18 @@ def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
             config = choose_directory(replace(config, resume=config.resume or again), scene)
         config = replace(config, resume=group.from_first(config.resume))
         summary = run_training(config, scene, group=group)
+        first = group.rank == 0
+    if first and summary["complete"]:  # not before the others have left: they would wait for the pictures
+        _draw_joint(config, scene)
     return 0 if summary["complete"] else 130
+
+
+def _draw_joint(config: TrainConfig, scene: Scene) -> None:
+    """Draws the panels of a joint run from its files."""
+    assert config.out is not None
+    if config.panels:
+        opened = open_run(config.out, scene=scene, backend=config.backend)
+        write_panels(opened.renderer, opened.diagram, scene, config.out / "images", views=config.panels)
 
 
 def run_training(
@@ -192,6 +203,8 @@ def _train_and_draw(
         if config.panels and isinstance(trainer, Trainer):
             with trainer.averaged():
                 write_panels(trainer.renderer, trainer.diagram, scene, out / "images", views=config.panels)
+        elif group is None:
+            _draw_joint(config, scene)
         if trainer.writes:
             write_curve(out)
         say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")

@@ -11,9 +11,10 @@ from voronerf.data.blender import load_blender
 from voronerf.data.builtin import builtin_scene, city_scene, rich_scene
 from voronerf.data.builtin.city import city_of
 from voronerf.data.colmap import find_model, load_colmap
+from voronerf.data.errors import SceneError
 from voronerf.data.llff import FILE, load_llff
 from voronerf.data.photographs import Reading
-from voronerf.data.scene import KINDS, Scene, SceneError, Split
+from voronerf.data.scene import KINDS, Scene, Split
 from voronerf.data.transforms import load_transforms
 
 __all__ = [

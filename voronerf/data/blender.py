@@ -12,9 +12,10 @@ from typing import Any
 import torch
 
 from voronerf.data.carving import carve_box
+from voronerf.data.errors import SceneError
 from voronerf.data.images import read_images
 from voronerf.data.photographs import Reading, distinct_names
-from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.scene import Scene, Split
 from voronerf.data.transforms import (
     Frame,
     Listed,

@@ -19,10 +19,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from voronerf.data.errors import SceneError
 from voronerf.data.folders import choose_images, named_images, stay_inside
 from voronerf.data.lenses import MODELS, Lens, colmap_lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, photograph_scene
-from voronerf.data.scene import Scene, SceneError
+from voronerf.data.scene import Scene
 from voronerf.data.transforms import LARGEST, LONGEST
 
 Array = NDArray[Any]

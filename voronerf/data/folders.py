@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from voronerf.data.errors import SceneError
 from voronerf.data.photographs import least_factor
-from voronerf.data.scene import SceneError
 from voronerf.files import leads_outside
 
 log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from voronerf.checks import available_memory
-from voronerf.data.scene import SceneError
+from voronerf.data.errors import SceneError
 from voronerf.data.store import stored
 
 #: Decided by the content of a file. Pillow would read others too, some of them by starting another program.

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from voronerf.data.errors import SceneError
 from voronerf.data.folders import choose_images, listed_images, stay_inside
 from voronerf.data.lenses import PERSPECTIVE, Lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, photograph_scene
-from voronerf.data.scene import Scene, SceneError
+from voronerf.data.scene import Scene
 from voronerf.data.transforms import LARGEST, ORTHONORMAL
 
 FILE = "poses_bounds.npy"

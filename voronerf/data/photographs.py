@@ -18,9 +18,10 @@ import torch
 from torch import Tensor
 
 from voronerf.data.carving import carve_box
+from voronerf.data.errors import SceneError
 from voronerf.data.images import read_images, read_masks
 from voronerf.data.lenses import PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
-from voronerf.data.scene import Scene, SceneError, Sightings, Split
+from voronerf.data.scene import Scene, Sightings, Split
 from voronerf.data.soundness import camera_faults, lost_cameras
 from voronerf.rendering.cameras import Cameras, focus_point
 from voronerf.rendering.contraction import Contraction, Perspective

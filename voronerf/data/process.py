@@ -31,10 +31,10 @@ import torch
 from PIL import Image
 
 from voronerf.data.colmap import FILES, ColmapImage, depth_bounds, points_seen, read_model
+from voronerf.data.errors import SceneError
 from voronerf.data.folders import listed_images
 from voronerf.data.images import read_header, read_image
 from voronerf.data.lenses import COEFFICIENTS, MODELS
-from voronerf.data.scene import SceneError
 from voronerf.data.soundness import camera_faults, lost_cameras
 from voronerf.files import write_text
 from voronerf.ops.camera_rays.reference import FISHEYE, FOV

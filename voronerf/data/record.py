@@ -5,14 +5,15 @@ With it a run is rendered before the images are read, or where they are not. Fie
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from voronerf.data.scene import KINDS, Scene, SceneError, Split
+from voronerf.data.errors import SceneError
+from voronerf.data.scene import KINDS, Scene, Split
 from voronerf.files import json_text, read_json, write_text
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.contraction import Contraction, Perspective
@@ -39,6 +40,19 @@ def write_scene(path: Path, scene: Scene) -> None:
         split = getattr(scene, part)
         values[part] = {"names": list(split.names), **_of_fields(split.cameras)}
     write_text(path, json_text(values) + "\n")
+
+
+def within(scene: Scene, run: Path) -> Scene:
+    """A scene with the bounds and the background of the record in a run directory, where there is one.
+
+    Raises:
+        SceneError: the record is damaged.
+    """
+    path = run / "scene.json"
+    if not path.is_file():
+        return scene
+    known = read_scene(path)
+    return replace(scene, box=known.box, near=known.near, far=known.far, background=known.background)
 
 
 def read_scene(path: Path) -> Scene:

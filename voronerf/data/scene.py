@@ -11,15 +11,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from voronerf.data.store import check_mapped
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.contraction import Contraction, Perspective
 
 #: An object on white; cameras that look the same way; that look outwards; that look at one place with surroundings.
 KINDS = ("object", "forward", "inside-out", "unbounded")
-
-
-class SceneError(ValueError):
-    """The data of a scene cannot be used. The message is one line and names the file."""
 
 
 class Sightings(NamedTuple):
@@ -68,8 +65,6 @@ class Split:
     def truth(self, index: int, background: Tensor | None) -> Tensor:
         """One image in 0..1 over `background` ([3]; None is black, as in rendering), float32 [h, w, 3]."""
         if self.on_disk:
-            from voronerf.data.store import check_mapped  # here, since the store raises what this file has
-
             check_mapped()
         width, height = self.cameras.size(index)
         image = self.images[index, :height, :width].float() / 255

@@ -31,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from voronerf.data.scene import SceneError
+from voronerf.data.errors import SceneError
 from voronerf.files import cache_folder, json_text, private_folder, read_json, write_text
 
 log = logging.getLogger(__name__)

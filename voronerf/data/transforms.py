@@ -18,10 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from voronerf.data.errors import SceneError
 from voronerf.data.images import read_header
 from voronerf.data.lenses import COEFFICIENTS, FISHEYE, PERSPECTIVE, Lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, least_factor, photograph_scene
-from voronerf.data.scene import Scene, SceneError
+from voronerf.data.scene import Scene
 from voronerf.files import leads_outside, read_json
 
 log = logging.getLogger(__name__)

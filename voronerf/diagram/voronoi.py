@@ -16,7 +16,7 @@ Coordinates are in scene units, in the world frame of the query points.
 
 import itertools
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -326,6 +326,48 @@ class VoronoiDiagram(nn.Module):
             torch.cat(tables), torch.cat(offsets_all), torch.cat(links), torch.cat(powers) if weighted else None
         )
         return refined, parents
+
+    @classmethod
+    def join(cls, diagrams: Sequence["VoronoiDiagram"]) -> "VoronoiDiagram":
+        """The diagram of all centres of the first levels; below them each keeps the levels that it has.
+
+        Leaves are numbered diagram after diagram. Power weights of flat diagrams are compared as they are.
+
+        Args:
+            diagrams: at least one, on one device.
+
+        Raises:
+            ValueError: no diagram.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiDiagram
+            >>> left = VoronoiDiagram(torch.zeros(1, 3))
+            >>> right = VoronoiDiagram(torch.tensor([[2.0, 0, 0], [3.0, 0, 0]]))
+            >>> VoronoiDiagram.join([left, right]).locate(torch.tensor([[0.9, 0, 0], [2.6, 0, 0]]))
+            tensor([0, 2], dtype=torch.int32)
+        """
+        if not diagrams:
+            raise ValueError("VoronoiDiagram.join: diagrams must hold at least one, got none")
+        roots, inner, root_rows, inner_rows, ends = [], [], [], [], []
+        nodes, leaves = 0, 0
+        for diagram in diagrams:
+            child, first = diagram.child, int(diagram.child_offsets[1])
+            # A root's own number, 0, is none of the links.
+            links = torch.where(child < 0, child - leaves, child + nodes)
+            table = torch.cat((diagram.centres, diagram._power_or_zero()[:, None]), 1)
+            roots.append(table[:first])
+            inner.append(table[first:])
+            root_rows.append(links[:first])
+            inner_rows.append(links[first:])
+            ends.append(diagram.child_offsets[1:].diff())
+            nodes, leaves = nodes + diagram.child_offsets.shape[0] - 2, leaves + diagram.num_cells
+        table = torch.cat((*roots, *inner))
+        counts = torch.cat((torch.tensor([sum(map(len, roots))], device=table.device), *ends))
+        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(0))).to(torch.int32)
+        weighted = any(diagram.power is not None for diagram in diagrams)
+        centres, power = table[:, :3].contiguous(), table[:, 3].contiguous()
+        return cls._from_tables(centres, offsets, torch.cat((*root_rows, *inner_rows)), power if weighted else None)
 
     def part(self, cells: Tensor) -> "VoronoiDiagram":
         """The diagram of some of the cells. A point that lies in one of them is located in it again.

@@ -6,15 +6,16 @@ n rows of a part, c columns. A part for the same rank is not sent. All parts for
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Hashable, Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from voronerf.distributed.group import Group
 
-K = TypeVar("K", bound=Hashable)
+#: Of a part: the territory, or the rank, that it is from, and the territory that it is for.
+Key = tuple[int, int]
 
 
 class Route(NamedTuple):
@@ -28,14 +29,16 @@ class Route(NamedTuple):
 
     source: int
     target: int
-    key: Hashable
+    key: Key
 
     def back(self) -> Route:
         """The way of the answer."""
         return Route(self.target, self.source, self.key)
 
 
-def send(group: Group, kind: str, width: int, parts: Mapping[K, Tensor], routes: Sequence[Route]) -> dict[K, Tensor]:
+def send(
+    group: Group, kind: str, width: int, parts: Mapping[Key, Tensor], routes: Sequence[Route]
+) -> dict[Key, Tensor]:
     """Sends the parts of this rank, and returns those that others have sent it.
 
     Args:
@@ -52,17 +55,18 @@ def send(group: Group, kind: str, width: int, parts: Mapping[K, Tensor], routes:
         >>> import torch
         >>> from voronerf.distributed.group import Group
         >>> from voronerf.distributed.mail import Route, send
-        >>> send(Group(torch.device("cpu")), "news", 1, {"a": torch.ones(1, 1)}, [Route(0, 0, "a")])
-        {'a': tensor([[1.]])}
+        >>> send(Group(torch.device("cpu")), "news", 1, {(0, 1): torch.ones(1, 1)}, [Route(0, 0, (0, 1))])
+        {(0, 1): tensor([[1.]])}
     """
     empty = torch.empty(0, width, device=group.device)
-    there, here = defaultdict(list), defaultdict(list)
-    found: dict[K, Tensor] = {}
+    there: dict[int, list[Tensor]] = defaultdict(list)
+    here: dict[int, list[Key]] = defaultdict(list)
+    found: dict[Key, Tensor] = {}
     for source, target, key in routes:
         if source == target:
-            found[key] = parts.get(key, empty)  # type: ignore[index, call-overload]
+            found[key] = parts.get(key, empty)
         elif source == group.rank:
-            there[target].append(parts.get(key, empty))  # type: ignore[call-overload]
+            there[target].append(parts.get(key, empty))
         else:
             here[source].append(key)
     came = group.exchange(kind, width, {rank: _packed(those, width) for rank, those in there.items()}, here)

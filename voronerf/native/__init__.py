@@ -73,6 +73,8 @@ compiled.name_dtypes(DTYPES)
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
+# Results of at least this many bytes are put on huge pages; for smaller ones the allocator usually has warm memory.
+_LARGE = 1 << 22
 LEAST_GAIN = 1.25
 """Of bfloat16 products over float32 ones, for networks to use them: rounding and pairing operands costs some."""
 _bfloat16_gain = compiled.bfloat16_gain()
@@ -128,6 +130,12 @@ def cpu() -> compiled.Cpu:
 def machine(tensor: Tensor) -> compiled.Cpu | compiled.Cuda:
     """Where the compiled function for a tensor runs."""
     return compiled.Cuda(*stream(tensor)) if on_cuda(tensor) else cpu()
+
+
+def on_huge_pages(result: Tensor) -> None:
+    """Asks for huge pages for a result that has just been allocated, where it is large and the system gives them."""
+    if result.nbytes >= _LARGE and result.device.type == "cpu":
+        compiled.advise_huge_pages(result, result.nbytes)
 
 
 def refuse_where_deterministic(op: str, tensor: Tensor) -> None:

@@ -145,6 +145,36 @@ def plain_cell(routed: nn.Module, index: int) -> nn.Module:
     return plain
 
 
+@torch.no_grad()
+def join_cells(routed: nn.Module, modules: Sequence[nn.Module]) -> None:
+    """Gives a routed module the cells of several modules like it, one after the other.
+
+    Raises:
+        ValueError: Where names, shapes, or what cells share differ.
+    """
+    states = [module.state_dict(keep_vars=True) for module in modules]
+    stacked = [{id(parameter) for parameter in cell_parameters(module)} for module in modules]
+    own = routed.state_dict(keep_vars=True)
+    for number, (state, cells) in enumerate(zip(states, stacked, strict=True)):
+        for name in sorted(own.keys() | state.keys()):
+            mine, other = states[0].get(name), state.get(name)
+            rule = f"{_OP}.join: routers must be around modules of one kind, {name} of router {number}"
+            if mine is None or other is None:
+                raise ValueError(f"{rule} is {'new' if mine is None else 'missing'}")
+            if (id(mine) in stacked[0]) != (id(other) in cells):
+                raise ValueError(f"{rule} is {'shared' if id(mine) in stacked[0] else 'not shared'} by its cells")
+            first = 1 if id(other) in cells else 0
+            if mine.shape[first:] != other.shape[first:]:
+                came = list(other.shape[first:])
+                raise ValueError(f"{rule} must have shape {list(mine.shape[first:])}, got {came}")
+            if not first and not torch.equal(mine, other.to(mine)):
+                raise ValueError(f"{rule} is shared by its cells and has other values (router.Parts takes both)")
+    kept = {id(parameter) for parameter in cell_parameters(routed)}
+    for name, parameter in own.items():
+        if id(parameter) in kept:
+            _replace_values(parameter, torch.cat([state[name].detach().to(parameter) for state in states]))
+
+
 def renew_cells(routed: nn.Module, parents: Tensor, new: Tensor, fresh: dict[str, Tensor] | None = None) -> None:
     """Replaces the cells of a routed module by copies of their parents.
 

@@ -90,7 +90,8 @@ class Fused:
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
-        self._recorded = any(node.meta.get("grad") for node in trace.graph.nodes)
+        self._recorded = torch.is_grad_enabled() or any(node.meta.get("grad") for node in trace.graph.nodes)
+        self._differentiates = any(node.target is torch.autograd.grad for node in trace.graph.nodes)
         self._lowering = Lowering(trace.rows)
         self._entries: dict[fx.Node, Entries] = {}  # of values that steps make or move
         self._ready: dict[fx.Node, int] = {}  # of what PyTorch makes: the first run that can read it
@@ -282,9 +283,11 @@ class Fused:
         for node, place in self._parameters.items():
             owner, name = owned[place]
             values[node] = owner._parameters[name]
-        with torch.set_grad_enabled(self._recorded):
+        recorded = torch.is_grad_enabled()
+        with torch.set_grad_enabled(recorded or self._differentiates):
             self._compute(values, grouping, sort)
-        return Results(self._result, [values[node] for node in self._outputs], grouping if sort else None)
+        found = [values[node] if recorded else values[node].detach() for node in self._outputs]
+        return Results(self._result, found, grouping if sort else None)
 
     def _compute(self, values: dict[Any, Any], grouping: Grouping, sort: bool) -> None:
         self._compute_weights(values)

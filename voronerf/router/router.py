@@ -26,6 +26,7 @@ from voronerf.router.cells import (
     detach_results,
     draw_parameters,
     fill_cell,
+    join_cells,
     plain_cell,
     renew_cells,
     stack_parameters,
@@ -156,6 +157,8 @@ class VoronoiRouter(nn.Module):
         self.diagram = own if first is None or first.is_meta else own.to(first.device)
         self.module: nn.Module = clone_module(module)
         stack_parameters(self.module, own.num_cells, share)
+        #: What a file needs to make the module again, if whoever made it has said so.
+        self.recipe: dict[str, Any] | None = None
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature, self.blend = assignment, temperature, blend
@@ -192,6 +195,61 @@ class VoronoiRouter(nn.Module):
         for index, module in enumerate(modules):
             fill_cell(router.module, index, module, f"VoronoiRouter.from_modules: modules[{index}]")
         return router
+
+    @classmethod
+    @torch.no_grad()
+    def join(cls, *routers: VoronoiRouter) -> VoronoiRouter:
+        """One router with the cells of several around the same kind of module, with the options of the first.
+
+        Of several diagrams the nearest centre of the first levels decides; below it each keeps its levels. Modules that
+        differ, and those in other frames, are joined by :class:`voronerf.router.Parts`.
+
+        Args:
+            *routers: At least one.
+
+        Raises:
+            ValueError: No router, or modules that differ in parameters' names or shapes, or in what cells share.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> whole = VoronoiRouter(torch.nn.Linear(3, 1), torch.rand(8, 3), coords="first3")
+            >>> halves = whole.part(torch.arange(4)), whole.part(torch.arange(4, 8))
+            >>> joined, points = VoronoiRouter.join(*halves), torch.rand(100, 3)
+            >>> torch.allclose(joined(points), whole(points))
+            True
+        """
+        if not routers:
+            raise ValueError("VoronoiRouter.join: routers must hold at least one, got none")
+        joined = copy.deepcopy(routers[0])
+        join_cells(joined.module, [router.module for router in routers])
+        joined.diagram = VoronoiDiagram.join([router.diagram for router in routers]).to(joined.diagram.centres.device)
+        joined._set_frozen(torch.cat([router.frozen.to(joined.diagram.centres.device) for router in routers]))
+        return joined
+
+    @torch.no_grad()
+    def part(self, cells: Tensor) -> VoronoiRouter:
+        """A router with some of the cells, and a copy of what all cells share; it gives the same results in them.
+
+        Args:
+            cells: int64 [c], ascending numbers, at least one; they become 0 to c - 1.
+
+        Raises:
+            ValueError: No cells, cells out of range, or cells that do not ascend.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 1), torch.rand(8, 3), coords="first3")
+            >>> router.part(torch.tensor([2, 5])).module.weight.shape
+            torch.Size([2, 1, 3])
+        """
+        diagram = self.diagram.part(cells)
+        taken = copy.deepcopy(self)
+        renew_cells(taken.module, cells, torch.zeros(len(cells), dtype=torch.bool))
+        taken.diagram = diagram
+        taken._set_frozen(self.frozen[cells])
+        return taken
 
     # Cells ------------------------------------------------------------------------------------------------------------
 

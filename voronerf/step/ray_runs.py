@@ -109,13 +109,6 @@ class JointLoss:
         #: For each own territory how many of its rays met each, and had not ended, and last the rays that it drew.
         self.wanted = {number: torch.zeros(len(owner) + 1, dtype=torch.int64) for number in territories}
 
-    @property
-    def _extra(self) -> int:
-        """Columns of a ray beside origin, direction, near and far."""
-        first = next(iter(self.territories.values()), None)
-        cones = first is not None and first.renderer.cones
-        return int(cones) + int(self.sightings > 0)
-
     def survey(self, step: int) -> None:
         """At some steps, all territories tell what of them is not empty, and where their rays go."""
         if step % SURVEY_EVERY and (step > SURVEY_EVERY or step & (step - 1)):
@@ -133,26 +126,29 @@ class JointLoss:
         record = self.group.total(record).cpu()
         self.map = Map(record[:, :6].reshape(-1, 2, 3).float(), record[:, 6:].long())
 
-    def run(self, batches: Mapping[int, Batch]) -> dict[int, Found]:
+    def run(self, batches: Mapping[int, Batch], *, backward: bool = False) -> dict[int, Found]:
         """The loss and what was found, for each own territory.
 
         Args:
-            batches: The rays that each own territory draws; a territory without views has none.
+            batches: The rays that each own territory draws; not all need to draw some.
+            backward: Whether gradients may be added to those of the parameters at once; a loss that has none then.
         """
-        homes = {n: _Pass(self.territories[n], batch, self.sightings) for n, batch in batches.items()}
+        given: dict[str, Any] = {"sightings": self.sightings, "backward": backward}
+        homes = {n: _Pass(self.territories[n], batch, **given) for n, batch in batches.items()}
         guests: dict[int, _Pass] = {}
 
         def travel() -> None:
             parts, rows, learnt = self._leave(homes, batches)
             routes = self._routes()
-            came = send(self.group, "rays", 8 + self._extra, parts, routes)
+            came = send(self.group, "rays", 8 + (self.sightings > 0), parts, routes)
             sizes: dict[int, list[tuple[Any, int]]] = {n: [] for n in self.territories}
             for key, table in came.items():
                 sizes[key[1]].append((key, len(table)))
             for number, territory in self.territories.items():
                 if sizes[number]:
                     table = torch.cat([came[key] for key, _ in sizes[number]])
-                    guests[number] = _Pass(territory, self._batch(table), self.sightings)
+                    seen = table[:, 8] if self.sightings else None
+                    guests[number] = _Pass(territory, _batch(table, seen), **given)
             _nest(list(guests.values()), lambda: compose_all(sizes, rows, learnt, routes))
 
         def compose_all(sizes: Any, rows: Any, learnt: Any, routes: list[Route]) -> None:
@@ -208,18 +204,9 @@ class JointLoss:
         """Rays as rows of numbers."""
         rays = batch.rays
         columns = [rays.origins, rays.directions, batch.near[:, None], batch.far[:, None]]
-        if rays.radii is not None:
-            columns.append(rays.radii[:, None])
         if self.sightings:
             columns.append(_points(batch)[:, None])
         return torch.cat(columns, 1)
-
-    def _batch(self, table: Tensor) -> Batch:
-        """Rays that came from elsewhere; their colours are not known here."""
-        cones = table.shape[1] > 8 + int(self.sightings > 0)
-        rays = Rays(table[:, :3].contiguous(), table[:, 3:6].contiguous(), table[:, 8] if cones else None)
-        seen = table[:, -1] if self.sightings else None
-        return Batch(rays, table[:, 6].contiguous(), table[:, 7].contiguous(), table[:, :0], None, seen)
 
     def _compose(
         self, home: _Pass, batch: Batch, came: Mapping[Any, Tensor], rows: Mapping[Any, Tensor], learnt: Tensor
@@ -263,8 +250,8 @@ class _Pass:
         found: What was found, for these rays.
     """
 
-    def __init__(self, territory: Territory, batch: Batch, sightings: float) -> None:
-        self.territory, self.renderer, self.sightings = territory, territory.renderer, sightings
+    def __init__(self, territory: Territory, batch: Batch, *, sightings: float = 0.0, backward: bool = False) -> None:
+        self.territory, self.renderer, self.backward = territory, territory.renderer, backward
         near, far, device = batch.near, batch.far, batch.near.device
         hit = torch.ones_like(near, dtype=torch.bool)
         if self.renderer.contraction is None:
@@ -293,10 +280,10 @@ class _Pass:
         cells = place.cells(known.positions, renderer.backend)
         along = known.ray_index, known.depths, known.deltas, cells, place.own.to(cells.device)
         bent = renderer.contraction is not None
-        if why_not_fused(renderer) is None:
+        if why_not_fused(renderer) is None and self.points is None:
             self._fused(own_samples(known.positions, *along, bent=bent, backend=renderer.backend), then)
         else:
-            self._composed(keep_own(known.inputs, *along, bent=bent), then)
+            self._composed(keep_own(known.positions, *along, bent=bent), then)
 
     def _fused(self, own: OwnSamples, then: Callable[[], None]) -> None:
         """From what the networks put out."""
@@ -318,7 +305,7 @@ class _Pass:
             return
         network = field.table_arguments(own.positions, self.rays.directions, own.ray_index)
         assert network is not None
-        self.total = learn_outputs(network, loss, backward=True, backend=backend)
+        self.total = learn_outputs(network, loss, backward=self.backward, backend=backend)
 
     def _composed(self, own: OwnSamples, then: Callable[[], None]) -> None:
         """From colours and densities, which torch differentiates."""
@@ -405,13 +392,19 @@ def _together(home: _Pass | None, guest: _Pass | None) -> Found:
     offsets = torch.cat((first.samples.ray_offsets, second.samples.ray_offsets[1:] + len(first.weights)))
     values = (torch.cat((getattr(first.samples, n), getattr(second.samples, n))) for n in ("depths", "deltas"))
     samples = Samples(torch.cat((first.samples.inputs, second.samples.inputs)), index, offsets, *values)
-    rest = (torch.cat((getattr(first, n), getattr(second, n))) for n in ("error", "weights", "density"))
-    return Found(loss, *rest, samples)
+    rest = {n: torch.cat((getattr(first, n), getattr(second, n))) for n in ("error", "weights", "density")}
+    return Found(loss, **rest, samples=samples)
 
 
 def _samples(own: OwnSamples) -> Samples:
     """Own samples as those of a sampler; their runs are no whole rays."""
     return Samples(own.positions, own.ray_index, own.run_offsets, own.depths, own.deltas)
+
+
+def _batch(table: Tensor, seen: Tensor | None = None) -> Batch:
+    """Rays of a table [r, 8]; their colours are known elsewhere."""
+    rays = Rays(table[:, :3].contiguous(), table[:, 3:6].contiguous())
+    return Batch(rays, table[:, 6].contiguous(), table[:, 7].contiguous(), table[:, :0], None, seen)
 
 
 def _points(batch: Batch) -> Tensor:
@@ -461,10 +454,8 @@ def see_together(joint: JointLoss, rays: Rays, near: Tensor, far: Tensor, backgr
         background: [3] or [r, 3], or None.
     """
     group, ranks = joint.group, range(joint.group.size)
-    extra = int(rays.radii is not None)
     met = joint.map.met(rays, near, far)
-    columns = [rays.origins, rays.directions, near[:, None], far[:, None]]
-    table = torch.cat(columns if rays.radii is None else [*columns, rays.radii[:, None]], 1)
+    table = torch.cat((rays.origins, rays.directions, near[:, None], far[:, None]), 1)
     rows = {(group.rank, number): met[:, number].nonzero()[:, 0] for number in range(len(joint.owner))}
     routes = [
         Route(rank, owner, (rank, number))
@@ -473,7 +464,7 @@ def see_together(joint: JointLoss, rays: Rays, near: Tensor, far: Tensor, backgr
         if group.rank in (rank, owner)
     ]
     parts = {key: table[chosen] for key, chosen in rows.items()}
-    came = send(group, "rays of pictures", 8 + extra, parts, routes)
+    came = send(group, "rays of pictures", 8, parts, routes)
     sums = {key: _pictured(joint.territories[key[1]], part) for key, part in came.items()}
     told = send(group, "sums of pictures", 7, sums, [route.back() for route in routes])
     found = []
@@ -495,9 +486,7 @@ def see_together(joint: JointLoss, rays: Rays, near: Tensor, far: Tensor, backgr
 @torch.no_grad()
 def _pictured(territory: Territory, table: Tensor) -> Tensor:
     """The partial sums [q, 7] of rays of pictures: colour, optical depth, start, ray and depth."""
-    radii = table[:, 8] if table.shape[1] > 8 else None
-    batch = Batch(Rays(table[:, :3], table[:, 3:6], radii), table[:, 6], table[:, 7], table[:, :0])
-    found = _Pass(territory, batch, 0.0)
+    found = _Pass(territory, _batch(table))
     renderer, place, rays = found.renderer, territory.place, found.rays
     if not len(found.ids):
         return table.new_empty(0, 7)
@@ -508,7 +497,7 @@ def _pictured(territory: Territory, table: Tensor) -> Tensor:
         known = sampler.sample(rays, found.near, found.far)
     cells = place.cells(known.positions, renderer.backend)
     along = known.ray_index, known.depths, known.deltas, cells, place.own.to(cells.device)
-    own = keep_own(known.inputs, *along, bent=renderer.contraction is not None)
+    own = keep_own(known.positions, *along, bent=renderer.contraction is not None)
     if not len(own.depths):
         return table.new_empty(0, 7)
     colour, density = (v.to(table.dtype) for v in ask(renderer.field, rays, _samples(own), sampler.space))

@@ -4,18 +4,22 @@ The tensors are those of the routers with their diagrams, of the optimiser, of t
 generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file, beside a checksum for
 each tensor and one for the JSON.
 
-A joint training writes a file for each territory, a checkpoint of its own, and then the checkpoint that names them.
+A joint training writes a file for each territory, a checkpoint of its own, and then the checkpoint that names them. The
+networks of an edited run of several parts are in files whose names are hashes of what is in them: networks that did not
+change are not written again, and equal ones are stored once.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import json
+import re
 import threading
 import warnings
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +34,8 @@ from voronerf.files import parse_json, rename, write_bytes
 FORMAT = "voronerf-checkpoint-2"
 #: The name of the checksum of the JSON, beside those of the tensors.
 _VALUES = "values"
+#: The file of the networks of one router of a part.
+_NETWORKS = re.compile(r"(networks|part)-[0-9a-z-]+\.safetensors")
 
 
 class CheckpointError(ValueError):
@@ -86,21 +92,21 @@ def part_path(run: Path, token: str, number: int) -> Path:
 
 
 def _remove_parts(run: Path) -> None:
-    """Removes the parts that no checkpoint of a run names; none while it has a file that cannot be read."""
+    """Removes parts and networks that no checkpoint of a run names; none while it has a file that cannot be read."""
     named: set[str] = set()
     for path in checkpoint_paths(run):
         try:
             with safe_open(path, framework="pt") as file:
-                named |= set(part_files(parse_json(file.metadata()[_VALUES])))
+                named |= set(network_files(parse_json(file.metadata()[_VALUES])))
         except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OSError):
             return
-    for path in checkpoint_path(run).parent.glob("part-*.safetensors"):
-        if path.name not in named:
+    for path in checkpoint_path(run).parent.glob("*.safetensors"):
+        if _NETWORKS.fullmatch(path.name) and path.name not in named:
             path.unlink(missing_ok=True)
 
 
-def part_files(values: dict[str, Any]) -> list[str]:
-    """The names of the files of a checkpoint's parts, which its JSON tells."""
+def network_files(values: dict[str, Any]) -> list[str]:
+    """The names of the files with the networks of parts, which the JSON of a checkpoint tells."""
     return [str(router["file"]) for part in values.get("parts", ()) for router in part["routers"]]
 
 
@@ -247,16 +253,66 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Writes a checkpoint atomically.
+    """Writes a checkpoint atomically, after the networks of its parts, if it has any.
 
     Raises:
         OSError: When it cannot be written; an older checkpoint at ``path`` is then untouched.
     """
+    if "parts" in checkpoint.values:
+        checkpoint = _write_networks(path.parent, checkpoint)
     values = json.dumps(checkpoint.values)
     sums = {name: _checksum(tensor) for name, tensor in checkpoint.tensors.items()}
     sums[_VALUES] = zlib.crc32(values.encode())
     metadata = {"format": FORMAT, "values": values, "checksums": json.dumps(sums)}
     write_bytes(path, save(checkpoint.tensors, metadata))
+
+
+def _write_networks(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
+    """Writes the networks of parts into files of a folder; the checkpoint without them, which names the files."""
+    tensors, parts = dict(checkpoint.tensors), []
+    for i, part in enumerate(checkpoint.values["parts"]):
+        routers = []
+        for j, router in enumerate(part["routers"]):
+            prefix = f"part-{i}.router-{j}."
+            own = {name[len(prefix) :]: tensors.pop(name) for name in sorted(tensors) if name.startswith(prefix)}
+            if not own and "file" in router:  # whoever made the checkpoint has written it
+                routers.append(router)
+                continue
+            kind = {name: value for name, value in router.items() if name != "file"}
+            digest = hashlib.sha256(json.dumps(kind, sort_keys=True).encode())
+            for name, tensor in own.items():
+                digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
+                digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+            if not own and "file" in router:  # of a joint training, which has written it
+                routers.append(router)
+                continue
+            path = folder / f"networks-{digest.hexdigest()}.safetensors"
+            if not path.is_file():
+                save_checkpoint(path, Checkpoint(own, kind))
+            routers.append({**kind, "file": path.name})
+        parts.append({**part, "routers": routers})
+    return replace(checkpoint, tensors=tensors, values={**checkpoint.values, "parts": parts})
+
+
+def _read_networks(path: Path, values: dict[str, Any], keep: Callable[[str], bool]) -> dict[str, Tensor]:
+    """The tensors of the networks of parts, those of one file once.
+
+    Raises:
+        CheckpointError: When a file is missing, damaged or no file of networks.
+    """
+    tensors: dict[str, Tensor] = {}
+    if not keep("part-"):
+        return tensors
+    files: dict[str, Checkpoint] = {}
+    for i, part in enumerate(values.get("parts", ())):
+        for j, router in enumerate(part["routers"]):
+            name = str(router["file"])
+            if not _NETWORKS.fullmatch(name):
+                raise CheckpointError(f"{path}: parts must name files of networks beside it, got {name!r:.100}")
+            if name not in files:
+                files[name] = load_checkpoint(path.with_name(name))
+            tensors |= {f"part-{i}.router-{j}.{key}": tensor for key, tensor in files[name].tensors.items()}
+    return tensors
 
 
 def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
@@ -287,7 +343,7 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
                 what = "has another checksum" if name in found else "is missing"
                 raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
         values = parse_json(metadata["values"])
-        tensors = {name: tensor for name, tensor in tensors.items() if keep(name)}
+        tensors = {name: tensor for name, tensor in tensors.items() if keep(name)} | _read_networks(path, values, keep)
         return Checkpoint(tensors, values, str(path))
     except CheckpointError:
         raise

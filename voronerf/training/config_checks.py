@@ -179,6 +179,14 @@ def check_joint(config: TrainConfig, ranks: int) -> None:
             SAMPLERS[config.sampling].passes == 1,
             "take one pass with several territories, as stratified: no territory sees whole rays, where a second looks",
         ),
+        "field": (
+            not config.field_type.cones,
+            "take points with several territories: a run of parts asks its networks about points",
+        ),
+        "contraction": (
+            config.contraction != "ndc",
+            "be none or sphere with several territories: parts have no normalised device coordinates",
+        ),
         "blend": (
             config.blend == 0,
             "be 0 with several territories, which train apart; `voronerf eval RUN --blend` blends the finished run",

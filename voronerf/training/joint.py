@@ -12,7 +12,7 @@ import functools
 import math
 import secrets
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -35,6 +35,7 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.marching import Seen
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
+from voronerf.router import Similarity
 from voronerf.step.ray_runs import JointLoss, Map, Territory, see_together
 from voronerf.training import state
 from voronerf.training.batches import RayBatches
@@ -44,13 +45,14 @@ from voronerf.training.checkpoint import (
     CheckpointWriter,
     checkpoint_paths,
     load_checkpoint,
-    part_files,
+    network_files,
     part_path,
 )
 from voronerf.training.config import TrainConfig
 from voronerf.training.config_checks import ConfigError, check_joint
 from voronerf.training.divergence import PATIENCE, SETTLED, all_finite, one_colour_psnr, why_scores_are_poor
 from voronerf.training.networks import check_shapes, resolve_config
+from voronerf.training.parts import recipe_of
 from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.rates import learning_rate
 from voronerf.training.renderers import make_contraction, make_grid
@@ -69,7 +71,7 @@ def joint_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     """The settings with which a joint run is drawn as a whole: strata are as long as those of its territories."""
     territories = cut_space(scene, int(config.territories or 1), _contraction(config, scene))
     own = resolve_config(config, territories.scene(scene, 0))
-    whole = resolve_config(config, scene)
+    whole = replace(resolve_config(config, scene), territories=None)
     if scene.box is None or whole.contraction != "none":
         return whole
     lengths = [float((box[1] - box[0]).norm()) for box in (scene.box, territories.boxes[0])]
@@ -120,6 +122,7 @@ class JointTrainer:
         self.device = torch.device(config.device)
         self.group = group or Group(self.device)
         check_joint(config, self.group.size)
+        check_joint(resolve_config(config, scene), self.group.size)  # what follows from the scene
         self.whole, count = resolve_config(config, scene), int(config.territories or 1)
         try:
             self.territories = cut_space(scene, count, _contraction(config, scene))
@@ -134,7 +137,7 @@ class JointTrainer:
         self.evaluated, self.skipped, self.rate_factor = 0, 0, 1.0
         self.metrics: list[dict[str, Any]] = []
         self.stopped = self._asked_to_stop = self.described = False
-        self.loss, self.one_colour = math.nan, None
+        self.loss, self.one_colour = math.nan, one_colour_psnr(scene)
         self.work = dict.fromkeys(range(count), 0)
         self.writer = CheckpointWriter(self.out, config.keep_checkpoints, self.group)
         if config.resume:
@@ -194,20 +197,21 @@ class JointTrainer:
     def _own(self) -> list[int]:
         return [number for number, rank in enumerate(self.owner) if rank == self.group.rank]
 
-    def _take(self, checkpoints: dict[int, Checkpoint | None], known: Map) -> None:
+    def _take(self, checkpoints: Mapping[int, Checkpoint | None], known: Map) -> None:
         """Makes the trainers of territories, new or from their checkpoints."""
         self.trainers = {number: self._trainer(number, found) for number, found in checkpoints.items()}
         self._join(known, checkpoints)
 
-    def _join(self, known: Map, checkpoints: dict[int, Checkpoint | None]) -> None:
+    def _join(self, known: Map, checkpoints: Mapping[int, Checkpoint | None]) -> None:
         """Lets the rays of the trainers cross."""
         members = {
             number: Territory(self.places[number], trainer.renderer, trainer.draws)
             for number, trainer in self.trainers.items()
         }
-        wanted = {} if not hasattr(self, "joint") else self.joint.wanted
-        self.joint = JointLoss(self.group, members, self.owner, known, self.whole.sightings or 0.0)
-        self.joint.wanted |= {number: counts for number, counts in wanted.items() if number in members}
+        before = getattr(self, "joint", None)
+        self.joint: JointLoss = JointLoss(self.group, members, self.owner, known, self.whole.sightings or 0.0)
+        if before is not None:
+            self.joint.wanted |= {n: counts for n, counts in before.wanted.items() if n in members}
         for number, found in checkpoints.items():
             if found is not None:
                 self.joint.wanted[number] = found.tensors["joint.wanted"].clone()
@@ -222,7 +226,6 @@ class JointTrainer:
         batches = RayBatches(
             self.scene,
             self.device,
-            cones=config.field_type.cones,
             sightings=bool(self.whole.sightings),
             views=views,
             backend=config.backend,
@@ -258,7 +261,7 @@ class JointTrainer:
                 trainer.prepare()
                 batches[number] = trainer.draw()
             with first.precision():
-                found = self.joint.run(batches)
+                found = self.joint.run(batches, backward=self.config.precision == "fp32")
             self._losses = 0.0
             for number, trainer in self.trainers.items():
                 self.rays_done += len(batches[number].rays)
@@ -269,19 +272,17 @@ class JointTrainer:
 
     def _balance(self) -> None:
         """Moves territories from the rank that evaluates the most samples, while it has more than `HEAVIEST` allow."""
-        work = torch.zeros(len(self.owner), dtype=torch.float64, device=self.group.device)
-        for number in self.trainers:
-            work[number] = self.work[number]
-        work = self.group.total(work).tolist()
+        own = [float(self.work[number]) if number in self.trainers else 0.0 for number in range(len(self.owner))]
+        work = self.group.total(torch.tensor(own, dtype=torch.float64, device=self.group.device)).tolist()
         self.work = dict.fromkeys(self.work, 0)
         owner = list(self.owner)
         for _ in owner:
             loads = [sum(w for w, rank in zip(work, owner, strict=True) if rank == r) for r in range(self.group.size)]
             heaviest, lightest = loads.index(max(loads)), loads.index(min(loads))
-            own = [number for number, rank in enumerate(owner) if rank == heaviest]
-            if max(loads) <= HEAVIEST * sum(loads) / len(loads) or len(own) < 2:
+            some = [number for number, rank in enumerate(owner) if rank == heaviest]
+            if max(loads) <= HEAVIEST * sum(loads) / len(loads) or len(some) < 2:
                 break
-            best = min(own, key=lambda n: (max(loads[heaviest] - work[n], loads[lightest] + work[n]), n))
+            best = min(some, key=lambda n: (max(loads[heaviest] - work[n], loads[lightest] + work[n]), n))
             if loads[lightest] + work[best] >= loads[heaviest]:
                 break
             owner[best] = lightest
@@ -413,8 +414,7 @@ class JointTrainer:
         with self.averaged(), torch.no_grad():
             scores = evaluate(self.renderer, self.scene, views=own, lpips=lpips, stop=lambda: self._asked_to_stop)
             none = torch.empty(0, device=self.device)
-            radii = none if self.renderer.cones else None
-            rays = Rays(none.reshape(0, 3), none.reshape(0, 3), radii)
+            rays = Rays(none.reshape(0, 3), none.reshape(0, 3))
             while self.group.total(torch.zeros(1, device=self.group.device)) > 0:
                 see_together(self.joint, rays, none, none, None)
         table = torch.zeros(len(chosen) + 1, 3, dtype=torch.float64, device=self.group.device)
@@ -451,8 +451,6 @@ class JointTrainer:
             f"{self.seconds:7.1f} s  step {self.step:6d}  {self.cells_now:4d} cells  "
             f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
         )
-        if self.one_colour is None:
-            self.one_colour = one_colour_psnr(self.scene)
         settled = self.step >= SETTLED and self.fraction >= 0.5
         poor = why_scores_are_poor(self.metrics, self.config, self.one_colour, settled=settled)
         if poor is not None:
@@ -533,17 +531,19 @@ class JointTrainer:
             sizes.append(diagrams[number].num_cells)
             grids.append(part.group("occupancy"))
             config = TrainConfig.from_json(json_text(part.values["config"]), str(path))
-            recipe = {"field": config.field, "options": config.network_options, "cell_tables": config.cell_tables}
-            recipes.append({"file": path.name, **recipe})
+            recipes.append({"file": path.name, **recipe_of(config)})
         diagram = root.refine(diagrams)[0] if len(paths) > 1 else diagrams[0]
         owner = torch.repeat_interleave(torch.arange(len(paths)), torch.tensor(sizes)).to(torch.int32)
         tensors = {**known.tensors, "part-0.owner": owner}
         tensors |= {f"part-0.diagram.{name}": value for name, value in diagram.state_dict().items()}
-        if self.whole.occupancy:
+        seen = _contraction(self.config, self.scene)
+        if self.whole.occupancy and seen is None:
             grid = _whole_grid(make_grid(joint_config(self.config, self.scene), self.scene, "cpu", 1), grids)
             tensors |= {f"occupancy.{name}": value for name, value in grid.state_dict().items()}
-        part = {"routers": recipes, "frame": None, "region": None, "layer": 0, "contraction": None}
-        return Checkpoint(tensors, {**known.values, "parts": [part]})
+        sphere = None if seen is None else {"centre": seen.centre.tolist(), "radius": seen.radius}
+        frame = Similarity().to_values()
+        told = {"routers": recipes, "frame": frame, "region": [], "layer": 0, "contraction": sphere}
+        return Checkpoint(tensors, {**known.values, "parts": [told]})
 
     def _resume(self) -> None:
         """Puts all territories where they were at the last checkpoint that all ranks can read.
@@ -556,7 +556,7 @@ class JointTrainer:
             index, parts, failure = None, {}, None
             try:
                 index = load_checkpoint(path, keep=lambda name: not name.startswith("part-"))
-                files = part_files(index.values)
+                files = network_files(index.values)
                 stored, values = state.stored_values(index)
                 different = state.differences(stored, self.config)
                 if different:

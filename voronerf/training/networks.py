@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import fnmatch
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,11 +19,12 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import DensityField
 from voronerf.rendering.contraction import Perspective
 from voronerf.rendering.samplers import SAMPLERS
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.training.adam import Adam
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import why_no_occupancy
+from voronerf.training.parts import grouped_parameters, open_parts, parts_states, recipe_of, restore_parts
 from voronerf.training.renderers import make_contraction
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
@@ -150,13 +152,17 @@ def make_network(config: TrainConfig, name: str = "field") -> nn.Module:
 
 def parameter_shapes(config: TrainConfig, name: str) -> dict[str, tuple[torch.Size, bool]]:
     """The shape of each parameter of one network, and whether all cells share it; without memory for any of them."""
+    share = config.router_options.get("share", ()) if name != "proposal" else ()
+    return _shapes(functools.partial(make_network, config, name), share)
+
+
+def _shapes(make: Callable[[], nn.Module], share: Sequence[str]) -> dict[str, tuple[torch.Size, bool]]:
     try:
         with torch.device("meta"):
-            network = make_network(config, name)
+            network = make()
     except RuntimeError:  # a field that computes numbers where it is made
         with torch.random.fork_rng(devices=[]):  # draws nothing from the caller's random numbers
-            network = make_network(config, name)
-    share = config.router_options.get("share", ()) if name != "proposal" else ()
+            network = make()
     return {
         key: (parameter.shape, any(fnmatch.fnmatchcase(key, pattern) for pattern in share))
         for key, parameter in network.named_parameters()
@@ -247,12 +253,25 @@ def solve_width(config: TrainConfig, total: int) -> int:
     return low
 
 
+def open_routers(
+    config: TrainConfig, device: torch.device | str, checkpoint: Checkpoint | None
+) -> dict[str, VoronoiRouter | Parts]:
+    """The parts of a checkpoint that has some, with their parameters; else what :func:`make_routers` makes.
+
+    Raises:
+        CheckpointError: When a part is damaged.
+    """
+    if checkpoint is not None and "parts" in checkpoint.values:
+        return {"field": open_parts(checkpoint, device, config.backend)}
+    return {**make_routers(config, device)}
+
+
 def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, VoronoiRouter]:
     """A router of one cell around each network, for the coarse stage; the seed alone decides its parameters."""
     with torch.random.fork_rng():  # of GPUs as well: manual_seed reaches them
         torch.manual_seed(config.seed)
         networks = {name: make_network(config, name) for name in network_names(config)}
-    return {
+    routers = {
         name: VoronoiRouter(
             network,
             VoronoiDiagram(torch.zeros(1, 3)),
@@ -265,22 +284,31 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
         ).to(device)
         for name, network in networks.items()
     }
+    routers["field"].recipe = recipe_of(config)
+    return routers
 
 
-def computes_natively(routers: Mapping[str, VoronoiRouter], config: TrainConfig) -> bool:
+def computes_natively(routers: Mapping[str, VoronoiRouter | Parts], config: TrainConfig) -> bool:
     """Whether native CPU ops evaluate all networks, so that torch is left with little to do in a step."""
     device = torch.device(config.device)
     chosen = backends.chosen("routed_mlp", device, torch.float32, backend=config.backend)
-    return device.type == "cpu" and chosen == "native" and all(router.by_table for router in routers.values())
+    return (
+        device.type == "cpu"
+        and chosen == "native"
+        and all(getattr(router, "by_table", False) for router in routers.values())
+    )
 
 
 def parameter_groups(
-    routers: Mapping[str, VoronoiRouter], config: TrainConfig
+    routers: Mapping[str, VoronoiRouter | Parts], config: TrainConfig
 ) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
     """The parameters in the order that the optimiser numbers them: those of the networks, then the tables."""
+    if isinstance(parts := routers["field"], Parts):
+        return grouped_parameters(parts.routers)
     dense: list[nn.Parameter] = []
     tables: list[nn.Parameter] = []
     for network, router in routers.items():
+        assert isinstance(router, VoronoiRouter)
         patterns = () if network == "proposal" else config.field_type.sparse_parameters
         for name, parameter in router.module.named_parameters():
             sparse = any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
@@ -288,7 +316,7 @@ def parameter_groups(
     return dense, tables
 
 
-def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig) -> Adam:
+def make_optimizer(routers: Mapping[str, VoronoiRouter | Parts], config: TrainConfig) -> Adam:
     """Adam with a decay of 0.99 for the squared gradients, where the default is 0.999.
 
     After a split each cell sees fewer samples and other gradients than its parent. With the default, the moments of the
@@ -315,6 +343,8 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
     Raises:
         CheckpointError: for a parameter that is missing, of another shape, or not for as many cells as there are.
     """
+    if "parts" in checkpoint.values:  # which are compared where they are made
+        return
     for name in network_names(config):
         state = checkpoint.group(_group(name))
         try:
@@ -332,12 +362,16 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
                 )
 
 
-def router_states(routers: Mapping[str, VoronoiRouter]) -> dict[str, dict[str, Any]]:
+def router_states(routers: Mapping[str, VoronoiRouter | Parts]) -> dict[str, dict[str, Any]]:
     """The states of the routers, by their names in a checkpoint."""
+    if isinstance(parts := routers["field"], Parts):
+        return {**parts_states(parts)}
     return {_group(name): router.state_dict() for name, router in routers.items()}
 
 
-def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint, *, assign: bool = False) -> None:
+def restore_routers(
+    routers: Mapping[str, VoronoiRouter | Parts], checkpoint: Checkpoint, *, assign: bool = False
+) -> None:
     """Loads the cells of a checkpoint into routers; their number may differ.
 
     Args:
@@ -349,6 +383,9 @@ def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint
         CheckpointError: When the checkpoint's parameters are of another architecture.
     """
     for name, router in routers.items():
+        if isinstance(router, Parts):
+            restore_parts(router, checkpoint)
+            continue
         try:
             router.load_state_dict(checkpoint.group(_group(name)), assign=assign)
         except RuntimeError as error:

@@ -17,7 +17,7 @@ from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
 from voronerf.rendering.samplers import SAMPLERS, Occupancy, Stratified
 from voronerf.rendering.volume import Space
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.step.cells import DECAY
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import why_no_occupancy
@@ -39,7 +39,7 @@ PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 def make_renderer(
     config: TrainConfig,
     scene: Scene,
-    routers: Mapping[str, VoronoiRouter],
+    routers: Mapping[str, VoronoiRouter | Parts],
     *,
     samples: int | None = None,
     fine_samples: int | None = None,
@@ -62,6 +62,8 @@ def make_renderer(
     """
     device, backend = next(routers["field"].parameters()).device, backend or config.backend
     contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
+    if isinstance(routers["field"], Parts):  # each has its own
+        contraction = None
     full_gradient = None
     if scene.kind == "unbounded" and isinstance(contraction, Contraction):
         full_gradient = contraction.radius
@@ -80,8 +82,10 @@ def through_grid(sampler: Stratified, grid: OccupancyGrid, *, picture_samples: i
     return Occupancy(grid, sampler.samples, picture_samples=more, space=sampler.space, backend=sampler.backend)
 
 
-def as_field(router: VoronoiRouter) -> Field:
+def as_field(router: VoronoiRouter | Parts) -> Field:
     """A router as the renderer asks it: with one direction for each ray, or for each sample where it takes no other."""
+    if isinstance(router, Parts):
+        return router
     takes_rays = "ray_index" in inspect.signature(router.module.forward).parameters
     return router if takes_rays else DirectionPerSample(router)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.training.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -21,6 +21,7 @@ from voronerf.training.checkpoint import (
 )
 from voronerf.training.config import TrainConfig, differences
 from voronerf.training.networks import check_shapes, router_states
+from voronerf.training.parts import describe_parts
 from voronerf.training.progress import Stage
 from voronerf.training.schema import check_types
 
@@ -70,7 +71,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
 
 def collect(
     stored: Stored,
-    routers: Mapping[str, VoronoiRouter],
+    routers: Mapping[str, VoronoiRouter | Parts],
     optimizer: torch.optim.Optimizer,
     parts: Mapping[str, Mapping[str, Any]],
 ) -> Checkpoint:
@@ -81,7 +82,10 @@ def collect(
         for prefix, group in every.items()
         for name, value in group.items()
     }
-    return Checkpoint(tensors, {**asdict(stored), "stages": list(stored.stages)})
+    values = {**asdict(stored), "stages": list(stored.stages)}
+    if isinstance(field := routers["field"], Parts):
+        values["parts"] = describe_parts(field)
+    return Checkpoint(tensors, values)
 
 
 def resumed_checkpoint(config: TrainConfig, run: Path) -> Checkpoint:

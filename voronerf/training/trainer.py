@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.data import Scene
-from voronerf.data.record import write_scene
+from voronerf.data.record import within, write_scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
@@ -27,7 +27,7 @@ from voronerf.files import json_text, write_bytes, write_text
 from voronerf.ops import Guard
 from voronerf.ops.sparse_adam.reference import judge
 from voronerf.rendering.occupancy import OccupancyGrid
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.step import Batch, Cells, Found, Step
 from voronerf.training import state
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
@@ -53,7 +53,7 @@ from voronerf.training.networks import (
     check_memory,
     computes_natively,
     make_optimizer,
-    make_routers,
+    open_routers,
     resolve_config,
     restore_routers,
 )
@@ -99,6 +99,8 @@ class Trainer:
     ) -> None:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
+        if config.resume:  # the space is that of the run, whatever the views
+            scene = within(scene, config.out)
         self.out, self.scene = config.out, scene
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)
@@ -121,7 +123,7 @@ class Trainer:
             sightings=bool(config.sightings),
             backend=config.backend,
         )
-        self.routers = make_routers(config, self.device)
+        self.routers = open_routers(config, self.device, checkpoint)
         for router in self.routers.values():
             router.generator = self.draws
         #: Whether native ops compute the networks: then steps are the same bit for bit on any number of threads.
@@ -132,7 +134,7 @@ class Trainer:
         self.renderer = make_renderer(config, scene, self.routers, occupancy=grid)
         self.cells = Cells(
             self.renderer,
-            self.routers,
+            cast(dict[str, VoronoiRouter], self.routers),  # of parts it asks for what they have alone
             self.plan,
             config.split_rule,
             generator=self.generator,
@@ -164,8 +166,8 @@ class Trainer:
         return int(self.guard.skipped)
 
     @property
-    def router(self) -> VoronoiRouter:
-        """The router whose colours count."""
+    def router(self) -> VoronoiRouter | Parts:
+        """The router whose colours count, or the parts of a run that was joined."""
         return self.routers["field"]
 
     @property
@@ -539,14 +541,17 @@ class Trainer:
         try:
             state.load_moments(self.optimizer, checkpoint, stored.step)
             self.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
-            self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
             if self.occupancy is not None:
                 self.occupancy.load_state_dict(checkpoint.group("occupancy"))
-            generators = checkpoint.group("generator")
-            self.generator.set_state(generators["state"])
-            drawn = generators["draws"]
-            if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
-                self.draws.set_state(drawn)  # else the run began on another kind of device
+            if (
+                stored.stages[0]["cells"] == 1 or stored.step
+            ):  # else nothing was trained since it was made of other runs
+                self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
+                generators = checkpoint.group("generator")
+                self.generator.set_state(generators["state"])
+                drawn = generators["draws"]
+                if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
+                    self.draws.set_state(drawn)  # else the run began on another kind of device
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
         threads = torch.get_num_threads()

@@ -24,7 +24,7 @@ from voronerf.evaluation.panels import (
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.field import Field
 from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.viewer.cameras import crop_camera
 from voronerf.viewer.errors import ViewErrors
 
@@ -64,7 +64,7 @@ class Subject:
     name: str
     folder: Path
     scene: Scene
-    router: VoronoiRouter
+    router: VoronoiRouter | Parts
     renderer: Renderer
     weights: Callable[[], AbstractContextManager[None]] = nullcontext
 
@@ -119,8 +119,11 @@ def render_bands(subject: Subject, camera: Cameras, look: Look, rows: int) -> It
         hidden = torch.zeros(subject.diagram.num_cells, dtype=torch.bool)
         hidden[list(look.hidden)] = True
         hidden = hidden.to(renderer.device)
+        parts = subject.router
         fields: dict[str, Field] = {
             name: VisibleCells(field, subject.diagram, hidden, renderer.backend)
+            if not isinstance(parts, Parts)
+            else parts.without(hidden)
             for name, field in renderer.fields.items()
         }
         renderer = copy.copy(renderer)
@@ -146,8 +149,10 @@ def render_look(subject: Subject, camera: Cameras, look: Look) -> RenderedImage:
 
 def cells_of(subject: Subject, places: Tensor) -> Tensor:
     """The leaves int64 [...] of places [..., 3], as `RenderedImage.heaviest` has them."""
-    cells = subject.diagram.locate(places.to(subject.renderer.device), backend=subject.renderer.backend)
-    return cells.cpu().long()
+    where = places.to(subject.renderer.device)
+    if isinstance(subject.router, Parts):  # where no part speaks there is nothing to see, in the last of the cells
+        return subject.router.assign(where.reshape(-1, 3)).reshape(where.shape[:-1]).cpu().long()
+    return subject.diagram.locate(where, backend=subject.renderer.backend).cpu().long()
 
 
 def picture_of(subject: Subject, camera: Cameras, image: RenderedImage, look: Look, errors: ViewErrors) -> Tensor:

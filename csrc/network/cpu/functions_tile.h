@@ -1,5 +1,4 @@
-// The functions of programs, each with its first three derivatives: a line each. x is the value, a and b are the
-// function's numbers.
+// What the functions of programs (network/functions.h) are made of, in vectors.
 #pragma once
 
 #include "common/elementwise_math.h"
@@ -8,15 +7,6 @@
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
-
-VN_INLINE F32 constant(float a) {
-  return splat(a);
-}
-
-// Where x > 0, and where it is not.
-VN_INLINE F32 positive(F32 x, F32 yes, F32 no) {
-  return x > splat(0.0f) ? yes : no;
-}
 
 VN_INLINE F32 square_root(F32 x) {
 #if VN_ISA == 2
@@ -31,11 +21,23 @@ VN_INLINE F32 square_root(F32 x) {
 #endif
 }
 
+// With x = 2^e m, m from sqrt(1/2) to sqrt 2: e log 2 + 2 atanh((m - 1) / (m + 1)).
 VN_INLINE F32 logarithm(F32 x) {
-  float lanes[kLanes];
-  store(lanes, x);
-  for (int i = 0; i < kLanes; ++i) lanes[i] = __builtin_logf(lanes[i]);
-  return load(lanes);
+  const F32 zero = splat(0.0f), one = splat(1.0f), least = splat(1.17549435e-38f);
+  const F32 normal = x < least ? x * splat(8388608.0f) : x;
+  const Bits bits = reinterpret_cast<Bits>(normal);
+  F32 e = __builtin_convertvector((bits >> 23) - 127, F32), m = reinterpret_cast<F32>((bits & 0x7fffff) | 0x3f800000);
+  e = x < least ? e - splat(23.0f) : e;
+  e = m > splat(1.41421356f) ? e + one : e;
+  m = m > splat(1.41421356f) ? splat(0.5f) * m : m;
+  const F32 s = (m - one) / (m + one), u = s * s;
+  F32 p = fma(u, splat(1.0f / 9), splat(1.0f / 7));
+  p = fma(u, p, splat(1.0f / 5));
+  p = fma(u, p, splat(1.0f / 3));
+  p = fma(u * (s + s), p, s + s);
+  const F32 found = fma(e, splat(0.693359375f), fma(e, splat(-2.12194440e-4f), p));
+  const F32 infinite = splat(__builtin_inff());
+  return x > zero ? (x < infinite ? found : x) : x == zero ? zero - infinite : splat(__builtin_nanf(""));
 }
 
 VN_INLINE F32 rounded_down(F32 x) {
@@ -43,19 +45,6 @@ VN_INLINE F32 rounded_down(F32 x) {
   store(lanes, x);
   for (int i = 0; i < kLanes; ++i) lanes[i] = __builtin_floorf(lanes[i]);
   return load(lanes);
-}
-
-// x^p for multiples of 0.5, times the factors of `order` derivatives of x^(p + order).
-VN_INLINE F32 raised(F32 x, float p, int order) {
-  float factor = 1.0f;
-  for (int i = 0; i < order; ++i) factor *= p + static_cast<float>(order - i);
-  const float size = p < 0.0f ? -p : p;
-  int whole = static_cast<int>(size);
-  F32 result = size > static_cast<float>(whole) ? square_root(x) : splat(1.0f);
-  for (F32 power = x; whole > 0; whole >>= 1, power = power * power) {
-    if (whole & 1) result = result * power;
-  }
-  return splat(factor) * (p < 0.0f ? splat(1.0f) / result : result);
 }
 
 // sin(angle + half * pi) of angles some of which are too large for `sine`, by the scalar function. Lane by lane: what
@@ -83,120 +72,8 @@ VN_INLINE F32 any_exponential(F32 x) {
   return root * root;
 }
 
-VN_INLINE F32 hyperbolic_tangent(F32 x) {
-  const F32 t = exponential_minus_one(splat(-2.0f) * abs(x)), size = splat(0.0f) - t / (t + splat(2.0f));
-  return x < splat(0.0f) ? splat(0.0f) - size : size;
-}
-
-// Its slope, 1 - tanh^2 without cancellation.
-VN_INLINE F32 tangent_slope(F32 x) {
-  const F32 e = any_exponential(splat(-2.0f) * abs(x)), sum = splat(1.0f) + e;
-  return splat(4.0f) * e / (sum * sum);
-}
-
-// As far as any density is more than 0, so that 0 times a power of x is not 0 times infinity.
-VN_INLINE F32 nearby(F32 x) {
-  return x > splat(30.0f) ? splat(30.0f) : x < splat(-30.0f) ? splat(-30.0f) : x;
-}
-
-// The density of the normal distribution.
-VN_INLINE F32 density(F32 x) {
-  return splat(0.39894228f) * any_exponential(splat(-0.5f) * x * x);
-}
-
-// Its distribution function, erfc(-x / sqrt 2) / 2; erfc by Numerical Recipes' erfcc, relative error 1.2e-7.
-VN_INLINE F32 distribution(F32 x) {
-  const F32 z = abs(x) * splat(0.70710678f), t = splat(1.0f) / fma(z, splat(0.5f), splat(1.0f));
-  constexpr float kSeries[] = {0.17087277f,  -0.82215223f, 1.48851587f, -1.13520398f, 0.27886807f,
-                               -0.18628806f, 0.09678418f,  0.37409196f, 1.00002368f,  -1.26551223f};
-  F32 p = splat(kSeries[0]);
-  for (int i = 1; i < 10; ++i) p = fma(p, t, splat(kSeries[i]));
-  const F32 tail = splat(0.5f) * t * any_exponential(p - z * z);
-  return x > splat(0.0f) ? splat(1.0f) - tail : tail;
-}
-
-// The logistic function and its derivatives.
-template <int Order>
-VN_INLINE F32 logistic(F32 x) {
-  const F32 one = splat(1.0f), e = x < splat(-87.0f) ? splat(__builtin_inff()) : any_exponential(splat(0.0f) - x);
-  const F32 s = one / (one + e), slope = s * (one - s);
-  if (Order == 0) return s;
-  if (Order == 1) return slope;
-  return slope * (Order == 2 ? one - s - s : one - splat(6.0f) * slope);
-}
-
-// GELU with tanh: x (1 + T) / 2 with T = tanh u, u = c (x + d x^3).
-template <int Order>
-VN_INLINE F32 gelu_by_tanh(F32 x) {
-  const F32 c = splat(0.79788456f), d = splat(0.044715f), half = splat(0.5f), one = splat(1.0f), xx = x * x;
-  const F32 u = c * x * fma(d, xx, one), t = hyperbolic_tangent(u), s = tangent_slope(u);
-  if (Order == 0) return half * x * (one + t);
-  const F32 u1 = c * fma(splat(3.0f) * d, xx, one), u2 = splat(6.0f) * c * d * x, t1 = s * u1;
-  if (Order == 1) return half * (one + t) + half * x * t1;
-  const F32 t2 = s * (u2 - splat(2.0f) * t * u1 * u1);
-  if (Order == 2) return t1 + half * x * t2;
-  const F32 t3 = splat(6.0f) * c * d - splat(6.0f) * t * u1 * u2 + (splat(6.0f) * t * t - splat(2.0f)) * u1 * u1 * u1;
-  return splat(1.5f) * t2 + half * x * s * t3;
-}
-
-#define VN_FUNCTION(NAME, F0, F1, F2, F3)                                                          \
-  struct NAME##_function {                                                                         \
-    template <int Order>                                                                           \
-    VN_INLINE F32 at([[maybe_unused]] F32 x, [[maybe_unused]] float a, [[maybe_unused]] float b) { \
-      [[maybe_unused]] const F32 zero = splat(0.0f), one = splat(1.0f);                            \
-      if constexpr (Order == 0) {                                                                  \
-        return F0;                                                                                 \
-      } else if constexpr (Order == 1) {                                                           \
-        return F1;                                                                                 \
-      } else if constexpr (Order == 2) {                                                           \
-        return F2;                                                                                 \
-      } else {                                                                                     \
-        return F3;                                                                                 \
-      }                                                                                            \
-    }                                                                                              \
-  };
-
-VN_FUNCTION(copy, x, one, zero, zero)
-VN_FUNCTION(stop, x, zero, zero, zero)
-VN_FUNCTION(step, positive(x, one, zero), zero, zero, zero)
-VN_FUNCTION(at_least, x >= zero ? one : zero, zero, zero, zero)
-VN_FUNCTION(floor, rounded_down(x), zero, zero, zero)
-VN_FUNCTION(affine, fma(splat(a), x, splat(b)), splat(a), zero, zero)
-VN_FUNCTION(relu, x < zero ? zero : x, x <= zero ? zero : one, zero, zero)
-VN_FUNCTION(leaky_relu, positive(x, x, splat(a) * x), positive(x, one, splat(a)), zero, zero)
-VN_FUNCTION(abs, abs(x), positive(x, one, x < zero ? zero - one : zero), zero, zero)
-VN_FUNCTION(clamp, x<splat(a) ? splat(a) : x> splat(b) ? splat(b) : x,
-            x >= splat(a) ? (x <= splat(b) ? one : zero) : zero, zero, zero)
-VN_FUNCTION(elu, positive(x, x, splat(a) * exponential_minus_one(x)), positive(x, one, splat(a) * any_exponential(x)),
-            x >= zero ? zero : splat(a) * any_exponential(x), x >= zero ? zero : splat(a) * any_exponential(x))
-VN_FUNCTION(softplus, splat(a) * x > splat(b) ? x : softplus(splat(a) * x) * splat(1.0f / a),
-            splat(a) * x > splat(b) ? one : logistic<0>(splat(a) * x),
-            splat(a) * x > splat(b) ? zero : splat(a) * logistic<1>(splat(a) * x),
-            splat(a) * x > splat(b) ? zero : splat(a * a) * logistic<2>(splat(a) * x))
-VN_FUNCTION(sigmoid, logistic<0>(x), logistic<1>(x), logistic<2>(x), logistic<3>(x))
-VN_FUNCTION(tanh, hyperbolic_tangent(x), tangent_slope(x), splat(-2.0f) * hyperbolic_tangent(x) * tangent_slope(x),
-            tangent_slope(x) * (splat(4.0f) - splat(6.0f) * tangent_slope(x)))
-VN_FUNCTION(silu, x* logistic<0>(x), logistic<0>(x) + x * logistic<1>(x),
-            logistic<1>(x) * splat(2.0f) + x * logistic<2>(x), logistic<2>(x) * splat(3.0f) + x * logistic<3>(x))
-VN_FUNCTION(gelu, x* distribution(x), distribution(x) + x * density(x),
-            density(x) * (splat(2.0f) - nearby(x) * nearby(x)),
-            density(x) * nearby(x) * (nearby(x) * nearby(x) - splat(4.0f)))
-VN_FUNCTION(gelu_tanh, gelu_by_tanh<0>(x), gelu_by_tanh<1>(x), gelu_by_tanh<2>(x), gelu_by_tanh<3>(x))
-VN_FUNCTION(sine, any_sine(fma(splat(a), x, splat(b)), false), splat(a) * any_sine(fma(splat(a), x, splat(b)), true),
-            splat(-a* a) * any_sine(fma(splat(a), x, splat(b)), false),
-            splat(-a * a * a) * any_sine(fma(splat(a), x, splat(b)), true))
-VN_FUNCTION(exp, any_exponential(x), any_exponential(x), any_exponential(x), any_exponential(x))
-VN_FUNCTION(log, logarithm(x), one / x, zero - one / (x * x), splat(2.0f) / (x * x * x))
-VN_FUNCTION(power, raised(x, a, 0), raised(x, a - 1.0f, 1), raised(x, a - 2.0f, 2), raised(x, a - 3.0f, 3))
-
-// In the order of FUNCTIONS in voronerf/program.py.
-// clang-format off
-#define VN_FUNCTIONS(DO)                                                                                         \
-  DO(0, copy) DO(1, stop) DO(2, step) DO(3, at_least) DO(4, floor) DO(5, affine) DO(6, relu) DO(7, leaky_relu)   \
-  DO(8, abs) DO(9, clamp) DO(10, elu) DO(11, softplus) DO(12, sigmoid) DO(13, tanh) DO(14, silu) DO(15, gelu)    \
-  DO(16, gelu_tanh) DO(17, sine) DO(18, exp) DO(19, log) DO(20, power)
-// clang-format on
-
 }  // namespace
 }  // namespace VN_ISA_NAMESPACE
 }  // namespace voronerf
+
+#include "network/functions.h"

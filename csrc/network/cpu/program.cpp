@@ -43,7 +43,8 @@ void fetch(const ProgramCall& call, int64_t cell) {
 void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads) {
   check_offsets("grouped_program", in.offsets, in.k, in.n);
   const auto& header = *reinterpret_cast<const ProgramHeader*>(in.code);
-  const ProgramCall call{in.code, in.constants, in.inputs, outputs, sums, in.parameters, in.strides, in.order};
+  const ProgramCall call{in.code, in.constants, in.inputs,     in.turned,  in.n,
+                         outputs, sums,         in.parameters, in.strides, in.order};
   const auto clear = [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       for (int64_t o = 0; o < in.outputs; ++o) {

@@ -46,6 +46,8 @@ struct ProgramCall {
   const int32_t* code;
   const float* constants;
   const float* const* inputs;
+  const int32_t* turned;
+  int64_t n;
   float* const* outputs;
   float* const* sums;
   const float* const* parameters;

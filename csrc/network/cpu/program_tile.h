@@ -103,6 +103,7 @@ struct ProgramTile {
     switch (step.op) {
       case kInput: {
         const float* from = call.inputs[step.number];
+        if (call.turned[step.number]) return turn(from, step);
         if (call.order == nullptr && width == stride) {
           __builtin_memcpy(to, from + begin * width, sizeof(float) * rows * width);
           return;
@@ -154,6 +155,18 @@ struct ProgramTile {
         return move(step, operands);
       default:
         return sum(step, operands);
+    }
+  }
+
+  // Columns [width][n] as rows.
+  void turn(const float* from, const ProgramStep& step) const {
+    float* const to = at(step.slot);
+    int64_t c = 0;
+    for (; call.order == nullptr && c + 4 <= step.width; c += 4) {
+      transpose_four(from + c * call.n + begin, call.n, rows, to + c, step.stride);
+    }
+    for (; c < step.width; ++c) {
+      for (int64_t row = 0; row < rows; ++row) to[row * step.stride + c] = from[c * call.n + place(row)];
     }
   }
 

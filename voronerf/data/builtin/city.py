@@ -23,7 +23,8 @@ from voronerf.data.builtin.city_solids import city
 from voronerf.data.builtin.opaque import SUPERSAMPLES, Hits, bounds, render_views, see
 from voronerf.data.builtin.rich import caster
 from voronerf.data.builtin.solids import Array, Rows, Solid, first_hits, rotation, slab
-from voronerf.data.scene import Scene, SceneError, Split
+from voronerf.data.errors import SceneError
+from voronerf.data.scene import Scene, Split
 from voronerf.data.store import Make, stored
 from voronerf.rendering.cameras import Cameras, look_at
 

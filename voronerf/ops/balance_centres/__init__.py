@@ -7,15 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import (
-    check_count,
-    check_dtype,
-    check_flag,
-    check_integer,
-    check_number,
-    check_same_device,
-    check_shape,
-)
+from voronerf.checks import Checked, check_flag, check_integer, check_number
 
 _OP = backends.declare(
     "balance_centres",
@@ -69,29 +61,17 @@ def balance_centres(
         >>> weights  # 3 and 1 before
         tensor([2., 2.], dtype=torch.float64)
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "samples", samples, ("m", 3), sizes)
-    check_shape(_OP, "masses", masses, ("m",), sizes)
-    check_shape(_OP, "centres", centres, ("k", 3), sizes)
-    check_dtype(_OP, "samples", samples, (torch.float32,))
-    check_dtype(_OP, "masses", masses, (torch.float64,))
-    check_dtype(_OP, "centres", centres, (torch.float32,))
-    check_same_device(_OP, samples=samples, masses=masses, centres=centres)
-    check_count(_OP, "samples", sizes["m"])
+    given = Checked(_OP)
+    given.tensor("samples", samples, (torch.float32,), "m", 3)
+    given.tensor("masses", masses, (torch.float64,), "m")
+    given.tensor("centres", centres, (torch.float32,), "k", 3)
     check_integer(_OP, "steps", steps, 0)
     check_integer(_OP, "neighbours", neighbours, 1)
     check_number(_OP, "alpha", alpha)
     check_flag(_OP, "global_norm", global_norm)
-    if sizes["k"] < 1:
+    if given.sizes["k"] < 1:
         raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
     run = backends.resolve(_OP, backend=backend, device=samples.device, dtype=samples.dtype)
-    moved, weights = run(
-        samples.detach(),
-        masses.detach(),
-        centres.detach(),
-        steps=steps,
-        alpha=float(alpha),
-        neighbours=neighbours,
-        global_norm=global_norm,
-    )
+    tensors = samples.detach(), masses.detach(), centres.detach()
+    moved, weights = run(*tensors, steps, float(alpha), neighbours, global_norm)
     return moved, weights

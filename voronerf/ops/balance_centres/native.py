@@ -8,21 +8,14 @@ import torch
 from torch import Tensor
 
 from voronerf import native
-from voronerf.native.custom_op import custom_op
-
-
-def balance_centres(
-    samples: Tensor, masses: Tensor, centres: Tensor, *, steps: int, alpha: float, neighbours: int, global_norm: bool
-) -> tuple[Tensor, Tensor]:
-    """The published update, repeated; see ``voronerf.ops.balance_centres``."""
-    moved, weights = _balance(samples, masses, centres, steps, alpha, neighbours, global_norm)
-    return moved, weights
+from voronerf.custom_op import custom_op
 
 
 @custom_op("balance_centres_native", devices=("cpu",))
-def _balance(
+def balance_centres(
     samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int, global_norm: bool
 ) -> Iterator[tuple[Tensor, Tensor]]:
+    """The published update, repeated; see ``voronerf.ops.balance_centres``."""
     m, k = samples.shape[0], centres.shape[0]
     moved, weights = centres.new_empty(centres.shape), masses.new_empty(k)
     yield moved, weights

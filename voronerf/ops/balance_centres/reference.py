@@ -10,7 +10,7 @@ from voronerf.ops.nearest_centre.reference import nearest_centre
 
 @torch.no_grad()
 def balance_centres(
-    samples: Tensor, masses: Tensor, centres: Tensor, *, steps: int, alpha: float, neighbours: int, global_norm: bool
+    samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int, global_norm: bool
 ) -> tuple[Tensor, Tensor]:
     """The published update, repeated; see ``voronerf.ops.balance_centres``."""
     weights = cell_masses(samples, masses, centres)

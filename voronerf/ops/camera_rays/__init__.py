@@ -7,15 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import (
-    INDEX,
-    check_count,
-    check_dtype,
-    check_range,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-)
+from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_range
 
 _OP = backends.declare(
     "camera_rays",
@@ -71,37 +63,28 @@ def camera_rays(
         tensor([[ 0.0000,  0.0000, -1.0000],
                 [ 0.7071,  0.0000, -0.7071]])
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "poses", poses, ("c", 4, 4), sizes)
-    check_shape(_OP, "intrinsics", intrinsics, ("c", 4), sizes)
-    check_shape(_OP, "x", x, ("b",), sizes)
-    check_shape(_OP, "y", y, ("b",), sizes)
-    check_dtype(_OP, "poses", poses, (torch.float32,))
-    if camera is not None:
-        check_shape(_OP, "camera", camera, ("b",), sizes)
-        check_dtype(_OP, "camera", camera, INDEX)
-        check_range(_OP, "camera", camera, sizes["c"])
-    check_lenses(_OP, distortion, models, sizes)
-    check_same_dtype(_OP, poses=poses, intrinsics=intrinsics, x=x, y=y, distortion=distortion)
-    check_same_device(
-        _OP, poses=poses, intrinsics=intrinsics, x=x, y=y, camera=camera, distortion=distortion, models=models
-    )
-    check_count(_OP, "x", sizes["b"])
-    if sizes["c"] < 1:
+    given = Checked(_OP)
+    given.tensor("poses", poses, (torch.float32,), "c", 4, 4)
+    given.tensor("intrinsics", intrinsics, LIKE_FIRST, "c", 4)
+    given.tensor("x", x, LIKE_FIRST, "b")
+    given.tensor("y", y, LIKE_FIRST, "b")
+    given.optional("camera", camera, INDEX, "b")
+    check_lenses(given, distortion, models)
+    if given.sizes["c"] < 1:
         raise ValueError(f"{_OP}: poses must hold at least one camera, got none")
+    if camera is not None:
+        check_range(_OP, "camera", camera, given.sizes["c"])
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
-    tensors = (tensor.detach() for tensor in (poses, intrinsics, x, y))
-    origins, directions = run(*tensors, camera=camera, distortion=distortion, models=models)
+    poses, intrinsics, x, y = (tensor.detach() for tensor in (poses, intrinsics, x, y))
+    origins, directions = run(poses, intrinsics, x, y, camera, distortion, models)
     return origins, directions
 
 
-def check_lenses(op: str, distortion: Tensor | None, models: Tensor | None, sizes: dict[str, int]) -> None:
-    """Checks what `camera_rays` and `pixel_rays` take of lenses; `sizes` as in `check_shape`, with c."""
-    if distortion is not None:
-        check_shape(op, "distortion", distortion, ("c", 8), sizes)
+def check_lenses(given: Checked, distortion: Tensor | None, models: Tensor | None) -> None:
+    """Checks what `camera_rays` and `pixel_rays` take of lenses."""
+    given.optional("distortion", distortion, LIKE_FIRST, "c", 8)
+    given.optional("models", models, INDEX, "c")
     if models is not None:
-        check_shape(op, "models", models, ("c",), sizes)
-        check_dtype(op, "models", models, INDEX)
-        check_range(op, "models", models, 3)
+        check_range(given.op, "models", models, 3)
         if distortion is None:
-            raise ValueError(f"{op}: distortion must be given with models, got None")
+            raise ValueError(f"{given.op}: distortion must be given with models, got None")

@@ -20,7 +20,6 @@ def camera_rays(
     intrinsics: Tensor,
     x: Tensor,
     y: Tensor,
-    *,
     camera: Tensor | None,
     distortion: Tensor | None,
     models: Tensor | None,

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_same_device, check_same_dtype, check_shape
+from voronerf.checks import INDEX, LIKE_FIRST, Checked
 
 _OP = backends.declare(
     "cast_solids",
@@ -54,18 +54,12 @@ def cast_solids(
         >>> cast_solids(kinds, frames, sizes, origins, directions)
         (tensor([4., inf]), tensor([ 0, -1], dtype=torch.int32))
     """
-    sizes_of: dict[str, int] = {}
-    check_shape(_OP, "kinds", kinds, ("s",), sizes_of)
-    check_shape(_OP, "frames", frames, ("s", 4, 3), sizes_of)
-    check_shape(_OP, "sizes", sizes, ("s", 3), sizes_of)
-    check_shape(_OP, "origins", origins, ("r", 3), sizes_of)
-    check_shape(_OP, "directions", directions, ("r", 3), sizes_of)
-    check_dtype(_OP, "kinds", kinds, INDEX)
-    check_dtype(_OP, "frames", frames, (torch.float32,))
-    check_same_dtype(_OP, frames=frames, sizes=sizes, origins=origins, directions=directions)
-    check_same_device(_OP, kinds=kinds, frames=frames, sizes=sizes, origins=origins, directions=directions)
-    check_count(_OP, "origins", sizes_of["r"])
-    check_count(_OP, "kinds", sizes_of["s"])
+    given = Checked(_OP)
+    given.tensor("kinds", kinds, INDEX, "s")
+    given.tensor("frames", frames, (torch.float32,), "s", 4, 3)
+    given.tensor("sizes", sizes, LIKE_FIRST, "s", 3)
+    given.tensor("origins", origins, LIKE_FIRST, "r", 3)
+    given.tensor("directions", directions, LIKE_FIRST, "r", 3)
     run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
     depths, solids = run(kinds, *(tensor.detach() for tensor in (frames, sizes, origins, directions)))
     return depths, solids

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_shape
+from voronerf.checks import INDEX, Checked, check_integer
 
 _OP = backends.declare(
     "cell_sort",
@@ -50,10 +50,8 @@ def cell_sort(cells: Tensor, k: int, *, backend: str = "auto") -> tuple[Tensor, 
         >>> x[order]  # cells 0, 0, 2, 2; cell 1 is empty
         tensor([11, 13, 10, 12])
     """
-    check_shape(_OP, "cells", cells, ("n",))
-    check_dtype(_OP, "cells", cells, INDEX)
+    Checked(_OP).tensor("cells", cells, INDEX, "n")
     check_integer(_OP, "k", k, 1)
-    check_count(_OP, "cells", cells.shape[0])
     run = backends.resolve(_OP, backend=backend, device=cells.device, dtype=cells.dtype)
     order, offsets = run(cells, k)
     return order, offsets

@@ -9,20 +9,15 @@ from torch import Tensor
 
 from voronerf import native
 from voronerf.checks import check_range
-from voronerf.native.custom_op import custom_op
+from voronerf.custom_op import custom_op
 
 WAYS = native.compiled.CellSortWay
 """Of sorting on CUDA; "automatic" is by the number of cells."""
 
 
-def cell_sort(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Stable order and cell offsets; see ``voronerf.ops.cell_sort``."""
-    order, offsets = _cell_sort(cells, k)
-    return order, offsets
-
-
 @custom_op("cell_sort")
-def _cell_sort(cells: Tensor, k: int) -> Iterator[tuple[Tensor, Tensor]]:
+def cell_sort(cells: Tensor, k: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Stable order and cell offsets; see ``voronerf.ops.cell_sort``."""
     order, offsets = cells.new_empty(cells.shape[0]), cells.new_empty(k + 1)
     yield order, offsets
     sort(cells, order, offsets, "cell_sort")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import COORDINATES, Implementation
-from voronerf.checks import check_dtype, check_same_device, check_shape
+from voronerf.checks import FLOATING, LIKE_FIRST, Checked
 from voronerf.ops.centre_grid.reference import BRICK_BITS, CELL_BITS, GridTables, centre_table, root_bits
 
 _OP = backends.declare(
@@ -77,23 +77,16 @@ class CentreGrid:
 
 def _check_tables(centres: Tensor, weights: Tensor | None, tables: GridTables) -> None:
     """Raises unless every walk through the tables ends at a list of centres that are there."""
-    kind, sizes = "CentreGrid", dict[str, int]()
-    check_shape(kind, "centres", centres, ("k", 3), sizes)
-    check_dtype(kind, "centres", centres, (torch.float32, torch.float64))
-    if weights is not None:
-        check_shape(kind, "weights", weights, ("k",), sizes)
-        check_dtype(kind, "weights", weights, (centres.dtype,))
+    kind = "CentreGrid"
+    given = Checked(kind)
+    given.tensor("centres", centres, (torch.float32, torch.float64), "k", 3)
+    given.optional("weights", weights, LIKE_FIRST, "k")
     frame, entries, lists, table, bits = tables
-    for name, tensor, shape, dtype in (
-        ("frame", frame, (2, 3), torch.float32),
-        ("entries", entries, ("e",), torch.int32),
-        ("lists", lists, ("l",), torch.int32),
-        ("table", table, ("k", 4), torch.float32),
-    ):
-        check_shape(kind, f"tables.{name}", tensor, shape, sizes)
-        check_dtype(kind, f"tables.{name}", tensor, (dtype,))
-    check_same_device(kind, centres=centres, weights=weights, frame=frame, entries=entries, lists=lists, table=table)
-    k, root, brick = sizes["k"], 8 ** root_bits(sizes["k"]), 8**BRICK_BITS
+    given.tensor("tables.frame", frame, (torch.float32,), 2, 3)
+    given.tensor("tables.entries", entries, (torch.int32,), "e")
+    given.tensor("tables.lists", lists, (torch.int32,), "l")
+    given.tensor("tables.table", table, (torch.float32,), "k", 4)
+    k, root, brick = len(centres), 8 ** root_bits(len(centres)), 8**BRICK_BITS
     if bits != root_bits(k):
         raise ValueError(f"{kind}: tables.bits must be {root_bits(k)} for {k} centres, got {bits}")
     if not torch.equal(table, centre_table(centres, weights)):
@@ -154,16 +147,12 @@ def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str 
         >>> nearest_centre(centres[:4] + 1e-4, centres, grid=grid)
         tensor([0, 1, 2, 3], dtype=torch.int32)
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "centres", centres, ("k", 3), sizes)
-    check_dtype(_OP, "centres", centres)
+    given = Checked(_OP)
+    given.tensor("centres", centres, FLOATING, "k", 3)
     if centres.is_meta:
         raise ValueError(f"{_OP}: centres must have values, got a tensor on the device meta")
-    if weights is not None:
-        check_shape(_OP, "weights", weights, ("k",), sizes)
-        check_dtype(_OP, "weights", weights)
-    check_same_device(_OP, centres=centres, weights=weights)
-    if sizes["k"] < 1:
+    given.optional("weights", weights, FLOATING, "k")
+    if len(centres) < 1:
         raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
     dtype = torch.promote_types(centres.dtype, torch.float32)
     if weights is not None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf import native
-from voronerf.native.custom_op import custom_op
+from voronerf.custom_op import custom_op
 from voronerf.ops.centre_grid.reference import GridTables, centre_table, root_bits
 
 

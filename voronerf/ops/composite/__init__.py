@@ -6,16 +6,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import (
-    INDEX,
-    check_count,
-    check_dtype,
-    check_no_inference,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-    check_tensor,
-)
+from voronerf.checks import FLOATING, INDEX, LIKE_FIRST, Checked, check_count
 from voronerf.ops.composite.reference import Composite
 
 _OP = backends.declare(
@@ -74,23 +65,15 @@ def composite(
         >>> result.colour, result.depth, result.weights
         (tensor([[1., 0., 0.]]), tensor([2.]), tensor([[0., 1., 0.]]))
     """
-    sizes: dict[str, int] = {}
+    given = Checked(_OP)
     samples = ("r", "s") if ray_offsets is None else ("m",)
-    check_shape(_OP, "sigma", sigma, samples, sizes)
-    check_shape(_OP, "rgb", rgb, (*samples, "c"), sizes)
-    check_shape(_OP, "depths", depths, samples, sizes)
-    check_shape(_OP, "deltas", deltas, samples, sizes)
-    check_dtype(_OP, "sigma", sigma)
-    if ray_offsets is not None:
-        check_shape(_OP, "ray_offsets", ray_offsets, ("r+1",), sizes)
-        check_dtype(_OP, "ray_offsets", ray_offsets, INDEX)
-    if background is not None:
-        check_tensor(_OP, "background", background)
-        check_shape(_OP, "background", background, ("c",) if background.dim() == 1 else ("r", "c"), sizes)
-    check_same_dtype(_OP, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas, background=background)
-    tensors = {"sigma": sigma, "rgb": rgb, "depths": depths, "deltas": deltas, "ray_offsets": ray_offsets}
-    check_same_device(_OP, **tensors, background=background)
-    check_no_inference(_OP, **tensors, background=background)
+    given.tensor("sigma", sigma, FLOATING, *samples)
+    given.tensor("rgb", rgb, LIKE_FIRST, *samples, "c")
+    given.tensor("depths", depths, LIKE_FIRST, *samples)
+    given.tensor("deltas", deltas, LIKE_FIRST, *samples)
+    given.optional("ray_offsets", ray_offsets, INDEX, "r+1")
+    given.each_or_all("background", background, LIKE_FIRST, "r", "c")
+    given.no_inference()
     check_count(_OP, "sigma", sigma.numel())
     run = backends.resolve(_OP, backend=backend, device=sigma.device, dtype=sigma.dtype)
-    return Composite(*run(sigma, rgb, depths, deltas, ray_offsets=ray_offsets, background=background))
+    return Composite(*run(sigma, rgb, depths, deltas, ray_offsets, background))

@@ -1,58 +1,59 @@
-"""Autograd of ``composite``, shared by native and Warp, and its further derivatives by the reference."""
+"""What native and Warp share of ``composite``: its arguments as custom ops take them, and its derivatives."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from voronerf.derivatives import aliases, second_derivatives
+from voronerf.custom_op import Op
+from voronerf.derivatives import register_derivatives
 from voronerf.ops.composite.reference import composite
 
 
-def composite_forward_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    """Keeps sigma, rgb, depths, deltas, ray_offsets and background."""
-    ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*inputs)
+class RaySamples(NamedTuple):
+    """Samples of rays, in float32; ``voronerf.ops.composite`` says what each is."""
 
+    sigma: Tensor
+    rgb: Tensor
+    depths: Tensor
+    deltas: Tensor
+    ray_offsets: Tensor | None
+    background: Tensor | None
 
-def composite_forward_backward(backward: Callable[..., list[Tensor]]) -> Callable[..., tuple[Tensor | None, ...]]:
-    """Backward of composite by a backend's op, which takes the gradients of the four outputs (None for zero), the six
-    inputs and which of the five gradients are wanted."""
+    @property
+    def rays(self) -> int:
+        """r."""
+        return self.sigma.shape[0] if self.ray_offsets is None else self.ray_offsets.shape[0] - 1
 
-    def run(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        inputs = ctx.saved_tensors
-        needs = ctx.needs_input_grad
-        if all(gradient is None for gradient in gradients):
-            return (None,) * len(inputs)
-        wanted = [*needs[:4], needs[5]]
-        results = backward(*gradients, *inputs, wanted)
-        found = [result if need else None for result, need in zip(results, wanted)]
-        return (*found[:4], None, found[4])
+    def results(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Memory for colour, opacity, depth and weights."""
+        sigma, r = self.sigma, self.rays
+        return (
+            sigma.new_empty(r, self.rgb.shape[-1]),
+            sigma.new_empty(r),
+            sigma.new_empty(r),
+            sigma.new_empty(sigma.shape),
+        )
 
-    return run
-
-
-def composite_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
-    """Keeps the arguments of the backward op."""
-    *tensors, ctx.wanted = inputs
-    ctx.save_for_backward(*tensors)
-
-
-def composite_backward_backward(ctx: Any, cotangents: list[Tensor | None]) -> tuple[Tensor | None, ...]:
-    """Derivative of the gradients of composite."""
-    saved = ctx.saved_tensors
-    ray_offsets = saved[8]
-    leaves, graph = aliases([None if i == 8 else tensor for i, tensor in enumerate(saved)])
-    with torch.enable_grad():
-        gradients, inputs = leaves[:4], [*leaves[4:8], leaves[9]]
-        parts = composite(*inputs[:4], ray_offsets=ray_offsets, background=inputs[4])  # type: ignore[arg-type]
-        outputs = [(part, gradient) for part, gradient in zip(parts, gradients) if gradient is not None]
-        pairs = [
-            (tensor, cotangent)
-            for tensor, cotangent, want in zip(inputs, cotangents, ctx.wanted)
-            if want and tensor is not None and cotangent is not None
+    def gradients(self, wanted: list[bool]) -> list[Tensor]:
+        """Memory for the gradients of the smooth parts, empty where not wanted; that to sigma is always there."""
+        smooth = self.sigma, self.rgb, self.depths, self.deltas, self.background
+        return [
+            self.sigma.new_empty(tensor.shape if tensor is not None and want else 0)
+            for tensor, want in zip(smooth, [True, *wanted[1:]])
         ]
-        return (*second_derivatives(outputs, pairs, leaves, graph), None)
+
+
+class Arriving(NamedTuple):
+    """Gradients of the results, None for zero."""
+
+    colour: Tensor | None
+    opacity: Tensor | None
+    depth: Tensor | None
+    weights: Tensor | None
+
+
+def register(forward: Op, backward: Op) -> None:
+    """Registers the derivatives of two ops."""
+    register_derivatives(forward, backward, composite, ("sigma", "rgb", "depths", "deltas", "background"))

@@ -56,7 +56,6 @@ def composite(
     rgb: Tensor,
     depths: Tensor,
     deltas: Tensor,
-    *,
     ray_offsets: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Composite:

@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_number, check_same_device, check_shape
+from voronerf.checks import FLOATING, check_number
+from voronerf.ops.locate_cell import check_tree
+from voronerf.ops.nearest_centre import of_one_dtype
 
 _OP = backends.declare("draw_cell")
 
@@ -66,49 +68,19 @@ def draw_cell(
         >>> draw_cell(points, centres, child_offsets, child, uniforms, temperature=0.1, depth=1)
         tensor([0, 1, 0], dtype=torch.int32)
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "points", points, ("n", 3), sizes)
-    check_shape(_OP, "centres", centres, ("m", 3), sizes)
-    check_shape(_OP, "child_offsets", child_offsets, ("g+1",), sizes)
-    check_shape(_OP, "child", child, ("m",), sizes)
-    check_integer(_OP, "depth", depth, 1)
-    check_shape(_OP, "uniforms", uniforms, ("n", "depth"), {**sizes, "depth": depth})
-    check_dtype(_OP, "points", points)
-    check_dtype(_OP, "centres", centres)
-    check_dtype(_OP, "child_offsets", child_offsets, INDEX)
-    check_dtype(_OP, "child", child, INDEX)
-    check_dtype(_OP, "uniforms", uniforms)
-    if weights is not None:
-        check_shape(_OP, "weights", weights, ("m",), sizes)
-        check_dtype(_OP, "weights", weights)
-    check_same_device(
-        _OP,
-        points=points,
-        centres=centres,
-        child_offsets=child_offsets,
-        child=child,
-        uniforms=uniforms,
-        weights=weights,
-    )
-    check_count(_OP, "points", sizes["n"])
+    given = check_tree(_OP, points, centres, child_offsets, child, depth, weights)
+    given.sizes["depth"] = depth
+    given.tensor("uniforms", uniforms, FLOATING, "n", "depth")
     check_number(_OP, "temperature", temperature)
     if not 0.0 < temperature < float("inf"):
         raise ValueError(f"{_OP}: temperature must be positive and finite, got {temperature}")
-    if sizes["m"] < 1 or sizes["g"] < 1:
-        count = f"{sizes['m']} centres in {sizes['g']} diagrams"
-        raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
-    dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
-    if weights is not None:
-        dtype = torch.promote_types(dtype, weights.dtype)
-        weights = weights.detach().to(dtype)
-    points, centres, uniforms = (tensor.detach().to(dtype) for tensor in (points, centres, uniforms))
-    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=dtype)
+    points, centres, weights = of_one_dtype(points, centres, weights)
+    uniforms = uniforms.detach().to(points.dtype)
+    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
     host = _on_host(points)
     if host:
         _check_tree(child_offsets, child)
-    leaf: Tensor = run(
-        points, centres, child_offsets, child, uniforms, temperature=float(temperature), depth=depth, weights=weights
-    )
+    leaf: Tensor = run(points, centres, child_offsets, child, uniforms, float(temperature), depth, weights)
     if host and bool((leaf < 0).any()):
         raise ValueError(f"{_OP}: depth must be the number of levels of the tree, got {depth}, which is too few")
     return leaf

@@ -19,7 +19,6 @@ def draw_cell(
     child_offsets: Tensor,
     child: Tensor,
     uniforms: Tensor,
-    *,
     temperature: float,
     depth: int,
     weights: Tensor | None = None,

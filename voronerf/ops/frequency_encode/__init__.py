@@ -6,7 +6,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import check_count, check_dtype, check_flag, check_integer, check_no_inference, check_shape
+from voronerf.checks import FLOATING, Checked, check_flag, check_integer
 
 _OP = backends.declare(
     "frequency_encode",
@@ -42,12 +42,11 @@ def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, bac
         >>> frequency_encode(x, 2).round(decimals=4)  # x, sin x, cos x, sin 2x, cos 2x
         tensor([[ 1.0000,  0.8415,  0.5403,  0.9093, -0.4161]])
     """
-    check_shape(_OP, "x", x, ("n", "d"))
-    check_dtype(_OP, "x", x)
+    given = Checked(_OP)
+    given.tensor("x", x, FLOATING, "n", "d")
+    given.no_inference()
     check_flag(_OP, "include_input", include_input)
     check_integer(_OP, "octaves", octaves, 0, 127)  # 2^128 is beyond float32
-    check_no_inference(_OP, x=x)
-    check_count(_OP, "x", x.shape[0])
     run = backends.resolve(_OP, backend=backend, device=x.device, dtype=x.dtype)
-    encoded: Tensor = run(x, octaves, include_input=include_input)
+    encoded: Tensor = run(x, octaves, include_input)
     return encoded

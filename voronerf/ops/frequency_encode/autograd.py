@@ -1,54 +1,42 @@
-"""Autograd of both frequency encodings, shared by native and Warp, and its further derivatives by the reference."""
+"""What native and Warp share of both frequency encodings: their arguments, and their derivatives."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from voronerf.derivatives import aliases, second_derivatives
+from voronerf.custom_op import Op
+from voronerf.derivatives import register_derivatives
 from voronerf.ops.frequency_encode.reference import frequency_encode
 from voronerf.ops.integrated_encode.reference import integrated_encode
 
 
-def encode_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    """Keeps x, variances (None for the plain encoding), octaves and include_input."""
-    x, variances, ctx.octaves, ctx.include_input = inputs
-    ctx.save_for_backward(x, variances)
+class Encoding(NamedTuple):
+    """The arguments of ``frequency_encode`` or, with variances, of ``integrated_encode``, in float32."""
+
+    x: Tensor
+    variances: Tensor | None
+    octaves: int
+    include_input: bool
+
+    def result(self) -> Tensor:
+        """Memory for the features."""
+        n, d = self.x.shape
+        return self.x.new_empty(n, d * (self.include_input + 2 * self.octaves))
+
+    def gradients(self) -> list[Tensor]:
+        """Memory for the gradients to x and to the variances, the second empty without them."""
+        x, variances = self.x, self.variances
+        return [x.new_empty(x.shape), x.new_empty(0 if variances is None else variances.shape)]
 
 
-def encode_gradients(backward: Callable[..., list[Tensor]]) -> Callable[..., tuple[Tensor | None, ...]]:
-    """Backward of the encodings by a backend's op, which takes the gradient and what `encode_setup` keeps."""
-
-    def run(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        x, variances = ctx.saved_tensors
-        of_x, of_variances = backward(gradient, x, variances, ctx.octaves, ctx.include_input)
-        return of_x, None if variances is None else of_variances, None, None
-
-    return run
+def register(forward: Op, backward: Op) -> None:
+    """Registers the derivatives of two ops."""
+    register_derivatives(forward, backward, _formula, ("x", "variances"))
 
 
-def encode_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
-    """Keeps the arguments of the backward op."""
-    gradient, x, variances, ctx.octaves, ctx.include_input = inputs
-    ctx.save_for_backward(gradient, x, variances)
-
-
-def encode_backward_backward(ctx: Any, cotangents: list[Tensor]) -> tuple[Tensor | None, ...]:
-    """Derivative of the gradients of the encodings."""
-    leaves, graph = aliases(ctx.saved_tensors)
-    with torch.enable_grad():
-        gradient, x, variances = leaves
-        assert x is not None
-        if variances is None:
-            out = frequency_encode(x, ctx.octaves, include_input=ctx.include_input)
-            inputs = [x]
-        else:
-            out = integrated_encode(x, variances, ctx.octaves)
-            inputs = [x, variances]
-        if not out.requires_grad:
-            return (None,) * 5
-        pairs = list(zip(inputs, cotangents))
-        return (*second_derivatives([(out, gradient)], pairs, leaves, graph), None, None)
+def _formula(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Tensor:
+    if variances is None:
+        return frequency_encode(x, octaves, include_input)
+    return integrated_encode(x, variances, octaves)

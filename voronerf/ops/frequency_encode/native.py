@@ -6,72 +6,64 @@ derivatives come from the reference formulas.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from torch import Tensor
 
 from voronerf import native
-from voronerf.native.custom_op import custom_op, on_huge_pages
-from voronerf.ops.frequency_encode.autograd import (
-    encode_backward_backward,
-    encode_backward_setup,
-    encode_gradients,
-    encode_setup,
-)
+from voronerf.custom_op import custom_op, in_float32
+from voronerf.derivatives import OfOne
+from voronerf.ops.frequency_encode.autograd import Encoding, register
 
 
-def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True) -> Tensor:
+def frequency_encode(x: Tensor, octaves: int, include_input: bool = True) -> Tensor:
     """``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``; see ``voronerf.ops.frequency_encode``."""
-    encoded: Tensor = encode(x.float(), None, octaves, include_input)
-    return encoded.to(x.dtype)
+    encoded: Tensor = in_float32(encode, Encoding(x, None, octaves, include_input))
+    return encoded
 
 
 @custom_op("encode_native")
-def encode(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Iterator[Tensor]:
+def encode(given: Encoding) -> Iterator[Tensor]:
     """The frequency encoding or, with variances, the integrated one."""
-    out = x.new_empty(x.shape[0], x.shape[1] * (include_input + 2 * octaves))
+    out = given.result()
     yield out
-    on_huge_pages(out)
-    compiled, machine = native.compiled, native.machine(x)
-    given = _encoding(x, variances, octaves, include_input)
+    native.on_huge_pages(out)
+    compiled, machine = native.compiled, native.machine(out)
+    inputs = _inputs(given)
     if isinstance(machine, compiled.Cuda):
-        compiled.encode(given, out, machine)
+        compiled.encode(inputs, out, machine)
     else:
-        compiled.encode(given, out, _workspace(x, octaves, machine), machine)
+        compiled.encode(inputs, out, _workspace(given, machine), machine)
 
 
 @custom_op("encode_native_backward")
-def _backward(
-    gradient: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool
-) -> Iterator[list[Tensor]]:
-    """Gradients to x and to the variances, the second empty without them."""
-    of_x, of_variances = x.new_empty(x.shape), x.new_empty(0 if variances is None else variances.shape)
-    yield [of_x, of_variances]
-    compiled, machine = native.compiled, native.machine(x)
-    given = _encoding(x, variances, octaves, include_input)
-    results = of_x, None if variances is None else of_variances
+def _backward(arriving: OfOne, given: Encoding, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
+    of_x, of_variances = results = given.gradients()
+    yield results
+    compiled, machine = native.compiled, native.machine(of_x)
+    assert arriving.result is not None
+    inputs = _inputs(given), arriving.result, of_x, None if given.variances is None else of_variances
     if isinstance(machine, compiled.Cuda):
-        compiled.encode_backward(given, gradient, *results, machine)
+        compiled.encode_backward(*inputs, machine)
     else:
-        compiled.encode_backward(given, gradient, *results, _workspace(x, octaves, machine), machine)
+        compiled.encode_backward(*inputs, _workspace(given, machine), machine)
 
 
-def _encoding(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> native.compiled.Encoding:
-    n, d = x.shape
+def _inputs(given: Encoding) -> native.compiled.Encoding:
+    n, d = given.x.shape
     return native.compiled.Encoding(
-        x=x,
-        variances=variances,
+        x=given.x,
+        variances=given.variances,
         n=n,
         d=d,
-        octaves=octaves,
-        include_input=include_input,
-        width=d * (include_input + 2 * octaves),
+        octaves=given.octaves,
+        include_input=given.include_input,
+        width=d * (given.include_input + 2 * given.octaves),
     )
 
 
-def _workspace(x: Tensor, octaves: int, machine: native.compiled.Cpu) -> Tensor:
-    return x.new_empty(native.compiled.encode_workspace(x.shape[1], octaves, machine))
+def _workspace(given: Encoding, machine: native.compiled.Cpu) -> Tensor:
+    return given.x.new_empty(native.compiled.encode_workspace(given.x.shape[1], given.octaves, machine))
 
 
-encode.register_autograd(encode_gradients(_backward), setup_context=encode_setup)
-_backward.register_autograd(encode_backward_backward, setup_context=encode_backward_setup)
+register(encode, _backward)

@@ -7,16 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import (
-    INDEX,
-    check_choice,
-    check_count,
-    check_dtype,
-    check_no_inference,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-)
+from voronerf.checks import FLOATING, INDEX, Checked, check_choice, check_same_dtype
 from voronerf.layers import ACTIVATIONS
 
 _OP = backends.declare(
@@ -67,21 +58,14 @@ def grouped_linear(
         >>> grouped_linear(x, offsets, weight, activation="relu").flatten()
         tensor([10., 20.,  0.])
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "x", x, ("n", "i"), sizes)
-    check_shape(_OP, "weight", weight, ("k", "o", "i"), sizes)
-    check_shape(_OP, "offsets", offsets, ("k+1",), sizes)
-    check_dtype(_OP, "x", x)
-    check_dtype(_OP, "offsets", offsets, INDEX)
-    check_dtype(_OP, "weight", weight)
-    if bias is not None:
-        check_shape(_OP, "bias", bias, ("k", "o"), sizes)
-        check_dtype(_OP, "bias", bias)
-    check_same_device(_OP, x=x, offsets=offsets, weight=weight, bias=bias)
-    check_no_inference(_OP, x=x, offsets=offsets, weight=weight, bias=bias)
-    check_count(_OP, "x", sizes["n"])
+    given = Checked(_OP)
+    given.tensor("x", x, FLOATING, "n", "i")
+    given.tensor("weight", weight, FLOATING, "k", "o", "i")
+    given.tensor("offsets", offsets, INDEX, "k+1")
+    given.optional("bias", bias, FLOATING, "k", "o")
+    given.no_inference()
     check_choice(_OP, "activation", activation, ACTIVATIONS)
-    if min(sizes["k"], sizes["o"], sizes["i"]) < 1:
+    if 0 in weight.shape:
         raise ValueError(f"{_OP}: weight must have no empty dimension, got {list(weight.shape)}")
     if not torch.is_autocast_enabled(x.device.type):
         check_same_dtype(_OP, x=x, weight=weight, bias=bias)

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from voronerf import native
+from voronerf.custom_op import custom_op
 from voronerf.derivatives import asked_for
-from voronerf.native.custom_op import custom_op, on_huge_pages
 
 
 @custom_op("grouped_linear_native", devices=("cpu",))
@@ -23,7 +23,7 @@ def layer(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None, activ
     """Every sample through the layer of its cell, in the dtype of x."""
     out = x.new_empty(x.shape[0], weight.shape[1])
     yield out
-    on_huge_pages(out)
+    native.on_huge_pages(out)
     native.compiled.grouped_linear(_inputs(x, offsets, weight, bias, activation), out, native.cpu())
 
 
@@ -42,7 +42,7 @@ def _backward(
     results = [x.new_empty(0 if tensor is None else tensor.shape) for tensor in chosen]
     yield results
     for result in results:
-        on_huge_pages(result)
+        native.on_huge_pages(result)
     of_x, of_weight, of_bias = (None if tensor is None else result for tensor, result in zip(chosen, results))
     gradients = native.compiled.LinearGradients(out=gradient, x=of_x, weight=of_weight, bias=of_bias)
     native.compiled.grouped_linear_backward(_inputs(x, offsets, weight, bias, activation), gradients, native.cpu())

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from voronerf.checks import FLOATS, INDEX, check_dtype, check_same_dtype, check_shape, check_tensor
+from voronerf.checks import FLOATING, INDEX, check_dtype, check_same_dtype, check_shape, check_tensor
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
 
 
@@ -45,7 +45,7 @@ def check_network(
         weight, bias = weights[index], biases[index]
         if index == 0 or not _fits(weight, (sizes["k"], o, i), weights[0].dtype):
             check_shape(op, f"weights[{index}]", weight, ("k", o, i), sizes)
-            check_dtype(op, f"weights[{index}]", weight, FLOATS if index == 0 else (weights[0].dtype,))
+            check_dtype(op, f"weights[{index}]", weight, FLOATING if index == 0 else (weights[0].dtype,))
         if bias is not None and not _fits(bias, (sizes["k"], o), weights[0].dtype):
             check_shape(op, f"biases[{index}]", bias, ("k", o), sizes)
             check_same_dtype(op, **{"weights[0]": weights[0], f"biases[{index}]": bias})

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from voronerf import native
+from voronerf.custom_op import custom_op
 from voronerf.derivatives import asked_for
 from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
-from voronerf.native.custom_op import custom_op, on_huge_pages
 from voronerf.ops.grouped_mlp.layer_table import (
     Given,
     Network,
@@ -153,8 +153,8 @@ def new_output(network: Network) -> Tensor:
 
 def run(out: Tensor, encoded: Tensor, network: Network, offsets: Tensor, order: Tensor | None) -> None:
     """Fills the output of sorted rows, or of those that ``order`` int32 [n] sorts."""
-    on_huge_pages(out)
-    on_huge_pages(encoded)
+    native.on_huge_pages(out)
+    native.on_huge_pages(encoded)
     given, inputs = _compiled_table(network), _inputs(network, offsets, order, encoded)
     compiled, machine = native.compiled, native.machine(network.positions)
     if isinstance(machine, compiled.Cuda):
@@ -185,7 +185,7 @@ def backward(
             result.zero_()
         return
     for result in results:
-        on_huge_pages(result)
+        native.on_huge_pages(result)
     compiled, machine = native.compiled, native.machine(positions)
     given, inputs = _compiled_table(network), _inputs(network, offsets, order, encoded)
     to_directions = results[-2] if wanted[2] else None

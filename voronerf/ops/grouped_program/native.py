@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from voronerf import native
+from voronerf.custom_op import custom_op
 from voronerf.derivatives import asked_for
-from voronerf.native.custom_op import custom_op, on_huge_pages
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
 from voronerf.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient, merged
 
@@ -54,12 +54,14 @@ def _run(
     sums = [inputs[0].new_empty(k, *shape) for shape in program.sums]
     yield [*results, *sums]
     for result in results:
-        on_huge_pages(result)
+        native.on_huge_pages(result)
     plan = _plan(text)
+    turned = [not x.is_contiguous() and x.t().is_contiguous() for x in inputs]
     given = native.compiled.ProgramInputs(
         code=plan.code,
         constants=plan.constants,
-        inputs=inputs,
+        inputs=[x.t() if turn else x for x, turn in zip(inputs, turned)],
+        turned=torch.tensor(turned, dtype=torch.int32),
         parameters=parameters,
         strides=torch.tensor([p[0].numel() if p.shape[0] > 1 else 0 for p in parameters], dtype=torch.int64),
         widths=plan.widths,

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_no_inference, check_same_device, check_shape
+from voronerf.checks import FLOATING, INDEX, Checked
 from voronerf.grids import HashGrid
 
 _OP = backends.declare(
@@ -56,20 +56,14 @@ def hash_encode(
                 [0.5000, 1.0000],
                 [0.5000, 1.0000]])
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "positions", positions, ("n", 3), sizes)
-    check_dtype(_OP, "positions", positions)
-    check_count(_OP, "positions", sizes["n"])
     if not isinstance(grid, HashGrid):
         raise TypeError(f"{_OP}: grid must be a HashGrid, got {type(grid).__name__}")
-    check_shape(_OP, "table", table, (() if cells is None else ("k",)) + grid.table_shape, sizes)
-    check_dtype(_OP, "table", table)
-    if cells is not None:
-        check_shape(_OP, "cells", cells, ("n",), sizes)
-        check_dtype(_OP, "cells", cells, INDEX)
-    check_same_device(_OP, positions=positions, table=table, cells=cells)
-    check_no_inference(_OP, positions=positions, table=table, cells=cells)
+    given = Checked(_OP)
+    given.tensor("positions", positions, FLOATING, "n", 3)
+    given.tensor("table", table, FLOATING, *(() if cells is None else ("k",)), *grid.table_shape)
+    given.optional("cells", cells, INDEX, "n")
+    given.no_inference()
     dtype = torch.promote_types(positions.dtype, table.dtype)
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=dtype)
-    encoded: Tensor = run(positions, table, grid, cells=cells)
+    encoded: Tensor = run(positions, table, grid, cells)
     return encoded

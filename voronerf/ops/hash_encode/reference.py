@@ -13,7 +13,7 @@ from voronerf.grids import GridLevel, HashGrid
 _PRIMES = (1, 2654435761, 805459861)
 
 
-def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, *, cells: Tensor | None = None) -> Tensor:
+def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None = None) -> Tensor:
     """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
     if cells is not None:
         check_range("hash_encode", "cells", cells, len(table))

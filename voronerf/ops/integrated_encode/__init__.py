@@ -6,15 +6,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import (
-    check_count,
-    check_dtype,
-    check_integer,
-    check_no_inference,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-)
+from voronerf.checks import FLOATING, LIKE_FIRST, Checked, check_integer
 
 _OP = backends.declare(
     "integrated_encode",
@@ -53,15 +45,11 @@ def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend
         >>> integrated_encode(means, torch.full((1, 3), 4.0), 1).round(decimals=4)  # a wide Gaussian: closer to 0
         tensor([[0.1139, 0.0000, 0.0000, 0.0731, 0.1353, 0.1353]])
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "means", means, ("n", 3), sizes)
-    check_shape(_OP, "variances", variances, ("n", 3), sizes)
-    check_dtype(_OP, "means", means)
-    check_same_dtype(_OP, means=means, variances=variances)
-    check_same_device(_OP, means=means, variances=variances)
-    check_no_inference(_OP, means=means, variances=variances)
+    given = Checked(_OP)
+    given.tensor("means", means, FLOATING, "n", 3)
+    given.tensor("variances", variances, LIKE_FIRST, "n", 3)
+    given.no_inference()
     check_integer(_OP, "octaves", octaves, 0, 127)  # 2^128 is beyond float32
-    check_count(_OP, "means", sizes["n"])
     run = backends.resolve(_OP, backend=backend, device=means.device, dtype=means.dtype)
     encoded: Tensor = run(means, variances, octaves)
     return encoded

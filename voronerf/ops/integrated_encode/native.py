@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from voronerf.custom_op import in_float32
+from voronerf.ops.frequency_encode.autograd import Encoding
 from voronerf.ops.frequency_encode.native import encode
 
 
 def integrated_encode(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
     """Expected encoding of a Gaussian; see ``voronerf.ops.integrated_encode``."""
-    encoded: Tensor = encode(means.float(), variances.float(), octaves, False)
-    return encoded.to(means.dtype)
+    encoded: Tensor = in_float32(encode, Encoding(means, variances, octaves, False))
+    return encoded

@@ -10,11 +10,9 @@ def integrated_encode(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
     """Expected encoding of a Gaussian; see ``voronerf.ops.integrated_encode``."""
     wide = torch.promote_types(means.dtype, torch.float32)
     mean, variance = means.to(wide), variances.to(wide)
-    parts = []
+    parts = [mean[:, :0]]
     for octave in range(octaves):
         angle = mean * 2.0**octave
         blur = torch.exp(-0.5 * 4.0**octave * variance)
         parts += [angle.sin() * blur, angle.cos() * blur]
-    if not parts:
-        return means.new_empty(means.shape[0], 0)
     return torch.cat(parts, dim=1).to(means.dtype)

@@ -3,12 +3,12 @@ diagrams."""
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_integer, check_same_device, check_shape
+from voronerf.checks import FLOATING, INDEX, Checked, check_integer
+from voronerf.ops.nearest_centre import of_one_dtype
 
 _OP = backends.declare(
     "locate_cell",
@@ -66,29 +66,31 @@ def locate_cell(
         >>> locate_cell(points, centres, child_offsets, child, depth=2)
         tensor([0, 1, 2], dtype=torch.int32)
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "points", points, ("n", 3), sizes)
-    check_shape(_OP, "centres", centres, ("m", 3), sizes)
-    check_shape(_OP, "child_offsets", child_offsets, ("g+1",), sizes)
-    check_shape(_OP, "child", child, ("m",), sizes)
-    check_dtype(_OP, "points", points)
-    check_dtype(_OP, "centres", centres)
-    check_dtype(_OP, "child_offsets", child_offsets, INDEX)
-    check_dtype(_OP, "child", child, INDEX)
-    if weights is not None:
-        check_shape(_OP, "weights", weights, ("m",), sizes)
-        check_dtype(_OP, "weights", weights)
-    check_same_device(_OP, points=points, centres=centres, child_offsets=child_offsets, child=child, weights=weights)
-    check_count(_OP, "points", sizes["n"])
-    check_integer(_OP, "depth", depth, 1)
-    if sizes["m"] < 1 or sizes["g"] < 1:
-        count = f"{sizes['m']} centres in {sizes['g']} diagrams"
-        raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
-    dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
-    if weights is not None:
-        dtype = torch.promote_types(dtype, weights.dtype)
-        weights = weights.detach().to(dtype)
-    points, centres = points.detach().to(dtype), centres.detach().to(dtype)
-    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=dtype)
-    leaf: Tensor = run(points, centres, child_offsets, child, depth=depth, weights=weights)
+    check_tree(_OP, points, centres, child_offsets, child, depth, weights)
+    points, centres, weights = of_one_dtype(points, centres, weights)
+    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
+    leaf: Tensor = run(points, centres, child_offsets, child, depth, weights)
     return leaf
+
+
+def check_tree(
+    op: str,
+    points: Tensor,
+    centres: Tensor,
+    child_offsets: Tensor,
+    child: Tensor,
+    depth: int,
+    weights: Tensor | None,
+) -> Checked:
+    """Checks points and the tables of a tree."""
+    given = Checked(op)
+    given.tensor("points", points, FLOATING, "n", 3)
+    given.tensor("centres", centres, FLOATING, "m", 3)
+    given.tensor("child_offsets", child_offsets, INDEX, "g+1")
+    given.tensor("child", child, INDEX, "m")
+    given.optional("weights", weights, FLOATING, "m")
+    check_integer(op, "depth", depth, 1)
+    if given.sizes["m"] < 1 or given.sizes["g"] < 1:
+        count = f"{given.sizes['m']} centres in {given.sizes['g']} diagrams"
+        raise ValueError(f"{op}: centres must hold at least one centre of one diagram, got {count}")
+    return given

@@ -8,23 +8,14 @@ import torch
 from torch import Tensor
 
 from voronerf import native
-from voronerf.native.custom_op import custom_op
-from voronerf.ops.nearest_centre.native import as_compared
-
-
-def locate_cell(
-    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, *, depth: int, weights: Tensor | None = None
-) -> Tensor:
-    """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
-    points, centres, weights = as_compared(points, centres, weights)
-    leaves: Tensor = _locate_cell(points, centres, child_offsets, child, depth, weights)
-    return leaves
+from voronerf.custom_op import custom_op
 
 
 @custom_op("locate_cell")
-def _locate_cell(
+def locate_cell(
     points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
 ) -> Iterator[Tensor]:
+    """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
     leaves = points.new_empty(points.shape[0], dtype=torch.int32)
     yield leaves
     find(leaves, points, centres, child_offsets, child, depth, weights, "locate_cell")

@@ -11,7 +11,7 @@ _PIECE = 1 << 17
 
 
 def locate_cell(
-    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, *, depth: int, weights: Tensor | None = None
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None = None
 ) -> Tensor:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``.
 

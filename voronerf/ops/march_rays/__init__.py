@@ -7,16 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import (
-    INDEX,
-    check_choice,
-    check_count,
-    check_dtype,
-    check_integer,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-)
+from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_choice, check_count, check_integer
 from voronerf.ops.march_rays.reference import March, Rays
 
 _OP = backends.declare(
@@ -103,63 +94,31 @@ def march_rays(
         >>> march.ray_offsets
         tensor([0, 2], dtype=torch.int32)
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "origins", origins, ("r", 3), sizes)
-    check_shape(_OP, "directions", directions, ("r", 3), sizes)
-    check_shape(_OP, "near", near, ("r",), sizes)
-    check_shape(_OP, "far", far, ("r",), sizes)
-    check_shape(_OP, "occupied", occupied, ("x", "y", "z"), sizes)
-    check_shape(_OP, "box", box, (2, 3))
-    check_integer(_OP, "samples", samples, 1)
-    check_dtype(_OP, "origins", origins, (torch.float32, torch.float64))
-    check_dtype(_OP, "occupied", occupied, (torch.bool,))
-    if contraction is not None:
-        sphere = isinstance(contraction, Tensor) and contraction.dim() == 1
-        check_shape(_OP, "contraction", contraction, (4,) if sphere else (5, 3))
-    if uniforms is not None:
-        check_shape(_OP, "uniforms", uniforms, ("r", "s"), {**sizes, "s": samples})
-    if seed is not None:
-        if uniforms is not None:
-            raise ValueError(f"{_OP}: seed must be None where uniforms are given, got both")
-        check_shape(_OP, "seed", seed, (1,))
-        check_dtype(_OP, "seed", seed, INDEX)
-    if start is not None:
-        check_shape(_OP, "start", start, ("r",), sizes)
-        check_dtype(_OP, "start", start, INDEX)
-    check_same_dtype(
-        _OP,
-        origins=origins,
-        directions=directions,
-        near=near,
-        far=far,
-        box=box,
-        uniforms=uniforms,
-        contraction=contraction,
-    )
-    check_same_device(
-        _OP,
-        origins=origins,
-        directions=directions,
-        near=near,
-        far=far,
-        occupied=occupied,
-        box=box,
-        uniforms=uniforms,
-        seed=seed,
-        start=start,
-        contraction=contraction,
-    )
+    check_integer(_OP, "samples", samples, 1, 65_535)
+    given = Checked(_OP)
+    given.sizes["s"] = samples
+    given.tensor("origins", origins, (torch.float32, torch.float64), "r", 3)
+    given.tensor("directions", directions, LIKE_FIRST, "r", 3)
+    given.tensor("near", near, LIKE_FIRST, "r")
+    given.tensor("far", far, LIKE_FIRST, "r")
+    given.tensor("occupied", occupied, (torch.bool,), "x", "y", "z")
+    given.tensor("box", box, LIKE_FIRST, 2, 3)
+    given.optional("uniforms", uniforms, LIKE_FIRST, "r", "s")
+    if seed is not None and uniforms is not None:
+        raise ValueError(f"{_OP}: seed must be None where uniforms are given, got both")
+    given.optional("seed", seed, INDEX, 1)
+    given.optional("start", start, INDEX, "r")
+    sphere = isinstance(contraction, Tensor) and contraction.dim() == 1
+    given.optional("contraction", contraction, LIKE_FIRST, *((4,) if sphere else (5, 3)))
     check_choice(_OP, "spacing", spacing, _SPACINGS)
     for name, value in (("most", most), ("capacity", capacity)):
         if value is not None:
             check_integer(_OP, name, value, 1)
             check_count(_OP, name, value)
     check_count(_OP, "occupied", occupied.numel())
-    check_count(_OP, "samples of all rays", sizes["r"] * samples)
+    check_count(_OP, "samples of all rays", given.sizes["r"] * samples)
     if occupied.numel() < 1:
         raise ValueError(f"{_OP}: occupied must have at least one cell, got {list(occupied.shape)}")
-    if samples > 65_535:
-        raise ValueError(f"{_OP}: samples must be at most 65535, got {samples}")
     run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
     rays = Rays(
         origins=origins.detach(),

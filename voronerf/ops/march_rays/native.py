@@ -13,7 +13,7 @@ from torch import Tensor
 
 from voronerf import native
 from voronerf.checks import MAX_COUNT
-from voronerf.native.custom_op import custom_op
+from voronerf.custom_op import custom_op
 from voronerf.ops.march_rays.reference import March, Rays
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.checks import check_count, check_dtype, check_same_device, check_shape
+from voronerf.checks import FLOATING, Checked
 from voronerf.ops.centre_grid import CentreGrid
 from voronerf.ops.nearest_centre_grid import nearest_centre_grid
 
@@ -58,26 +58,24 @@ def nearest_centre(
         >>> nearest_centre(points, centres, weights=torch.tensor([0.0, 0.5]))  # the second cell is larger
         tensor([0, 1, 1], dtype=torch.int32)
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "points", points, ("n", 3), sizes)
-    check_shape(_OP, "centres", centres, ("k", 3), sizes)
-    check_dtype(_OP, "points", points)
-    check_dtype(_OP, "centres", centres)
-    if weights is not None:
-        check_shape(_OP, "weights", weights, ("k",), sizes)
-        check_dtype(_OP, "weights", weights)
-    check_same_device(_OP, points=points, centres=centres, weights=weights)
-    check_count(_OP, "points", sizes["n"])
-    if sizes["k"] < 1:
+    given = Checked(_OP)
+    given.tensor("points", points, FLOATING, "n", 3)
+    given.tensor("centres", centres, FLOATING, "k", 3)
+    given.optional("weights", weights, FLOATING, "k")
+    if given.sizes["k"] < 1:
         raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
-    # One type for all backends: float64 when any argument is, float32 otherwise.
+    points, centres, weights = of_one_dtype(points, centres, weights)
+    if grid is not None:
+        return nearest_centre_grid(points, centres, weights, grid, backend)
+    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
+    cells: Tensor = run(points, centres, weights)
+    return cells
+
+
+def of_one_dtype(points: Tensor, centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """What is compared, in one type for all backends: float64 where any is, float32 otherwise."""
     dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
     if weights is not None:
         dtype = torch.promote_types(dtype, weights.dtype)
         weights = weights.detach().to(dtype)
-    points, centres = points.detach().to(dtype), centres.detach().to(dtype)
-    if grid is not None:
-        return nearest_centre_grid(points, centres, weights, grid, backend)
-    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=dtype)
-    cells: Tensor = run(points, centres, weights=weights)
-    return cells
+    return points.detach().to(dtype), centres.detach().to(dtype), weights

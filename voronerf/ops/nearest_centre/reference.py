@@ -11,7 +11,7 @@ _PIECE = 1 << 17
 """Distances evaluated at a time: 1 MiB of float64, what a core's second-level cache holds."""
 
 
-def nearest_centre(points: Tensor, centres: Tensor, *, weights: Tensor | None = None) -> Tensor:
+def nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
     """Index of the centre with the smallest ``|x - c|^2 - w`` for every point; see ``voronerf.ops.nearest_centre``."""
     run = lambda points: distances(points, centres, weights).argmin(dim=1).to(torch.int32)  # noqa: E731
     return in_pieces(run, _PIECE // centres.shape[0], points)

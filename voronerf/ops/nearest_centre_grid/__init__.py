@@ -27,5 +27,5 @@ def nearest_centre_grid(
     if not belongs(centres, weights):
         raise ValueError("nearest_centre: grid must be made from these centres and weights, got that of others")
     run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
-    cells: Tensor = run(points, centres, grid.tables, weights=weights)
+    cells: Tensor = run(points, centres, weights, grid.tables)
     return cells

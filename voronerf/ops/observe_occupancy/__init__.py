@@ -7,23 +7,14 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import (
-    check_count,
-    check_dtype,
-    check_number,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-    check_writable,
-)
+from voronerf.checks import LIKE_FIRST, Checked, check_count, check_number, check_writable
+from voronerf.ops.observe_occupancy.reference import Observed
 
 _OP = backends.declare(
     "observe_occupancy",
     native=Implementation(EVERYWHERE, (torch.float32,)),
     warp=Implementation(EVERYWHERE, (torch.float32,)),
 )
-#: Positions, sigma, deltas and weights.
-Samples = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def observe_occupancy(
@@ -75,35 +66,22 @@ def observe_occupancy(
         >>> density.flatten(), occupied.flatten()
         (tensor([2., 9., 4.]), tensor([False,  True,  True]))
     """
-    samples = positions, sigma, deltas, weights
-    _check(_OP, density, occupied, box, samples, decay=decay, threshold=threshold, hidden=hidden)
-    run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)
-    constant = (tensor.detach() for tensor in (box, *samples))
-    run(density.detach(), occupied, *constant, float(decay), float(threshold), float(hidden))
-
-
-def _check(op: str, density: Tensor, occupied: Tensor, box: Tensor, samples: Samples, **numbers: float) -> None:
-    positions, sigma, deltas, weights = samples
-    sizes: dict[str, int] = {}
-    check_shape(op, "density", density, ("x", "y", "z"), sizes)
-    check_shape(op, "occupied", occupied, ("x", "y", "z"), sizes)
-    check_shape(op, "box", box, (2, 3))
-    check_shape(op, "positions", positions, ("m", 3), sizes)
-    floats = {"density": density, "box": box, "positions": positions}
+    given = Checked(_OP)
+    given.tensor("density", density, (torch.float32,), "x", "y", "z")
+    given.tensor("occupied", occupied, (torch.bool,), "x", "y", "z")
+    given.tensor("box", box, LIKE_FIRST, 2, 3)
+    given.tensor("positions", positions, LIKE_FIRST, "m", 3)
     for name, value in (("sigma", sigma), ("deltas", deltas), ("weights", weights)):
-        check_shape(op, name, value, ("m",), sizes)
-        floats[name] = value
-    check_dtype(op, "density", density, (torch.float32,))
-    check_dtype(op, "occupied", occupied, (torch.bool,))
-    check_same_dtype(op, **floats)
-    check_same_device(op, **floats, occupied=occupied)
-    check_count(op, "density", density.numel())
-    check_count(op, "positions", sizes["m"])
-    for name, grid in (("density", density), ("occupied", occupied)):
-        check_writable(op, name, grid)
+        given.tensor(name, value, LIKE_FIRST, "m")
+    check_count(_OP, "density", density.numel())
+    check_writable(_OP, "density", density)
+    check_writable(_OP, "occupied", occupied)
     if density.numel() < 1:
-        raise ValueError(f"{op}: density must have at least one cell, got {list(density.shape)}")
-    for name, number in numbers.items():
-        check_number(op, name, number)
-    if not 0 <= numbers["decay"] <= 1:
-        raise ValueError(f"{op}: decay must lie in 0 to 1, got {numbers['decay']}")
+        raise ValueError(f"{_OP}: density must have at least one cell, got {list(density.shape)}")
+    for name, number in (("decay", decay), ("threshold", threshold), ("hidden", hidden)):
+        check_number(_OP, name, number)
+    if not 0 <= decay <= 1:
+        raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
+    tensors = (tensor.detach() for tensor in (density, occupied, box, positions, sigma, deltas, weights))
+    observed = Observed._make([*tensors, float(decay), float(threshold), float(hidden)])
+    backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)(observed)

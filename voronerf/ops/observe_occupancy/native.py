@@ -3,39 +3,28 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from voronerf import native
+from voronerf.ops.observe_occupancy.reference import Observed
 
 
-def observe_occupancy(
-    density: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    positions: Tensor,
-    sigma: Tensor,
-    deltas: Tensor,
-    weights: Tensor,
-    decay: float,
-    threshold: float,
-    hidden: float,
-) -> None:
+def observe_occupancy(given: Observed) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    m, (x, y, z) = positions.shape[0], density.shape
-    given = native.compiled.ObservedSamples(
-        positions=positions,
-        sigma=sigma,
-        deltas=deltas,
-        weights=weights,
-        box=box,
+    density, m, (x, y, z) = given.density, len(given.positions), given.density.shape
+    samples = native.compiled.ObservedSamples(
+        positions=given.positions,
+        sigma=given.sigma,
+        deltas=given.deltas,
+        weights=given.weights,
+        box=given.box,
         x=x,
         y=y,
         z=z,
         m=m,
-        decay=decay,
-        threshold=threshold,
-        hidden=hidden,
+        decay=given.decay,
+        threshold=given.threshold,
+        hidden=given.hidden,
     )
-    machine = native.machine(density)
-    cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
-    native.compiled.observe_occupancy(given, density, occupied.view(torch.uint8), cells, before, machine)
+    memory = density.new_empty(m, dtype=torch.int32), density.new_empty(m)  # cells, and the densities that these had
+    occupied = given.occupied.view(torch.uint8)
+    native.compiled.observe_occupancy(samples, density, occupied, *memory, native.machine(density))

@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 
+class Observed(NamedTuple):
+    """A grid, samples in it, and what they count; see ``voronerf.ops.observe_occupancy``."""
+
+    density: Tensor
+    occupied: Tensor
+    box: Tensor
+    positions: Tensor
+    sigma: Tensor
+    deltas: Tensor
+    weights: Tensor
+    decay: float
+    threshold: float
+    hidden: float
+
+
 @torch.no_grad()
-def observe_occupancy(
-    density: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    positions: Tensor,
-    sigma: Tensor,
-    deltas: Tensor,
-    weights: Tensor,
-    decay: float,
-    threshold: float,
-    hidden: float,
-) -> None:
+def observe_occupancy(given: Observed) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    found = sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
+    found = given.sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
     # weight = light that arrives * share of it that is taken
-    seen = weights > hidden * -torch.expm1(-found * deltas)
-    rows = cells_of(positions, box, density.shape).long()
-    flat = density.view(-1)
+    seen = given.weights > given.hidden * -torch.expm1(-found * given.deltas)
+    rows = cells_of(given.positions, given.box, given.density.shape).long()
+    flat = given.density.view(-1)
     # A cell decays once, however often it occurs.
-    faded = flat.scatter(0, rows, flat[rows] * decay)
+    faded = flat.scatter(0, rows, flat[rows] * given.decay)
     flat.copy_(faded.scatter_reduce(0, rows, torch.where(seen, found, 0), "amax"))
-    occupied.view(-1)[rows] = flat[rows] >= threshold
+    given.occupied.view(-1)[rows] = flat[rows] >= given.threshold
 
 
 def cells_of(points: Tensor, box: Tensor, shape: torch.Size) -> Tensor:

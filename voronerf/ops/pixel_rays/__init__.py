@@ -7,15 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import (
-    check_count,
-    check_dtype,
-    check_number,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-    check_tensor,
-)
+from voronerf.checks import LIKE_FIRST, Checked, check_number
 from voronerf.ops.camera_rays import check_lenses
 from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
@@ -79,32 +71,16 @@ def pixel_rays(
         >>> rays.near, rays.far, rays.colour
         (tensor([2.]), tensor([3.]), tensor([[1.0000, 0.8000, 0.8000]]))
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "poses", poses, ("c", 4, 4), sizes)
-    check_shape(_OP, "intrinsics", intrinsics, ("c", 4), sizes)
-    check_shape(_OP, "images", images, ("c", "h", "w", "channels"), sizes)
-    check_shape(_OP, "index", index, ("b",), sizes)
-    check_dtype(_OP, "poses", poses, (torch.float32,))
-    check_dtype(_OP, "images", images, (torch.uint8,))
-    check_dtype(_OP, "index", index, (torch.int64,))
-    if box is not None:
-        check_shape(_OP, "box", box, (2, 3))
-    check_lenses(_OP, distortion, models, sizes)
-    if background is not None:
-        check_tensor(_OP, "background", background)
-        check_shape(_OP, "background", background, (3,) if background.dim() == 1 else ("b", 3), sizes)
-    floats = {
-        "poses": poses,
-        "intrinsics": intrinsics,
-        "box": box,
-        "distortion": distortion,
-        "background": background,
-    }
-    check_same_dtype(_OP, **floats)
-    check_same_device(_OP, **floats, images=images, index=index, models=models)
-    check_count(_OP, "index", sizes["b"])
-    if sizes["channels"] not in (3, 4):
-        raise ValueError(f"{_OP}: images must have 3 or 4 channels, got {sizes['channels']}")
+    given = Checked(_OP)
+    given.tensor("poses", poses, (torch.float32,), "c", 4, 4)
+    given.tensor("intrinsics", intrinsics, LIKE_FIRST, "c", 4)
+    given.tensor("images", images, (torch.uint8,), "c", "h", "w", "channels")
+    given.tensor("index", index, (torch.int64,), "b")
+    given.optional("box", box, LIKE_FIRST, 2, 3)
+    check_lenses(given, distortion, models)
+    given.each_or_all("background", background, LIKE_FIRST, "b", 3)
+    if given.sizes["channels"] not in (3, 4):
+        raise ValueError(f"{_OP}: images must have 3 or 4 channels, got {given.sizes['channels']}")
     check_number(_OP, "near", near)
     check_number(_OP, "far", far)
     if not 0 <= near < far:
@@ -112,18 +88,7 @@ def pixel_rays(
     if torch.finfo(torch.float32).max < far < float("inf"):
         raise ValueError(f"{_OP}: far must be at most 3.4e+38 or infinite, got {far}")
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
-    found: PixelRays = run(
-        Pixels(
-            poses=poses.detach(),
-            intrinsics=intrinsics.detach(),
-            images=images,
-            numbers=index,
-            box=None if box is None else box.detach(),
-            distortion=None if distortion is None else distortion.detach(),
-            models=models,
-            background=None if background is None else background.detach(),
-            near=float(near),
-            far=float(far),
-        )
-    )
-    return found
+    constant = (None if tensor is None else tensor.detach() for tensor in (box, distortion, background))
+    box, distortion, background = constant
+    views = poses.detach(), intrinsics.detach(), images
+    return PixelRays(*run(Pixels(*views, index, box, distortion, models, background, float(near), float(far))))

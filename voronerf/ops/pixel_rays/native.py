@@ -8,17 +8,13 @@ from torch import Tensor
 
 from voronerf import native
 from voronerf.checks import check_range
-from voronerf.native.custom_op import custom_op
-from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
-
-
-def pixel_rays(pixels: Pixels) -> PixelRays:
-    """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    return PixelRays(*_pixel_rays(pixels))
+from voronerf.custom_op import custom_op
+from voronerf.ops.pixel_rays.reference import Pixels
 
 
 @custom_op("pixel_rays_native")
-def _pixel_rays(pixels: Pixels) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+def pixel_rays(pixels: Pixels) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
     poses, intrinsics, images, index, box, distortion, models, background, near, far = pixels
     b = index.shape[0]
     origins, directions, colour = poses.new_empty(b, 3), poses.new_empty(b, 3), poses.new_empty(b, 3)

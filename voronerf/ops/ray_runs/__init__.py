@@ -13,21 +13,11 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import (
-    INDEX,
-    check_dtype,
-    check_flag,
-    check_integer,
-    check_number,
-    check_range,
-    check_same_device,
-    check_same_dtype,
-    check_shape,
-    check_tensor,
-)
+from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_flag, check_integer, check_number, check_range
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.ray_runs.reference import OwnSamples
 
+_FLOATS = (torch.float32, torch.float64)
 _NATIVE = Implementation(("cpu",), (torch.float32,), file="ray_runs")
 _OWN, _SUMS, _COMPOSE, _GRADIENTS = (
     backends.declare(op, native=_NATIVE, reference=Implementation(file="ray_runs"))
@@ -78,19 +68,15 @@ def own_samples(
         >>> mine.depths, mine.run_offsets
         (tensor([0.1000, 0.9000]), tensor([0, 1, 2], dtype=torch.int32))
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OWN, "positions", positions, ("n", 3), sizes)
-    for name, values in (("ray_index", ray_index), ("depths", depths), ("deltas", deltas), ("cells", cells)):
-        check_shape(_OWN, name, values, ("n",), sizes)
-    check_shape(_OWN, "own", own, ("k",), sizes)
-    check_dtype(_OWN, "positions", positions, (torch.float32, torch.float64))
-    for name, values in (("ray_index", ray_index), ("cells", cells), ("own", own)):
-        check_dtype(_OWN, name, values, INDEX)
-    check_same_dtype(_OWN, positions=positions, depths=depths, deltas=deltas)
-    check_same_device(_OWN, positions=positions, ray_index=ray_index, depths=depths, cells=cells, own=own)
-    check_same_device(_OWN, positions=positions, deltas=deltas)
+    given = Checked(_OWN)
+    given.tensor("positions", positions, _FLOATS, "n", 3)
+    given.tensor("ray_index", ray_index, INDEX, "n")
+    given.tensor("depths", depths, LIKE_FIRST, "n")
+    given.tensor("deltas", deltas, LIKE_FIRST, "n")
+    given.tensor("cells", cells, INDEX, "n")
+    given.tensor("own", own, INDEX, "k")
     check_flag(_OWN, "bent", bent)
-    check_range(_OWN, "cells", cells, sizes["k"])
+    check_range(_OWN, "cells", cells, len(own))
     run = backends.resolve(_OWN, backend=backend, device=positions.device, dtype=positions.dtype)
     found: OwnSamples = run(positions.detach(), ray_index, depths.detach(), deltas.detach(), cells, own, bent=bent)
     return found
@@ -158,15 +144,10 @@ def compose_runs(
         >>> float(loss), float(answers[0, 5])
         (0.25, 0.75)
     """
-    sizes: dict[str, int] = {}
-    check_shape(_COMPOSE, "sums", sums, ("q", 6), sizes)
-    check_shape(_COMPOSE, "target", target, ("r", 3), sizes)
-    check_dtype(_COMPOSE, "sums", sums, (torch.float32, torch.float64))
-    if background is not None:
-        check_tensor(_COMPOSE, "background", background)
-        check_shape(_COMPOSE, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
-    check_same_dtype(_COMPOSE, sums=sums, target=target, background=background)
-    check_same_device(_COMPOSE, sums=sums, target=target, background=background)
+    given = Checked(_COMPOSE)
+    given.tensor("sums", sums, _FLOATS, "q", 6)
+    given.tensor("target", target, LIKE_FIRST, "r", 3)
+    given.each_or_all("background", background, LIKE_FIRST, "r", 3)
     check_integer(_COMPOSE, "first", first, 0)
     check_integer(_COMPOSE, "rays", rays, 1)
     run = backends.resolve(_COMPOSE, backend=backend, device=sums.device, dtype=sums.dtype)
@@ -211,10 +192,8 @@ def run_gradients(
         >>> run_gradients(raw, mine, answers, density_scale=1.0)[0][:, :3].round(decimals=4)  # lighter
         tensor([[-0.0833, -0.0833, -0.0833]])
     """
-    _check_outputs(_GRADIENTS, raw, samples, density_scale)
-    check_shape(_GRADIENTS, "answers", answers, (len(samples.run_offsets) - 1, 6))
-    check_same_dtype(_GRADIENTS, raw=raw, answers=answers)
-    check_same_device(_GRADIENTS, raw=raw, answers=answers)
+    given = _check_outputs(_GRADIENTS, raw, samples, density_scale)
+    given.tensor("answers", answers, LIKE_FIRST, "q", 6)
     check_number(_GRADIENTS, "hidden", hidden)
     if not 0 <= hidden < 1:
         raise ValueError(f"{_GRADIENTS}: hidden must lie in [0, 1), got {hidden}")
@@ -223,21 +202,17 @@ def run_gradients(
     return gradient, weights
 
 
-def _check_outputs(op: str, raw: Tensor, samples: OwnSamples, density_scale: float) -> None:
+def _check_outputs(op: str, raw: Tensor, samples: OwnSamples, density_scale: float) -> Checked:
     if not isinstance(samples, OwnSamples):
         raise TypeError(f"{op}: samples must be OwnSamples, got {type(samples).__name__}")
-    check_shape(op, "raw", raw, ("m", 4))
-    check_dtype(op, "raw", raw, (torch.float32, torch.float64))
-    sizes = {"m": len(raw)}
-    check_shape(op, "deltas", samples.deltas, ("m",), sizes)
-    check_shape(op, "depths", samples.depths, ("m",), sizes)
-    check_shape(op, "ray_index", samples.ray_index, ("m",), sizes)
-    check_shape(op, "run_offsets", samples.run_offsets, ("q+1",), sizes)
-    check_dtype(op, "ray_index", samples.ray_index, INDEX)
-    check_dtype(op, "run_offsets", samples.run_offsets, INDEX)
-    check_same_dtype(op, raw=raw, depths=samples.depths, deltas=samples.deltas)
-    check_same_device(op, raw=raw, depths=samples.depths, run_offsets=samples.run_offsets)
+    given = Checked(op)
+    given.tensor("raw", raw, _FLOATS, "m", 4)
+    given.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
+    given.tensor("depths", samples.depths, LIKE_FIRST, "m")
+    given.tensor("ray_index", samples.ray_index, INDEX, "m")
+    given.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
     check_ray_offsets(op, samples.run_offsets, len(raw))
     check_number(op, "density_scale", density_scale)
     if not density_scale > 0:
         raise ValueError(f"{op}: density_scale must be positive, got {density_scale}")
+    return given

@@ -7,17 +7,8 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import (
-    INDEX,
-    check_count,
-    check_dtype,
-    check_no_inference,
-    check_number,
-    check_same_device,
-    check_shape,
-    check_tensor,
-)
-from voronerf.ops.render_loss.reference import RenderLoss
+from voronerf.checks import FLOATING, INDEX, Checked, check_count, check_number
+from voronerf.ops.render_loss.reference import Rendered, RenderLoss
 
 _OP = backends.declare(
     "render_loss",
@@ -84,12 +75,8 @@ def render_loss(
         >>> raw.grad[:, :3].round(decimals=4)  # lighter
         tensor([[-0.0833, -0.0833, -0.0833]])
     """
-    _check(_OP, raw, deltas, ray_offsets, target, background, density_scale, hidden)
-    run = backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)
-    constant = (deltas.detach(), ray_offsets, target.detach())
-    background = None if background is None else background.detach()
-    numbers = {"density_scale": float(density_scale), "hidden": float(hidden)}
-    return RenderLoss(*run(raw, *constant, background=background, **numbers))
+    given = _checked(_OP, raw, deltas, ray_offsets, target, background, density_scale, hidden)
+    return RenderLoss(*backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)(given))
 
 
 def render_loss_gradient(
@@ -131,15 +118,12 @@ def render_loss_gradient(
         >>> float(result.loss), gradient[:, :3].round(decimals=4)
         (0.25, tensor([[-0.0833, -0.0833, -0.0833]]))
     """
-    _check(_GRADIENT, raw, deltas, ray_offsets, target, background, density_scale, hidden)
-    run = backends.resolve(_GRADIENT, backend=backend, device=raw.device, dtype=raw.dtype)
-    tensors = raw.detach(), deltas.detach(), ray_offsets, target.detach()
-    background = None if background is None else background.detach()
-    *parts, gradient = run(*tensors, background, float(density_scale), float(hidden))
+    given = _checked(_GRADIENT, raw.detach(), deltas, ray_offsets, target, background, density_scale, hidden)
+    *parts, gradient = backends.resolve(_GRADIENT, backend=backend, device=raw.device, dtype=raw.dtype)(given)
     return RenderLoss(*parts), gradient
 
 
-def _check(
+def _checked(
     op: str,
     raw: Tensor,
     deltas: Tensor,
@@ -148,18 +132,16 @@ def _check(
     background: Tensor | None,
     density_scale: float,
     hidden: float,
-) -> None:
-    sizes: dict[str, int] = {}
-    check_shape(op, "raw", raw, ("m", 4), sizes)
-    check_shape(op, "deltas", deltas, ("m",), sizes)
-    check_shape(op, "ray_offsets", ray_offsets, ("r+1",), sizes)
-    check_dtype(op, "raw", raw)
-    check_dtype(op, "ray_offsets", ray_offsets, INDEX)
+) -> Rendered:
+    """The arguments, of which the outputs of the networks alone are part of a graph."""
+    tensors = Checked(op)
+    tensors.tensor("raw", raw, FLOATING, "m", 4)
     wide = (torch.promote_types(raw.dtype, torch.float32),)
-    check_dtype(op, "deltas", deltas, wide)
-    check_targets(op, target, background, wide, sizes)
-    check_same_device(op, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
-    check_no_inference(op, raw=raw, deltas=deltas, ray_offsets=ray_offsets, target=target, background=background)
+    tensors.tensor("deltas", deltas, wide, "m")
+    tensors.tensor("ray_offsets", ray_offsets, INDEX, "r+1")
+    tensors.tensor("target", target, wide, "r", 3)
+    tensors.each_or_all("background", background, wide, "r", 3)
+    tensors.no_inference()
     check_count(op, "raw", raw.numel())
     check_number(op, "density_scale", density_scale)
     if not density_scale > 0:
@@ -167,15 +149,6 @@ def _check(
     check_number(op, "hidden", hidden)
     if not 0 <= hidden < 1:
         raise ValueError(f"{op}: hidden must lie in [0, 1), got {hidden}")
-
-
-def check_targets(
-    op: str, target: Tensor, background: Tensor | None, dtypes: tuple[torch.dtype, ...], sizes: dict[str, int]
-) -> None:
-    """Checks what rays are compared with; ``sizes`` holds r."""
-    check_shape(op, "target", target, ("r", 3), sizes)
-    check_dtype(op, "target", target, dtypes)
-    if background is not None:
-        check_tensor(op, "background", background)
-        check_shape(op, "background", background, (3,) if background.dim() == 1 else ("r", 3), sizes)
-        check_dtype(op, "background", background, dtypes)
+    background = None if background is None else background.detach()
+    constant = deltas.detach(), ray_offsets, target.detach(), background
+    return Rendered(raw, *constant, float(density_scale), float(hidden))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -37,43 +37,37 @@ class RenderLoss(NamedTuple):
     error: Tensor
 
 
-def render_loss(
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
-    *,
-    background: Tensor | None = None,
-    density_scale: float,
-    hidden: float = 0.0,
-) -> RenderLoss:
+class Rendered(NamedTuple):
+    """What ``render_loss`` takes; ``voronerf.ops.render_loss`` says what each is."""
+
+    raw: Tensor
+    deltas: Tensor
+    ray_offsets: Tensor
+    target: Tensor
+    background: Tensor | None
+    density_scale: float
+    hidden: float
+
+
+def render_loss(given: Rendered) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
+    raw, deltas, ray_offsets, target, background, density_scale, hidden = given
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
     check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
-    given: dict[str, Any] = {"background": background, "density_scale": density_scale}
     if hidden and raw.requires_grad:
-        found = render_loss(raw.detach(), deltas, ray_offsets, target, **given)
+        found = render_loss(given._replace(raw=raw.detach()))
         unseen = found.weights <= hidden * -torch.expm1(-found.density * deltas)
         raw = torch.where(unseen[:, None], raw.detach(), raw)
     colours, density = torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
-    seen = composite(density, colours, deltas, deltas, ray_offsets=ray_offsets, background=background)
+    seen = composite(density, colours, deltas, deltas, ray_offsets, background)
     error = (seen.colour - target).square().sum(-1)
     rest = (seen.colour, seen.weights, density, error)
     return RenderLoss(error.mean() / 3, *(part.detach() for part in rest))
 
 
 @torch.enable_grad()
-def render_loss_gradient(
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
-    background: Tensor | None,
-    density_scale: float,
-    hidden: float,
-) -> tuple[Tensor, ...]:
+def render_loss_gradient(given: Rendered) -> tuple[Tensor, ...]:
     """The result of `render_loss`, and the gradient of its loss to ``raw``."""
-    raw = raw.detach().requires_grad_()
-    numbers: dict[str, Any] = {"density_scale": density_scale, "hidden": hidden}
-    found = render_loss(raw, deltas, ray_offsets, target, background=background, **numbers)
-    return found.loss.detach(), *found[1:], torch.autograd.grad(found.loss, raw)[0]
+    given = given._replace(raw=given.raw.detach().requires_grad_())
+    found = render_loss(given)
+    return found.loss.detach(), *found[1:], torch.autograd.grad(found.loss, given.raw)[0]

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_same_dtype, check_shape
+from voronerf.checks import FLOATING, LIKE_FIRST, Checked, check_count, check_integer
 
 _OP = backends.declare(
     "resample",
@@ -48,19 +48,17 @@ def resample(
         >>> resample(weights, edges, 4)
         tensor([[2.1250, 2.3750, 2.6250, 2.8750]])
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "weights", weights, ("r", "s"), sizes)
-    check_shape(_OP, "edges", edges, ("r", "s+1"), sizes)
+    given = Checked(_OP)
+    given.tensor("weights", weights, FLOATING, "r", "s")
+    given.tensor("edges", edges, LIKE_FIRST, "r", "s+1")
     check_integer(_OP, "count", count, 1)
-    if uniforms is not None:
-        check_shape(_OP, "uniforms", uniforms, ("r", "count"), {**sizes, "count": count})
-    check_dtype(_OP, "weights", weights)
-    check_same_dtype(_OP, weights=weights, edges=edges, uniforms=uniforms)
-    check_same_device(_OP, weights=weights, edges=edges, uniforms=uniforms)
+    given.sizes["count"] = count
+    given.optional("uniforms", uniforms, LIKE_FIRST, "r", "count")
     check_count(_OP, "weights", weights.numel())
-    check_count(_OP, "depths", sizes["r"] * count)
-    if sizes["s"] < 1:
+    check_count(_OP, "depths", given.sizes["r"] * count)
+    if given.sizes["s"] < 1:
         raise ValueError(f"{_OP}: weights must have at least one bin, got none")
     run = backends.resolve(_OP, backend=backend, device=weights.device, dtype=weights.dtype)
-    depths: Tensor = run(weights, edges, count, uniforms=uniforms)
+    uniforms = None if uniforms is None else uniforms.detach()
+    depths: Tensor = run(weights.detach(), edges.detach(), count, uniforms)
     return depths

@@ -8,15 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf import native
-from voronerf.native.custom_op import custom_op
-
-
-def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None) -> Tensor:
-    """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
-    if uniforms is not None:
-        uniforms = uniforms.detach().float()
-    depths: Tensor = _resample(weights.detach().float(), edges.detach().float(), count, uniforms)
-    return depths.to(edges.dtype)
+from voronerf.custom_op import custom_op, in_float32
 
 
 @custom_op("resample_native")
@@ -30,3 +22,9 @@ def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | Non
         compiled.resample(weights, edges, uniforms, depths, workspace, r, s, count, machine)
     else:
         compiled.resample(weights, edges, uniforms, depths, r, s, count, machine)
+
+
+def resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
+    """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
+    depths: Tensor = in_float32(_resample, (weights, edges, count, uniforms))
+    return depths

@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 @torch.no_grad()
-def resample(weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None) -> Tensor:
+def resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None = None) -> Tensor:
     """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
     wide = torch.float64
     mass = torch.where(weights.isfinite(), weights, 0).to(wide).clamp(min=0)

@@ -24,6 +24,7 @@ from voronerf.checks import (
 from voronerf.compiler import constant_result
 from voronerf.layers import MLP
 from voronerf.ops.grouped_mlp.checks import check_network
+from voronerf.ops.nearest_centre import of_one_dtype
 from voronerf.ops.routed_mlp.reference import Operations
 from voronerf.ops.routed_mlp.reference import routed_mlp as compose
 
@@ -265,15 +266,6 @@ def _check_tables(
     if sizes["m"] < 1 or sizes["g"] < 1:
         count = f"{sizes['m']} centres in {sizes['g']} diagrams"
         raise ValueError(f"{op}: centres must hold at least one centre of one diagram, got {count}")
-
-
-def of_one_dtype(coords: Tensor, centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """What is compared, in one type: float64 where any is, float32 otherwise."""
-    dtype = torch.promote_types(torch.promote_types(coords.dtype, centres.dtype), torch.float32)
-    if weights is not None:
-        dtype = torch.promote_types(dtype, weights.dtype)
-        weights = weights.detach().to(dtype)
-    return coords.detach().to(dtype), centres.detach().to(dtype), weights
 
 
 def _operations(device: torch.device, weights: torch.dtype, coords: Tensor | None) -> Operations:

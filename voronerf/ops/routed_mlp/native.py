@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
+from voronerf.custom_op import custom_op
 from voronerf.layers import MLP
-from voronerf.native.custom_op import custom_op
 from voronerf.ops.cell_sort import native as cell_sort
 from voronerf.ops.grouped_mlp import native as grouped_mlp
 from voronerf.ops.grouped_mlp.layer_table import Given, Network, network
@@ -86,9 +86,9 @@ def prepared(
     if own and before and weights[0].shape[0] > 1 and cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
-            cells = nearest_centre.nearest_centre(coords, centres, weights=centre_weights)
+            cells = nearest_centre.nearest_centre(coords, centres, centre_weights)
         else:
-            cells = locate_cell.locate_cell(coords, centres, child_offsets, child, depth=depth, weights=centre_weights)
+            cells = locate_cell.locate_cell(coords, centres, child_offsets, child, depth, centre_weights)
         centres = None
     if features is not None and own and weights[0].shape[0] == 1:
         given = given._replace(features=features[0])

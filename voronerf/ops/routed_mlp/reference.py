@@ -71,9 +71,9 @@ def routed_mlp(
     if cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
-            cells = operations.nearest_centre(coords, centres, weights=centre_weights)
+            cells = operations.nearest_centre(coords, centres, centre_weights)
         else:
-            cells = operations.locate_cell(coords, centres, child_offsets, child, depth=depth, weights=centre_weights)
+            cells = operations.locate_cell(coords, centres, child_offsets, child, depth, centre_weights)
     check_range("routed_mlp", "cells", cells, k)
     order, offsets = operations.cell_sort(cells, k)
     if direction_index is not None:

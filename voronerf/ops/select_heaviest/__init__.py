@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.checks import check_count, check_dtype, check_integer, check_same_device, check_shape
+from voronerf.checks import Checked, check_integer
 
 _OP = backends.declare("select_heaviest")
 
@@ -40,13 +40,9 @@ def select_heaviest(points: Tensor, importance: Tensor, count: int, *, backend: 
         >>> heaviest[:, 0], importance
         (tensor([1., 2.]), tensor([3., 2.]))
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "points", points, ("n", 3), sizes)
-    check_shape(_OP, "importance", importance, ("n",), sizes)
-    check_dtype(_OP, "points", points, (torch.float32,))
-    check_dtype(_OP, "importance", importance, (torch.float32,))
-    check_same_device(_OP, points=points, importance=importance)
-    check_count(_OP, "points", sizes["n"])
+    given = Checked(_OP)
+    given.tensor("points", points, (torch.float32,), "n", 3)
+    given.tensor("importance", importance, (torch.float32,), "n")
     check_integer(_OP, "count", count, 1)
     run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
     kept_points, kept = run(points.detach(), importance.detach(), count)

@@ -163,8 +163,8 @@ def sparse_adam(
                 [-0.2500,  0.2500],
                 [ 0.0000,  0.0000]])
     """
-    tensors = {"parameters": parameter, "gradients": gradient, "means": mean, "squares": square}
-    _check(_OP, tensors)
+    if not _are_plain([parameter], [gradient], [mean], [square]):
+        _check(_OP, {"parameters": parameter, "gradients": gradient, "means": mean, "squares": square})
     check_integer(_OP, "step", step, 1)
     check_number(_OP, "learning_rate", learning_rate)
     _check_decay(_OP, betas, epsilon)

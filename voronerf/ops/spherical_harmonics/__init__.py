@@ -6,7 +6,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import check_count, check_dtype, check_integer, check_no_inference, check_shape
+from voronerf.checks import FLOATING, Checked, check_integer
 
 _OP = backends.declare(
     "spherical_harmonics",
@@ -45,13 +45,10 @@ def spherical_harmonics(directions: Tensor, degree: int, *, backend: str = "auto
         >>> spherical_harmonics(up, 4).shape
         torch.Size([1, 16])
     """
-    check_shape(_OP, "directions", directions, ("n", 3))
-    check_dtype(_OP, "directions", directions)
-    check_integer(_OP, "degree", degree, 1)
-    if degree > 4:
-        raise ValueError(f"{_OP}: degree must be at most 4, got {degree}")
-    check_no_inference(_OP, directions=directions)
-    check_count(_OP, "directions", directions.shape[0])
+    given = Checked(_OP)
+    given.tensor("directions", directions, FLOATING, "n", 3)
+    given.no_inference()
+    check_integer(_OP, "degree", degree, 1, 4)
     run = backends.resolve(_OP, backend=backend, device=directions.device, dtype=directions.dtype)
     encoded: Tensor = run(directions, degree)
     return encoded

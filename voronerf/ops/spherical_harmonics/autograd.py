@@ -1,44 +1,23 @@
-"""Autograd of ``spherical_harmonics``, shared by native and Warp, and its further derivatives by the reference."""
+"""What native and Warp share of ``spherical_harmonics``: its arguments, and its derivatives."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from voronerf.derivatives import aliases, second_derivatives
+from voronerf.custom_op import Op
+from voronerf.derivatives import register_derivatives
 from voronerf.ops.spherical_harmonics.reference import spherical_harmonics
 
 
-def harmonics_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    """Keeps directions and degree."""
-    directions, ctx.degree = inputs
-    ctx.save_for_backward(directions)
+class Harmonics(NamedTuple):
+    """The arguments, in float32."""
+
+    directions: Tensor
+    degree: int
 
 
-def harmonics_gradient(backward: Callable[..., Tensor]) -> Callable[..., tuple[Tensor, None]]:
-    """Backward of spherical_harmonics by a backend's op, which takes the gradient, the directions and the degree."""
-
-    def run(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (directions,) = ctx.saved_tensors
-        return backward(gradient, directions, ctx.degree), None
-
-    return run
-
-
-def harmonics_backward_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    """Keeps the arguments of the backward op."""
-    gradient, directions, ctx.degree = inputs
-    ctx.save_for_backward(gradient, directions)
-
-
-def harmonics_backward_backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-    """Derivative of the gradient of spherical_harmonics."""
-    leaves, graph = aliases(ctx.saved_tensors)
-    with torch.enable_grad():
-        gradient, directions = leaves
-        assert directions is not None
-        out = spherical_harmonics(directions, ctx.degree)
-        return (*second_derivatives([(out, gradient)], [(directions, cotangent)], leaves, graph), None)
+def register(forward: Op, backward: Op) -> None:
+    """Registers the derivatives of two ops."""
+    register_derivatives(forward, backward, spherical_harmonics, ("directions",))

@@ -6,42 +6,39 @@ formula.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from torch import Tensor
 
 from voronerf import native
-from voronerf.native.custom_op import custom_op, on_huge_pages
-from voronerf.ops.spherical_harmonics.autograd import (
-    harmonics_backward_backward,
-    harmonics_backward_setup,
-    harmonics_gradient,
-    harmonics_setup,
-)
+from voronerf.custom_op import custom_op, in_float32
+from voronerf.derivatives import OfOne
+from voronerf.ops.spherical_harmonics.autograd import Harmonics, register
 
 
 def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     """Bands 0 to degree - 1; see ``voronerf.ops.spherical_harmonics``."""
-    encoded: Tensor = _forward(directions.float(), degree)
-    return encoded.to(directions.dtype)
+    encoded: Tensor = in_float32(_forward, Harmonics(directions, degree))
+    return encoded
 
 
 @custom_op("spherical_harmonics_native")
-def _forward(directions: Tensor, degree: int) -> Iterator[Tensor]:
-    n = directions.shape[0]
-    out = directions.new_empty(n, degree**2)
+def _forward(given: Harmonics) -> Iterator[Tensor]:
+    directions, degree = given
+    out = directions.new_empty(directions.shape[0], degree**2)
     yield out
-    on_huge_pages(out)
-    native.compiled.spherical_harmonics(directions, out, n, degree, native.machine(directions))
+    native.on_huge_pages(out)
+    native.compiled.spherical_harmonics(directions, out, directions.shape[0], degree, native.machine(out))
 
 
 @custom_op("spherical_harmonics_native_backward")
-def _backward(gradient: Tensor, directions: Tensor, degree: int) -> Iterator[Tensor]:
-    n = directions.shape[0]
-    found = directions.new_empty(n, 3)
-    yield found
-    native.compiled.spherical_harmonics_backward(directions, gradient, found, n, degree, native.machine(directions))
+def _backward(arriving: OfOne, given: Harmonics, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
+    directions, degree = given
+    found = directions.new_empty(directions.shape)
+    yield [found]
+    assert arriving.result is not None
+    inputs = directions, arriving.result, found, directions.shape[0], degree
+    native.compiled.spherical_harmonics_backward(*inputs, native.machine(found))
 
 
-_forward.register_autograd(harmonics_gradient(_backward), setup_context=harmonics_setup)
-_backward.register_autograd(harmonics_backward_backward, setup_context=harmonics_backward_setup)
+register(_forward, _backward)

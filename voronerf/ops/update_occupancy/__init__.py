@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_number, check_same_device, check_shape
+from voronerf.checks import INDEX, Checked, check_count, check_number
 
 _OP = backends.declare(
     "update_occupancy",
@@ -50,20 +50,15 @@ def update_occupancy(
         >>> density.flatten(), occupied.flatten()
         (tensor([9., 2., 4.]), tensor([ True, False,  True]))
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "density", density, ("x", "y", "z"), sizes)
-    check_shape(_OP, "cells", cells, ("q",), sizes)
-    check_shape(_OP, "values", values, ("q",), sizes)
-    check_dtype(_OP, "density", density, (torch.float32,))
-    check_dtype(_OP, "cells", cells, INDEX)
-    check_dtype(_OP, "values", values, (torch.float32,))
-    check_same_device(_OP, density=density, cells=cells, values=values)
+    given = Checked(_OP)
+    given.tensor("density", density, (torch.float32,), "x", "y", "z")
+    given.tensor("cells", cells, INDEX, "q")
+    given.tensor("values", values, (torch.float32,), "q")
     check_count(_OP, "density", density.numel())
-    check_count(_OP, "cells", cells.numel())
     check_number(_OP, "decay", decay)
     check_number(_OP, "threshold", threshold)
     if not 0 <= decay <= 1:
         raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
     run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)
-    remembered, occupied = run(density.detach(), cells, values.detach(), decay=float(decay), threshold=float(threshold))
+    remembered, occupied = run(density.detach(), cells, values.detach(), float(decay), float(threshold))
     return remembered, occupied

@@ -9,21 +9,14 @@ from torch import Tensor
 
 from voronerf import native
 from voronerf.checks import check_range
-from voronerf.native.custom_op import custom_op
-
-
-def update_occupancy(
-    density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
-) -> tuple[Tensor, Tensor]:
-    """The larger of the density found and the decayed old one; see ``voronerf.ops.update_occupancy``."""
-    remembered, occupied = _update(density, cells, values, decay, threshold)
-    return remembered, occupied
+from voronerf.custom_op import custom_op
 
 
 @custom_op("update_occupancy_native")
-def _update(
+def update_occupancy(
     density: Tensor, cells: Tensor, values: Tensor, decay: float, threshold: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
+    """The larger of the density found and the decayed old one; see ``voronerf.ops.update_occupancy``."""
     remembered, occupied = density.new_empty(density.shape), density.new_empty(density.shape, dtype=torch.bool)
     yield remembered, occupied
     n, q = density.numel(), cells.shape[0]

@@ -10,7 +10,7 @@ from voronerf.checks import check_range
 
 @torch.no_grad()
 def update_occupancy(
-    density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
+    density: Tensor, cells: Tensor, values: Tensor, decay: float, threshold: float
 ) -> tuple[Tensor, Tensor]:
     """The larger of the density found and the decayed old one; see ``voronerf.ops.update_occupancy``."""
     check_range("update_occupancy", "cells", cells, density.numel())

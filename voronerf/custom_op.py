@@ -1,4 +1,5 @@
-"""One declaration of an op of the compiled module: its custom op, its fake and its direct call, from one function."""
+"""One declaration of an op of the compiled module or of Warp: its custom op, its fake and its direct call, from one
+function."""
 
 from __future__ import annotations
 
@@ -11,18 +12,14 @@ import torch
 from torch import Tensor
 from torch.library import CustomOpDef
 
-from voronerf import native
-
 # torch has no public names for these questions; without an answer the custom op is called.
 _LISTENERS = [
-    getattr(torch._C, name, lambda: True)
-    for name in ("_len_torch_function_stack", "_len_torch_dispatch_stack", "_are_functorch_transforms_active")
+    getattr(torch._C, "_len_torch_function_stack", lambda: True),
+    getattr(torch._C, "_len_torch_dispatch_stack", lambda: True),
+    getattr(torch._C, "_are_functorch_transforms_active", lambda: True),
+    getattr(torch.autograd, "_profiler_enabled", lambda: True),
 ]
 _PLAIN = (Tensor, torch.nn.Parameter)
-_PROFILES = getattr(torch.autograd, "_profiler_enabled", lambda: True)
-
-# Results of at least this many bytes are put on huge pages; for smaller ones the allocator usually has warm memory.
-_LARGE = 1 << 22
 
 
 def custom_op(
@@ -68,24 +65,38 @@ def custom_op(
         schema = torch.library.infer_schema(flat, mutates_args=())
         op = torch.library.custom_op(f"voronerf::{name}", flat, mutates_args=(), device_types=devices, schema=schema)
         op.register_fake(fake or (lambda *arguments: next(steps(*structs.packed(arguments)))))
-        return Op(op, run, devices, structs, listed=typing.get_origin(results) is list)
+        made = Op(op, run, devices, structs, listed=typing.get_origin(results) is list)
+        made.__module__, made.__name__, made.__doc__ = steps.__module__, steps.__name__, steps.__doc__
+        return made
 
     return declare
 
 
 class Structs:
-    """The arguments of a function of which some are named tuples, and those of its custom op, which knows none."""
+    """The arguments of a function of which some are named tuples, and those of its custom op, which knows none.
+
+    Attributes:
+        kinds: the named tuple of each argument, None for others.
+        tensors: places of the arguments of the custom op that are tensors, or None.
+        lists: of those that are lists of them.
+    """
 
     def __init__(self, signature: inspect.Signature) -> None:
         self._parameters = list(signature.parameters.values())
-        self._kinds = [kind if hasattr(kind := given.annotation, "_fields") else None for given in self._parameters]
-        self._widths = [1 if kind is None else len(kind._fields) for kind in self._kinds]
-        self._any = any(kind is not None for kind in self._kinds)
+        self.kinds = [kind if hasattr(kind := given.annotation, "_fields") else None for given in self._parameters]
+        self._widths = [1 if kind is None else len(kind._fields) for kind in self.kinds]
+        self._any = any(kind is not None for kind in self.kinds)
+        self._alone = self._any and len(self.kinds) == 1
+        hints = [given.annotation for given in self.flat_signature(None).parameters.values()]
+        kinds = (Tensor, Tensor | None)
+        self.tensors = [place for place, hint in enumerate(hints) if hint in kinds]
+        self.lists = [place for place, hint in enumerate(hints) if any(of in kinds for of in typing.get_args(hint))]
+        self.lists = [place for place in self.lists if place not in self.tensors]
 
     def flat_signature(self, results: Any) -> inspect.Signature:
         """The signature with the fields of named tuples in their place."""
         found = []
-        for given, kind in zip(self._parameters, self._kinds):
+        for given, kind in zip(self._parameters, self.kinds):
             hints = {given.name: given.annotation} if kind is None else typing.get_type_hints(kind)
             found += [inspect.Parameter(name, given.kind, annotation=hint) for name, hint in hints.items()]
         return inspect.Signature(found, return_annotation=results)
@@ -94,18 +105,20 @@ class Structs:
         """The arguments of the function."""
         if not self._any:
             return flat
+        if self._alone:
+            return (self.kinds[0]._make(flat),)  # type: ignore[union-attr]
         found, at = [], 0
-        for kind, width in zip(self._kinds, self._widths):
+        for kind, width in zip(self.kinds, self._widths):
             found.append(flat[at] if kind is None else kind._make(flat[at : at + width]))
             at += width
         return found
 
     def flat(self, packed: Sequence[Any]) -> Sequence[Any]:
         """The arguments of the custom op."""
-        if not self._any:
-            return packed
+        if not self._any or self._alone:
+            return packed[0] if self._alone else packed
         found: list[Any] = []
-        for given, kind in zip(packed, self._kinds):
+        for given, kind in zip(packed, self.kinds):
             if kind is None:
                 found.append(given)
             else:
@@ -124,18 +137,21 @@ class Op:
     def __init__(
         self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], structs: Structs, listed: bool
     ) -> None:
-        self._op, self._run, self._devices, self._structs, self._listed = op, run, devices, structs, listed
+        self._op, self._run, self._devices, self.structs, self._listed = op, run, devices, structs, listed
         self._function: Any = None
+        self.__name__ = ""
 
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
-        flat = self._structs.flat(arguments)
-        if torch.compiler.is_compiling() or _PROFILES() or any(listens() for listens in _LISTENERS):
+        flat = self.structs.flat(arguments)
+        if torch.compiler.is_compiling():
             return self._op(*flat)
-        tensors = [argument for argument in flat if isinstance(argument, Tensor)]
-        for argument in flat:
-            if isinstance(argument, (list, tuple)):
-                tensors += [entry for entry in argument if isinstance(entry, Tensor)]
+        for listens in _LISTENERS:
+            if listens():
+                return self._op(*flat)
+        tensors = [flat[place] for place in self.structs.tensors if flat[place] is not None]
+        for place in self.structs.lists:
+            tensors += [entry for entry in flat[place] if entry is not None]
         for tensor in tensors:
             if type(tensor) not in _PLAIN or tensor.device.type not in self._devices:
                 return self._op(*flat)
@@ -143,7 +159,7 @@ class Op:
             return self._run(*arguments)
         if self._function is None:
             return self._op(*flat)
-        entries, lengths = _flattened(flat)
+        entries, lengths = _flattened(flat) if self.structs.lists else (flat, None)
         results = self._function.apply(*entries, lengths)
         return list(results) if self._listed else results
 
@@ -153,7 +169,7 @@ class Op:
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
         """The op's backward, as of ``torch.library.custom_op``; inputs and gradients are packed like the arguments."""
-        structs = self._structs
+        structs = self.structs
 
         def setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
             setup_context(ctx, structs.packed(inputs), output)
@@ -166,13 +182,15 @@ class Op:
 
         def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
             *given, lengths = flat
-            arguments, ctx.lengths = structs.packed(_nested(given, lengths)), lengths
+            arguments, ctx.lengths = structs.packed(_nested(given, lengths) if lengths else given), lengths
             result = self._run(*arguments)
             setup_context(ctx, arguments, result)
             return tuple(result) if self._listed else result  # autograd.Function knows no lists
 
         def gradients(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
             found = unpacked(ctx, of_results) if self._listed else unpacked(ctx, *of_results)
+            if ctx.lengths is None:
+                return (*found, None)
             lists = zip(found, ctx.lengths, strict=True)
             return (*_flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0], None)
 
@@ -200,7 +218,18 @@ def _nested(flat: list[Any], lengths: list[int]) -> tuple[Any, ...]:
     return tuple(next(entries) if n < 0 else [next(entries) for _ in range(n)] for n in lengths)
 
 
-def on_huge_pages(result: Tensor) -> None:
-    """Asks for huge pages for a result that has just been allocated, where it is large and the system gives them."""
-    if result.nbytes >= _LARGE and result.device.type == "cpu":
-        native.compiled.advise_huge_pages(result, result.nbytes)
+def in_float32(op: Op, given: tuple[Any, ...]) -> Any:
+    """What an op gives that computes in float32, in the dtype of the tensors it is given.
+
+    Args:
+        op: of floating-point tensors of one dtype; its results are a tensor or a tuple of them.
+        given: its arguments or, as a named tuple, its only one.
+    """
+    narrow = next(part.dtype for part in given if isinstance(part, Tensor) and part.is_floating_point())
+    if narrow is not torch.float32:
+        wide = [part.float() if isinstance(part, Tensor) and part.is_floating_point() else part for part in given]
+        given = type(given)._make(wide) if hasattr(given, "_make") else tuple(wide)
+    found = op(given) if hasattr(given, "_make") else op(*given)
+    if narrow is torch.float32:
+        return found
+    return found.to(narrow) if isinstance(found, Tensor) else tuple(part.to(narrow) for part in found)

@@ -1,0 +1,5 @@
+"""What reading a scene raises."""
+
+
+class SceneError(ValueError):
+    """The data of a scene cannot be used. The message is one line and names the file."""
