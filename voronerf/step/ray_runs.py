@@ -60,7 +60,7 @@ class Territory:
 
 @dataclass
 class Map:
-    """What all ranks know of all territories, 152 bytes of each.
+    """What all ranks know of all territories, 280 bytes of each.
 
     Attributes:
         bounds: [T, 2, 3], around what is not empty.
