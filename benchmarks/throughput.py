@@ -46,14 +46,14 @@ from ops.targets import architecture_lines, target_lines
 from voronerf import backends
 from voronerf.files import write_text
 
-OPTIONAL = {"scipy": "scipy", "faiss": "faiss-cpu", "jax": "jax", "pykeops": "pykeops", "warp": "warp-lang"}
+OPTIONAL = {"scipy": "scipy", "faiss": "faiss-cpu", "warp": "warp-lang"}
 """Packages that are used where they are installed, and what to install."""
 LIMITS = {"ours": 0.8, "alternative": 0.5}
 QUICK_LIMITS = {"ours": 0.3, "alternative": 0.15}
 """Seconds of timings of one contender, at three timings or more: see ``harness.measure``."""
 DISTURBED = 0.1
 """Cores that other processes may keep busy before a row's timings are reported as disturbed."""
-SLOW = ("compile", "jax", "F.grouped_mm")
+SLOW = ("compile", "F.grouped_mm")
 """Parts of the names of alternatives that take seconds to compile or to run, which --quick leaves out."""
 
 

@@ -23,6 +23,13 @@ def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float3
     return wp.from_torch(tensor.detach().resolve_neg())  # which torch leaves to ops that take lists
 
 
+def filled(struct: Any, **fields: Any) -> Any:
+    """A struct with values in these fields: views of tensors, or numbers."""
+    for name, value in fields.items():
+        setattr(struct, name, array(value, value) if isinstance(value, Tensor) else value)
+    return struct
+
+
 def of_both_dtypes(kernel: Any) -> None:
     """Has a kernel of points, centres and weights compiled for float32 and float64 when its file is."""
     for scalar in (wp.float32, wp.float64):

@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.custom_op import custom_op
-from voronerf.kernels._launch import array, launch
+from voronerf.kernels._launch import filled, launch
 from voronerf.ops.camera_rays.reference import FISHEYE, FOV, NEWTON_STEPS, PERSPECTIVE, TINY
 
 wp.set_module_options({"enable_backward": False})
@@ -22,36 +22,50 @@ _PERSPECTIVE, _FISHEYE, _FOV = wp.constant(PERSPECTIVE), wp.constant(FISHEYE), w
 _TINY = wp.constant(TINY)
 
 
+@wp.struct
+class Pixels:
+    """Places in images, and the cameras that took them."""
+
+    poses: wp.array3d(dtype=wp.float32)
+    intrinsics: wp.array2d(dtype=wp.float32)
+    x: wp.array(dtype=wp.float32)
+    y: wp.array(dtype=wp.float32)
+    camera: wp.array(dtype=wp.int32)
+    several: wp.bool
+    distortion: wp.array2d(dtype=wp.float32)
+    distorted: wp.bool
+    models: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Rays:
+    """Results."""
+
+    origins: wp.array2d(dtype=wp.float32)
+    directions: wp.array2d(dtype=wp.float32)
+
+
 @wp.kernel
 def _camera_rays_kernel(
-    poses: wp.array3d(dtype=wp.float32),
-    intrinsics: wp.array2d(dtype=wp.float32),
-    x: wp.array(dtype=wp.float32),
-    y: wp.array(dtype=wp.float32),
-    camera: wp.array(dtype=wp.int32),
-    several: wp.bool,
-    distortion: wp.array2d(dtype=wp.float32),
-    distorted: wp.bool,
-    models: wp.array(dtype=wp.int32),
-    origins: wp.array2d(dtype=wp.float32),
-    directions: wp.array2d(dtype=wp.float32),
+    given: Pixels,
+    rays: Rays,
 ) -> None:
     i = wp.tid()
     c = wp.int32(0)
-    if several:
-        c = wp.clamp(camera[i], 0, poses.shape[0] - 1)
-    u = (wp.float64(x[i]) - wp.float64(intrinsics[c, 2])) / wp.float64(intrinsics[c, 0])
-    v = (wp.float64(y[i]) - wp.float64(intrinsics[c, 3])) / wp.float64(intrinsics[c, 1])
+    if given.several:
+        c = wp.clamp(given.camera[i], 0, given.poses.shape[0] - 1)
+    u = (wp.float64(given.x[i]) - wp.float64(given.intrinsics[c, 2])) / wp.float64(given.intrinsics[c, 0])
+    v = (wp.float64(given.y[i]) - wp.float64(given.intrinsics[c, 3])) / wp.float64(given.intrinsics[c, 1])
     ahead = wp.float64(1.0)
-    if distorted:
-        k1 = wp.float64(distortion[c, 0])
-        k2 = wp.float64(distortion[c, 1])
-        p1 = wp.float64(distortion[c, 2])
-        p2 = wp.float64(distortion[c, 3])
-        k3 = wp.float64(distortion[c, 4])
-        k4 = wp.float64(distortion[c, 5])
-        k5 = wp.float64(distortion[c, 6])
-        k6 = wp.float64(distortion[c, 7])
+    if given.distorted:
+        k1 = wp.float64(given.distortion[c, 0])
+        k2 = wp.float64(given.distortion[c, 1])
+        p1 = wp.float64(given.distortion[c, 2])
+        p2 = wp.float64(given.distortion[c, 3])
+        k3 = wp.float64(given.distortion[c, 4])
+        k4 = wp.float64(given.distortion[c, 5])
+        k5 = wp.float64(given.distortion[c, 6])
+        k6 = wp.float64(given.distortion[c, 7])
         nothing = wp.float64(0.0)
         s1 = nothing
         s2 = nothing
@@ -62,8 +76,8 @@ def _camera_rays_kernel(
         four = wp.float64(4.0)
         six = wp.float64(6.0)
         model = wp.int32(_PERSPECTIVE)
-        if models.shape[0] > 0:
-            model = models[c]
+        if given.models.shape[0] > 0:
+            model = given.models[c]
         if model == _FOV:
             radius = wp.max(wp.sqrt(u * u + v * v), wp.float64(_TINY))
             if k1 != nothing:
@@ -115,11 +129,13 @@ def _camera_rays_kernel(
     along = wp.vec3(wp.float32(u), -wp.float32(v), -wp.float32(ahead))
     direction = wp.vec3(0.0, 0.0, 0.0)
     for axis in range(3):
-        direction[axis] = poses[c, axis, 0] * along[0] + poses[c, axis, 1] * along[1] + poses[c, axis, 2] * along[2]
-        origins[i, axis] = poses[c, axis, 3]
+        direction[axis] = (
+            given.poses[c, axis, 0] * along[0] + given.poses[c, axis, 1] * along[1] + given.poses[c, axis, 2] * along[2]
+        )
+        rays.origins[i, axis] = given.poses[c, axis, 3]
     direction = direction / wp.max(wp.length(direction), 1.0e-12)
     for axis in range(3):
-        directions[i, axis] = direction[axis]
+        rays.directions[i, axis] = direction[axis]
 
 
 @custom_op("camera_rays_warp")
@@ -135,9 +151,9 @@ def camera_rays(
     """Origins and unit directions; see ``voronerf.ops.camera_rays``."""
     origins, directions = poses.new_empty(x.shape[0], 3), poses.new_empty(x.shape[0], 3)
     yield origins, directions
-    given = [array(tensor, poses) for tensor in (poses, intrinsics, x, y)]
-    lens = array(intrinsics.new_empty(0, 8) if distortion is None else distortion, poses)
-    kinds = array(models, poses, torch.int32)
-    choice = [array(camera, poses, torch.int32), camera is not None, lens, distortion is not None, kinds]
-    inputs = [*given, *choice, array(origins, poses), array(directions, poses)]
-    launch(_camera_rays_kernel, x.shape[0], inputs, poses)
+    none = x.new_empty(0, dtype=torch.int32)
+    cameras = {"poses": poses, "intrinsics": intrinsics, "models": none if models is None else models}
+    lens = intrinsics.new_empty(0, 8) if distortion is None else distortion
+    given = filled(Pixels(), x=x, y=y, camera=none if camera is None else camera, several=camera is not None, **cameras)
+    filled(given, distortion=lens, distorted=distortion is not None)
+    launch(_camera_rays_kernel, x.shape[0], [given, filled(Rays(), origins=origins, directions=directions)], poses)

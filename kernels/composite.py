@@ -19,7 +19,7 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.custom_op import custom_op, in_float32
-from voronerf.kernels._launch import array, launch
+from voronerf.kernels._launch import filled, launch
 from voronerf.ops.composite.autograd import Arriving, RaySamples, register
 
 wp.set_module_options({"enable_backward": False})
@@ -49,107 +49,118 @@ def _absorbed(optical: wp.float32) -> wp.float32:
     return absorbed
 
 
+@wp.struct
+class Samples:
+    """Samples of rays, numbered through all rays; dense ones, s of each ray, unless packed."""
+
+    sigma: wp.array(dtype=wp.float32)
+    rgb: wp.array2d(dtype=wp.float32)
+    depths: wp.array(dtype=wp.float32)
+    deltas: wp.array(dtype=wp.float32)
+    offsets: wp.array(dtype=wp.int32)
+    packed: wp.bool
+    s: wp.int32
+    background: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class Results:
+    """What is shown of rays, and the weights of samples; or the gradients of these."""
+
+    colour: wp.array2d(dtype=wp.float32)
+    opacity: wp.array(dtype=wp.float32)
+    depth: wp.array(dtype=wp.float32)
+    weights: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Gradients:
+    """Gradients of samples, and what each ray leaves of the light."""
+
+    sigma: wp.array(dtype=wp.float32)
+    rgb: wp.array2d(dtype=wp.float32)
+    depths: wp.array(dtype=wp.float32)
+    deltas: wp.array(dtype=wp.float32)
+    left: wp.array(dtype=wp.float32)
+
+
 @wp.func
-def _bound(offsets: wp.array(dtype=wp.int32), ray: wp.int32, packed: wp.bool, s: wp.int32, m: wp.int32) -> wp.int32:
+def _bound(given: Samples, ray: wp.int32) -> wp.int32:
     """First sample of a ray; never out of range, whatever the offsets say."""
-    bound = ray * s
-    if packed:
-        bound = wp.clamp(offsets[ray], 0, m)
+    bound = ray * given.s
+    if given.packed:
+        bound = wp.clamp(given.offsets[ray], 0, given.sigma.shape[0])
     return bound
 
 
 @wp.kernel
 def _composite_kernel(
-    sigma: wp.array(dtype=wp.float32),
-    rgb: wp.array2d(dtype=wp.float32),
-    depths: wp.array(dtype=wp.float32),
-    deltas: wp.array(dtype=wp.float32),
-    offsets: wp.array(dtype=wp.int32),
-    packed: wp.bool,
-    s: wp.int32,
-    background: wp.array2d(dtype=wp.float32),
-    colour: wp.array2d(dtype=wp.float32),
-    opacity: wp.array(dtype=wp.float32),
-    depth: wp.array(dtype=wp.float32),
-    weights: wp.array(dtype=wp.float32),
+    given: Samples,
+    found: Results,
 ) -> None:
     ray = wp.tid()
-    begin = _bound(offsets, ray, packed, s, sigma.shape[0])
-    end = _bound(offsets, ray + 1, packed, s, sigma.shape[0])
+    begin = _bound(given, ray)
+    end = _bound(given, ray + 1)
     front = wp.float64(0.0)
     total = wp.float32(0.0)
     distance = wp.float32(0.0)
     for i in range(begin, end):
-        optical = _density(sigma[i]) * deltas[i]
+        optical = _density(given.sigma[i]) * given.deltas[i]
         weight = wp.exp(-wp.float32(front)) * _absorbed(optical)
         front += wp.float64(optical)
-        weights[i] = weight
+        found.weights[i] = weight
         total += weight
-        distance += weight * depths[i]
-    opacity[ray] = total
-    depth[ray] = distance
+        distance += weight * given.depths[i]
+    found.opacity[ray] = total
+    found.depth[ray] = distance
     left = wp.exp(-wp.float32(front))
-    for k in range(rgb.shape[1]):
+    for k in range(given.rgb.shape[1]):
         channel = wp.float32(0.0)
         for i in range(begin, end):
-            channel += weights[i] * rgb[i, k]
-        if background.shape[0] > 0:
-            channel += left * background[ray, k]
-        colour[ray, k] = channel
+            channel += found.weights[i] * given.rgb[i, k]
+        if given.background.shape[0] > 0:
+            channel += left * given.background[ray, k]
+        found.colour[ray, k] = channel
 
 
 @wp.kernel
 def _composite_backward_kernel(
-    to_colour: wp.array2d(dtype=wp.float32),
-    to_opacity: wp.array(dtype=wp.float32),
-    to_depth: wp.array(dtype=wp.float32),
-    to_weights: wp.array(dtype=wp.float32),
-    sigma: wp.array(dtype=wp.float32),
-    rgb: wp.array2d(dtype=wp.float32),
-    depths: wp.array(dtype=wp.float32),
-    deltas: wp.array(dtype=wp.float32),
-    offsets: wp.array(dtype=wp.int32),
-    packed: wp.bool,
-    s: wp.int32,
-    background: wp.array2d(dtype=wp.float32),
-    grad_sigma: wp.array(dtype=wp.float32),
-    grad_rgb: wp.array2d(dtype=wp.float32),
-    grad_depths: wp.array(dtype=wp.float32),
-    grad_deltas: wp.array(dtype=wp.float32),
-    left: wp.array(dtype=wp.float32),
+    arriving: Results,
+    given: Samples,
+    found: Gradients,
 ) -> None:
     ray = wp.tid()
-    begin = _bound(offsets, ray, packed, s, sigma.shape[0])
-    end = _bound(offsets, ray + 1, packed, s, sigma.shape[0])
+    begin = _bound(given, ray)
+    end = _bound(given, ray + 1)
     front = wp.float64(0.0)
     for i in range(begin, end):
-        grad_sigma[i] = wp.float32(front)
-        front += wp.float64(_density(sigma[i]) * deltas[i])
-    left[ray] = wp.exp(-wp.float32(front))
+        found.sigma[i] = wp.float32(front)
+        front += wp.float64(_density(given.sigma[i]) * given.deltas[i])
+    found.left[ray] = wp.exp(-wp.float32(front))
     # Of the gradient to each weight, what is the same for all samples of the ray; and what is behind, the background.
-    common = to_opacity[ray]
+    common = arriving.opacity[ray]
     behind = wp.float32(0.0)
-    if background.shape[0] > 0:
-        for k in range(rgb.shape[1]):
-            behind += left[ray] * to_colour[ray, k] * background[ray, k]
+    if given.background.shape[0] > 0:
+        for k in range(given.rgb.shape[1]):
+            behind += found.left[ray] * arriving.colour[ray, k] * given.background[ray, k]
     for reverse in range(end - begin):
         i = end - 1 - reverse
-        density = _density(sigma[i])
-        optical = density * deltas[i]
-        ahead = grad_sigma[i]
+        density = _density(given.sigma[i])
+        optical = density * given.deltas[i]
+        ahead = found.sigma[i]
         weight = wp.exp(-ahead) * _absorbed(optical)
-        gradient = common + to_depth[ray] * depths[i] + to_weights[i]
-        for k in range(rgb.shape[1]):
-            gradient += to_colour[ray, k] * rgb[i, k]
-            grad_rgb[i, k] = weight * to_colour[ray, k]
-        grad_depths[i] = weight * to_depth[ray]
+        gradient = common + arriving.depth[ray] * given.depths[i] + arriving.weights[i]
+        for k in range(given.rgb.shape[1]):
+            gradient += arriving.colour[ray, k] * given.rgb[i, k]
+            found.rgb[i, k] = weight * arriving.colour[ray, k]
+        found.depths[i] = weight * arriving.depth[ray]
         to_optical = gradient * wp.exp(-(ahead + optical)) - behind
         behind += gradient * weight
-        grad_deltas[i] = to_optical * density
-        if sigma[i] > _OPAQUE:
-            grad_sigma[i] = 0.0
+        found.deltas[i] = to_optical * density
+        if given.sigma[i] > _OPAQUE:
+            found.sigma[i] = 0.0
         else:
-            grad_sigma[i] = to_optical * deltas[i]
+            found.sigma[i] = to_optical * given.deltas[i]
 
 
 def composite(*given: Tensor | None) -> Any:
@@ -163,8 +174,8 @@ def _forward(given: RaySamples) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor
     yield results
     # Samples that belong to no ray.
     weights.zero_()
-    outputs = [array(tensor, colour) for tensor in (colour, opacity, depth, weights.view(-1))]
-    launch(_composite_kernel, given.rays, [*_inputs(given), *outputs], colour)
+    outputs = filled(Results(), colour=colour, opacity=opacity, depth=depth, weights=weights.view(-1))
+    launch(_composite_kernel, given.rays, [_inputs(given), outputs], colour)
 
 
 @custom_op("composite_warp_backward")
@@ -180,26 +191,32 @@ def _backward(arriving: Arriving, given: RaySamples, wanted: Sequence[bool]) -> 
     for result in to_samples:
         result.zero_()
     to_sigma, to_rgb, to_depths, to_deltas = to_samples
-    flat = to_sigma.view(-1), to_rgb.view(-1, rgb.shape[-1]), to_depths.view(-1), to_deltas.view(-1), left
-    gradients = [array(tensor, sigma) for tensor in (colour, opacity, depth, weights.reshape(-1))]
-    outputs = [array(tensor, sigma) for tensor in flat]
-    launch(_composite_backward_kernel, given.rays, [*gradients, *_inputs(given), *outputs], sigma)
+    arrived = filled(Results(), colour=colour, opacity=opacity, depth=depth, weights=weights.reshape(-1))
+    found = filled(Gradients(), sigma=to_sigma.view(-1), rgb=to_rgb.view(-1, rgb.shape[-1]), left=left)
+    filled(found, depths=to_depths.view(-1), deltas=to_deltas.view(-1))
+    launch(_composite_backward_kernel, given.rays, [arrived, _inputs(given), found], sigma)
     if to_background.numel():
         seen = colour * left[:, None]
         to_background.copy_(seen if to_background.dim() == 2 else seen.sum(dim=0, dtype=torch.float64))
 
 
-def _inputs(given: RaySamples) -> list[Any]:
-    """The inputs of both kernels, in their order. Samples are numbered through all rays."""
-    sigma, rgb, ray_offsets, rays = given.sigma, given.rgb, given.ray_offsets, given.rays
-    flat = [sigma.reshape(-1), rgb.reshape(sigma.numel(), rgb.shape[-1])]
-    flat += [given.depths.reshape(-1), given.deltas.reshape(-1)]
+def _inputs(given: RaySamples) -> Any:
+    """The inputs of both kernels. Samples are numbered through all rays."""
+    sigma, rgb, offsets, rays = given.sigma, given.rgb, given.ray_offsets, given.rays
     behind = rgb.new_empty(0, rgb.shape[-1])
     if given.background is not None:
         behind = given.background.expand(rays, rgb.shape[-1])
-    views, offsets = [array(tensor, sigma) for tensor in flat], array(ray_offsets, sigma, torch.int32)
-    s = 0 if ray_offsets is not None else sigma.shape[1]
-    return [*views, offsets, ray_offsets is not None, s, array(behind, sigma)]
+    return filled(
+        Samples(),
+        sigma=sigma.reshape(-1),
+        rgb=rgb.reshape(sigma.numel(), rgb.shape[-1]),
+        depths=given.depths.reshape(-1),
+        deltas=given.deltas.reshape(-1),
+        offsets=sigma.new_empty(0, dtype=torch.int32) if offsets is None else offsets,
+        packed=offsets is not None,
+        s=0 if offsets is not None else sigma.shape[1],
+        background=behind,
+    )
 
 
 register(_forward, _backward)

@@ -8,6 +8,7 @@ on its own (``fuse_fp`` off): a sample falls in the same cell.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 import warp as wp
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from voronerf.checks import MAX_COUNT
 from voronerf.custom_op import custom_op
-from voronerf.kernels._launch import array, launch
+from voronerf.kernels._launch import array, filled, launch
 from voronerf.ops.march_rays.reference import March, Rays
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -115,88 +116,102 @@ def _cell(point: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) 
     return cell
 
 
+@wp.struct
+class Given:
+    """Rays and a grid; ``space`` is [0, 0] for the world's own, [1, 4] or [5, 3]."""
+
+    origins: wp.array2d(dtype=wp.float32)
+    directions: wp.array2d(dtype=wp.float32)
+    near: wp.array(dtype=wp.float32)
+    far: wp.array(dtype=wp.float32)
+    occupied: wp.array3d(dtype=wp.uint8)
+    box: wp.array2d(dtype=wp.float32)
+    uniforms: wp.array2d(dtype=wp.float32)
+    jittered: wp.bool
+    seed: wp.array(dtype=wp.int32)
+    hashed: wp.bool
+    start: wp.array(dtype=wp.int32)
+    started: wp.bool
+    space: wp.array2d(dtype=wp.float32)
+    samples: wp.int32
+    disparity: wp.bool
+    most: wp.int32
+
+
+@wp.struct
+class Samples:
+    """Numbers of samples of the rays, or the samples."""
+
+    counts: wp.array(dtype=wp.int32)
+    ray_index: wp.array(dtype=wp.int32)
+    depths: wp.array(dtype=wp.float32)
+    deltas: wp.array(dtype=wp.float32)
+    positions: wp.array2d(dtype=wp.float32)
+    stop: wp.array(dtype=wp.int32)
+
+
 @wp.kernel
 def _march_kernel(
-    origins: wp.array2d(dtype=wp.float32),
-    directions: wp.array2d(dtype=wp.float32),
-    near: wp.array(dtype=wp.float32),
-    far: wp.array(dtype=wp.float32),
-    occupied: wp.array3d(dtype=wp.uint8),
-    box: wp.array2d(dtype=wp.float32),
-    uniforms: wp.array2d(dtype=wp.float32),
-    jittered: wp.bool,
-    seed: wp.array(dtype=wp.int32),
-    hashed: wp.bool,
-    start: wp.array(dtype=wp.int32),
-    started: wp.bool,
-    space: wp.array2d(dtype=wp.float32),
-    samples: wp.int32,
-    disparity: wp.bool,
-    most: wp.int32,
+    given: Given,
     counting: wp.bool,
     offsets: wp.array(dtype=wp.int32),
-    counts: wp.array(dtype=wp.int32),
-    ray_index: wp.array(dtype=wp.int32),
-    depths: wp.array(dtype=wp.float32),
-    deltas: wp.array(dtype=wp.float32),
-    positions: wp.array2d(dtype=wp.float32),
-    stop: wp.array(dtype=wp.int32),
+    out: Samples,
 ) -> None:
     ray = wp.tid()
-    origin = wp.vec3(origins[ray, 0], origins[ray, 1], origins[ray, 2])
-    direction = wp.vec3(directions[ray, 0], directions[ray, 1], directions[ray, 2])
-    begin = near[ray]
-    end = far[ray]
+    origin = wp.vec3(given.origins[ray, 0], given.origins[ray, 1], given.origins[ray, 2])
+    direction = wp.vec3(given.directions[ray, 0], given.directions[ray, 1], given.directions[ray, 2])
+    begin = given.near[ray]
+    end = given.far[ray]
     stratum = wp.int32(0)
-    if started:
-        stratum = wp.max(start[ray], 0)
+    if given.started:
+        stratum = wp.max(given.start[ray], 0)
     row = wp.int32(0)
     room = wp.int32(0)
     if not counting:
         row = offsets[ray]
         room = offsets[ray + 1] - row
     key = wp.uint32(0)
-    if hashed:
-        key = _mixed(wp.uint32(seed[0]) + wp.uint32(ray))
+    if given.hashed:
+        key = _mixed(wp.uint32(given.seed[0]) + wp.uint32(ray))
     found = wp.int32(0)
-    going = end > begin and stratum < samples
+    going = end > begin and stratum < given.samples
     while going:
-        first = _edge(begin, end, stratum, samples, disparity)
-        last = _edge(begin, end, stratum + 1, samples, disparity)
+        first = _edge(begin, end, stratum, given.samples, given.disparity)
+        last = _edge(begin, end, stratum + 1, given.samples, given.disparity)
         inside = wp.float32(0.5)
-        if jittered:
-            inside = uniforms[ray, stratum]
-        if hashed:
+        if given.jittered:
+            inside = given.uniforms[ray, stratum]
+        if given.hashed:
             inside = _hashed(key, stratum)
-        at = _sample(begin, end, stratum, inside, samples, disparity, first, last)
-        point = _point(origin, direction, at, space)
-        x = _cell(point[0], box[0, 0], box[1, 0], occupied.shape[0])
-        y = _cell(point[1], box[0, 1], box[1, 1], occupied.shape[1])
-        z = _cell(point[2], box[0, 2], box[1, 2], occupied.shape[2])
+        at = _sample(begin, end, stratum, inside, given.samples, given.disparity, first, last)
+        point = _point(origin, direction, at, given.space)
+        x = _cell(point[0], given.box[0, 0], given.box[1, 0], given.occupied.shape[0])
+        y = _cell(point[1], given.box[0, 1], given.box[1, 1], given.occupied.shape[1])
+        z = _cell(point[2], given.box[0, 2], given.box[1, 2], given.occupied.shape[2])
         taken = wp.bool(False)
         if x >= 0 and y >= 0 and z >= 0:
-            taken = occupied[x, y, z] != wp.uint8(0)
+            taken = given.occupied[x, y, z] != wp.uint8(0)
         if taken and not counting:
             if found == room:
                 # The ray is cut; the next call starts here.
                 going = wp.bool(False)
             else:
-                ray_index[row + found] = ray
-                depths[row + found] = at
-                deltas[row + found] = last - first
+                out.ray_index[row + found] = ray
+                out.depths[row + found] = at
+                out.deltas[row + found] = last - first
                 for axis in range(3):
-                    positions[row + found, axis] = point[axis]
+                    out.positions[row + found, axis] = point[axis]
         if going:
             stratum += 1
             if taken:
                 found += 1
-            going = stratum < samples and found < most
+            going = stratum < given.samples and found < given.most
     if counting:
-        counts[ray] = found
+        out.counts[ray] = found
     elif end > begin:
-        stop[ray] = wp.min(stratum, samples)
+        out.stop[ray] = wp.min(stratum, given.samples)
     else:
-        stop[ray] = samples
+        out.stop[ray] = given.samples
 
 
 def march_rays(rays: Rays, capacity: int | None) -> March:
@@ -212,9 +227,9 @@ def _count(rays: Rays, capacity: int) -> Iterator[Tensor]:
     offsets = near.new_empty(r + 1, dtype=torch.int32)
     yield offsets
     counts = torch.zeros_like(offsets)
-    none, no_index = array(near[:0], near), array(counts[:0], near)
-    results = [array(counts[1:], near), no_index, none, none, array(rays.origins[:0], near), no_index]
-    launch(_march_kernel, r, [*_inputs(rays), True, no_index, *results], near)
+    out = filled(Samples(), counts=counts[1:], positions=rays.origins[:0])
+    filled(out, ray_index=counts[:0], depths=near[:0], deltas=near[:0], stop=counts[:0])
+    launch(_march_kernel, r, [_inputs(rays), True, array(counts[:0], near), out], near)
     # In int64: the number of samples of all rays may not fit int32; the capacity does.
     offsets.copy_(counts.cumsum(dim=0).clamp(max=capacity))
 
@@ -224,23 +239,25 @@ def _fill(rays: Rays, offsets: Tensor, rows: int) -> Iterator[tuple[Tensor, Tens
     near, r = rays.near, rays.near.shape[0]
     # Rays, depths, deltas and positions, 0 in rows that belong to no ray; and where the rays stop.
     index, stop = near.new_zeros(rows, dtype=torch.int32), near.new_empty(r, dtype=torch.int32)
-    results = index, near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3), stop
-    yield results
-    arrays = [array(tensor, near) for tensor in (offsets[:0], *results)]
-    launch(_march_kernel, r, [*_inputs(rays), False, array(offsets, near), *arrays], near)
+    depths, deltas, positions = near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3)
+    yield index, depths, deltas, positions, stop
+    out = filled(Samples(), counts=offsets[:0], ray_index=index, depths=depths, deltas=deltas)
+    filled(out, positions=positions, stop=stop)
+    launch(_march_kernel, r, [_inputs(rays), False, array(offsets, near), out], near)
 
 
-def _inputs(rays: Rays) -> list[object]:
-    """The inputs of both launches, in the order of the kernel."""
+def _inputs(rays: Rays) -> Any:
     near, contraction = rays.near, rays.contraction
-    places = near.new_empty(0, 0) if rays.uniforms is None else rays.uniforms
-    given = (rays.origins, rays.directions, near, rays.far, rays.occupied, rays.box, places)
-    views = [array(tensor, near) for tensor in given]
-    hashed = [array(rays.seed, near, torch.int32), rays.seed is not None]
-    first = [array(rays.start, near, torch.int32), rays.start is not None]
-    # [0, 0] for the world's own, [1, 4] or [5, 3].
-    space = near.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1])
-    return [
-        *(*views, rays.uniforms is not None, *hashed, *first),
-        *(array(space, near), rays.samples, rays.disparity, rays.most),
-    ]
+    none = near.new_empty(0, dtype=torch.int32)
+    given = filled(
+        Given(),
+        uniforms=near.new_empty(0, 0) if rays.uniforms is None else rays.uniforms,
+        jittered=rays.uniforms is not None,
+        seed=none if rays.seed is None else rays.seed,
+        hashed=rays.seed is not None,
+        start=none if rays.start is None else rays.start,
+        started=rays.start is not None,
+        space=near.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1]),
+    )
+    rest = ("origins", "directions", "near", "far", "occupied", "box", "samples", "disparity", "most")
+    return filled(given, **{name: getattr(rays, name) for name in rest})

@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.custom_op import custom_op
-from voronerf.kernels._launch import array, launch, of_both_dtypes
+from voronerf.kernels._launch import array, filled, launch, of_both_dtypes
 from voronerf.ops.centre_grid.reference import BRICK_BITS, CELL_BITS, REACH, GridTables
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -37,46 +37,53 @@ def _cell(u: wp.float64) -> wp.int32:
     return wp.clamp(wp.int32((p + wp.float64(4.0) / three) * wp.float64(0.375) * side), 0, (1 << _CELL) - 1)
 
 
+@wp.struct
+class Grid:
+    """The tables of a grid."""
+
+    frame: wp.array2d(dtype=wp.float32)
+    entries: wp.array(dtype=wp.int32)
+    lists: wp.array(dtype=wp.int32)
+    bits: wp.int32
+
+
 @wp.kernel
 def _nearest_centre_grid_kernel(
     points: wp.array2d(dtype=Any),
     centres: wp.array2d(dtype=Any),
     weights: wp.array(dtype=Any),
     weighted: wp.bool,
-    frame: wp.array2d(dtype=wp.float32),
-    entries: wp.array(dtype=wp.int32),
-    lists: wp.array(dtype=wp.int32),
-    bits: wp.int32,
+    grid: Grid,
     cells: wp.array(dtype=wp.int32),
 ) -> None:
     i = wp.tid()
     x = wp.float64(points[i, 0])
     y = wp.float64(points[i, 1])
     z = wp.float64(points[i, 2])
-    u = (x - wp.float64(frame[0, 0])) * wp.float64(frame[1, 0])
-    v = (y - wp.float64(frame[0, 1])) * wp.float64(frame[1, 1])
-    w = (z - wp.float64(frame[0, 2])) * wp.float64(frame[1, 2])
+    u = (x - wp.float64(grid.frame[0, 0])) * wp.float64(grid.frame[1, 0])
+    v = (y - wp.float64(grid.frame[0, 1])) * wp.float64(grid.frame[1, 1])
+    w = (z - wp.float64(grid.frame[0, 2])) * wp.float64(grid.frame[1, 2])
     place = wp.int32(-1)
     count = centres.shape[0]
     if wp.abs(u) <= _REACH and wp.abs(v) <= _REACH and wp.abs(w) <= _REACH:
         a = _cell(u)
         b = _cell(v)
         c = _cell(w)
-        shift = _CELL - bits
-        entry = entries[((((a >> shift) << bits) + (b >> shift)) << bits) + (c >> shift)]
+        shift = _CELL - grid.bits
+        entry = grid.entries[((((a >> shift) << grid.bits) + (b >> shift)) << grid.bits) + (c >> shift)]
         while entry < 0 and shift >= _BRICK:
             shift -= _BRICK
             low = (1 << _BRICK) - 1
             slot = (((((a >> shift) & low) << _BRICK) + ((b >> shift) & low)) << _BRICK) + ((c >> shift) & low)
-            entry = entries[-1 - entry + slot]
+            entry = grid.entries[-1 - entry + slot]
         place = entry
-        count = lists[place]
+        count = grid.lists[place]
     best = wp.float64(1.7976931348623157e308)
     cell = wp.int32(0)
     for row in range(count):
         j = row
         if place >= 0:
-            j = lists[place + 1 + row]
+            j = grid.lists[place + 1 + row]
         dx = x - wp.float64(centres[j, 0])
         dy = y - wp.float64(centres[j, 1])
         dz = z - wp.float64(centres[j, 2])
@@ -99,6 +106,6 @@ def nearest_centre_grid(points: Tensor, centres: Tensor, weights: Tensor | None,
     cells = points.new_empty(points.shape[0], dtype=torch.int32)
     yield cells
     given = [array(tensor, points, points.dtype) for tensor in (points, centres, weights)]
-    tables = [array(tensor, points) for tensor in (grid.frame, grid.entries, grid.lists)]
-    inputs = [*given, weights is not None, *tables, grid.bits, array(cells, points)]
+    tables = filled(Grid(), frame=grid.frame, entries=grid.entries, lists=grid.lists, bits=grid.bits)
+    inputs = [*given, weights is not None, tables, array(cells, points)]
     launch(_nearest_centre_grid_kernel, points.shape[0], inputs, points)

@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.custom_op import custom_op
-from voronerf.kernels._launch import array, launch
+from voronerf.kernels._launch import array, filled, launch
 from voronerf.kernels.composite import _OPAQUE, _absorbed, _density
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.render_loss.autograd import Results, register, results
@@ -41,61 +41,77 @@ def _softplus(x: wp.float32) -> wp.float32:
     return rest
 
 
+@wp.struct
+class Inputs:
+    """Outputs of networks for the samples of rays, and what the rays are compared with."""
+
+    raw: wp.array2d(dtype=wp.float32)
+    deltas: wp.array(dtype=wp.float32)
+    offsets: wp.array(dtype=wp.int32)
+    target: wp.array2d(dtype=wp.float32)
+    background: wp.array2d(dtype=wp.float32)
+    scale: wp.float32
+    hidden: wp.float32
+
+
+@wp.struct
+class Found:
+    """Results of rays and of samples."""
+
+    colour: wp.array2d(dtype=wp.float32)
+    weights: wp.array(dtype=wp.float32)
+    error: wp.array(dtype=wp.float32)
+    gradient: wp.array2d(dtype=wp.float32)
+
+
 @wp.kernel
 def _render_loss_kernel(
-    raw: wp.array2d(dtype=wp.float32),
-    deltas: wp.array(dtype=wp.float32),
-    offsets: wp.array(dtype=wp.int32),
-    target: wp.array2d(dtype=wp.float32),
-    background: wp.array2d(dtype=wp.float32),
-    scale: wp.float32,
-    hidden: wp.float32,
-    colour: wp.array2d(dtype=wp.float32),
-    weights: wp.array(dtype=wp.float32),
-    error: wp.array(dtype=wp.float32),
-    gradient: wp.array2d(dtype=wp.float32),
+    given: Inputs,
+    found: Found,
 ) -> None:
     ray = wp.tid()
-    begin = wp.clamp(offsets[ray], 0, raw.shape[0])
-    end = wp.clamp(offsets[ray + 1], 0, raw.shape[0])
+    begin = wp.clamp(given.offsets[ray], 0, given.raw.shape[0])
+    end = wp.clamp(given.offsets[ray + 1], 0, given.raw.shape[0])
     front = wp.float64(0.0)
     light = wp.vec3(0.0, 0.0, 0.0)
     for i in range(begin, end):
-        optical = _density(_softplus(raw[i, 3]) * scale) * deltas[i]
+        optical = _density(_softplus(given.raw[i, 3]) * given.scale) * given.deltas[i]
         weight = wp.exp(-wp.float32(front)) * _absorbed(optical)
-        gradient[i, 3] = wp.float32(front)
+        found.gradient[i, 3] = wp.float32(front)
         front += wp.float64(optical)
-        weights[i] = weight
-        light = light + weight * wp.vec3(_sigmoid(raw[i, 0]), _sigmoid(raw[i, 1]), _sigmoid(raw[i, 2]))
+        found.weights[i] = weight
+        light = light + weight * wp.vec3(
+            _sigmoid(given.raw[i, 0]), _sigmoid(given.raw[i, 1]), _sigmoid(given.raw[i, 2])
+        )
     left = wp.exp(-wp.float32(front))
     shown = wp.vec3(0.0, 0.0, 0.0)
-    if background.shape[0] > 0:
-        shown = wp.vec3(background[ray, 0], background[ray, 1], background[ray, 2])
+    if given.background.shape[0] > 0:
+        shown = wp.vec3(given.background[ray, 0], given.background[ray, 1], given.background[ray, 2])
     seen = light + left * shown
-    off = seen - wp.vec3(target[ray, 0], target[ray, 1], target[ray, 2])
-    slopes = off * (2.0 / (3.0 * wp.float32(target.shape[0])))
+    off = seen - wp.vec3(given.target[ray, 0], given.target[ray, 1], given.target[ray, 2])
+    slopes = off * (2.0 / (3.0 * wp.float32(given.target.shape[0])))
     for k in range(3):
-        colour[ray, k] = seen[k]
-    error[ray] = wp.dot(off, off)
+        found.colour[ray, k] = seen[k]
+    found.error[ray] = wp.dot(off, off)
     behind = left * wp.dot(slopes, shown)
     for reverse in range(end - begin):
         i = end - 1 - reverse
-        density = _softplus(raw[i, 3]) * scale
-        optical = _density(density) * deltas[i]
-        ahead = gradient[i, 3]
-        value = wp.vec3(_sigmoid(raw[i, 0]), _sigmoid(raw[i, 1]), _sigmoid(raw[i, 2]))
+        density = _softplus(given.raw[i, 3]) * given.scale
+        optical = _density(density) * given.deltas[i]
+        ahead = found.gradient[i, 3]
+        value = wp.vec3(_sigmoid(given.raw[i, 0]), _sigmoid(given.raw[i, 1]), _sigmoid(given.raw[i, 2]))
         to_weight = wp.dot(slopes, value)
         to_optical = to_weight * wp.exp(-(ahead + optical)) - behind
-        behind += to_weight * weights[i]
+        behind += to_weight * found.weights[i]
         for k in range(3):
-            gradient[i, k] = weights[i] * slopes[k] * (value[k] * (1.0 - value[k]))
-        slope = _sigmoid(raw[i, 3]) * scale
+            found.gradient[i, k] = found.weights[i] * slopes[k] * (value[k] * (1.0 - value[k]))
+        slope = _sigmoid(given.raw[i, 3]) * given.scale
         if density > _OPAQUE:
             slope = wp.float32(0.0)
-        gradient[i, 3] = to_optical * deltas[i] * slope
-        if wp.exp(-ahead) <= hidden:
+        found.gradient[i, 3] = to_optical * given.deltas[i] * slope
+        if wp.exp(-ahead) <= given.hidden:
             for k in range(4):
-                gradient[i, k] = 0.0
+                found.gradient[i, k] = 0.0
 
 
 @wp.kernel
@@ -112,17 +128,18 @@ def render_loss(given: Rendered) -> list[Tensor]:
 
 @custom_op("render_loss_warp")
 def _render_loss(given: Rendered) -> Iterator[Results]:
-    loss, colour, weights, density, error, gradient = found = results(given)
-    yield found
+    loss, colour, weights, density, error, gradient = results(given)
+    yield loss, colour, weights, density, error, gradient
     raw, target, m, r = given.raw, given.target, given.raw.shape[0], given.target.shape[0]
     check_ray_offsets("render_loss", given.ray_offsets, m)
     for of_strays in (weights, gradient):  # samples that belong to no ray
         of_strays.zero_()
     behind = target.new_empty(0, 3) if given.background is None else given.background.expand_as(target)
-    inputs = [array(tensor, raw) for tensor in (raw, given.deltas, given.ray_offsets, target, behind)]
-    outputs = [array(tensor, raw) for tensor in (colour, weights, error, gradient)]
-    launch(_render_loss_kernel, r, [*inputs, given.density_scale, given.hidden, *outputs], raw)
-    launch(_density_kernel, m, [inputs[0], given.density_scale, array(density, raw)], raw)
+    compared = {"target": target, "background": behind, "scale": given.density_scale, "hidden": given.hidden}
+    inputs = filled(Inputs(), raw=raw, deltas=given.deltas, offsets=given.ray_offsets, **compared)
+    outputs = filled(Found(), colour=colour, weights=weights, error=error, gradient=gradient)
+    launch(_render_loss_kernel, r, [inputs, outputs], raw)
+    launch(_density_kernel, m, [array(raw, raw), given.density_scale, array(density, raw)], raw)
     loss.copy_(error.mean(dtype=torch.float64) / 3)
 
 

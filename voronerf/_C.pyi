@@ -308,6 +308,14 @@ class ProgramInputs(NamedTuple):
     n: int  # int64
     k: int  # int64
 
+class ProgramSizes(NamedTuple):
+    columns: int  # int64
+    partial: int  # int64
+    inputs: int  # int64
+    parameters: int  # int64
+    outputs: int  # int64
+    sums: int  # int64
+
 class RenderLossInputs(NamedTuple):
     raw: Tensor | None  # const float32*
     deltas: Tensor | None  # const float32*
@@ -460,7 +468,14 @@ def grouped_mlp_hashes(_0: MlpTable, _1: str, _2: str, _3: Cuda) -> bool: ...
 def grouped_mlp_workspace(_0: MlpTable, _1: int, _2: int, _3: bool, _4: bool, _5: str, _6: str, _7: Cuda) -> int: ...
 
 # ProgramInputs, float32**, float32**, Cpu
+@overload
 def grouped_program(_0: ProgramInputs, _1: Sequence[Tensor | None] | None, _2: Sequence[Tensor | None] | None, _3: Cpu) -> None: ...
+# ProgramInputs, ProgramSizes, float32**, float32**, uint8*, Cuda
+@overload
+def grouped_program(_0: ProgramInputs, _1: ProgramSizes, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Tensor | None, _5: Cuda) -> None: ...
+
+# ProgramSizes, int64, int64, Cuda
+def grouped_program_workspace(_0: ProgramSizes, _1: int, _2: int, _3: Cuda) -> int: ...
 
 # HashInputs, HashGrid, float32*, Cpu
 @overload

@@ -21,7 +21,7 @@ from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
 from voronerf.router import Parts, Similarity, Solid, VoronoiRouter
 from voronerf.training.average import load_averages
-from voronerf.training.checkpoint import last_checkpoint
+from voronerf.training.checkpoint import NETWORKS, checkpoint_path, last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
 from voronerf.training.joint import joint_config
@@ -29,6 +29,10 @@ from voronerf.training.networks import check_shapes, open_routers, parameter_gro
 from voronerf.training.renderers import make_picture_grid, make_renderer, through_grid
 from voronerf.training.run_directory import check_folders, check_stored_paths
 from voronerf.training.state import stored_values
+from voronerf.training.streaming import Pages, bytes_of
+
+#: Rays of a picture of a run of parts that are rendered at a time.
+PARTS_RAYS = 16_384
 
 
 @dataclass(frozen=True)
@@ -217,6 +221,10 @@ def _shows(name: str) -> bool:
     return not name.startswith("optimizer.") or name.endswith(".average")
 
 
+def _shows_without_networks(name: str) -> bool:
+    return name != NETWORKS and _shows(name)
+
+
 def open_run(
     path: Path | str,
     *,
@@ -230,6 +238,7 @@ def open_run(
     blend: float | None = None,
     device: str = "cpu",
     backend: str = "auto",
+    memory: str | int | None = None,
 ) -> Run:
     """Opens a run that ``voronerf train`` or :class:`voronerf.training.trainer.Trainer` has written.
 
@@ -251,6 +260,9 @@ def open_run(
         blend: Margin in scene units within which neighbouring cells are blended; None for that of the training.
         device: Torch device.
         backend: Backend of the operations.
+        memory: Bound on the memory of this process and on what the files of networks take of the system's, such as
+            "512M", for a run of several parts on the CPU. Networks are read as rays meet them, those that were not used
+            for longest are dropped, and their checksums are not compared. Pictures are the same bit for bit.
 
     Raises:
         CheckpointError: If there is no usable checkpoint.
@@ -283,12 +295,17 @@ def open_run(
     if blend is not None and not 0 <= blend < math.inf:
         raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
     check_folders(path)
-    checkpoint = last_checkpoint(path, keep=_shows)
+    pages = None if memory is None else Pages(checkpoint_path(path).parent, bytes_of(memory))
+    checkpoint = last_checkpoint(path, keep=_shows if pages is None else _shows_without_networks)
+    if pages is not None and ("parts" not in checkpoint.values or torch.device(device).type != "cpu"):
+        raise ConfigError(
+            f"--memory needs --device cpu and a run of parts, as join, cut and place make; {path} is none"
+        )
     config, _ = stored_values(checkpoint)
     if scene is None and data is None:
         check_stored_paths(path, data=config.data)
     check_shapes(config, checkpoint)
-    routers = open_routers(config, device, checkpoint)
+    routers = open_routers(config, device, checkpoint, pages)
     if isinstance(routers["field"], VoronoiRouter):
         restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
     load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
@@ -307,6 +324,8 @@ def open_run(
     if several and (config.territories or 1) > 1:  # as it was trained: its parts know their own settings
         config = joint_config(config, scene)
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
+    if several:  # the networks of as few parts as possible at a time
+        renderer.most_rays = PARTS_RAYS
     state = checkpoint.group("occupancy")
     grid = None
     if state:

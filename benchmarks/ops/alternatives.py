@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ops.case import BACKWARD, Contender, NotApplicable, optional
+from ops.case import BACKWARD, Contender, NotApplicable
 from ops.networks import Batch, with_gradients
 from voronerf import ops
 from voronerf.layers import DIRECTIONS, MLP, POSITIONS
@@ -25,8 +25,6 @@ PIECE = 4096
 """Rows of a piece whose activations stay in cache."""
 MOST_BYTES = 3 << 30
 """Memory that padding may take."""
-STATIC_CELLS = 64
-"""Cells up to which JAX gets a program with one product for each; beyond, compiling it takes minutes."""
 
 Linear = Callable[[Tensor, Any, Any, str], Tensor]
 
@@ -71,9 +69,7 @@ def row_pieces(bounds: Sequence[int], piece: int | None) -> Iterator[tuple[int, 
             yield cell, first, min(first + step, stop)
 
 
-def loop(
-    batch: Batch, encoded: Encoded, *, piece: int | None = None, stacked: bool = False, compiled: bool = False
-) -> Contender:
+def loop(batch: Batch, encoded: Encoded, *, piece: int | None = None, stacked: bool = False) -> Contender:
     """A loop over cells, each a plain torch network.
 
     Parameters of a cell are leaves of their own unless ``stacked``: gradients then need no stacking.
@@ -91,18 +87,13 @@ def loop(
     def network(x: Tensor, d: Tensor | None, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
         return join(evaluate(net, x, d, weights, biases, torch_linear))
 
-    step: Callable[..., Tensor] = network
-    if compiled:
-        torch.compiler.reset()  # no row is compiled for what an earlier one has met
-        step = torch.compile(network, dynamic=True)
-
     def outputs(call: int) -> Iterator[tuple[slice, Tensor]]:
         x, d = encoded.positions[call % 2], encoded.directions
         columns = [tensor.unbind() for tensor in leaves] if stacked else per_cell
         cells = list(zip(*columns))
         for cell, first, last in pieces:
             rows, own = slice(first, last), cells[cell]
-            yield rows, step(x[rows], None if d is None else d[rows], own[:count], own[count:])
+            yield rows, network(x[rows], None if d is None else d[rows], own[:count], own[count:])
 
     def forward(call: int) -> Tensor:
         out = torch.empty(batch.n, net.out_features, dtype=dtype, device=parts[0].device)
@@ -122,8 +113,6 @@ def loop(
             full = [torch.stack(full[at : at + batch.k]) for at in range(0, len(full), batch.k)]
         return out, full
 
-    if compiled:
-        compile_now(lambda: (both if training else forward)(1))
     return Contender(both, adapt) if training else Contender(forward)
 
 
@@ -264,64 +253,7 @@ def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Conte
     return _finish(batch, forward, [])
 
 
-def jax_program(batch: Batch, encoded: Encoded) -> Contender:
-    """JAX, compiled: one product for each cell where they are few, ``ragged_dot`` where they are many."""
-    jax = optional("jax")
-    jnp = optional("jax.numpy")
-    if batch.positions[0].device.type != "cpu":
-        raise NotApplicable("runs on the CPU")
-    if batch.dtype != torch.float32:
-        raise NotApplicable("measured in float32")
-    net, count = batch.net, len(batch.weights)
-    x = [jnp.asarray(tensor.numpy()) for tensor in encoded.positions]
-    d = None if encoded.directions is None else jnp.asarray(encoded.directions.numpy())
-    leaves = [jnp.asarray(tensor.detach().numpy()) for tensor in batch.parameters]
-    sizes = jnp.asarray(batch.offsets.diff().numpy())
-    cells = jnp.repeat(jnp.arange(batch.k), sizes, total_repeat_length=batch.n)
-
-    def layers(x: Any, d: Any, own: Sequence[Any], product: Callable[..., Any]) -> Any:
-        results: list[Any] = []
-        for layer, weight, bias in zip(net.layers, own[:count], own[count:]):
-            sources = [x if s == POSITIONS else d if s == DIRECTIONS else results[s] for s in layer.inputs]
-            y = product(jnp.concatenate(sources, -1), weight, bias)
-            results.append(jax.nn.relu(y) if layer.activation == "relu" else y)
-        return jnp.concatenate([results[index] for index in net.outputs], -1)
-
-    def static(x: Any, d: Any, leaves: Any) -> Any:
-        parts = []
-        for cell, first, last in row_pieces(batch.bounds, None):
-            own = [leaf[cell] for leaf in leaves]
-            columns = None if d is None else d[first:last]
-            parts.append(layers(x[first:last], columns, own, lambda x, w, b: x @ w.T + b))
-        return jnp.concatenate(parts)
-
-    def ragged(x: Any, d: Any, leaves: Any) -> Any:
-        def product(x: Any, w: Any, b: Any) -> Any:
-            return jax.lax.ragged_dot(x, w.transpose(0, 2, 1), sizes) + b[cells]
-
-        return layers(x, d, leaves, product)
-
-    program = static if batch.k <= STATIC_CELLS else ragged
-    to_torch = torch.from_dlpack
-    if batch.direction != BACKWARD:
-        run = jax.jit(program)
-        run(x[0], d, leaves).block_until_ready()  # compiles
-        return Contender(lambda call: run(x[call % 2], d, leaves).block_until_ready(), to_torch)
-
-    @jax.jit
-    def both(x: Any, d: Any, leaves: Any, gradient: Any) -> Any:
-        out, pull = jax.vjp(lambda leaves: program(x, d, leaves), leaves)
-        return out, pull(gradient)[0]
-
-    gradients = [jnp.asarray(gradient.numpy()) for gradient in batch.gradients]
-    jax.block_until_ready(both(x[0], d, leaves, gradients[0]))  # compiles
-    return Contender(
-        lambda call: jax.block_until_ready(both(x[call % 2], d, leaves, gradients[min(call, 1)])),
-        lambda result: (to_torch(result[0]), [to_torch(part) for part in result[1]]),
-    )
-
-
-def alternatives(batch: Batch, *, compiled: bool) -> dict[str, Callable[[], Contender]]:
+def alternatives(batch: Batch) -> dict[str, Callable[[], Contender]]:
     """Everything above that makes sense for a batch; bfloat16 competes with float32 as well."""
     made: dict[torch.dtype, Encoded] = {}
 
@@ -342,15 +274,12 @@ def alternatives(batch: Batch, *, compiled: bool) -> dict[str, Callable[[], Cont
         found[f"torch loop, {PIECE} rows, float32"] = lambda: loop(batch, encoded(torch.float32), piece=PIECE)
     if batch.direction == BACKWARD and batch.k > 1:
         found["torch loop, stacked"] = lambda: loop(batch, own(), stacked=True)
-    if compiled:
-        found["torch.compile of the loop"] = lambda: loop(batch, own(), compiled=True)
     if batch.k > 1:
         found["padded bmm"] = lambda: padded_bmm(batch, own())
         found["F.grouped_mm"] = lambda: grouped_mm(batch, own())
     if batch.direction != BACKWARD:
         found["oneDNN"] = lambda: onednn(batch, own())
         found[f"oneDNN, {PIECE} rows"] = lambda: onednn(batch, own(), piece=PIECE)
-    found["jax"] = lambda: jax_program(batch, own())
     return found
 
 

@@ -13,7 +13,7 @@ from voronerf import backends, ops
 from voronerf.ops import cases as of_ops
 from voronerf.ops.cases import Draw
 
-from .case import FORWARD, Case, Contender, Work, relative_error
+from .case import BACKWARD, FORWARD, Case, Contender, Work, relative_error
 
 ROWS = 1 << 14
 
@@ -21,21 +21,34 @@ ROWS = 1 << 14
 def cases(others: list[Case]) -> list[Case]:
     """Rows of the operations that have none among the others."""
     covered = {case.op for case in others}
-    missing = [op for op, case in of_ops.cases().items() if case.comparable and op not in covered]
-    return [
-        Case(op, f"n={ROWS}", torch.float32, FORWARD, ROWS, None, functools.partial(_work, op), backends.BACKENDS, True)
-        for op in missing
-    ]
+    missing = {op: case for op, case in of_ops.cases().items() if case.comparable and op not in covered}
+    found = []
+    for op, case in missing.items():
+        for direction in (FORWARD, BACKWARD) if case.differentiable else (FORWARD,):
+            work = functools.partial(_work, op, direction)
+            quick = direction == FORWARD
+            found.append(Case(op, f"n={ROWS}", torch.float32, direction, ROWS, None, work, backends.BACKENDS, quick))
+    return found
 
 
-def _work(op: str, device: torch.device) -> Work:
+def _work(op: str, direction: str, device: torch.device) -> Work:
     case = of_ops.cases()[op]
-    given = tree_map_only(Tensor, lambda tensor: tensor.to(device), case.make(Draw(), ROWS))
+    backward = direction == BACKWARD
+
+    def ready(tensor: Tensor) -> Tensor:
+        return tensor.to(device).requires_grad_(backward and tensor.is_floating_point())
+
+    given = tree_map_only(Tensor, ready, case.make(Draw(), ROWS))
+    leaves = [leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.requires_grad]
 
     def run(backend: str, call: int) -> list[Tensor]:
         own = tree_map_only(Tensor, Tensor.clone, given) if case.in_place else given
         out = getattr(ops, case.call or op)(**own, backend=backend)
-        return [part for part in tree_leaves(own if case.in_place else out) if isinstance(part, Tensor)]
+        found = [part for part in tree_leaves(own if case.in_place else out) if isinstance(part, Tensor)]
+        if backward:
+            total = sum(part.square().sum() for part in found if part.requires_grad)
+            found += torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+        return [part.detach() for part in found]
 
     expected = run("reference", 0)
 
@@ -47,5 +60,7 @@ def _work(op: str, device: torch.device) -> Work:
     def alternative(function: Any) -> Contender:
         return Contender(lambda call: function(**given), lambda result: [result])
 
-    alternatives = {name: functools.partial(alternative, function) for name, function in case.alternatives.items()}
+    alternatives = {
+        name: functools.partial(alternative, function) for name, function in case.alternatives.items() if not backward
+    }
     return Work(lambda name: Contender(functools.partial(run, name)), alternatives, error, 1e-4, float(ROWS), "")

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ops.alternatives import compile_now, evaluate, join, row_pieces, torch_linear
+from ops.alternatives import compile_now
 from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation
 from voronerf import MLP, HashGrid, Layer
 from voronerf.ops import hash_encode, nearest_centre, routed_mlp, spherical_harmonics
@@ -174,18 +174,6 @@ def network_work(n: int, direction: str, device: torch.device) -> Work:
         given: dict[str, Any] = {"layers": behind, "direction_index": index, "backend": "native"}
         return routed_mlp(x, *own, directions=seen, cells=owners, **given)[0]
 
-    def by_loop(x: Tensor, seen: Tensor, owners: Tensor, table: Tensor, *own: list[Tensor]) -> Tensor:
-        """Sort by cell, then each cell's network on its rows."""
-        keys, order = torch.sort(owners.to(torch.uint8), stable=True)
-        edges = torch.searchsorted(keys.int(), torch.arange(CELLS + 1, device=device)).tolist()
-        features, harmonics = _by_indexing(x, table, grid), spherical_harmonics(seen, 4, backend="reference")
-        parts = []
-        for cell, first, last in row_pieces(edges, None):
-            rows, of_cell = order[first:last], ([tensor[cell] for tensor in tensors] for tensors in own)
-            parts.append(join(evaluate(behind, features[rows], harmonics[index[rows]], *of_cell, torch_linear)))
-        joined = torch.cat(parts)
-        return torch.zeros_like(joined).index_copy(0, order, joined)
-
     @functools.cache
     def exact() -> list[Tensor]:
         return results(0, fused("reference"), torch.float64)
@@ -202,7 +190,6 @@ def network_work(n: int, direction: str, device: torch.device) -> Work:
         lambda backend: Contender(functools.partial(results, network=fused(backend))),
         {
             "native, encoded before": lambda: Contender(functools.partial(results, network=separate)),
-            "torch, indexing, sort + loop": lambda: Contender(functools.partial(results, network=by_loop)),
         },
         error,
         3e-2,  # a ReLU within rounding of its kink may go either way

@@ -174,7 +174,6 @@ def _update_work(n: int, device: torch.device) -> Work:
         lambda backend: contender(functools.partial(ops.update_occupancy, backend=backend)),
         {
             "torch index_select + index_put": lambda: contender(_update_gather),
-            "torch scatter_reduce": lambda: contender(_update_scatter),
         },
         error,
         1e-5,

@@ -47,12 +47,6 @@ MLP_QUICK = {
     ("w64d4", BASE, 16, HALF, FORWARD),
     ("w64d4", BASE, 16, FULL, BACKWARD),
 }
-COMPILED = {
-    ("w64d4", BASE, 16, FULL, FORWARD),
-    ("w64d4", BASE, 16, FULL, BACKWARD),
-    ("nerf64", BASE, 16, FULL, FORWARD),
-}
-"""Rows in which the loop is compiled as well, which takes many seconds each."""
 AVX2_ROWS = (("w64d4", BASE, 16, FULL, FORWARD), ("w64d4", BASE, 16, FULL, BACKWARD))
 
 ROUTE_ROWS: tuple[tuple[str, int, int, torch.dtype, str], ...] = (
@@ -89,12 +83,12 @@ def cases() -> list[Case]:
         net, n, k, dtype, direction = row
         shown = ("native",) if (net, dtype, direction) in seen or net in ("nerf128", "nerf256") else BOTH
         seen.add((net, dtype, direction))
-        work = functools.partial(_mlp_work, row, row in COMPILED)
+        work = functools.partial(_mlp_work, row)
         name = f"{net} n={n} k={k}"
         found.append(Case("grouped_mlp", name, dtype, direction, n, k, work, shown, row in MLP_QUICK))
     for row in AVX2_ROWS:
         net, n, k, dtype, direction = row
-        work = functools.partial(_mlp_work, row, False)
+        work = functools.partial(_mlp_work, row)
         name = f"{net} n={n} k={k} avx2"
         found.append(Case("grouped_mlp", name, dtype, direction, n, k, work, isa="avx2"))
     for row in ROUTE_ROWS:
@@ -116,21 +110,21 @@ def _linear_work(layer: str, n: int, k: int, dtype: torch.dtype, direction: str,
     return _work(batch, price.forward + (price.backward if direction == BACKWARD else 0.0), None)
 
 
-def _mlp_work(row: tuple[str, int, int, torch.dtype, str], compiled: bool, device: torch.device) -> Work:
+def _mlp_work(row: tuple[str, int, int, torch.dtype, str], device: torch.device) -> Work:
     name, n, k, dtype, direction = row
     net = NETS[name]
     batch, price = make_batch(net, n, k, dtype, direction, device), cost(net)
     if direction == FORWARD:
-        return _work(batch, price.forward, None, compiled)
+        return _work(batch, price.forward, None)
     useful = price.forward + price.backward
-    return _work(batch, useful, useful + price.again, compiled)
+    return _work(batch, useful, useful + price.again)
 
 
-def _work(batch: Any, flops: float, executed: float | None, compiled: bool = False) -> Work:
+def _work(batch: Any, flops: float, executed: float | None) -> Work:
     """The case of a batch whose samples cost so much each."""
     return Work(
         functools.partial(ours, batch),
-        alternatives(batch, compiled=compiled),
+        alternatives(batch),
         network_error(batch),
         TOLERANCE[batch.dtype, batch.direction],
         flops * batch.n,

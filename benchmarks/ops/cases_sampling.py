@@ -60,7 +60,7 @@ def cases() -> list[Case]:
     ):
         base = n == BASE
         kind = "packed" if packed else "dense"
-        work = functools.partial(_composite_work, n, packed, direction, base and not packed)
+        work = functools.partial(_composite_work, n, packed, direction)
         shown = ALL if base else ("native",)
         quick = base and direction == FORWARD
         found.append(Case("composite", f"{kind} n={n}", FULL, direction, n, None, work, shown, quick))
@@ -165,7 +165,7 @@ def _encode_work(op: str, n: int, dtype: torch.dtype, direction: str, compiled: 
         return _flat(_contender(lambda *x: run(*x, OCTAVES, backend="reference"), [rows], given).run(0))
 
     functions: dict[str, Function] = (
-        {"torch, octave by octave": _integrated_by_octave, "torch, all octaves at once": _integrated_at_once}
+        {"torch, octave by octave": _integrated_by_octave}
         if integrated
         else {"torch, octave by octave": _frequency_by_octave, "torch, all octaves at once": _frequency_at_once}
     )
@@ -262,17 +262,11 @@ def _integrated_by_octave(mean: Tensor, variance: Tensor) -> Tensor:
     return torch.cat(parts, 1)
 
 
-def _integrated_at_once(mean: Tensor, variance: Tensor) -> Tensor:
-    powers = _powers(mean)
-    angles, blur = mean[:, None, None, :] * powers, torch.exp(-0.5 * powers**2 * variance[:, None, None, :])
-    return torch.cat([angles.sin() * blur, angles.cos() * blur], 2).flatten(1)
-
-
 def _powers(x: Tensor) -> Tensor:
     return (2.0 ** torch.arange(OCTAVES, device=x.device)).to(x.dtype)[None, :, None, None]
 
 
-def _composite_work(n: int, packed: bool, direction: str, compiled: bool, device: torch.device) -> Work:
+def _composite_work(n: int, packed: bool, direction: str, device: torch.device) -> Work:
     rays = n // SAMPLES
     ray_offsets = None
     shape: tuple[int, ...] = (rays, SAMPLES)
@@ -320,7 +314,7 @@ def _composite_work(n: int, packed: bool, direction: str, compiled: bool, device
         lambda found: found,
         exact,
         bytes_a_sample * total,
-        list(functions) if compiled else [],
+        [],
         1e-3,
     )
 

@@ -27,7 +27,19 @@ struct ProgramInputs {
   int64_t n, k;
 };
 
+// What the host must know of a program for CUDA.
+struct ProgramSizes {
+  int64_t columns, partial;                   // of the values of a row; floats of the sums of a task
+  int64_t inputs, parameters, outputs, sums;  // how many
+};
+
 // Throws std::invalid_argument for offsets that fall or exceed n.
 void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads);
+
+// On CUDA `code` and `constants` are on the device too; strides, turned and widths are not. Both throw
+// std::invalid_argument where the values of a few rows do not fit into shared memory.
+int64_t grouped_program_workspace_cuda(const ProgramSizes& sizes, int64_t n, int64_t k);
+void grouped_program_cuda(const ProgramInputs& in, const ProgramSizes& sizes, float* const* outputs, float* const* sums,
+                          unsigned char* workspace, void* stream);
 
 }  // namespace voronerf

@@ -117,7 +117,7 @@ def test_every_operation_has_rows_in_both_modes():
         assert len(set(keys)) == len(keys)
     both = {(case.op, case.direction) for case in throughput.chosen_cases(throughput.parse([]))}
     differentiable = {op for op, case in of_ops.cases().items() if case.differentiable}
-    assert {op for op, direction in both if direction == "forward+backward"} == differentiable - {"grouped_program"}
+    assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 
 def test_foreign_fields_have_rows_of_their_own():
@@ -168,12 +168,8 @@ def test_alternatives_compute_the_same(name, direction):
             if voronerf.backends.missing(backend, CPU) is None:
                 contender = alternatives.ours(batch, backend)
                 assert error(contender.adapt(contender.run(0))) < tolerance, backend
-        for label, set_up in alternatives.alternatives(batch, compiled=False).items():
-            try:
-                contender = set_up()
-            except case.NotApplicable as reason:
-                assert label == "jax", f"{label}: {reason}"
-                continue
+        for label, set_up in alternatives.alternatives(batch).items():
+            contender = set_up()
             assert error(contender.adapt(contender.run(0))) < tolerance, f"{label}, {dtype}"
             # A later call sees other samples and a dense gradient.
             assert error(contender.adapt(contender.run(1))) > 0
@@ -220,7 +216,7 @@ def test_what_is_compared_is_right_in_every_small_case():
         works[f"hash_encode, {direction}"] = cases_hash.hash_work(512, 12, direction, False, CPU)
         works[f"hash + MLP, {direction}"] = cases_hash.network_work(512, direction, CPU)
         for packed in (False, True):
-            work = sampling._composite_work(512, packed, direction, False, CPU)
+            work = sampling._composite_work(512, packed, direction, CPU)
             works[f"composite, packed {packed}, {direction}"] = work
     for label, work in works.items():
         contenders = {"reference": work.ours("reference")}
@@ -356,7 +352,7 @@ def test_targets_read_the_rows():
     rows = [
         _row(f"w64d4 n={n} k=16", 20.0, {"torch loop": 60.0}, percent_of_peak=86.0),
         _row(f"nerf64 n={n} k=16", 50.0, {"torch loop": 160.0}, percent_of_peak=84.0),
-        _row(f"nerf256 n={n} k=1", 600.0, {"torch loop": 1500.0, "oneDNN": 900.0, "jax": None}),
+        _row(f"nerf256 n={n} k=1", 600.0, {"torch loop": 1500.0, "oneDNN": 900.0, "F.grouped_mm": None}),
         _row(f"mlp32 n={n} k=16", 6.0, {}),
         _row(f"mlp32 n={n} k=4096", 12.0, {}),
         _row(f"n={n} k=16", 0.131072, {"faiss flat": 4.0, "numpy": 0.1}, op="nearest_centre"),
@@ -387,12 +383,9 @@ def test_targets_name_rows_that_the_benchmark_has():
     rows = [_row(case.case, 1.0, both, op=case.op, direction=case.direction) for case in cases]
     for row, each in zip(rows, cases):
         row |= {"dtype": str(each.dtype).removeprefix("torch."), "executed_percent_of_peak": 1.0}
-    known = cases_lookup.frozen_lookup() is not None
-    frozen = set() if known else {"nearest_centre, k = 4,096, frozen centres"}
-    assert {target.what for target, value in targets.reached(rows) if value is None} == frozen
+    assert all(value is not None for _, value in targets.reached(rows))
     for pattern in table.SHOWN:
-        known = "frozen" not in pattern or not frozen
-        assert not known or any(re.search(pattern, case.key) for case in cases), pattern
+        assert any(re.search(pattern, case.key) for case in cases), pattern
 
 
 def test_a_disturbed_limit_does_not_flatter():

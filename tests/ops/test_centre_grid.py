@@ -170,11 +170,9 @@ def test_errors():
         refuses("grid must be made from these centres and weights, got that of others", **others)
     refuses("grid must be a CentreGrid, got Tensor", grid=centres)
     refuses = refusals(centre_grid, centres=centres)
-    refuses("centres must have shape [k, 3], got [5, 2]", centres=centres[:, :2])
     refuses("centres must hold at least one centre, got none", centres=centres[:0])
     refuses("centres must be finite, got NaN or infinity", centres=torch.full((2, 3), torch.inf))
     refuses("weights must be finite, got NaN or infinity", weights=torch.full((5,), torch.nan))
-    refuses("centres must have dtype ... or float64, got int64", centres=centres.long())
     refuses("weights must have shape [k] with k = 5, got [4]", weights=weights[:4])
 
 

@@ -231,14 +231,9 @@ def test_errors():
     points, centres, uniforms = torch.rand(4, 3), torch.rand(10, 3), torch.rand(4, 3)
     tree = {"child_offsets": CHILD_OFFSETS, "child": CHILD, "uniforms": uniforms, "depth": 3}
     refuses = refusals(draw_cell, points=points, centres=centres, **tree, temperature=0.1)
-    refuses("points must have shape [n, 3], got [3]", points=points[0])
-    refuses("centres must have shape [m, 3], got [10, 2]", centres=centres[:, :2])
-    refuses("uniforms must have shape [n, depth] with n = 4, depth = 3, got [4, 2]", uniforms=uniforms[:, :2])
     refuses("child must have shape [m] with m = 9, got [10]", centres=centres[:9])
-    refuses("weights must have shape [m] with m = 10, got [1]", weights=torch.zeros(1))
     refuses("depth must be at least 1, got 0", uniforms=uniforms[:, :0], depth=0)
     for temperature in (0.0, -1.0, math.inf, math.nan):
         refuses(f"temperature must be positive and finite, got {temperature}", temperature=temperature)
     refuses("centres must hold ... got 0 centres in 4 diagrams", centres=centres[:0], child=CHILD[:0])
     refuses("child must have dtype int32, got int64", child=CHILD.long())
-    refuses("uniforms must be on the device of points, cpu, got meta", uniforms=uniforms.to("meta"))

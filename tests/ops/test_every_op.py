@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import functools
 import re
+from collections import Counter
+from unittest import mock
 
 import pytest
 import torch
@@ -17,7 +19,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from voronerf import backends, ops
+from voronerf import backends, checks, ops
 from voronerf.ops.cases import Draw, cases
 
 CASES = cases()
@@ -33,6 +35,8 @@ RUNS = [
     for backend in backends.implemented(op)
     for device in ("cpu", "cuda")
 ]
+NETWORKS = ("grouped_mlp", "grouped_program", "learn_outputs", "routed_mlp", "sparse_adam", "adam")
+"""Ops that check their tensors in ways of their own."""
 every_op = pytest.mark.parametrize(
     ("name", "backend", "device"), RUNS, indirect=["device"], ids=["-".join(run) for run in RUNS]
 )
@@ -174,3 +178,50 @@ def test_refuses(op, message):
     )
     with refused(TypeError if of_types else ValueError, f"{name}: {message}"):
         getattr(ops, name)(**{**given, **case.refused[message]})
+
+
+def shapes_of(name, call, given):
+    """The shapes that a call checks, by the names of its tensors, and how often it speaks of each letter."""
+    shapes, letters = {}, Counter()
+
+    def tensor(self, key, value, dtypes, *shape):
+        if self.op == name:
+            letters.update(self.sizes.keys() - known)  # a size that is no tensor's, such as a number of samples
+        whole(self, key, value, dtypes, *shape)
+        if self.op == name:
+            shapes[key] = [str(entry).removesuffix("+1") for entry in shape]
+            letters.update(shapes[key])
+            known.update(self.sizes)
+
+    known, whole = set(), checks.Checked.tensor
+    with mock.patch.object(checks.Checked, "tensor", tensor):
+        call(**given)
+    return shapes, letters
+
+
+@pytest.mark.parametrize("op", CASES)
+def test_refuses_tensors_that_do_not_fit(op):
+    """Anything but a tensor, other numbers of rows and columns, dtypes and devices, by the name of the argument."""
+    case = CASES[op]
+    call, name = getattr(ops, case.call or op), case.call or op
+    for kind in case.kinds.values():
+        given = case.make(Draw(**kind), 6)
+        tensors = {key: value for key, value in given.items() if isinstance(value, Tensor)}
+        shapes, letters = shapes_of(name, call, given)
+        assert op in NETWORKS or tensors.keys() <= shapes.keys()
+        for key, tensor in tensors.items():
+            with pytest.raises(TypeError, match=rf"^{name}: {key} must be a tensor, got str$"):
+                call(**{**given, key: "x"})
+            other = tensor.long() if tensor.dtype == torch.int32 else tensor.to(torch.int8)
+            with pytest.raises(TypeError, match=rf"^{name}: \S+ must have (the )?dtype .*, got "):
+                call(**{**given, key: other})
+            wrong = [tensor[None]]
+            for place, entry in enumerate(shapes.get(key, [])):
+                if entry.isdigit() or letters[entry] > 1:
+                    wrong.append(tensor.narrow(place, 0, tensor.shape[place] - 1))
+            for part in wrong:
+                with pytest.raises(ValueError, match=rf"^{name}: \S+ must have shape \[.*, got "):
+                    call(**{**given, key: part})
+            if len(tensors) > 1:
+                with pytest.raises(ValueError, match=rf"^{name}: \S+ must (be on the device of|have values)"):
+                    call(**{**given, key: tensor.to("meta")})

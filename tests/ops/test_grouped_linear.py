@@ -185,20 +185,13 @@ def test_autocast(device, backend):
 
 
 def test_errors():
-    x, weight, bias = layer([2, 3], 4, 5)
+    x, weight, _ = layer([2, 3], 4, 5)
     offsets = offsets_of([2, 3])
     refuses = refusals(grouped_linear, x=x, offsets=offsets, weight=weight)
-    refuses("x must have shape [n, i], got [5]", x=x[:, 0])
     refuses("weight must have shape [k, o, i] with i = 3, got [2, 5, 4]", x=x[:, :3])
-    refuses("offsets must have shape [k+1] with k = 2, got [2]", offsets=offsets[1:])
-    refuses("bias must have shape [k, o] with k = 2, o = 5, got [2, 4]", bias=bias[:, 1:])
     refuses("weight must have no empty dimension, got [2, 0, 4]", weight=weight[:, :0])
     refuses("activation must be one of none, relu, ..., sine, got 'tanh'", activation="tanh")
     refuses("offsets must have dtype int32, got int64", offsets=offsets.long())
-    refuses("weight must have the dtype of x, float32, got float64", weight=weight.double())
-    refuses("bias must have the dtype of x, float32, got float16", bias=bias.half())
-    refuses("x must have dtype ..., got int32", x=x.int())
-    refuses("weight must be on the device of x, cpu, got meta", weight=weight.to("meta"))
 
 
 @pytest.mark.parametrize("bad", [[0, 2, 6], [0, 4, 3], [-1, 2, 5]])

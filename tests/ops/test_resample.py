@@ -111,14 +111,8 @@ def test_carries_no_gradient(device, backend):
 def test_errors():
     weights, edges = rays(4, 5)
     refuses = refusals(resample, weights=weights, edges=edges, count=3)
-    refuses("weights must have shape [r, s], got [5]", weights=weights[0])
-    refuses("edges must have shape [r, s+1] with r = 4, s = 5, got [4, 5]", edges=edges[:, 1:])
-    refuses("uniforms must have shape [r, count] with r = 4, count = 3, got...", uniforms=torch.rand(4, 2))
     refuses("count must be at least 1, got 0", count=0)
     refuses("weights must have at least one bin, got none", weights=weights[:, :0], edges=edges[:, :1])
-    refuses("edges must have the dtype of weights, float32, got float64", edges=edges.double())
-    refuses("weights must have dtype ... or float64, got int64", weights=weights.long())
-    refuses("edges must be on the device of weights, cpu, got meta", edges=edges.to("meta"))
 
 
 @pytest.mark.parametrize("scale", [3e38, 1e-45])

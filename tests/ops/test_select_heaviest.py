@@ -30,6 +30,5 @@ def test_what_does_not_count_is_left_out(device, backend):
 def test_refuses_what_makes_no_sense():
     points = torch.rand(4, 3)
     refuses = refusals(select_heaviest, points=points, importance=torch.rand(4), count=2)
-    refuses("importance must have shape [n] with n = 4, got [3]", importance=torch.rand(3))
     refuses("importance must have dtype float32, got float64", importance=torch.rand(4).double())
     refuses("count must be at least 1, got 0", count=0)

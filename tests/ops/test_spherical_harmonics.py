@@ -133,8 +133,6 @@ def test_not_a_number_stays_in_its_row(device, backend):
 def test_errors():
     directions = torch.rand(4, 3)
     refuses = refusals(spherical_harmonics, directions=directions, degree=2)
-    refuses("directions must have shape [n, 3], got [4, 2]", directions=directions[:, :2])
     refuses("degree must be at least 1, got 0", degree=0)
     refuses("degree must be at most 4, got 5", degree=5)
     refuses("degree must be an integer, got float", degree=2.0)
-    refuses("directions must have dtype ... or float64, got int32", directions=directions.int())

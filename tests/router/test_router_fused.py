@@ -54,6 +54,10 @@ STEPS: dict[str, Callable[[Any, Tensor], Tensor]] = {
     "hardshrink": lambda net, h: F.hardshrink(h, 0.2),
     "softsign": lambda net, h: F.softsign(h),
     "tanhshrink": lambda net, h: F.tanhshrink(3 * h),
+    "arcs": lambda net, h: (
+        torch.asin(0.9 * h) + torch.acos(0.9 * h.square()) + torch.atan(h) + torch.tan(h) + torch.erf(h)
+    ),
+    "a power": lambda net, h: (h + 1.2) ** 2.4 + (h + 1.1) ** (1 / 3),
     "sign": lambda net, h: h * torch.sign(h),
     "ceil, frac, remainder": lambda net, h: h * (3 * h).ceil() + (3 * h).frac() + torch.remainder(h, 0.4),
     "lerp": lambda net, h: torch.lerp(h, h.roll(1, -1), 0.3) + torch.lerp(h, h.square(), h),
@@ -164,7 +168,7 @@ BETWEEN: dict[str, tuple[Callable[[], nn.Module], str]] = {
     "a custom function bound early": (lambda: Around(lambda net, h: bound_early(h)), "Exponential.apply"),
     "a gradient": (lambda: Slope(lambda net, h: h.square()), "grad"),
     "a gradient of a sum, by what was computed": (lambda: Around(by_sum), "sum, grad"),
-    "no gradient": (lambda: Around(lambda net, h: h * torch.no_grad()(torch.erf)(h)), "torch.erf"),
+    "no gradient": (lambda: Around(lambda net, h: h * torch.no_grad()(torch.lgamma)(h + 1.5)), "torch.lgamma"),
 }
 
 

@@ -195,6 +195,18 @@ def test_rays_are_for_modules_that_count_dimensions(rays: int) -> None:
     assert router.explain() == "forward: grouped"
 
 
+@pytest.mark.filterwarnings("error:VoronoiRouter")
+@pytest.mark.parametrize("width", [41, 43, 37])
+def test_constants_of_as_many_rows_as_a_trial_has_samples(width):
+    class Waves(nn.Linear):
+        def forward(self, x: Tensor) -> Tensor:
+            return (torch.linspace(1, 2, width) * self.bias) * torch.sin(super().forward(x))
+
+    router, x = VoronoiRouter(Waves(3, width), centres(), coords="first3", way="grouped"), uniform((50,))
+    torch.testing.assert_close(router(x), router.cell(0)(x))
+    assert router.explain() == "forward: grouped"
+
+
 # explain, register and single batches ---------------------------------------------------------------------------------
 
 
@@ -227,6 +239,21 @@ def test_explain_names_each_method_and_the_step_in_the_way() -> None:
     assert forward.partition("cell by cell: ")[2] in str(said[0].message)
     with pytest.raises(AttributeError, match=r"colour"):
         router.colour  # noqa: B018
+
+
+def test_explain_says_why_a_method_is_not_fused() -> None:
+    class Both(nn.Linear):
+        def shade(self, x: Tensor) -> Tensor:
+            return super().forward(x) + torch.rand_like(x[:, :1])
+
+    router = VoronoiRouter(Both(3, 2), centres(), coords="first3", methods=["shade"], fuse=True, way="fused")
+    with pytest.warns(UserWarning, match=r"fuse=True needs a network that can be fused, but in Both.shade"):
+        router.shade(uniform((40,)))
+    for n in (5, 40, 5):
+        router(uniform((n,)))
+    few, forward, shade = router.explain().split("\n")
+    assert (few, forward) == ("forward: cell by cell: first calls of fewer than 8 samples", "forward: fused")
+    assert shade.startswith("shade: grouped: not fused, since torch.rand_like draws random numbers (test_router_prom")
 
 
 def test_a_method_that_is_not_routed_names_the_remedy() -> None:

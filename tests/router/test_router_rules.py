@@ -56,6 +56,18 @@ class Normed(nn.Module):
         return self.rms(self.net(x))
 
 
+class Added(nn.Module):
+    """Layers written by ``addmm``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b = nn.Parameter(torch.randn(3, 8)), nn.Parameter(torch.randn(8, 2))
+        self.shift, self.constant = nn.Parameter(torch.randn(8)), torch.ones(2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.addmm(self.constant, torch.tanh(torch.addmm(self.shift, x, self.a)), self.b)
+
+
 class TensorVM(nn.Module):
     """nerfstudio's TensoRF: three planes and three lines stacked in one parameter each."""
 
@@ -119,6 +131,7 @@ class Spectrum(Gabor):
 
 
 MODULES: dict[str, Callable[[], nn.Module]] = {
+    "addmm": Added,
     "FiLM": FiLM,
     "FiLM in the middle": WideFiLM,
     "LayerNorm": Normed,

@@ -33,6 +33,7 @@ from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.trainer import Trainer
 from voronerf.viewer import TrainingViewer, view_run
 from voronerf.viewer.cameras import scene_bounds
+from voronerf.viewer.pictures import Look, cells_of, render_look
 
 
 @pytest.fixture
@@ -410,3 +411,32 @@ def test_without_viser_it_is_one_line(run, monkeypatch, capsys) -> None:
     assert main(["view", str(run.path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "the viewer needs viser: pip install 'voronerf[viewer]'" in line
+
+
+def test_what_is_shown_is_saved_as_a_run(run, scene, viewer, tab) -> None:
+    tab.rest()
+    info, k = tab.gui["Click on a cell."], run.diagram.num_cells
+    (client,) = viewer.list_clients()
+
+    def save():
+        info["_markdown"] = None
+        tab.set("Save what is shown", True)
+        return tab.until(lambda: info["_markdown"])
+
+    assert "Not saved: everything is shown" in save()
+    client.change(hidden=frozenset(range(1, k)))
+    folder = run.path.resolve()
+    assert f"{folder.name}-cut" in save()
+    saved = open_run(folder.parent / f"{folder.name}-cut", scene=scene)
+    assert saved.router.num_cells == 1
+    client.change(hidden=frozenset({0}), crop=((-1.0, -1.0, -1.0), (1.0, 1.0, 0.2)))
+    assert f"{folder.name}-cut-2" in save()
+    cut = open_run(folder.parent / f"{folder.name}-cut-2", scene=scene)
+    assert cut.router.num_cells <= k - 1 and cut.scene.box[1, 2] < 0.4
+    # What is opened again is viewed, hidden and picked like any run.
+    image = cut.render(scene.test.cameras, 0)
+    subject = viewer.subject.__class__("cut", cut.path, cut.scene, cut.router, cut.renderer)
+    cells = cells_of(subject, image.heaviest)
+    assert int(cells.max()) < cut.router.num_cells and image.opacity.max() > 0.5
+    gone = render_look(subject, scene.test.cameras[[0]], Look(hidden=frozenset(range(cut.router.num_cells))))
+    assert gone.opacity.max() == 0

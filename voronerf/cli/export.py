@@ -63,7 +63,7 @@ def export(
     if video is not None:
         check_video(video)
     given = given_path(path, spiral)
-    opened = opening.open(run)
+    opened = opening.open_without_images(run)
     corners = None if box is None else torch.tensor(box).view(2, 3)
     if points is not None:
         cloud = point_files.export_points(opened, points, count=count, box=corners)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from voronerf.data import Scene
+from voronerf.data.record import read_scene
 from voronerf.run import Run, open_run
 from voronerf.training.config import ConfigError
 
@@ -33,6 +34,15 @@ class Opening:
     """Torch device."""
     backend: str = "auto"
     """Backend of the operations."""
+    memory: str | None = None
+    """Bound on memory, such as 512M, for a run of several parts: networks are read as rays meet them, and those that
+    were not used for longest are dropped."""
+
+    def open_without_images(self, run: Path) -> Run:
+        """Opens the run with the cameras of its record, unless other data or other sizes are asked for."""
+        record = run / "scene.json"
+        known = self.data is None and self.downscale is None and record.is_file()
+        return self.open(run, scene=read_scene(record) if known else None)
 
     def open(self, run: Path, *, scene: Scene | None = None) -> Run:
         """Opens the run; see :func:`voronerf.open_run`."""

@@ -49,7 +49,7 @@ def view(
 
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(viewer):
         viewer.warm_up()
-        if scene is not None:
+        if scene is not None and opening.memory is None:
             threading.Thread(target=read_images, daemon=True).start()
         viewer.serve()
     return 0

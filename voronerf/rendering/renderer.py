@@ -62,6 +62,7 @@ class Renderer:
         fields: By name.
         sampler: Can be set at any time.
         look: How pictures are made; None for this process alone, without randomness. Ranks have a way of their own.
+        most_rays: Rays of a picture that are rendered at a time, at the most.
 
     Args:
         fields: By the names of the sampler's networks; "field" has the colours.
@@ -89,6 +90,7 @@ class Renderer:
             raise ValueError(f"Renderer: fields must be {' and '.join(wanted)}, got {sorted(fields)}")
         self.fields, self.sampler, self.backend = dict(fields), sampler, backend
         self.look: Look | None = None
+        self.most_rays = 1 << 30
 
     @property
     def field(self) -> Field:
@@ -205,6 +207,7 @@ class Renderer:
         """
         if chunk is None:
             chunk = 16_384 if self.look is not None else 4096 if self.occupancy is None else 131_072
+            chunk = min(chunk, self.most_rays)
         if chunk < 1:
             raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
         rays = cameras.image_rays(index, cones=self.cones)

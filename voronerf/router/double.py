@@ -6,6 +6,7 @@ The module itself never changes, so other threads may save, copy or call it at a
 from __future__ import annotations
 
 import functools
+import operator
 import types
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -79,7 +80,7 @@ class Double:
             Forbidden: Where the method adds, removes or replaces parameters, or writes into them.
         """
         placed = self.fill(values)
-        versions = [_version(value) for _, _, value in placed]
+        versions = _versions(placed)
         own = Call(self.module, call.method, call.layout, call.names, call.args, call.kwargs, call.kinds)
         try:
             return own.run(rows)
@@ -93,16 +94,17 @@ class Double:
             if vars(twin)["_parameters"] is not registry or registry.keys() != names:
                 odd = sorted(vars(twin)["_parameters"].keys() ^ names)
                 raise Forbidden(f"{_OP}: {name} must not add or remove parameters, but does so with {odd[0]!r}")
-        for (registry, own, value), version in zip(placed, versions, strict=True):
-            does = "replace parameters" if registry[own] is not value else "write into its parameters"
-            if registry[own] is not value or _version(value) != version:
+        now = _versions(placed)
+        for (registry, own, value), before, after in zip(placed, versions, now, strict=True):
+            if registry[own] is not value or before != after:
+                does = "replace parameters" if registry[own] is not value else "write into its parameters"
                 raise Forbidden(f"{_OP}: {name} must not {does}, but does so with {own!r}")
 
     def _begin_again(self, placed: list[tuple[dict[str, Any], str, Any]]) -> None:
         """Gives the parts the attributes that they had before the run."""
         for twin, own in self._kept:
             now = vars(twin)
-            if len(now) != len(own) or any(now.get(name) is not value for name, value in own.items()):
+            if now.keys() != own.keys() or not all(map(operator.is_, now.values(), own.values())):
                 kept = {name for name in now if any(now[name] is value for _, _, value in placed)}
                 self.keeps = next(iter(kept), self.keeps)
                 now.clear()
@@ -144,10 +146,12 @@ def _twin(part: nn.Module) -> nn.Module:
     return twin
 
 
-def _version(value: Any) -> int:
-    """Counts what was written into a tensor, or into all cells' ones that it stands for."""
-    tensor = getattr(value, "stacked", value)
-    return 0 if tensor.is_inference() else int(tensor._version)
+def _versions(placed: list[tuple[dict[str, Any], str, Any]]) -> list[int]:
+    """How often each tensor was written into; a loop over cells asks some hundred times a call."""
+    try:
+        return [value._version for _, _, value in placed]
+    except RuntimeError:  # of those of inference mode nobody knows
+        return [0] * len(placed)
 
 
 def _reaches(value: Any, parts: Mapping[int, nn.Module]) -> bool:

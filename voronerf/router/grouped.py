@@ -156,6 +156,10 @@ class PerCell(torch.Tensor):
         wrapper.stacked, wrapper.origin = stacked, origin or (stacked, 0)
         return wrapper
 
+    @property
+    def _version(self) -> int:  # type: ignore[override]
+        return self.stacked._version
+
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
         """Refuses what did not pass through the mode."""

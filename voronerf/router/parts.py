@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -413,6 +413,7 @@ class Parts(nn.Module):
         parts: In the order of their cells: part after part, the cells of each in the order of its leaves.
         diagram: Flat, of the centres of all cells in the scene; for drawings.
         num_cells: k.
+        on_use: Called with every part after it was asked.
 
     Args:
         parts: At least one.
@@ -450,18 +451,17 @@ class Parts(nn.Module):
         self.diagram = VoronoiDiagram(torch.cat(kept))
         self.num_cells = self.diagram.num_cells
         layers = sorted({part.layer for part in parts})
-        #: The parts of each layer, and the diagram of all their leaves where there are several.
+        #: The parts of each layer, and the diagram of all their cells where there are several.
         self.layers = [[i for i, part in enumerate(parts) if part.layer == layer] for layer in layers]
-        joint = [
-            VoronoiDiagram(torch.cat([parts[i].centres for i in of])) if len(of) > 1 else None for of in self.layers
-        ]
+        joint = [VoronoiDiagram(torch.cat([kept[i] for i in of])) if len(of) > 1 else None for of in self.layers]
         self.joint = nn.ModuleList(joint)  # type: ignore[arg-type]
         for level, of in enumerate(self.layers):
-            counts = torch.tensor([parts[i].diagram.num_cells for i in of])
+            counts = torch.tensor([parts[i].num_cells for i in of])
             owners = torch.arange(len(of), dtype=torch.int32).repeat_interleave(counts)
             self.register_buffer(f"_part_of_{level}", owners.to(self.diagram.centres.device), persistent=False)
         self.register_buffer("hidden", None, persistent=False)
         self.backend, self.blend = backend, blend
+        self.on_use: Callable[[Part], None] | None = None
 
     def __iter__(self) -> Iterator[Part]:
         return iter(self.parts)  # type: ignore[arg-type]
@@ -603,7 +603,7 @@ class Parts(nn.Module):
         found = []
         for index in of:
             claim = self._claim(index, positions, rows, None)
-            taken, centres = claim[1], self[index].centres
+            taken, centres = claim[1], self[index].centres[self[index].leaves]
             places = positions[taken]
             nearest = ops.nearest_centre(places, centres.to(places), backend=self.backend).long()
             away = (places - centres[nearest]).norm(dim=-1)
@@ -648,7 +648,8 @@ class Parts(nn.Module):
         of, n = self.layers[level], len(positions)
         if len(of) == 1:
             part = self[of[0]]
-            if part.whole and not part.region and self.hidden is None and len(part.routers) == 1:
+            whole = part.whole and not part.region and self.hidden is None and len(part.routers) == 1
+            if whole and self.on_use is None:
                 return None, *part.evaluate(part.own_points(positions), None, directions, ray_index)
         claims = self._claims(level, positions, 0.0 if self.training else self.blend)
         if not claims:
@@ -657,6 +658,8 @@ class Parts(nn.Module):
         for index, rows, own, leaf, weights in claims:
             rays = ray_index if len(rows) == n and weights is None else ray_index[rows]
             colour, density = self[index].evaluate(own, leaf, directions, rays, self.backend)
+            if self.on_use is not None:
+                self.on_use(self[index])
             if weights is not None:
                 colour, density = colour * weights[:, None], density * weights
             pieces.append((rows, colour, density))

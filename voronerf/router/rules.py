@@ -96,6 +96,13 @@ def matmul(run: GroupedRun, input: Tensor, other: Tensor) -> Any:
 register(torch.Tensor.__rmatmul__, lambda run, other, input: matmul(run, input, other))
 
 
+@rule(torch.addmm, torch.Tensor.addmm)
+def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: float = 1, alpha: float = 1) -> Any:
+    """A shift and rows [n * m, i] with [i, o], without factors."""
+    product = matmul(run, mat1, mat2) if beta == alpha == 1 else NotImplemented
+    return product if product is NotImplemented else _elementwise(torch.add, run, run.mark(product), input)
+
+
 _CONTRACTION = re.compile(r"(\w+?)(\w+),(?:(\w)\2|\2(\w))->\1(?:\3|\4)")
 
 

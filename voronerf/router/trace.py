@@ -41,11 +41,11 @@ class Unfusable(Exception):
     """A module cannot be fused; the message says where, and what to write instead."""
 
 
-def rows_for(module: nn.Module, given: list[Tensor]) -> int:
-    """The number of samples of a trace: a prime of which no size of the module and its arguments is a multiple."""
+def rows_for(module: nn.Module, given: list[Tensor], primes: tuple[int, ...] = _PRIMES) -> int:
+    """A number of samples: one of the primes, of which no size of the module and its arguments is a multiple."""
     sizes = {size for tensor in (*module.parameters(), *module.buffers()) for size in tensor.shape}
     sizes.update(size for tensor in given for size in tensor.shape[1:])
-    return next((rows for rows in _PRIMES if all(size % rows or not size for size in sizes)), _PRIMES[0])
+    return next((rows for rows in primes if all(size % rows or not size for size in sizes)), primes[0])
 
 
 class Trace(TorchFunctionMode):

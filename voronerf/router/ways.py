@@ -36,7 +36,7 @@ from voronerf.tolerances import agree, agree_gradients
 
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs
-_TRIED, _CELLS = 41, 3  # samples of a comparison, unlike any number of features, and their cells
+_TRIED, _CELLS = (41, 43, 47, 53), 3  # numbers of samples of a comparison, of which one is taken, and their cells
 _PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
 _KINDS = 256  # kinds of calls that are remembered
 _EQUAL = 1.02  # of the least time: what is not slower by more, and more promising, is taken
@@ -174,7 +174,7 @@ def find_out(call: Call, grouping: Grouping, choices: Choices, wish: Wish) -> Ki
         if layout.n < _FEWEST:
             if layout.n:
                 Trial(call, grouping).check_parameters()
-            return Kind([Loop(f"for fewer than {_FEWEST} samples")])
+            return Kind([Loop(f"first calls of fewer than {_FEWEST} samples")])
         trial = Trial(call, grouping)
         if kind is not None and not trial.is_groupable():
             kind.put_off()
@@ -337,9 +337,10 @@ class Trial:
     def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
         self.made_of = call, grouping
         device = grouping.device
-        picked = torch.arange(_TRIED, device=device) * call.layout.n // _TRIED
-        cells = (torch.arange(_TRIED, device=device) * 7 % 5 // 2).int()
-        self.entries = Grouping({"cells": cells}, _TRIED, _CELLS, device, grouping.backend, rows=picked)
+        self.n = n = rows_for(call.module, tensors_of((call.args, call.kwargs)), _TRIED)
+        picked = torch.arange(n, device=device) * call.layout.n // n
+        cells = (torch.arange(n, device=device) * 7 % 5 // 2).int()
+        self.entries = Grouping({"cells": cells}, n, _CELLS, device, grouping.backend, rows=picked)
         self.entries.source, self.entries.occupied  # noqa: B018  sorted here: under a mode torch imports its compiler
         generator = torch.Generator().manual_seed(0)
         memo: dict[int, Any] = {id(p): _made_different(p, generator) for p in cell_parameters(call.module)}
@@ -467,7 +468,7 @@ def admitted(trial: Trial, choices: Choices, wish: Wish) -> Kind:
     if loop.keeps:
         says = f"{trial.call.name} keeps a parameter as `{loop.keeps}`, which is of that call alone"
         choices.say_once(f"keeps {trial.call.method}", says)
-    ways, is_open = list[Way](), False
+    ways, is_open, unfused = list[Way](), False, ""
     if wish.fuse and wish.way in ("fastest", "fused"):
         try:
             ways.append(trial.fused(loop, expected, wish.assume))
@@ -478,13 +479,14 @@ def admitted(trial: Trial, choices: Choices, wish: Wish) -> Kind:
             says = f"fuse=True needs a network that can be fused, but in {trial.call.name} {why}"
             if not wish.several:
                 raise ValueError(f"{_OP}: {says}") from error
+            unfused = f"not fused, since {why}"
             choices.say_once(f"fuse {trial.call.method}", says)
             choices.fused.discard(trial.call.method)
     if wish.way in ("fastest", "grouped") or (wish.way == "fused" and not ways):
         try:
             tried = Grouped(quiet=True)
             if trial.agrees(tried, loop, expected):
-                ways.append(Grouped(min(max(_PIECE * _TRIED // tried.widest, 1 << 10), 1 << 16)))
+                ways.append(Grouped(min(max(_PIECE * trial.n // tried.widest, 1 << 10), 1 << 16), why=unfused))
             else:
                 loop.why = "its forward on the samples of all cells gives other results than on those of one cell"
         except BackendUnavailable:

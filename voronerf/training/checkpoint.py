@@ -34,6 +34,8 @@ from voronerf.files import parse_json, rename, write_bytes
 FORMAT = "voronerf-checkpoint-2"
 #: The name of the checksum of the JSON, beside those of the tensors.
 _VALUES = "values"
+#: What `keep` of `load_checkpoint` is asked about the networks of all parts.
+NETWORKS = "part-*.router-*"
 #: The file of the networks of one router of a part.
 _NETWORKS = re.compile(r"(networks|part)-[0-9a-z-]+\.safetensors")
 
@@ -301,7 +303,7 @@ def _read_networks(path: Path, values: dict[str, Any], keep: Callable[[str], boo
         CheckpointError: When a file is missing, damaged or no file of networks.
     """
     tensors: dict[str, Tensor] = {}
-    if not keep("part-"):
+    if not keep(NETWORKS):
         return tensors
     files: dict[str, Checkpoint] = {}
     for i, part in enumerate(values.get("parts", ())):

@@ -26,6 +26,7 @@ from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import why_no_occupancy
 from voronerf.training.parts import grouped_parameters, open_parts, parts_states, recipe_of, restore_parts
 from voronerf.training.renderers import make_contraction
+from voronerf.training.streaming import Pages
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
@@ -254,15 +255,21 @@ def solve_width(config: TrainConfig, total: int) -> int:
 
 
 def open_routers(
-    config: TrainConfig, device: torch.device | str, checkpoint: Checkpoint | None
+    config: TrainConfig, device: torch.device | str, checkpoint: Checkpoint | None, pages: Pages | None = None
 ) -> dict[str, VoronoiRouter | Parts]:
     """The parts of a checkpoint that has some, with their parameters; else what :func:`make_routers` makes.
+
+    Args:
+        config: The settings.
+        device: Of the networks.
+        checkpoint: Of the run that goes on, or is opened.
+        pages: As of :func:`voronerf.training.parts.open_parts`.
 
     Raises:
         CheckpointError: When a part is damaged.
     """
     if checkpoint is not None and "parts" in checkpoint.values:
-        return {"field": open_parts(checkpoint, device, config.backend)}
+        return {"field": open_parts(checkpoint, device, config.backend, pages)}
     return {**make_routers(config, device)}
 
 

@@ -14,13 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.diagram import VoronoiDiagram
-from voronerf.fields import FIELDS
+from voronerf.fields import FIELDS, FieldType
 from voronerf.rendering.contraction import Contraction
 from voronerf.router import Part, Parts, Similarity, Solid, VoronoiRouter
 from voronerf.router.grouping import cell_parameters
 from voronerf.training.average import load_averages
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
 from voronerf.training.config import TrainConfig
+from voronerf.training.streaming import Pages
 
 
 def recipe_of(config: TrainConfig) -> dict[str, Any]:
@@ -42,12 +43,22 @@ def make_router(recipe: Mapping[str, Any], device: torch.device | str = "cpu", b
     around = {
         key: value for key, value in kind.router_options.items() if not (recipe["cell_tables"] and key == "share")
     }
-    with torch.random.fork_rng(devices=[]):
-        network = kind.build(options)
+    network = _unfilled(kind, options)
     centre = VoronoiDiagram(torch.zeros(1, 3))
     router = VoronoiRouter(network, centre, coords="first3", backend=backend, way="fused", **around)
     router.recipe = {"field": name, "options": options, "cell_tables": bool(recipe["cell_tables"])}
-    return router.to(device)
+    return router if any(p.is_meta for p in router.parameters()) else router.to(device)
+
+
+def _unfilled(kind: FieldType, options: Mapping[str, Any]) -> nn.Module:
+    """A network without memory for its parameters, where it is nothing but these; else one with any."""
+    with torch.random.fork_rng(devices=[]):
+        try:
+            with torch.device("meta"):
+                network = kind.build(options)
+        except RuntimeError:  # a field that computes numbers where it is made
+            return kind.build(options)
+        return network if not any(True for _ in network.buffers()) else kind.build(options)
 
 
 def _tuples(value: Any) -> Any:
@@ -94,8 +105,16 @@ def parts_states(parts: Parts) -> dict[str, dict[str, Tensor]]:
     }
 
 
-def open_parts(checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> Parts:
+def open_parts(
+    checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto", pages: Pages | None = None
+) -> Parts:
     """The parts that a checkpoint has; a router that stands in several places is one object.
+
+    Args:
+        checkpoint: With the networks, unless there are pages.
+        device: Of the networks.
+        backend: Of the operations.
+        pages: The files of the networks, of which only as much is read as is needed.
 
     Raises:
         CheckpointError: When something is missing, damaged or does not fit.
@@ -111,14 +130,20 @@ def open_parts(checkpoint: Checkpoint, device: torch.device | str = "cpu", backe
                 file = str(recipe["file"])
                 if file not in made:
                     leaves = (owner == number).nonzero()[:, 0]
-                    state = checkpoint.group(f"part-{index}.router-{number}")
+                    state = checkpoint.group(f"part-{index}.router-{number}") if pages is None else pages.read(file)
                     made[file] = fill_router(make_router(recipe, device, backend), diagram.part(leaves), state, device)
+                    if pages is not None:
+                        pages.watch(file, made[file])
                 routers.append(made[file])
             found.append(place_part(values, routers, diagram.to(device), owner))
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
             line = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise CheckpointError(f"{checkpoint.source}: part {index}: {line}") from None
-    return Parts(found, backend=backend)
+    parts = Parts(found, backend=backend)
+    if pages is not None:
+        pages.check()
+        parts.on_use = pages.used
+    return parts
 
 
 @torch.no_grad()
@@ -158,7 +183,9 @@ def fill_router(
             shape = "nothing" if came is None else list(came.shape)
             raise ValueError(f"{name} must have shape {wanted}, got {shape}")
     values |= {f"diagram.{name}": tensor for name, tensor in diagram.state_dict().items()}
-    router.load_state_dict(values, assign=torch.device(device).type == "cpu")
+    empty = any(parameter.is_meta for parameter in router.parameters())
+    router.load_state_dict(values, assign=empty or torch.device(device).type == "cpu")
+    router.to(device)
     averages = {name: tensor for name, tensor in state.items() if name.endswith(".average")}
     load_averages([p for group in grouped_parameters([router]) for p in group], Checkpoint(averages, {}))
     return router.eval()

@@ -19,6 +19,7 @@ from viser.transforms import SO3
 
 from voronerf.evaluation.panels import palette
 from voronerf.rendering.cameras import Cameras
+from voronerf.training.config import ConfigError
 from voronerf.viewer.cameras import FLIP, look_point, make_camera, scene_bounds
 from voronerf.viewer.cells import describe_cell
 from voronerf.viewer.door import chosen
@@ -123,6 +124,9 @@ class Client:
             self.info = gui.add_markdown(NO_CELL)
             hide = gui.add_button_group("Cell", ("hide", "only this", "show all"))
             self.on(hide.on_click, lambda: self._hide(hide.value))
+            if self.viewer.subject.save is not None:
+                save = gui.add_button("Save what is shown", hint="As a run of its own, beside this one.")
+                self.on(save.on_click, lambda: self.viewer.do(lambda: self.viewer.serve_client(self, self._save)))
         with gui.add_folder("Scene", expand_by_default=False):
             centres = gui.add_checkbox("Centres", False)
             self.on(centres.on_update, lambda: self._show_centres(centres.value))
@@ -195,6 +199,14 @@ class Client:
             inside = groups == groups[self.picked]
             chosen = frozenset((inside if what == "hide" else ~inside).nonzero()[:, 0].tolist())
             self.change(hidden=self.look.hidden | chosen if what == "hide" else chosen)
+
+    def _save(self) -> None:
+        """Writes what is shown as a run, and says where, or why not."""
+        assert self.viewer.subject.save is not None
+        try:
+            self.info.content = f"Saved as `{self.viewer.subject.save(self.look).name}`."
+        except (ConfigError, OSError) as error:
+            self.info.content = f"Not saved: {error}."
 
     # --- what is drawn into the scene ------------------------------------------------------------------------------
 

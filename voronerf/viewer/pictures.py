@@ -59,6 +59,7 @@ class Subject:
         router: its diagram has the cells.
         renderer: how rays become colours.
         weights: a context in which the networks have the weights to show.
+        save: writes what a look shows as a run of its own, and says where; None for a run in training.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Subject:
     router: VoronoiRouter | Parts
     renderer: Renderer
     weights: Callable[[], AbstractContextManager[None]] = nullcontext
+    save: Callable[[Look], Path] | None = None
 
     @property
     def diagram(self) -> VoronoiDiagram:

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,9 +25,11 @@ import viser
 from torch import Tensor
 from viser.uplot import Scale, Series
 
+from voronerf import editing
 from voronerf.data import Scene
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.renderer import RenderedImage
+from voronerf.router import Solid
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
 from voronerf.training.run_directory import read_curve
@@ -255,6 +258,29 @@ def check_address(host: str, port: int) -> None:
         raise ConfigError(f"--host {host} --port {port}: cannot listen there: {error.strerror}") from None
 
 
+def save_shown(run: Run, look: Look) -> Path:
+    """Writes what a look shows of a run as a run beside it; returns the folder.
+
+    Raises:
+        ConfigError: nothing is hidden, or nothing is left.
+        OSError: it cannot be written.
+    """
+    if not look.hidden and look.crop is None:
+        raise ConfigError("everything is shown: hide cells or crop first")
+    source = run.source
+    if look.hidden:
+        shown = torch.ones(source.parts.num_cells, dtype=torch.bool)
+        shown[list(look.hidden)] = False
+        source = editing.cut(source, shown)
+    if look.crop is not None:
+        source = editing.cut(source, Solid.box(*look.crop))
+    folder = run.path.resolve()
+    names = (f"{folder.name}-cut", *(f"{folder.name}-cut-{i}" for i in range(2, 1000)))
+    out = next(path for name in names if not (path := folder.parent / name).exists())
+    editing.write(source, out)
+    return out
+
+
 def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
     """The viewer of a trained run; `Viewer.serve` renders for it.
 
@@ -266,7 +292,8 @@ def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
     Raises:
         ConfigError: the address cannot be listened at.
     """
-    subject = Subject(run.path.resolve().name, run.path, run.scene, run.router, run.renderer)
+    name = run.path.resolve().name
+    subject = Subject(name, run.path, run.scene, run.router, run.renderer, save=partial(save_shown, run))
     viewer = Viewer(subject, host=host, port=port)
     viewer.show_curve(read_curve(run.path))
     return viewer

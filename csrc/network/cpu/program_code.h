@@ -21,8 +21,22 @@ struct ProgramPack {
   int32_t parameter, o, i, start, width, at;
 };
 
+// In the order of voronerf/ops/grouped_program/native.py and of BINARY in voronerf/program.py.
+enum {
+  kProgramInput,
+  kProgramOutput,
+  kProgramLinear,
+  kProgramFunction,
+  kProgramBinary,
+  kProgramTotal,
+  kProgramMove,
+  kProgramOuter,
+  kProgramColumns
+};
+enum { kProgramAdd, kProgramSub, kProgramMul, kProgramDiv, kProgramGate };
+
 struct ProgramOperand {
-  int32_t parameter;  // 1: a packed vector; 0: a slot
+  int32_t parameter;  // 1: of a vector, whose pack stands in the place of the slot; 0: of a value
   int32_t slot, start, stride, width, spread, place;
 };
 
@@ -30,7 +44,7 @@ struct ProgramStep {
   int32_t op, name;
   int32_t order;  // function: of the derivative; linear: 1 or 4 outputs by few_outputs_tile.h, else 0; move: 1 if whole
   int32_t width, slot, stride;
-  int32_t number;            // input, output: which; linear: its panels; total: columns of a group; sums: their partial
+  int32_t number;            // input, output: which; linear: its pack; total: columns of a group; sums: their partial
   int32_t depth;             // linear: of the product; sums: 1 where the inputs are next to each other
   int32_t finish;            // linear: 0, 1 ReLU, 2 where ReLU is 0
   int32_t constants, count;  // of the function; operands, which follow

@@ -12,10 +12,6 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// In the order of voronerf/ops/grouped_program/native.py and of BINARY in voronerf/program.py.
-enum { kInput, kOutput, kLinear, kFunction, kBinary, kTotal, kMove, kOuter, kColumns };
-enum { kAdd, kSub, kMul, kDiv, kGate };
-
 // Columns of a value or of a vector: rows of `stride` floats, 0 where they are all the same.
 struct Rows {
   const float* data;
@@ -80,15 +76,18 @@ struct ProgramTile {
   int64_t begin, rows;
   bool fill;  // the first tile of a task
 
+  const ProgramPack* packs() const {
+    return reinterpret_cast<const ProgramPack*>(call.code + sizeof(ProgramHeader) / 4);
+  }
   float* at(int32_t slot) const { return tiles + int64_t{slot} * header.tile; }
   Rows operand(const ProgramOperand& o) const {
-    if (o.parameter) return {packed + o.slot, 0, o.spread != 0};
+    if (o.parameter) return {packed + packs()[o.slot].at, 0, o.spread != 0};
     return {at(o.slot) + o.start, o.stride, o.spread != 0};
   }
   int64_t place(int64_t row) const { return call.order == nullptr ? begin + row : call.order[begin + row]; }
 
   void run() const {
-    const int32_t* code = call.code + sizeof(ProgramHeader) / 4 + header.packs * sizeof(ProgramPack) / 4;
+    const int32_t* code = reinterpret_cast<const int32_t*>(packs() + header.packs);
     for (int32_t i = 0; i < header.steps; ++i) {
       const ProgramStep& step = *reinterpret_cast<const ProgramStep*>(code);
       const auto* operands = reinterpret_cast<const ProgramOperand*>(code + sizeof(ProgramStep) / 4);
@@ -101,7 +100,7 @@ struct ProgramTile {
     float* const to = at(step.slot);
     const int64_t stride = step.stride, width = step.width;
     switch (step.op) {
-      case kInput: {
+      case kProgramInput: {
         const float* from = call.inputs[step.number];
         if (call.turned[step.number]) return turn(from, step);
         if (call.order == nullptr && width == stride) {
@@ -111,7 +110,7 @@ struct ProgramTile {
         for (int64_t row = 0; row < rows; ++row) copy_row(from + place(row) * width, width, to + row * stride);
         return;
       }
-      case kOutput: {
+      case kProgramOutput: {
         const Rows x = operand(operands[0]);
         float* out = call.outputs[step.number];
         for (int64_t row = 0; row < rows; ++row) {
@@ -125,9 +124,9 @@ struct ProgramTile {
         }
         return;
       }
-      case kLinear:
+      case kProgramLinear:
         return linear(step, operands);
-      case kFunction: {
+      case kProgramFunction: {
         const Rows x = operand(operands[0]), times = step.count > 1 ? operand(operands[1]) : x;
         const Rows* by = step.count > 1 ? &times : nullptr;
         const float* numbers = call.constants + step.constants;
@@ -140,18 +139,18 @@ struct ProgramTile {
         }
         return;
       }
-      case kBinary: {
+      case kProgramBinary: {
         const Rows x = operand(operands[0]), y = operand(operands[1]);
         const F32 zero = splat(0.0f);
-        if (step.name == kAdd) return each(to, stride, rows, x, y, [](F32 a, F32 b) { return a + b; });
-        if (step.name == kSub) return each(to, stride, rows, x, y, [](F32 a, F32 b) { return a - b; });
-        if (step.name == kMul) return each(to, stride, rows, x, y, [](F32 a, F32 b) { return a * b; });
-        if (step.name == kDiv) return each(to, stride, rows, x, y, [](F32 a, F32 b) { return a / b; });
+        if (step.name == kProgramAdd) return each(to, stride, rows, x, y, [](F32 a, F32 b) { return a + b; });
+        if (step.name == kProgramSub) return each(to, stride, rows, x, y, [](F32 a, F32 b) { return a - b; });
+        if (step.name == kProgramMul) return each(to, stride, rows, x, y, [](F32 a, F32 b) { return a * b; });
+        if (step.name == kProgramDiv) return each(to, stride, rows, x, y, [](F32 a, F32 b) { return a / b; });
         return each(to, stride, rows, x, y, [=](F32 a, F32 b) { return b == zero ? zero : a; });
       }
-      case kTotal:
+      case kProgramTotal:
         return total(step, operand(operands[0]));
-      case kMove:
+      case kProgramMove:
         return move(step, operands);
       default:
         return sum(step, operands);
@@ -177,16 +176,17 @@ struct ProgramTile {
     const float* slope = step.finish == 2 ? operand(operands[step.count - 1]).data : nullptr;
     const Finish finish = step.finish == 0 ? Finish::none : step.finish == 1 ? Finish::relu : Finish::relu_slope;
     const Source source{x.data, x.stride, step.depth};
+    const float* const weights = packed + packs()[step.number].at;
     float* const to = at(step.slot);
     if (step.order > 0) {
       const auto product = step.order == 1 ? few_outputs<1> : few_outputs<4>;
-      return product(&source, 1, packed + step.number, step.depth, add.data, step.finish == 1, rows, to);
+      return product(&source, 1, weights, step.depth, add.data, step.finish == 1, rows, to);
     }
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       const int64_t columns = smaller(kPanel, step.stride - first);
       const float* start = add.data == kZeros ? kZeros : add.data + first;
-      multiply<false>({&source, 1, packed + step.number + first * step.depth, columns, start, add.stride, to + first,
-                       step.stride, finish, slope == nullptr ? nullptr : slope + first, nullptr, 0},
+      multiply<false>({&source, 1, weights + first * step.depth, columns, start, add.stride, to + first, step.stride,
+                       finish, slope == nullptr ? nullptr : slope + first, nullptr, 0},
                       rows, columns);
     }
   }
@@ -239,7 +239,7 @@ struct ProgramTile {
   void sum(const ProgramStep& step, const ProgramOperand* operands) const {
     float* const to = partial + step.number;
     const Rows g = operand(operands[0]);
-    if (step.op == kColumns) {
+    if (step.op == kProgramColumns) {
       for (int64_t c = 0; c < step.stride; c += kLanes) {
         F32 sums[4] = {fill ? splat(0.0f) : load(to + c), splat(0.0f), splat(0.0f), splat(0.0f)};
         const float* from = g.data + c;

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import INDEX, check_dtype, check_integer, check_same_device, check_shape
+from voronerf.checks import INDEX, Checked, check_integer, check_same_device
 from voronerf.ops.draw_pixels.reference import Runs
 
 _OP = backends.declare("draw_pixels", native=Implementation(("cpu",), (torch.int32,)))
@@ -42,8 +42,7 @@ def draw_pixels(
         >>> int(pixels.min()), int(pixels.max()), uniforms.shape
         (0, 49, torch.Size([1000, 3]))
     """
-    check_shape(_OP, "seed", seed, (1,))
-    check_dtype(_OP, "seed", seed, INDEX)
+    Checked(_OP).tensor("seed", seed, INDEX, 1)
     check_integer(_OP, "count", count, 1)
     check_integer(_OP, "below", below, 1, 2**48)
     if runs is not None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from voronerf import backends
-from voronerf.backends import FLOATS, Implementation
+from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import (
     INDEX,
     check_count,
@@ -24,7 +24,7 @@ from voronerf.program import Program
 
 _OP = backends.declare(
     "grouped_program",
-    native=Implementation(("cpu",), FLOATS),
+    native=Implementation(EVERYWHERE, FLOATS),
 )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,7 +45,7 @@ def grouped_program(
     return [tensor.to(dtype) for tensor in found]
 
 
-@custom_op("grouped_program_native", devices=("cpu",))
+@custom_op("grouped_program_native")
 def _run(
     inputs: Sequence[Tensor], parameters: Sequence[Tensor], offsets: Tensor, order: Tensor | None, text: str
 ) -> Iterator[list[Tensor]]:
@@ -53,13 +53,12 @@ def _run(
     results = [inputs[0].new_empty(n, columns.width) for columns in program.outputs]
     sums = [inputs[0].new_empty(k, *shape) for shape in program.sums]
     yield [*results, *sums]
-    for result in results:
-        native.on_huge_pages(result)
-    plan = _plan(text)
+    plan, machine = _plan(text), native.machine(inputs[0])
     turned = [not x.is_contiguous() and x.t().is_contiguous() for x in inputs]
+    code, constants = plan.on(inputs[0].device)
     given = native.compiled.ProgramInputs(
-        code=plan.code,
-        constants=plan.constants,
+        code=code,
+        constants=constants,
         inputs=[x.t() if turn else x for x, turn in zip(inputs, turned)],
         turned=torch.tensor(turned, dtype=torch.int32),
         parameters=parameters,
@@ -71,7 +70,14 @@ def _run(
         n=n,
         k=k,
     )
-    native.compiled.grouped_program(given, results, sums, native.cpu())
+    if isinstance(machine, native.compiled.Cpu):
+        for result in results:
+            native.on_huge_pages(result)
+        native.compiled.grouped_program(given, results, sums, machine)
+        return
+    sizes = plan.sizes
+    workspace = code.new_empty(native.compiled.grouped_program_workspace(sizes, n, k, machine), dtype=torch.uint8)
+    native.compiled.grouped_program(given, sizes, results, sums, workspace, machine)
 
 
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
@@ -108,12 +114,26 @@ _run.register_autograd(_gradients, setup_context=_keep)
 # Plans ----------------------------------------------------------------------------------------------------------------
 
 
-class Plan(NamedTuple):
-    """A program as the compiled module reads it (csrc/network/cpu/program_code.h)."""
+class Plan:
+    """A program as the compiled module reads it (csrc/network/cpu/program_code.h).
 
-    code: Tensor
-    constants: Tensor
-    widths: Tensor
+    Attributes:
+        widths: int64, columns of each output.
+        sizes: what CUDA is told of it.
+    """
+
+    def __init__(
+        self, code: list[int], constants: list[float], widths: list[int], sizes: native.compiled.ProgramSizes
+    ) -> None:
+        self._code, self._constants = torch.tensor(code, dtype=torch.int32), torch.tensor(constants)
+        self.widths, self.sizes = torch.tensor(widths, dtype=torch.int64), sizes
+        self._on = {torch.device("cpu"): (self._code, self._constants)}
+
+    def on(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Code and constants on a device, copied there once."""
+        if device not in self._on:
+            self._on[device] = self._code.to(device), self._constants.to(device)
+        return self._on[device]
 
 
 class _Slots:
@@ -162,7 +182,7 @@ class _Writing:
     def __init__(self, program: Program) -> None:
         self.program = program
         self.slots, self.where, self.packed, self.partial = _Slots(), dict[int, tuple[int, int]](), 0, 0
-        self.packs: dict[tuple[int, ...], int] = {}
+        self.packs: dict[tuple[int, ...], tuple[int, int]] = {}  # their number, and where they are
         self.code: list[int] = []
         self.constants: list[float] = [0.0, 0.0]
         self.sums: list[tuple[int, ...]] = []
@@ -174,14 +194,14 @@ class _Writing:
         self.slots.give(width, place)
 
     def pack(self, kind: int, parameter: int, start: int, width: int, floats: int) -> int:
-        """Where a part of a parameter is packed."""
+        """The number of the pack of a part of a parameter."""
         shape = self.program.parameters[parameter]
         o, i = shape if len(shape) == 2 else (1, shape[0])
         key = (kind, parameter, o, i, start, width)
         if key not in self.packs:
-            self.packs[key] = self.packed
+            self.packs[key] = len(self.packs), self.packed
             self.packed += floats
-        return self.packs[key]
+        return self.packs[key][0]
 
     def operand(self, c: Columns, place: int = 0) -> list[int]:
         """One operand's record."""
@@ -275,9 +295,11 @@ class _Writing:
         self.sums.sort()
         fitting = _FLOATS // max(self.slots.size, 1) // _ROWS[0] * _ROWS[0]
         tile = min(max(fitting, _ROWS[0]), _ROWS[1])
-        header = [tile, self.slots.size, self.packed, self.partial, len(self.packs), self.count, len(self.sums)]
-        packs = [entry for key, at in self.packs.items() for entry in (*key, at)]
+        program, columns = self.program, self.slots.size
+        header = [tile, columns, self.packed, self.partial, len(self.packs), self.count, len(self.sums)]
+        packs = [entry for key, (_, at) in self.packs.items() for entry in (*key, at)]
         sums = [entry for record in self.sums for entry in record]
-        code = torch.tensor([*header, *packs, *self.code, *sums], dtype=torch.int32)
-        widths = torch.tensor([c.width for c in self.program.outputs], dtype=torch.int64)
-        return Plan(code, torch.tensor(self.constants), widths)
+        counts = [len(part) for part in (program.inputs, program.parameters, program.outputs, program.sums)]
+        sizes = native.compiled.ProgramSizes(columns, self.partial, *counts)
+        widths = [c.width for c in program.outputs]
+        return Plan([*header, *packs, *self.code, *sums], self.constants, widths, sizes)

@@ -118,7 +118,7 @@ def render_loss_gradient(
         >>> float(result.loss), gradient[:, :3].round(decimals=4)
         (0.25, tensor([[-0.0833, -0.0833, -0.0833]]))
     """
-    given = _checked(_GRADIENT, raw.detach(), deltas, ray_offsets, target, background, density_scale, hidden)
+    given = _checked(_GRADIENT, raw, deltas, ray_offsets, target, background, density_scale, hidden)
     *parts, gradient = backends.resolve(_GRADIENT, backend=backend, device=raw.device, dtype=raw.dtype)(given)
     return RenderLoss(*parts), gradient
 
