@@ -1,16 +1,16 @@
 """Weak scaling of joint training: the city grows with the ranks, four blocks for each, in processes of this machine.
 
-    python benchmarks/scaling.py --ranks 1 2 4 8 16 32 --out benchmarks/results/scaling.json
+    python benchmarks/scaling.py --ranks 4 8 16 32 --out benchmarks/results/scaling.json --plot docs/images/scaling.png
 
 Each rank has one territory, with so many cells and rays whatever the number of ranks. Processor time is that of the
-whole process, its messages included; a rank that waits for others takes none.
+whole process, its messages included; a rank that waits for others takes none. With ``--territories 2 --blocks 4 4``,
+``--ranks 2`` and ``--ranks 1 --threads 2`` train the same run.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import multiprocessing
 import os
 import resource
@@ -32,19 +32,20 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
     """Trains on one rank; writes what it took."""
     os.environ |= {"RANK": str(number), "LOCAL_RANK": str(number), "WORLD_SIZE": str(size)}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "TORCHELASTIC_USE_AGENT_STORE": "True"}
-    torch.set_num_threads(1)
+    torch.set_num_threads(options["threads"])
     from voronerf.data import city_scene
     from voronerf.distributed.group import joined
     from voronerf.training.config import TrainConfig
     from voronerf.training.joint import JointTrainer
 
-    scene = city_scene(options["size"], blocks=CITIES[size], train_views=20, test_views=2, images="disk")
+    blocks = tuple(options["blocks"] or CITIES[size])
+    scene = city_scene(options["size"], blocks=blocks, train_views=20, test_views=2, images="disk")
     steps, last = options["steps"], options["last"]
     config = TrainConfig(
         out=Path(folder) / "run",
         data="builtin-city",
         steps=steps,
-        territories=size,
+        territories=options["territories"] or size,
         rays=options["rays"],
         ray_growth=1.0,
         cells=(options["cells"],),
@@ -59,7 +60,7 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
         trainer = JointTrainer(config, scene, group=group)
         found: list[dict[str, float]] = []
         for _ in range(steps):
-            own = next(iter(trainer.trainers.values()))
+            began = time.perf_counter()
             before = time.process_time(), sum(group.sent.values()), sum(group.messages.values())
             trainer._split()
             trainer.train_step()
@@ -70,9 +71,10 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
             found.append(
                 {
                     "ms": 1e3 * (after[0] - before[0]),
+                    "clock_ms": 1e3 * (time.perf_counter() - began),
                     "kb": (after[1] - before[1]) / 1e3,
                     "messages": after[2] - before[2],
-                    "samples": trainer.work[own_number(trainer)],
+                    "samples": sum(trainer.work.values()),
                 }
             )
             trainer.work = dict.fromkeys(trainer.work, 0)
@@ -86,14 +88,9 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
         result["early_ms"] = statistics.mean(step["ms"] for step in found[8:40])
         result["private_mb"] = private / 1e3
         result["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-        result["neighbours"] = int((trainer.joint.map.links[own_number(trainer)] >= 0).sum())
+        result["neighbours"] = max(int((trainer.joint.map.links[n] >= 0).sum()) for n in trainer.trainers)
         result["loss"] = trainer.loss
         Path(folder, f"{number}.json").write_text(json.dumps(result))
-
-
-def own_number(trainer: Any) -> int:
-    """The territory of a rank that has one."""
-    return next(iter(trainer.trainers))
 
 
 def measure(size: int, options: dict[str, Any]) -> dict[str, Any]:
@@ -109,11 +106,44 @@ def measure(size: int, options: dict[str, Any]) -> dict[str, Any]:
         for process in ranks:
             process.join()
         found = [json.loads(Path(folder, f"{n}.json").read_text()) for n in range(size)]
-    row: dict[str, Any] = {"ranks": size, "blocks": list(CITIES[size]), "wall_s": time.monotonic() - began}
+    row: dict[str, Any] = {
+        "ranks": size,
+        "blocks": list(options["blocks"] or CITIES[size]),
+        "wall_s": time.monotonic() - began,
+    }
     for name in found[0]:
         row[name] = statistics.median(each[name] for each in found)
         row[f"{name}_largest"] = max(each[name] for each in found)
     return row
+
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draws what a rank takes over the number of ranks, each as a multiple of that of four."""
+    import matplotlib.pyplot as plt
+
+    first = next(row for row in rows if row["ranks"] == 4)
+    shown = [row for row in rows if row["ranks"] >= 4]
+    figure, axes = plt.subplots(figsize=(6, 3.4))
+    names = {
+        "ms": "processor time, median",
+        "ms_largest": "processor time, largest",
+        "private_mb": "memory",
+        "kb": "bytes sent",
+        "messages": "messages",
+    }
+    for name, label in names.items():
+        axes.plot([row["ranks"] for row in shown], [row[name] / first[name] for row in shown], "o-", label=label)
+    axes.axhspan(0.85, 1.15, color="0.9")
+    axes.set(
+        xscale="log",
+        xlabel="ranks, each with four blocks of the city",
+        ylabel="over that of 4 ranks",
+    )
+    axes.set_xticks([row["ranks"] for row in shown], [str(row["ranks"]) for row in shown], minor=False)
+    axes.minorticks_off()
+    axes.legend(frameon=False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
 
 
 def main() -> None:
@@ -126,16 +156,21 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--size", type=int, default=50)
     parser.add_argument("--field", default="hashgrid")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--territories", type=int)
+    parser.add_argument("--blocks", type=int, nargs=2)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--plot", type=Path)
     arguments = vars(parser.parse_args())
-    out, sizes = arguments.pop("out"), arguments.pop("ranks")
+    out, sizes, drawn = arguments.pop("out"), arguments.pop("ranks"), arguments.pop("plot")
     rows = []
     for size in sizes:
         rows.append(measure(size, arguments))
         print({key: round(value, 3) if isinstance(value, float) else value for key, value in rows[-1].items()})
         load = [round(value, 1) for value in os.getloadavg()]
         out.write_text(json.dumps({"metadata": metadata(**arguments, load=load), "results": rows}, indent=1) + "\n")
-    assert all(math.isfinite(row["ms"]) for row in rows)
+    if drawn is not None:
+        plot(rows, drawn)
 
 
 if __name__ == "__main__":
